@@ -1,0 +1,1 @@
+"""Value types shared by every layer: frames, GPS time, heights, ids, rig, survey, errors."""

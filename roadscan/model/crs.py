@@ -1,0 +1,390 @@
+"""Where coordinates live: world frames, map frames and heights.
+
+A *world frame* is Cartesian and holds poses: the geocentric frame of a datum (ECEF), or
+``"local"`` for a rig whose poses are not tied to the Earth. A *map frame* is what products are
+written in: easting, northing and height, always in metres inside roadscan; products convert to
+the CRS's own unit. PROJ's network access is off, and a geoid is applied only from a named grid.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import pyproj.datadir
+from pyproj.crs.crs import CompoundCRS
+from pyproj.exceptions import CRSError as ProjCrsError
+from pyproj.exceptions import ProjError
+from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
+from pyproj.transformer import TransformerGroup
+
+from roadscan.model.errors import CrsError
+from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
+
+set_network_enabled(active=False)
+
+Float64 = npt.NDArray[np.float64]
+HeightKind = Literal["ellipsoidal", "orthometric"]
+
+LOCAL_WORLD: Final = "local"
+"""World frame of poses that are not tied to the Earth: x, y, z of the local frame itself."""
+WGS84_WORLD: Final = "EPSG:4978"
+
+_CARTESIAN_AXES: Final = {
+    "subtype": "Cartesian",
+    "axis": [
+        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}", "unit": "metre"} for a in "XYZ"
+    ],
+}
+
+
+def crs_from_text(text: str) -> pyproj.CRS:
+    """CRS from ``"EPSG:25832"``, WKT or PROJJSON; a clear error otherwise."""
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except ProjCrsError as error:
+        raise CrsError(
+            f"CRS '{text[:80]}' is not known to PROJ",
+            expected="an authority code such as EPSG:25832, or WKT",
+            change=f"PROJ says: {error}",
+        ) from error
+
+
+@functools.lru_cache(maxsize=64)
+def world_frame_of(crs: str) -> str:
+    """World frame (geocentric CRS of the same datum) that positions stated in `crs` live in."""
+    stated = crs_from_text(crs)
+    if stated.is_geocentric:
+        return _name_of(stated)
+    geodetic = stated.geodetic_crs
+    if geodetic is None:
+        raise CrsError(f"CRS '{crs}' has no datum", expected="a geographic, projected or geocentric CRS")
+    parts = geodetic.to_3d().to_json_dict()
+    datum = {k: parts[k] for k in ("datum", "datum_ensemble") if k in parts}
+    if datum.get("datum_ensemble", {}).get("id", {}).get("code") == 6326:
+        return WGS84_WORLD
+    return _name_of(
+        pyproj.CRS.from_json_dict(
+            {
+                "$schema": parts["$schema"],
+                "type": "GeodeticCRS",
+                "name": f"{geodetic.name} (geocentric)",
+                "coordinate_system": _CARTESIAN_AXES,
+                **datum,
+            }
+        )
+    )
+
+
+def _name_of(crs: pyproj.CRS) -> str:
+    authority = crs.to_authority(min_confidence=90)
+    if authority is None:
+        return str(crs.to_wkt())
+    return WGS84_WORLD if authority == ("EPSG", "4328") else ":".join(authority)
+
+
+def world_title(world: str) -> str:
+    """Short readable name of a world frame, for messages and pages."""
+    return "local frame" if world == LOCAL_WORLD else str(crs_from_text(world).name)
+
+
+def add_grid_folder(folder: str | Path) -> None:
+    """Let PROJ look for geoid grids in `folder` too."""
+    known = pyproj.datadir.get_data_dir().split(":")
+    if str(folder) not in known:
+        pyproj.datadir.append_data_dir(str(folder))
+
+
+@dataclass(frozen=True)
+class Geoid:
+    """A named geoid grid: orthometric = ellipsoidal − undulation."""
+
+    grid: str
+
+    def undulation_m(self, longitude_deg: npt.ArrayLike, latitude_deg: npt.ArrayLike) -> Float64:
+        """Geoid height above the ellipsoid (m) at geodetic degrees, (n,)."""
+        lon = np.atleast_1d(np.asarray(longitude_deg, dtype=np.float64))
+        lat = np.atleast_1d(np.asarray(latitude_deg, dtype=np.float64))
+        _, _, shifted = self._transformer().transform(np.radians(lon), np.radians(lat), np.zeros_like(lon))
+        height = np.asarray(shifted, dtype=np.float64)
+        if not np.all(np.isfinite(height)):
+            bad = int(np.flatnonzero(~np.isfinite(height))[0])
+            raise CrsError(
+                f"geoid grid '{self.grid}' does not cover longitude {lon[bad]:.4f}°, latitude {lat[bad]:.4f}°",
+                expected="a grid of the survey's region",
+                change="name another grid in map.geoid",
+            )
+        return height
+
+    def _transformer(self) -> pyproj.Transformer:
+        try:
+            return pyproj.Transformer.from_pipeline(f"+proj=vgridshift +grids={self.grid} +multiplier=1")
+        except ProjError as error:
+            folders = pyproj.datadir.get_data_dir()
+            raise CrsError(
+                f"geoid grid '{self.grid}' was not found",
+                expected=f"a file of that name in map.grids or in {folders}",
+                change="put the grid there (roadscan never downloads one), or use ellipsoidal heights",
+            ) from error
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Ties a local frame to the Earth: its origin, and where its y axis points."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    """Ellipsoidal height of the origin (m)."""
+    heading_deg: float = 0.0
+    """Heading of the local y axis, clockwise from true north (degrees); 0: x is east, y north."""
+    crs: str = "EPSG:4979"
+    """Geographic CRS of latitude, longitude and ellipsoidal height."""
+
+    @property
+    def world(self) -> str:
+        """World frame (ECEF) of the anchor's datum."""
+        return world_frame_of(self.crs)
+
+    def ecef_from_local(self) -> tuple[Float64, Float64]:
+        """Rotation (3, 3) and translation (3,) with p_ecef = R · p_local + t."""
+        geographic = crs_from_text(self.crs).to_3d()
+        to_ecef = pyproj.Transformer.from_crs(geographic, crs_from_text(self.world), always_xy=True)
+        origin = np.array(to_ecef.transform(self.longitude_deg, self.latitude_deg, self.height_m))
+        ecef_from_enu = (
+            ecef_from_ned(math.radians(self.latitude_deg), math.radians(self.longitude_deg)) @ ENU_FROM_NED.T
+        )
+        c, s = math.cos(math.radians(self.heading_deg)), math.sin(math.radians(self.heading_deg))
+        enu_from_local = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return ecef_from_enu @ enu_from_local, origin
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """The survey's map: a projected CRS, or a local engineering frame.
+
+    Coordinates are (n, 3) easting, northing, height in **metres**; divide by
+    `horizontal_unit_m` and `vertical_unit_m` for the CRS's own units.
+    """
+
+    crs: str | None
+    """Projected CRS; None for a local frame."""
+    local_name: str = ""
+    anchor: Anchor | None = None
+    height: HeightKind = "ellipsoidal"
+    geoid: Geoid | None = None
+    vertical_crs: str | None = None
+    """Vertical CRS named in the products' WKT; changes no number."""
+    max_datum_error_m: float = 0.05
+    """A change of datum less accurate than this is refused."""
+
+    def __post_init__(self) -> None:
+        if self.height == "orthometric" and self.geoid is None and self.crs is not None:
+            raise CrsError(
+                "orthometric heights were asked for, and no geoid is named",
+                expected="map.geoid, the file name of a grid",
+                change='add geoid = "us_noaa_g2018u0.tif" (your region\'s grid), or height = "ellipsoidal"',
+            )
+        if self.crs is not None:
+            horizontal = crs_from_text(self.crs)
+            if horizontal.is_compound:
+                raise CrsError(
+                    f"map.crs '{self.crs}' is compound",
+                    expected="a projected CRS; heights are stated apart",
+                    change="put the vertical part into map.vertical_crs, with map.height and map.geoid",
+                )
+            if not horizontal.is_projected:
+                raise CrsError(
+                    f"map.crs '{self.crs}' ({horizontal.name}) is not projected",
+                    expected="a CRS in metres or feet, such as a UTM zone",
+                )
+
+    @property
+    def is_local(self) -> bool:
+        """True for a local engineering frame."""
+        return self.crs is None
+
+    @property
+    def horizontal_unit_m(self) -> float:
+        """Length of the CRS's horizontal unit in metres."""
+        return 1.0 if self.crs is None else float(crs_from_text(self.crs).axis_info[0].unit_conversion_factor)
+
+    @property
+    def vertical_unit_m(self) -> float:
+        """Length of the CRS's height unit in metres (1 unless a vertical CRS says otherwise)."""
+        if self.vertical_crs is None:
+            return 1.0
+        return float(crs_from_text(self.vertical_crs).axis_info[-1].unit_conversion_factor)
+
+    def wkt(self, version: Literal["WKT1_GDAL", "WKT2_2019"] = "WKT2_2019") -> str:
+        """WKT of the horizontal CRS, compound where a vertical CRS is named."""
+        if self.crs is None:
+            name = self.local_name or "local"
+            if version == "WKT1_GDAL":
+                return f'LOCAL_CS["{name}",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+            return (
+                f'ENGCRS["{name}",EDATUM["{name}"],CS[Cartesian,2],AXIS["easting (x)",east],'
+                'AXIS["northing (y)",north],LENGTHUNIT["metre",1]]'
+            )
+        crs = crs_from_text(self.crs)
+        if self.vertical_crs is not None:
+            vertical = crs_from_text(self.vertical_crs)
+            crs = CompoundCRS(name=f"{crs.name} + {vertical.name}", components=[crs, vertical])
+        return str(crs.to_wkt(version))
+
+    def map_from_world(self, world: str, xyz_world_m: Float64) -> Float64:
+        """Easting, northing, height (n, 3) in metres of world positions (n, 3) in metres."""
+        return self._forward(world, np.asarray(xyz_world_m, dtype=np.float64))
+
+    def world_from_map(self, world: str, enh_m: Float64) -> Float64:
+        """World positions (n, 3) of map coordinates (n, 3) in metres: the inverse of `map_from_world`."""
+        return self._inverse(world, np.asarray(enh_m, dtype=np.float64))
+
+    def _forward(self, world: str, xyz: Float64) -> Float64:
+        if self.crs is None:
+            if world == LOCAL_WORLD:
+                return xyz.copy()
+            rotation, origin = self._anchor_for(world).ecef_from_local()
+            return (self._to_anchor_world(world).forward(xyz) - origin) @ rotation
+        if world == LOCAL_WORLD:
+            anchor = self._anchor_for(world)
+            rotation, origin = anchor.ecef_from_local()
+            return self._forward(anchor.world, xyz @ rotation.T + origin)
+        return _projection(self.crs, world, self.geoid, self.max_datum_error_m).forward(xyz)
+
+    def _inverse(self, world: str, enh: Float64) -> Float64:
+        if self.crs is None:
+            if world == LOCAL_WORLD:
+                return enh.copy()
+            rotation, origin = self._anchor_for(world).ecef_from_local()
+            return self._to_anchor_world(world).inverse(enh @ rotation.T + origin)
+        if world == LOCAL_WORLD:
+            anchor = self._anchor_for(world)
+            rotation, origin = anchor.ecef_from_local()
+            return (self._inverse(anchor.world, enh) - origin) @ rotation
+        return _projection(self.crs, world, self.geoid, self.max_datum_error_m).inverse(enh)
+
+    def _anchor_for(self, world: str) -> Anchor:
+        if self.anchor is None:
+            raise CrsError(
+                f"poses are in the {world_title(world)}, the map is "
+                + (f"'{self.crs}'" if self.crs else "a local frame without an anchor"),
+                expected="map.local.anchor, which ties the local frame to the Earth",
+                change="add anchor = { latitude_deg, longitude_deg, height_m, heading_deg }",
+            )
+        return self.anchor
+
+    def _to_anchor_world(self, world: str) -> _Step:
+        return _datum_step(world, self._anchor_for(world).world, self.max_datum_error_m)
+
+
+class _Step:
+    """A pyproj transformation with units brought to metres on the map side."""
+
+    def __init__(
+        self,
+        transformer: pyproj.Transformer,
+        unit_m: Float64,
+        geoid: Geoid | None = None,
+        to_degrees: pyproj.Transformer | None = None,
+    ) -> None:
+        self._transformer = transformer
+        self._unit_m = unit_m
+        self._geoid = geoid
+        self._to_degrees = to_degrees or transformer
+
+    def forward(self, xyz: Float64) -> Float64:
+        out = np.stack(self._transformer.transform(*xyz.T), axis=-1) * self._unit_m
+        if not np.all(np.isfinite(out)):
+            raise CrsError("a position cannot be projected into the map", change="check the CRS and the poses")
+        if self._geoid is not None:
+            out[:, 2] -= self._undulation(self._geoid, xyz)
+        return out
+
+    def inverse(self, enh: Float64) -> Float64:
+        ellipsoidal = enh
+        if self._geoid is not None:
+            # Undulation at the ground position; 100 m of height error would move it by less than 1 nm.
+            ground = self._back(enh)
+            ellipsoidal = enh + np.pad(self._undulation(self._geoid, ground)[:, None], ((0, 0), (2, 0)))
+        return self._back(ellipsoidal)
+
+    def _back(self, enh: Float64) -> Float64:
+        e, n, h = (enh / self._unit_m).T
+        return np.stack(self._transformer.transform(e, n, h, direction="INVERSE"), axis=-1)
+
+    def _undulation(self, geoid: Geoid, xyz: Float64) -> Float64:
+        x, y, z = xyz.T
+        lon, lat, _ = self._to_degrees.transform(x, y, z)
+        return geoid.undulation_m(lon, lat)
+
+
+@functools.lru_cache(maxsize=64)
+def _projection(crs: str, world: str, geoid: Geoid | None, limit_m: float) -> _Step:
+    target = crs_from_text(crs).to_3d()
+    units = np.array([axis.unit_conversion_factor for axis in target.axis_info[:3]])
+    source = crs_from_text(world)
+    geographic = _geographic_of(world)
+    to_degrees = pyproj.Transformer.from_crs(source, geographic, always_xy=True) if geoid else None
+    return _Step(_transformer(source, target, limit_m), units, geoid, to_degrees)
+
+
+@functools.lru_cache(maxsize=64)
+def _datum_step(world: str, target: str, limit_m: float) -> _Step:
+    return _Step(_transformer(crs_from_text(world), crs_from_text(target), limit_m), np.ones(3))
+
+
+def _geographic_of(world: str) -> pyproj.CRS:
+    source = crs_from_text(world)
+    parts: dict[str, Any] = source.to_json_dict()
+    axes = [
+        {"name": "Latitude", "abbreviation": "lat", "direction": "north", "unit": "degree"},
+        {"name": "Longitude", "abbreviation": "lon", "direction": "east", "unit": "degree"},
+        {"name": "Ellipsoidal height", "abbreviation": "h", "direction": "up", "unit": "metre"},
+    ]
+    parts.update(type="GeographicCRS", name=source.name, coordinate_system={"subtype": "ellipsoidal", "axis": axes})
+    parts.pop("id", None)
+    return pyproj.CRS.from_json_dict(parts)
+
+
+def _transformer(source: pyproj.CRS, target: pyproj.CRS, limit_m: float) -> pyproj.Transformer:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: we never do
+        group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+    known = [t for t in group.transformers if t.accuracy >= 0]
+    if known and known[0].accuracy <= limit_m:
+        return known[0]
+    found = f"known to {known[0].accuracy:g} m only" if known else "not known to PROJ"
+    raise CrsError(
+        f"the change of datum from {source.name} to {target.name} is {found}",
+        expected=f"a datum change within map.max_datum_error_m = {limit_m:g}",
+        change=(
+            "state the trajectory's crs in the datum it was really processed in (often the map's own), "
+            "or raise map.max_datum_error_m if that error is acceptable"
+        ),
+    )
+
+
+def geodetic_from_world(world: str, xyz_world_m: Float64) -> Float64:
+    """Longitude (°), latitude (°), ellipsoidal height (m), (n, 3), of positions in a geocentric world frame."""
+    to_degrees = pyproj.Transformer.from_crs(crs_from_text(world), _geographic_of(world), always_xy=True)
+    return np.stack(to_degrees.transform(*np.asarray(xyz_world_m, dtype=np.float64).T), axis=-1)
+
+
+def world_from_geodetic(world: str, lon_lat_height: Float64) -> Float64:
+    """Positions (n, 3) in a geocentric world frame of longitude (°), latitude (°), ellipsoidal height (m)."""
+    from_degrees = pyproj.Transformer.from_crs(_geographic_of(world), crs_from_text(world), always_xy=True)
+    return np.stack(from_degrees.transform(*np.asarray(lon_lat_height, dtype=np.float64).T), axis=-1)
+
+
+def grid_convergence_rad(crs: str, lon_lat_deg: Float64) -> Float64:
+    """Meridian convergence (rad, (n,)): grid north is this far clockwise from true north."""
+    factors = pyproj.Proj(crs_from_text(crs)).get_factors(*np.asarray(lon_lat_deg, dtype=np.float64)[:, :2].T)
+    return np.radians(np.asarray(factors.meridian_convergence, dtype=np.float64))

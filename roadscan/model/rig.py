@@ -1,0 +1,105 @@
+"""The rig: sensors and how they are mounted on the vehicle (``RIG.toml``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from roadscan.model.frames import BODY_FROM_AXES, body_from_axes, rotation_from_rph
+from roadscan.model.strict import Strict, load_toml
+
+Float64 = npt.NDArray[np.float64]
+
+SensorKind = Literal["profiler", "lidar", "camera", "gnss", "imu", "encoder"]
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Lever arm and boresight: p_body = body_from_sensor · p_sensor + lever_arm_body_m."""
+
+    lever_arm_body_m: tuple[float, float, float]
+    """IMU reference point to sensor origin, body axes (forward, right, down), metres."""
+    body_from_sensor: tuple[tuple[float, float, float], ...]
+    """(3, 3) rotation, sensor frame to body."""
+
+    def arrays(self) -> tuple[Float64, Float64]:
+        """Rotation (3, 3) and lever arm (3,)."""
+        return np.array(self.body_from_sensor), np.array(self.lever_arm_body_m)
+
+
+class Boresight(Strict):
+    """Small rotation between the sensor's nominal axes and its true ones (degrees, Z-Y-X)."""
+
+    roll_deg: float = 0.0
+    """Rotation about body x (forward); positive lowers the right side."""
+    pitch_deg: float = 0.0
+    """Rotation about body y (right); positive raises the front."""
+    heading_deg: float = 0.0
+    """Rotation about body z (down); positive turns clockwise seen from above."""
+
+
+class Sensor(Strict):
+    """One sensor of the rig."""
+
+    kind: SensorKind
+    """What it is: profiler, lidar, camera, gnss, imu or encoder."""
+    model: str = ""
+    """Maker's name, for the reader of the file only."""
+    axes: str = "frd"
+    """Where the sensor's x, y, z point when it is mounted without misalignment: three letters
+    of f(orward) b(ack) r(ight) l(eft) u(p) d(own): frd, flu, rfu or bru. Ignored with `body_from_sensor`."""
+    lever_arm_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the IMU reference point to the sensor's origin, body axes forward, right, down (m)."""
+    boresight: Boresight = Boresight()
+    """Misalignment: body_from_sensor = R(roll, pitch, heading) · body_from_axes."""
+    body_from_sensor: tuple[tuple[float, float, float], ...] | None = None
+    """The whole 3 × 3 rotation as rows, in place of `axes` and `boresight` (from a calibration sheet)."""
+    range_min_m: float = Field(default=0.0, ge=0.0)
+    """Readings nearer than this are left out (own vehicle)."""
+    range_max_m: float = Field(default=float("inf"), gt=0.0)
+    """Readings farther than this are left out."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.axes not in BODY_FROM_AXES:
+            raise ValueError(f"axes '{self.axes}', expected one of {', '.join(BODY_FROM_AXES)}")
+        if self.range_max_m <= self.range_min_m:
+            raise ValueError(f"range_max_m {self.range_max_m:g} is not above range_min_m {self.range_min_m:g}")
+        if self.body_from_sensor is not None:
+            matrix = np.array(self.body_from_sensor, dtype=np.float64)
+            if matrix.shape != (3, 3) or np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4:
+                raise ValueError("body_from_sensor is not a 3 × 3 rotation (rows do not make an orthonormal set)")
+            if np.linalg.det(matrix) < 0:
+                raise ValueError("body_from_sensor mirrors (determinant −1): an axis points the wrong way")
+        return self
+
+    def mounting(self) -> Mounting:
+        """Mounting as stated in the rig file."""
+        if self.body_from_sensor is not None:
+            rotation = np.array(self.body_from_sensor)
+        else:
+            b = self.boresight
+            rotation = rotation_from_rph(*np.radians([b.roll_deg, b.pitch_deg, b.heading_deg])) @ body_from_axes(
+                self.axes
+            )
+        rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
+        return Mounting(self.lever_arm_body_m, rows)
+
+
+class Rig(Strict):
+    """A vehicle and its sensors."""
+
+    name: str = ""
+    """Name of the rig."""
+    sensors: dict[str, Sensor] = {}
+    """Sensors by name; logs refer to them by this name."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read ``RIG.toml``."""
+        return cls.parse(load_toml(path), file=path)

@@ -1,0 +1,346 @@
+"""The survey: what was driven, on which map, and what to make of it (``SURVEY.toml``)."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.model.crs import Anchor, Geoid, MapFrame
+from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.model.ids import LanePass, PassId, RunId
+from roadscan.model.rig import Rig, Sensor
+from roadscan.model.strict import Strict, load_toml
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+
+
+class AnchorConfig(Strict):
+    """Ties the local frame to the Earth."""
+
+    latitude_deg: float = Field(ge=-90, le=90)
+    """Geodetic latitude of the origin (degrees)."""
+    longitude_deg: float = Field(ge=-180, le=360)
+    """Longitude of the origin (degrees)."""
+    height_m: float
+    """Ellipsoidal height of the origin (m)."""
+    heading_deg: float = 0.0
+    """Heading of the local y axis, clockwise from true north (degrees)."""
+    crs: str = "EPSG:4979"
+    """Geographic CRS of the three numbers above."""
+
+
+class LocalConfig(Strict):
+    """A local engineering frame: x to the right of y, z up, metres."""
+
+    name: str = "local"
+    """Name written into the products."""
+    anchor: AnchorConfig | None = None
+    """Where the frame lies on the Earth; needed only to mix it with Earth-bound data."""
+
+
+class MapConfig(Strict):
+    """Map frame of the survey and its heights."""
+
+    crs: str | None = None
+    """Projected CRS, such as "EPSG:25832"; its own unit is used in the products."""
+    local: LocalConfig | None = None
+    """A local engineering frame, in place of `crs`, or the frame of local poses beside it."""
+    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
+    """Kind of the products' heights; orthometric needs `geoid`."""
+    geoid: str | None = None
+    """File name of the geoid grid (GTX or GeoTIFF as PROJ reads it); never downloaded."""
+    grids: Path | None = None
+    """Folder with geoid grids, relative to the survey file."""
+    vertical_crs: str | None = None
+    """Vertical CRS to name in the products' WKT, such as "EPSG:7837"."""
+    max_datum_error_m: float = Field(default=0.05, ge=0)
+    """Largest accepted error of a change of datum between logs and map (m)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.crs is None and self.local is None:
+            raise ValueError('say where the map is: crs = "EPSG:…" or [map.local]')
+        return self
+
+    def frame(self) -> MapFrame:
+        """The map frame these settings describe."""
+        anchor = None
+        if self.local is not None and self.local.anchor is not None:
+            anchor = Anchor(**self.local.anchor.model_dump())
+        return MapFrame(
+            crs=self.crs,
+            local_name=self.local.name if self.local else "",
+            anchor=anchor,
+            height=self.height,
+            geoid=Geoid(self.geoid) if self.geoid and self.height == "orthometric" else None,
+            vertical_crs=self.vertical_crs,
+            max_datum_error_m=self.max_datum_error_m,
+        )
+
+
+class ClockConfig(Strict):
+    """Time system of a log and the clock's measured error."""
+
+    system: TimeSystem
+    """gps, gps_week_seconds, gps_adjusted, unix_gps, unix_utc, unix_tai, utc_hour or free."""
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Unit of numeric stamps."""
+    week: int | None = Field(default=None, ge=0, le=5000)
+    """GPS week of the log's first stamp."""
+    date: dt.date | None = None
+    """UTC date of the log's first stamp; stands for the week, and resolves the hour of `utc_hour`."""
+    offset_s: float = 0.0
+    """Measured correction added to every stamp (s)."""
+    drift_ppm: float = 0.0
+    """Measured rate error (parts per million) from `reference_s` on."""
+    reference_s: float = 0.0
+    """Stamp at which `offset_s` was measured (s of the log's own count)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.week is not None and self.date is not None:
+            raise ValueError("give week or date, not both")
+        if self.system is TimeSystem.FREE and self.offset_s == 0.0:
+            raise ValueError("a free-running clock needs offset_s, measured against GPS time")
+        return self
+
+    def clock(self) -> Clock:
+        """The clock these settings describe."""
+        return Clock(**self.model_dump())
+
+
+class LogConfig(Strict):
+    """One raw log."""
+
+    path: Path
+    """File or folder, relative to the survey file."""
+    format: str | None = None
+    """Format name (`roadscan formats`); found from the bytes where left out and unambiguous."""
+    sensor: str | None = None
+    """Sensor of the rig that wrote it; trajectories need none."""
+    clock: ClockConfig | None = None
+    """Time system; required unless the format states its own."""
+    crs: str | None = None
+    """CRS of positions in the log (for example "EPSG:4979", or "local"), where it holds any."""
+    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
+    """Kind of heights in the log, where it holds any."""
+    geoid: str | None = None
+    """Geoid grid that brings the log's orthometric heights to the ellipsoid."""
+    options: dict[str, Any] = {}
+    """Settings of the format (`roadscan formats NAME`)."""
+
+
+class RunConfig(Strict):
+    """One recorded drive."""
+
+    id: str = Field(pattern=_NAME)
+    """Name of the run."""
+    logs: list[LogConfig] = Field(min_length=1)
+    """Logs of this run."""
+
+
+class PassConfig(Strict):
+    """One traverse of a lane. Without any, each run is one pass."""
+
+    id: int = Field(ge=1, le=65_535)
+    """Pass number, the point_source_id of LAS."""
+    run: str
+    """Run it belongs to."""
+    start: dt.datetime | None = None
+    """First instant, with zone (2026-05-04T09:30:00Z); from the run's start where left out."""
+    end: dt.datetime | None = None
+    """Last instant, with zone; to the run's end where left out."""
+    lane: str = ""
+    """Lane, as the road authority names it."""
+    direction: str = ""
+    """Direction of travel, as the road authority names it."""
+
+
+class ControlConfig(Strict):
+    """Surveyed points."""
+
+    path: Path
+    """CSV, GeoJSON or GeoPackage, relative to the survey file."""
+    format: str | None = None
+    """Format name; found from the file where left out."""
+    crs: str
+    """CRS of the coordinates, such as "EPSG:25832" or "local"; never assumed."""
+    height: Literal["ellipsoidal", "orthometric"]
+    """Kind of the heights; never assumed."""
+    geoid: str | None = None
+    """Geoid grid of orthometric heights, where they must become ellipsoidal."""
+    options: dict[str, Any] = {}
+    """Settings of the format."""
+
+
+class NavigationConfig(Strict):
+    """How poses are interpolated."""
+
+    max_gap_s: float = Field(default=1.0, gt=0)
+    """Between two poses farther apart than this there is no pose: readings there are counted, not placed."""
+
+
+class FilterConfig(Strict):
+    """Which readings become points."""
+
+    height_min_m: float | None = None
+    """Lowest height kept, above the map's zero (m)."""
+    height_max_m: float | None = None
+    """Highest height kept (m)."""
+    above_body_min_m: float | None = None
+    """Lowest height kept, relative to the IMU reference point at the same instant (m)."""
+    above_body_max_m: float | None = None
+    """Highest height kept, relative to the IMU reference point at the same instant (m)."""
+    centre_line: Path | None = None
+    """Vector layer of road centre lines; only points within `centre_line_buffer_m` of one are kept."""
+    centre_line_buffer_m: float = Field(default=15.0, gt=0)
+    """Half width kept beside the centre line (m)."""
+
+
+class TileConfig(Strict):
+    """The grid."""
+
+    size_m: float = Field(default=10.0, gt=0)
+    """Edge of a tile (m)."""
+    cell_m: float = Field(default=0.05, gt=0)
+    """Edge of a cell (m); divides the tile's edge."""
+    block_tiles: int = Field(default=8, ge=1, le=64)
+    """Edge of the largest block of work, in tiles; changes no result."""
+    max_block_readings: int = Field(default=20_000_000, ge=1)
+    """A block expected to hold more readings is cut into smaller ones; changes no result."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        cells = self.size_m / self.cell_m
+        if abs(cells - round(cells)) > 1e-9:
+            raise ValueError(f"cell_m {self.cell_m:g} does not divide size_m {self.size_m:g}")
+        if round(cells) > 20_000:
+            raise ValueError(f"a tile would have {round(cells)}² cells; make cell_m larger")
+        if round(cells) % 2 and round(cells) > 1:
+            raise ValueError("a tile needs an even number of cells along its edge (overviews)")
+        return self
+
+
+class ProductConfig(Strict):
+    """What the run writes."""
+
+    make: list[str] | None = None
+    """Names of products (`roadscan products`); all of them where left out."""
+    options: dict[str, dict[str, Any]] = {}
+    """Settings by product name, for example { las = { spacing_m = 0.1 } }."""
+
+
+class SurveyConfig(Strict):
+    """Everything a run needs to know."""
+
+    id: str = Field(pattern=_NAME)
+    """Name of the survey; part of the store's path."""
+    title: str = ""
+    """One line about it."""
+    rig: Path | Rig = Rig()
+    """Rig file, relative to the survey file, or the rig itself."""
+    store: str = "store"
+    """Folder (relative to the survey file) or object-store URL that holds tables and products."""
+    map: MapConfig
+    """Map frame and heights."""
+    runs: list[RunConfig] = Field(min_length=1)
+    """Recorded drives."""
+    passes: list[PassConfig] = []
+    """Traverses of lanes."""
+    control: list[ControlConfig] = []
+    """Ground control and check points."""
+    navigation: NavigationConfig = NavigationConfig()
+    """Interpolation of poses."""
+    filters: FilterConfig = FilterConfig()
+    """Filters of points."""
+    tiles: TileConfig = TileConfig()
+    """Tiles and cells."""
+    products: ProductConfig = ProductConfig()
+    """Products."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        runs = [run.id for run in self.runs]
+        if len(set(runs)) < len(runs):
+            raise ValueError("two runs have the same id")
+        if len({p.id for p in self.passes}) < len(self.passes):
+            raise ValueError("two passes have the same id")
+        for one in self.passes:
+            if one.run not in runs:
+                raise ValueError(f"pass {one.id} names the unknown run '{one.run}'{nearest(one.run, runs)}")
+        return self
+
+
+class Survey:
+    """A loaded survey file: configuration with its rig and folder."""
+
+    def __init__(self, config: SurveyConfig, rig: Rig, folder: Path) -> None:
+        self.config = config
+        self.rig = rig
+        self.folder = folder
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read ``SURVEY.toml`` and the rig it names."""
+        file = Path(path)
+        return cls.parse(load_toml(file), folder=file.resolve().parent, file=file)
+
+    @classmethod
+    def parse(cls, values: dict[str, Any], *, folder: Path, file: str | Path | None = None) -> Self:
+        """Check `values` as a survey file in `folder`."""
+        config = SurveyConfig.parse(values, file=file)
+        rig = config.rig if isinstance(config.rig, Rig) else Rig.load(folder / config.rig)
+        for run in config.runs:
+            for log in run.logs:
+                if log.sensor is not None and log.sensor not in rig.sensors:
+                    raise ConfigError(
+                        f"log '{log.path}' names the unknown sensor '{log.sensor}'{nearest(log.sensor, rig.sensors)}",
+                        expected="a sensor of the rig: " + (", ".join(rig.sensors) or "it has none"),
+                        file=file,
+                    )
+        return cls(config, rig, folder)
+
+    @property
+    def store_url(self) -> str:
+        """Where tables and products live: an absolute folder, or a URL."""
+        store = self.config.store
+        return store if "://" in store else str((self.folder / store).resolve())
+
+    def resolve(self, path: Path) -> Path:
+        """Absolute path of one that the survey file states relative to itself."""
+        return (self.folder / path).resolve()
+
+    def sensor(self, name: str) -> Sensor:
+        """Sensor of the rig by name."""
+        return self.rig.sensors[name]
+
+    def passes(self, run_spans_gps_ns: dict[RunId, tuple[int, int]]) -> list[LanePass]:
+        """Passes with their spans; a run without any stated is one pass.
+
+        Parameters
+        ----------
+        run_spans_gps_ns : first and last epoch of each run's data.
+        """
+        stated = {p.run for p in self.config.passes}
+        used = {p.id for p in self.config.passes}
+        free = (n for n in range(1, 65_536) if n not in used)
+        found: list[LanePass] = []
+        for run in self.config.runs:
+            run_id = RunId(run.id)
+            own = None if run.id in stated else PassId(next(free))
+            if run_id not in run_spans_gps_ns:
+                continue
+            first, last = run_spans_gps_ns[run_id]
+            if own is not None:
+                found.append(LanePass(own, run_id, first, last + 1))
+                continue
+            for one in self.config.passes:
+                if one.run == run.id:
+                    start = first if one.start is None else gps_ns_from_utc(one.start)
+                    end = last + 1 if one.end is None else gps_ns_from_utc(one.end)
+                    found.append(LanePass(PassId(one.id), run_id, start, end, one.lane, one.direction))
+        return sorted(found)

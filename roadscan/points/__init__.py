@@ -1,0 +1,1 @@
+"""Readings + trajectory → points, and the filters of points."""

@@ -1,0 +1,52 @@
+"""How raw readings lie in their sensor's frame."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from roadscan.model.strict import Strict
+
+Float64 = npt.NDArray[np.float64]
+
+
+class ScanGeometry(Strict):
+    """Geometry of a line scanner's readings: reading i lies at origin_i + range · direction_i.
+
+    The profile lies in the sensor's y-z plane; z points along the range of the middle reading
+    (down to the road for a scanner that looks down), y to the right where the sensor is mounted
+    without misalignment in axes ``frd``.
+    """
+
+    kind: Literal["cartesian", "polar"]
+    """cartesian: reading i is measured along z at transverse position y_i (laser triangulation);
+    polar: along a beam at angle a_i from z towards y (rotating mirror)."""
+    readings: int = Field(gt=0)
+    """Readings a profile."""
+    first: float
+    """y of the first reading (m), or angle of the first beam (rad)."""
+    step: float
+    """Step from reading to reading (m, or rad)."""
+    range_offset_m: float = 0.0
+    """Range of a raw value of 0, were it valid (m)."""
+    range_step_m: float = Field(gt=0)
+    """Range of one raw unit (m)."""
+    reading_period_ns: float = Field(default=0.0, ge=0.0)
+    """Time from one reading to the next (ns); 0 where the whole profile is measured at once."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.step == 0.0 and self.readings > 1:
+            raise ValueError("step is 0: all readings would lie on one line")
+        return self
+
+    def rays(self) -> tuple[Float64, Float64]:
+        """Origins (n, 3) in metres and unit directions (n, 3) of the readings, sensor frame."""
+        where = self.first + self.step * np.arange(self.readings)
+        zero, one = np.zeros_like(where), np.ones_like(where)
+        if self.kind == "cartesian":
+            return np.stack([zero, where, zero], axis=-1), np.stack([zero, zero, one], axis=-1)
+        return np.zeros((self.readings, 3)), np.stack([zero, np.sin(where), np.cos(where)], axis=-1)

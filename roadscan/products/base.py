@@ -1,0 +1,183 @@
+"""The contract of a product, and the registry that finds products by themselves.
+
+A product is one file in this folder (or one entry point of the group ``roadscan.products``) with one
+subclass of :class:`TileProduct` or :class:`SurveyProduct`. It writes whole files to the path it is given;
+keys, temporary names, checks and the manifest are done for it.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import functools
+import importlib
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import ClassVar, Final, TypeAlias
+
+from roadscan.model.crs import MapFrame
+from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.ids import LanePass, TileId
+from roadscan.model.strict import Strict
+from roadscan.points.cloud import TilePoints
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import TileGrid
+
+ENTRY_POINT_GROUP: Final = "roadscan.products"
+"""Entry-point group through which a third party's package adds a product."""
+
+
+class NoOptions(Strict):
+    """Settings of a product without settings."""
+
+
+@dataclass(frozen=True)
+class ProductContext:
+    """What every product may need beside its data; nothing in it depends on how the work was batched."""
+
+    survey_id: str
+    title: str
+    map: MapFrame
+    grid: TileGrid
+    passes: tuple[LanePass, ...]
+    date: dt.date
+    """UTC date of the survey's first epoch; stands where files want a creation date."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A computed tile, as tile products receive it."""
+
+    points: TilePoints
+    cells: TileCells
+
+
+@dataclass(frozen=True)
+class TileSummary:
+    """One row of ``schemas/tiles.toml``, without the outline."""
+
+    tile: TileId
+    points: int
+    cells: int
+    height_min_m: float
+    height_mean_m: float
+    height_max_m: float
+    height_std_median_m: float
+    intensity_mean: float
+    passes: tuple[int, ...]
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+
+
+@dataclass(frozen=True)
+class Output:
+    """One file of a survey product."""
+
+    name: str
+    """File name below ``products/<product>/``."""
+    tiles: tuple[TileId, ...]
+    """Tiles its content depends on; it is rewritten when one of them changes."""
+
+
+LoadCells: TypeAlias = Callable[[TileId], TileCells | None]
+"""Gives the cells of a tile, or None where the survey has no such tile."""
+
+
+class TileProduct(ABC):
+    """A product of one file a tile, written while the tile's points are in memory."""
+
+    name: ClassVar[str]
+    """Name in survey files, and of its folder below ``tiles/``."""
+    title: ClassVar[str]
+    """One line: what it is and who reads it."""
+    suffix: ClassVar[str]
+    """File suffix with its dot."""
+    version: ClassVar[int] = 1
+    """Raised when the written bytes change."""
+    options: ClassVar[type[Strict]] = NoOptions
+    """Model of its settings."""
+    default: ClassVar[bool] = True
+    """Made where the survey file does not list products."""
+
+    def suffix_for(self, options: Strict) -> str:
+        """File suffix under these settings."""
+        return self.suffix
+
+    @abstractmethod
+    def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's file to `path` (a temporary name on a local disk)."""
+
+    @abstractmethod
+    def check(self, path: Path) -> None:
+        """Raise :class:`roadscan.model.errors.StoreError` unless `path` is whole and readable."""
+
+
+class SurveyProduct(ABC):
+    """A product over many tiles, made from their cells after all tiles are done."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    version: ClassVar[int] = 1
+    options: ClassVar[type[Strict]] = NoOptions
+    default: ClassVar[bool] = True
+
+    @abstractmethod
+    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+        """Files to write, in order; a later one may read an earlier one beside its own path."""
+
+    @abstractmethod
+    def write(
+        self,
+        output: Output,
+        tiles: Sequence[TileSummary],
+        load_cells: LoadCells,
+        options: Strict,
+        context: ProductContext,
+        path: Path,
+    ) -> None:
+        """Write one file to `path` (a temporary name) in bounded memory, whatever the survey's length."""
+
+    @abstractmethod
+    def check(self, path: Path) -> None:
+        """Raise :class:`roadscan.model.errors.StoreError` unless `path` is whole and readable."""
+
+
+Product: TypeAlias = TileProduct | SurveyProduct
+
+
+@functools.cache
+def products() -> dict[str, Product]:
+    """All products by name: the files of this folder and installed entry points."""
+    found: dict[str, Product] = {}
+    package = importlib.import_module("roadscan.products")
+    for module_info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f"roadscan.products.{module_info.name}")
+        for value in vars(module).values():
+            if (
+                isinstance(value, type)
+                and issubclass(value, TileProduct | SurveyProduct)
+                and value.__module__ == module.__name__
+            ):
+                _add(found, value)
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        _add(found, entry.load())
+    return dict(sorted(found.items()))
+
+
+def _add(found: dict[str, Product], kind: type[TileProduct | SurveyProduct]) -> None:
+    if kind.__abstractmethods__:
+        return
+    if kind.name in found:
+        raise ConfigError(f"two products are called '{kind.name}'", expected="unique names")
+    found[kind.name] = kind()
+
+
+def product_named(name: str) -> Product:
+    """Product by name, or an error that names the nearest known one."""
+    known = products()
+    if name not in known:
+        raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
+    return known[name]

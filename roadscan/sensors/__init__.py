@@ -1,0 +1,1 @@
+"""Raw logs in: one file a format, found by itself."""

@@ -1,0 +1,230 @@
+"""The contract of a raw format, and the registry that finds formats by themselves.
+
+A format is one file in this folder (or one entry point of the group ``roadscan.formats``) with one
+subclass of :class:`LogFormat`. It streams :class:`Rows` and :class:`Reject`; everything else
+(schemas, partitions, fingerprints, rejects table) is done for it.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, ClassVar, Final, Literal, TypeAlias
+
+import pyarrow as pa
+
+from roadscan.model.crs import Geoid, MapFrame
+from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
+from roadscan.model.gpstime import Clock
+from roadscan.model.rig import Sensor
+from roadscan.model.strict import Strict
+
+ENTRY_POINT_GROUP: Final = "roadscan.formats"
+"""Entry-point group through which a third party's package adds a format."""
+
+
+class NoOptions(Strict):
+    """Settings of a format without settings."""
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """One log as the survey file describes it."""
+
+    path: Path
+    """File or folder, absolute."""
+    options: Strict
+    """Checked settings of the format (an instance of its `options`)."""
+    clock: Clock | None = None
+    """Time system as stated; None where the survey file states none."""
+    sensor: Sensor | None = None
+    """Sensor of the rig that wrote the log."""
+    crs: str | None = None
+    """CRS of the log's positions as stated ("local" for a local frame)."""
+    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
+    """Kind of the log's heights."""
+    geoid: Geoid | None = None
+    """Geoid that brings orthometric heights to the ellipsoid."""
+    map: MapFrame | None = None
+    """The survey's map, for control points only."""
+    trajectory_span_gps_ns: tuple[int, int] | None = None
+    """Span of the run's trajectory, where it is already ingested."""
+
+    def need_clock(self, example: str) -> Clock:
+        """The stated clock, or an error that asks for one: time is never guessed."""
+        if self.clock is None:
+            raise TimeSystemError(
+                "the log's time system is not stated",
+                expected="clock.system: gps, gps_week_seconds, gps_adjusted, unix_gps, unix_utc, unix_tai, "
+                "utc_hour or free",
+                change=f"add clock = {example} to this log",
+                file=self.path,
+            )
+        return self.clock
+
+    def need_crs(self, example: str = "EPSG:4979") -> str:
+        """The stated CRS, or an error that asks for one: a datum is never guessed."""
+        if self.crs is None:
+            raise ConfigError(
+                "the CRS of the log's positions is not stated",
+                expected=f'crs, such as "{example}", or "local"',
+                file=self.path,
+            )
+        return self.crs
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A chunk of rows for one table (at most some 10 MB: readers stream)."""
+
+    table: str
+    """Name of the table in `schemas/`."""
+    batch: pa.RecordBatch
+    """Columns of the schema (nullable ones may be left out)."""
+    file: str = ""
+    """File the rows come from, relative to the log; '' for the log itself."""
+    first_record: int = 0
+    """Record number of the first row in that file, as the format counts records."""
+    first_offset: int = -1
+    """Byte offset of the first row, −1 where there is none."""
+    record_bytes: int = 0
+    """Bytes from one row to the next, 0 where it varies."""
+
+
+@dataclass(frozen=True)
+class Reject:
+    """A record (or a run of records) that could not be read."""
+
+    reason: str
+    """Why."""
+    record: int = -1
+    """Number of the first record, −1 where it has none."""
+    offset: int = -1
+    """Byte offset in the file, −1 where there is none."""
+    records: int = 1
+    """How many records, one after another."""
+    file: str = ""
+    """File, relative to the log; '' for the log itself."""
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """What is known of a log before its records are read; kept in the log record."""
+
+    attributes: dict[str, Any] = field(default_factory=dict)
+    """JSON values that readings need to be understood.
+
+    ``world_frame`` (trajectory): world frame of the poses.
+    ``scan_geometry`` (scans): fields of :class:`roadscan.points.readings.ScanGeometry`.
+    ``frame`` (returns): ``"sensor"``, or ``"body"`` where the maker already applied the mounting.
+    ``crs``, ``height``, ``geoid`` (cloud): what the coordinates are; the unit is metres.
+    Further entries are kept for the reader of the log record.
+    """
+    list_size: int | None = None
+    """Readings a profile, for tables with fixed-size lists."""
+
+
+Item: TypeAlias = Rows | Reject
+
+
+class LogFormat(ABC):
+    """One raw format."""
+
+    name: ClassVar[str]
+    """Name used in survey files, lower case."""
+    title: ClassVar[str]
+    """One line: whose format it is and what it holds."""
+    yields: ClassVar[tuple[str, ...]]
+    """Tables it fills."""
+    version: ClassVar[int] = 1
+    """Raised when the reader's output changes, so that logs are read again."""
+    time: ClassVar[str]
+    """What the format says about its time system and what the survey file has to state."""
+    options: ClassVar[type[Strict]] = NoOptions
+    """Model of the format's settings; the docstrings of its fields are the manual."""
+
+    @abstractmethod
+    def sniff(self, path: Path) -> bool:
+        """True if the file or folder is of this format, judged by content (cheap, never raises)."""
+
+    def files(self, path: Path) -> list[Path]:
+        """All files that make up the log, sorted; their content is its fingerprint."""
+        if path.is_dir():
+            return sorted(p for p in path.rglob("*") if p.is_file())
+        return [path]
+
+    @abstractmethod
+    def header(self, source: LogSource) -> LogHeader:
+        """Read what is known before the records.
+
+        Raises
+        ------
+        FormatError, TimeSystemError, CrsError, ConfigError
+            where the log as a whole cannot be read as stated.
+        """
+
+    @abstractmethod
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream the log's records in bounded chunks.
+
+        A damaged record becomes a :class:`Reject`; only a fault of the whole log raises.
+        """
+
+
+@functools.cache
+def log_formats() -> dict[str, LogFormat]:
+    """All formats by name: the files of this folder and installed entry points."""
+    found: dict[str, LogFormat] = {}
+    package = importlib.import_module("roadscan.sensors")
+    for module_info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f"roadscan.sensors.{module_info.name}")
+        for value in vars(module).values():
+            if isinstance(value, type) and issubclass(value, LogFormat) and value.__module__ == module.__name__:
+                _add(found, value, module.__name__)
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        _add(found, entry.load(), f"entry point {entry.value}")
+    return dict(sorted(found.items()))
+
+
+def _add(found: dict[str, LogFormat], kind: type[LogFormat], origin: str) -> None:
+    if kind.__abstractmethods__:
+        return
+    if kind.name in found:
+        raise ConfigError(f"two formats are called '{kind.name}'", expected="unique names", change=f"see {origin}")
+    found[kind.name] = kind()
+
+
+def format_named(name: str) -> LogFormat:
+    """Format by name, or an error that names the nearest known one."""
+    formats = log_formats()
+    if name not in formats:
+        raise ConfigError(f"unknown format '{name}'{nearest(name, formats)}", expected="one of: " + ", ".join(formats))
+    return formats[name]
+
+
+def format_of(path: Path) -> LogFormat:
+    """The one format whose content test the file or folder passes."""
+    if not path.exists():
+        raise FormatError("the log does not exist", change="check the path in the survey file", file=path)
+    fitting = [f for f in log_formats().values() if f.sniff(path)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not fitting:
+        raise FormatError(
+            "the content is of no known format",
+            expected="one of: " + ", ".join(log_formats()),
+            change='state format = "…" for this log',
+            file=path,
+        )
+    raise FormatError(
+        "the content fits " + " and ".join(f.name for f in fitting),
+        expected="one format",
+        change='state format = "…" for this log',
+        file=path,
+    )

@@ -1,0 +1,1 @@
+"""The Parquet store: schemas, partitions, manifest, SQL."""

@@ -1,0 +1,1 @@
+"""The 10 m grid, footprints, blocks and halos, cells."""

@@ -1,0 +1,82 @@
+"""The grid: tiles and cells of the map, as one object used everywhere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from roadscan.model.errors import ConfigError
+from roadscan.model.ids import TileId
+from roadscan.points.cloud import QUANTA_PER_M
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A box in the map frame (metres), lower edges inclusive, upper exclusive."""
+
+    easting_min_m: float
+    northing_min_m: float
+    easting_max_m: float
+    northing_max_m: float
+
+    def grown(self, margin_m: float) -> Bounds:
+        """The box with `margin_m` more on every side."""
+        return Bounds(
+            self.easting_min_m - margin_m,
+            self.northing_min_m - margin_m,
+            self.easting_max_m + margin_m,
+            self.northing_max_m + margin_m,
+        )
+
+    @property
+    def area_m2(self) -> float:
+        """Area (m²)."""
+        return (self.easting_max_m - self.easting_min_m) * (self.northing_max_m - self.northing_min_m)
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Square tiles of the map, each cut into square cells, anchored at the map's origin."""
+
+    size_m: float = 10.0
+    cell_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        if abs(self.size_m * QUANTA_PER_M - self.size_quanta) > 1e-6:
+            raise ConfigError(f"tile size {self.size_m} m", expected="a whole number of 10 µm")
+        if self.size_quanta % self.cells_per_edge:
+            raise ConfigError(f"cell {self.cell_m} m", expected="a cell edge of whole 10 µm that divides the tile")
+
+    @property
+    def size_quanta(self) -> int:
+        """Edge of a tile in quanta."""
+        return round(self.size_m * QUANTA_PER_M)
+
+    @property
+    def cells_per_edge(self) -> int:
+        """Cells along a tile's edge."""
+        return round(self.size_m / self.cell_m)
+
+    @property
+    def cell_quanta(self) -> int:
+        """Edge of a cell in quanta."""
+        return self.size_quanta // self.cells_per_edge
+
+    def tile_at(self, easting_m: float, northing_m: float) -> TileId:
+        """Tile that holds a position (m)."""
+        return TileId(
+            math.floor(easting_m * QUANTA_PER_M) // self.size_quanta,
+            math.floor(northing_m * QUANTA_PER_M) // self.size_quanta,
+        )
+
+    def bounds(self, tile: TileId) -> Bounds:
+        """Box of a tile (m)."""
+        e, n = tile.column * self.size_m, tile.row * self.size_m
+        return Bounds(e, n, e + self.size_m, n + self.size_m)
+
+    def tiles_in(self, box: Bounds) -> list[TileId]:
+        """Tiles that share ground with a box, by row and column."""
+        first = self.tile_at(box.easting_min_m, box.northing_min_m)
+        end_column = math.ceil(box.easting_max_m / self.size_m)
+        end_row = math.ceil(box.northing_max_m / self.size_m)
+        return [TileId(c, r) for r in range(first.row, end_row) for c in range(first.column, end_column)]

@@ -1,0 +1,95 @@
+# Everything is set up by the targets themselves: Python 3.11 or newer with pip and venv is all that has to be there.
+
+VENV := .venv
+BIN := $(VENV)/bin
+INTERPRETERS := python3 python3.13 python3.12 python3.11
+
+# Prefect: no usage statistics and no look-up of newer releases.
+export PREFECT_SERVER_ANALYTICS_ENABLED := false
+export DO_NOT_TRACK := 1
+export MPLBACKEND := Agg
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_NO_INPUT := 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test check lint types contracts docs docs-check pytest bench format venv install install-dev constraints clean
+
+help:  ## Show the targets.
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
+
+demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with its truth (into demo/).
+	$(BIN)/roadscan demo --out demo
+
+test: check pytest  ## All that CI runs: check, then the tests.
+
+check: lint types contracts docs-check  ## Lint, types, import contracts, documentation.
+
+lint: $(VENV)/.installed-dev  ## Style and formatting.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-dev  ## Static types.
+	$(BIN)/mypy
+	$(BIN)/mypy docs
+
+contracts: $(VENV)/.installed-dev  ## Import contracts: layers, and who may import what.
+	$(BIN)/lint-imports --no-logo
+
+docs: $(VENV)/.installed-dev  ## Write the generated pages of docs/.
+	$(BIN)/python docs/generate.py
+
+docs-check: $(VENV)/.installed-dev  ## Fail where a generated page is out of date.
+	$(BIN)/python docs/generate.py --check
+
+# The last lines of the output are pytest's summary.
+pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/model -n0" narrows them.
+	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
+
+bench: $(VENV)/.installed-dev  ## Benchmarks.
+	$(BIN)/python -m benchmarks
+
+format: $(VENV)/.installed-dev  ## Format the code and mend what the linter can mend.
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+install: $(VENV)/.installed  ## Install roadscan into .venv.
+
+install-dev: $(VENV)/.installed-dev  ## Install roadscan with the tools for development into .venv.
+
+venv: $(VENV)/.created
+
+$(VENV)/.created:
+	@for python in $(INTERPRETERS); do \
+	  if $$python -c 'import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; then \
+	    echo "creating $(VENV) with $$($$python --version)"; \
+	    rm -rf $(VENV) && $$python -m venv $(VENV) && touch $@ && exit 0; \
+	  fi; \
+	done; \
+	echo "No Python 3.11, 3.12 or 3.13 with venv was found (looked for: $(INTERPRETERS))." >&2; \
+	echo "On Debian or Ubuntu: apt-get install python3 python3-venv" >&2; exit 1
+
+# uv is faster where it is present and finds the packages; pip is always there.
+install_into_venv = { command -v uv >/dev/null && uv pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '$(1)'; } \
+	|| $(BIN)/python -m pip install --quiet --prefer-binary --constraint constraints.txt --editable '$(1)'
+
+$(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
+	@echo "installing roadscan (one to two minutes the first time)"
+	@$(call install_into_venv,.)
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt
+	@echo "installing roadscan and its tools (one to two minutes the first time)"
+	@$(call install_into_venv,.[dev])
+	@touch $@ $(VENV)/.installed
+
+constraints: $(VENV)/.created  ## Write constraints.txt anew from the newest versions that pyproject.toml allows.
+	rm -rf build/constraints && $(BIN)/python -m venv build/constraints
+	build/constraints/bin/python -m pip install --quiet --prefer-binary '.[dev]'
+	sed -n '/^#/p' constraints.txt > build/constraints.txt
+	build/constraints/bin/python -m pip freeze --exclude roadscan >> build/constraints.txt
+	mv build/constraints.txt constraints.txt && rm -rf build/constraints
+
+clean:  ## Remove everything that was made here.
+	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

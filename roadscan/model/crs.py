@@ -95,11 +95,20 @@ def world_title(world: str) -> str:
     return "local frame" if world == LOCAL_WORLD else str(crs_from_text(world).name)
 
 
+_grid_folders: list[Path] = []
+
+
 def add_grid_folder(folder: str | Path) -> None:
-    """Let PROJ look for geoid grids in `folder` too."""
-    known = pyproj.datadir.get_data_dir().split(":")
-    if str(folder) not in known:
-        pyproj.datadir.append_data_dir(str(folder))
+    """Look for geoid grids in `folder` too, in all threads of this process."""
+    known = Path(folder).resolve()
+    if known not in _grid_folders:
+        _grid_folders.append(known)
+
+
+def _grid_file(name: str) -> str:
+    # PROJ's own list of folders belongs to a thread; a full path holds in all of them.
+    found = (folder / name for folder in _grid_folders if (folder / name).is_file())
+    return str(next(found, name))
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class Geoid:
         """Geoid height above the ellipsoid (m) at geodetic degrees, (n,)."""
         lon = np.atleast_1d(np.asarray(longitude_deg, dtype=np.float64))
         lat = np.atleast_1d(np.asarray(latitude_deg, dtype=np.float64))
-        _, _, shifted = self._transformer().transform(np.radians(lon), np.radians(lat), np.zeros_like(lon))
+        _, _, shifted = self._transformer().transform(lon, lat, np.zeros_like(lon))
         height = np.asarray(shifted, dtype=np.float64)
         if not np.all(np.isfinite(height)):
             bad = int(np.flatnonzero(~np.isfinite(height))[0])
@@ -125,12 +134,12 @@ class Geoid:
 
     def _transformer(self) -> pyproj.Transformer:
         try:
-            return pyproj.Transformer.from_pipeline(f"+proj=vgridshift +grids={self.grid} +multiplier=1")
+            return pyproj.Transformer.from_pipeline(f'+proj=vgridshift +grids="{_grid_file(self.grid)}" +multiplier=1')
         except ProjError as error:
-            folders = pyproj.datadir.get_data_dir()
+            folders = " or ".join([*map(str, _grid_folders), pyproj.datadir.get_data_dir()])
             raise CrsError(
                 f"geoid grid '{self.grid}' was not found",
-                expected=f"a file of that name in map.grids or in {folders}",
+                expected=f"a file of that name in the folder map.grids; looked in {folders}",
                 change="put the grid there (roadscan never downloads one), or use ellipsoidal heights",
             ) from error
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any, Self
+from types import NoneType, UnionType
+from typing import Any, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -22,7 +23,9 @@ class Strict(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            faults = [_describe(cls, fault) for fault in error.errors()]
+            # A table where a path could stand too: only the table's own faults help.
+            found = [f for f in error.errors() if f["type"] != "path_type" or not isinstance(f["input"], dict)]
+            faults = [_describe(cls, fault) for fault in found]
             raise ConfigError("; ".join(faults), file=file) from error
 
 
@@ -38,37 +41,45 @@ def load_toml(path: str | Path) -> dict[str, Any]:
 
 
 def _describe(model: type[BaseModel], fault: Any) -> str:
-    where = ".".join(str(part) for part in fault["loc"])
+    where, current = _walk(model, fault["loc"])
     if fault["type"] == "extra_forbidden":
-        known = _fields_at(model, fault["loc"][:-1])
+        known = list(current.model_fields) if current is not None else []
         key = str(fault["loc"][-1])
         return f"unknown key '{where}'{nearest(key, known)}, expected one of: {', '.join(sorted(known))}"
     if fault["type"] == "missing":
         return f"key '{where}' is missing"
-    given = "" if isinstance(fault["input"], dict | list) else f" (got {fault['input']!r})"
     message = str(fault["msg"]).removeprefix("Value error, ")
+    if not where:
+        return message
+    given = "" if isinstance(fault["input"], dict | list | BaseModel) else f" (got {fault['input']!r})"
     return f"'{where}'{given}: {message}"
 
 
-def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the model that stands at `location` inside `model`."""
-    current: type[BaseModel] = model
+def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
+    """Keys of the file that lead to `location`, and the model that holds the last of them."""
+    names: list[str] = []
+    holder: type[BaseModel] | None = None
+    annotation: Any = model
     for part in location:
-        field = current.model_fields.get(str(part))
-        if field is None:
-            continue  # a list index or a dictionary key
-        inner = _model_in(field.annotation)
-        if inner is None:
-            return []
-        current = inner
-    return list(current.model_fields)
+        annotation, choices = _without_none(annotation)
+        if choices:  # pydantic names the member of a union, which the file does not
+            annotation = next((c for c in choices if getattr(c, "__name__", "") == part), None)
+            continue
+        names.append(str(part))
+        holder = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+        if holder is not None:
+            field = holder.model_fields.get(str(part))
+            annotation = None if field is None else field.annotation
+        else:  # a dictionary's key or a list's index
+            arguments = get_args(annotation)
+            position = 1 if get_origin(annotation) is dict else 0
+            annotation = arguments[position] if len(arguments) > position else None
+    return ".".join(names), holder
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_in(argument)
-        if found is not None:
-            return found
-    return None
+def _without_none(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The annotation without `None`, and its members where it is still a union."""
+    if get_origin(annotation) not in {Union, UnionType}:
+        return annotation, ()
+    members = tuple(a for a in get_args(annotation) if a is not NoneType)
+    return (members[0], ()) if len(members) == 1 else (annotation, members)

@@ -154,9 +154,9 @@ def _broken(column: Column, array: pa.Array) -> list[tuple[npt.NDArray[np.bool_]
         odd = ~np.isfinite(values)
         if odd.any():
             out.append((odd, f"{column.name} is not a finite number"))
-    if column.min is not None and values.size and values.min() < column.min:
+    if column.min is not None:
         out.append(((values < column.min) & ~missing, f"{column.name} is below {column.min:g}"))
-    if column.max is not None and values.size and values.max() > column.max:
+    if column.max is not None:
         out.append(((values > column.max) & ~missing, f"{column.name} is above {column.max:g}"))
     return out
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import datetime as dt
 import functools
+import hashlib
 import importlib
+import inspect
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -106,6 +108,10 @@ class TileProduct(ABC):
         """File suffix under these settings."""
         return self.suffix
 
+    def check_options(self, options: Strict, context: ProductContext) -> None:
+        """Raise :class:`ConfigError` where the settings do not fit the survey; asked once, before any work."""
+        return
+
     @abstractmethod
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
         """Write the tile's file to `path` (a temporary name on a local disk)."""
@@ -181,3 +187,13 @@ def product_named(name: str) -> Product:
     if name not in known:
         raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
     return known[name]
+
+
+@functools.cache
+def source_digest(product: Product) -> str:
+    """Hash of the code that writes a product: its own module and the modules of this folder."""
+    files = {Path(inspect.getfile(type(product))), *Path(__file__).parent.glob("*.py")}
+    digest = hashlib.blake2b(digest_size=8)
+    for file in sorted(files, key=lambda f: f.name):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,1 @@
+"""Prefect flows: pages of stage names, no formula."""

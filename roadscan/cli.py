@@ -1,0 +1,315 @@
+"""The command line. Heavy imports happen inside the commands: `roadscan --help` must be quick."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from roadscan.jobs.selection import Selection
+    from roadscan.jobs.stages import Run, Stage
+    from roadscan.jobs.status import Status
+
+app = typer.Typer(
+    name="roadscan",
+    help="Raw logs of a road survey in; pavement surfaces, point clouds and tables out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SurveyFile = Annotated[Path, typer.Argument(metavar="SURVEY.toml", help="The survey file.", show_default=False)]
+Workers = Annotated[
+    int | None, typer.Option(help="Worker processes of the embedded cluster; 0 computes in this process.")
+]
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, in place of the embedded cluster.")]
+
+
+@app.command()
+def run(
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
+) -> None:
+    """Run a survey: ingest, footprints, tiles, products. Does only what is missing or stale."""
+    if dry_run:
+        _print_status(_status(survey_file), survey_file)
+        return
+    if flow or os.environ.get("PREFECT_API_URL"):
+        from flows.survey import survey
+
+        survey(str(survey_file), workers, scheduler)
+        return
+    from roadscan.jobs.stages import STAGES
+
+    _run(survey_file, STAGES, workers, scheduler)
+
+
+@app.command()
+def ingest(survey_file: SurveyFile) -> None:
+    """Raw logs into tables."""
+    _run(survey_file, _stages("ingest"), 0, None)
+
+
+@app.command()
+def footprints(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
+    """Which raw block touches which tile."""
+    _run(survey_file, _stages("footprints"), workers, scheduler)
+
+
+@app.command()
+def tile(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
+    """Readings into points, cells and tile files."""
+    _run(survey_file, _stages("tiles"), workers, scheduler)
+
+
+@app.command("products")
+def make_products(
+    survey_file: Annotated[
+        Path | None, typer.Argument(metavar="[SURVEY.toml]", help="Make its products; without it, list all there are.")
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Mosaics, pictures and tables over all tiles; without a survey file, list the products there are."""
+    if survey_file is not None:
+        _run(survey_file, _stages("products"), workers, scheduler)
+        return
+    from roadscan.products.base import TileProduct, products
+
+    rows = [
+        (name, "tile" if isinstance(p, TileProduct) else "survey", "yes" if p.default else "on request", p.title)
+        for name, p in products().items()
+    ]
+    _table(("product", "of", "made", "what"), rows)
+
+
+@app.command()
+def reprocess(
+    survey_file: SurveyFile,
+    tiles: Annotated[list[str] | None, typer.Option("--tile", help="Tile COLUMN_ROW; may be repeated.")] = None,
+    bbox: Annotated[str | None, typer.Option(help="WEST,SOUTH,EAST,NORTH on the map, metres.")] = None,
+    span: Annotated[str | None, typer.Option(help="START/END in UTC, such as 2026-05-04T09:30:00Z/….")] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+) -> None:
+    """Compute some tiles once more, whether stale or not."""
+    from roadscan.jobs.stages import STAGES
+
+    done = _run(survey_file, STAGES, workers, scheduler, _selection(tiles, bbox, span))
+    typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings")
+
+
+@app.command()
+def status(survey_file: SurveyFile) -> None:
+    """What is ingested, current, stale and failed, and what the next run would do."""
+    found = _status(survey_file)
+    _print_status(found, survey_file)
+    if not found.is_complete:
+        raise typer.Exit(1)
+
+
+@app.command()
+def verify(survey_file: SurveyFile) -> None:
+    """Read every file the store should hold, and say which are missing or damaged."""
+    from roadscan.jobs.status import verify_store
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    reporter = _reporter()
+    faults = verify_store(Store(loaded.store_url, loaded.config.id), lambda d, t: reporter.progress("verify", d, t))
+    reporter.close()
+    for fault in faults:
+        typer.echo(fault)
+    typer.echo("every file is whole" if not faults else f"{len(faults)} files are not whole")
+    raise typer.Exit(1 if faults else 0)
+
+
+@app.command()
+def sql(
+    statement: Annotated[str, typer.Argument(help="DuckDB statement over the views (SHOW TABLES lists them).")],
+    survey_file: Annotated[Path, typer.Option("--survey", help="The survey file.")] = Path("SURVEY.toml"),
+    csv: Annotated[bool, typer.Option("--csv", help="Print comma-separated values.")] = False,
+) -> None:
+    """Ask the tables a question."""
+    from roadscan.model.survey import Survey
+    from roadscan.tables.sql import query
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    result = query(Store(loaded.store_url, loaded.config.id), statement)
+    if csv:
+        import pyarrow.csv
+
+        pyarrow.csv.write_csv(result, sys.stdout.buffer)
+        return
+    shown = result.slice(0, 200)
+    _table(tuple(result.column_names), [tuple(_cell(v) for v in row.values()) for row in shown.to_pylist()])
+    if result.num_rows > shown.num_rows:
+        typer.echo(f"… {result.num_rows:,} rows in all (--csv prints them)")
+
+
+@app.command("formats")
+def list_formats(
+    name: Annotated[str | None, typer.Argument(help="Show the settings of one format.", show_default=False)] = None,
+) -> None:
+    """Raw formats that can be read, and what they yield."""
+    from roadscan.sensors.base import format_named, log_formats
+
+    if name is None:
+        rows = [(n, ", ".join(f.yields), f.title) for n, f in log_formats().items()]
+        _table(("format", "yields", "what"), rows)
+        return
+    found = format_named(name)
+    typer.echo(f"{found.name}: {found.title}\nyields: {', '.join(found.yields)}\ntime: {found.time}")
+    for field, info in found.options.model_fields.items():
+        default = "required" if info.is_required() else f"default {info.default!r}"
+        typer.echo(f"  options.{field} ({default}): {info.description or ''}")
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of a shipped scene.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+) -> None:
+    """Write a survey with known truth as raw logs."""
+    from roadscan.simulate import load_scene
+    from roadscan.simulate import simulate as write
+
+    made = write(load_scene(scene), out)
+    typer.echo(f"survey file: {made.survey_file}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("demo"),
+    workers: Workers = None,
+) -> None:
+    """Simulate a small survey, run it, and compare the surface with the truth."""
+    from roadscan.jobs.demo import compare_with_truth, prepare_demo
+    from roadscan.jobs.stages import STAGES
+
+    survey_file = prepare_demo(out, typer.echo)
+    _run(survey_file, STAGES, workers, None)
+    for line in compare_with_truth(survey_file):
+        typer.echo(line)
+
+
+def main() -> None:
+    """Run the command line; an error the user can mend is printed without a traceback."""
+    from roadscan.model.errors import RoadscanError
+
+    try:
+        app()
+    except RoadscanError as error:
+        typer.secho(f"roadscan: {error}", err=True, fg=typer.colors.RED)
+        raise SystemExit(2) from None
+
+
+def _stages(name: str) -> tuple[Stage, ...]:
+    from roadscan.jobs.stages import STAGES
+
+    return tuple(s for s in STAGES if s.name == name)
+
+
+def _run(
+    survey_file: Path,
+    stages: tuple[Stage, ...],
+    workers: int | None,
+    scheduler: str | None,
+    selection: Selection | None = None,
+) -> Run:
+    from roadscan.jobs.compute import compute_on
+    from roadscan.jobs.stages import Run, run_stages
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    reporter = _reporter()
+    with compute_on(workers, scheduler) as compute:
+        run = Run(loaded, Store(loaded.store_url, loaded.config.id), compute, selection, reporter)
+        try:
+            run_stages(run, stages)
+        finally:
+            reporter.close()
+    return run
+
+
+def _reporter() -> Any:
+    from roadscan.progress import LineReporter, TerminalReporter
+
+    return TerminalReporter() if sys.stderr.isatty() else LineReporter()
+
+
+def _selection(tiles: list[str] | None, bbox: str | None, span: str | None) -> Selection:
+    import datetime as dt
+
+    from roadscan.jobs.selection import Selection
+    from roadscan.model.errors import ConfigError
+    from roadscan.model.gpstime import gps_ns_from_utc
+    from roadscan.model.ids import TileId
+    from roadscan.tiles.grid import Bounds
+
+    box = times = None
+    if bbox is not None:
+        try:
+            west, south, east, north = (float(part) for part in bbox.split(","))
+        except ValueError:
+            raise ConfigError(f"--bbox {bbox}", expected="WEST,SOUTH,EAST,NORTH in metres") from None
+        box = Bounds(west, south, east, north)
+    if span is not None:
+        try:
+            start, end = (dt.datetime.fromisoformat(part) for part in span.split("/"))
+        except ValueError:
+            raise ConfigError(f"--span {span}", expected="START/END, such as 2026-05-04T09:30:00Z/…") from None
+        times = (gps_ns_from_utc(start), gps_ns_from_utc(end))
+    return Selection(tuple(TileId.parse(t) for t in tiles or ()), box, times)
+
+
+def _status(survey_file: Path) -> Status:
+    from roadscan.jobs.status import survey_status
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    return survey_status(loaded, Store(loaded.store_url, loaded.config.id))
+
+
+def _print_status(found: Status, survey_file: Path) -> None:
+    typer.echo(f"survey file: {survey_file}")
+    _table(
+        ("run", "sensor", "log", "format", "state", "rows", "rejected", "bytes"),
+        [
+            (x["run"], x["sensor"], x["path"], x["format"], x["state"], f"{x['rows']:,}", f"{x['rejected']:,}",
+             f"{x['bytes']:,}")
+            for x in found.logs
+        ],
+    )  # fmt: skip
+    for log in found.unused_logs:
+        typer.echo(f"in the store, not in the survey file: {log}")
+    if found.readings:
+        typer.echo("readings: " + ", ".join(f"{n.replace('_', ' ')} {c:,}" for n, c in found.readings.items()))
+    typer.echo(f"tiles: {found.tiles_current:,} current, {found.tiles_stale:,} to do")
+    if found.outputs:
+        typer.echo("files: " + ", ".join(f"{n} {c:,}" for n, c in sorted(found.outputs.items())))
+    for failure in found.failures:
+        typer.echo(f"failed in the last run: {failure['stage']} {failure['unit']}: {failure['reason']}")
+    if found.next_run:
+        typer.echo("next run: " + ", ".join(f"{n.replace('_', ' ')} {c:,}" for n, c in found.next_run.items()))
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    widths = [max(len(str(r[i])) for r in [head, *rows]) for i in range(len(head))]
+    for row in [head, tuple("─" * w for w in widths), *rows]:
+        typer.echo("  ".join(str(v).ljust(w) for v, w in zip(row, widths, strict=True)).rstrip())
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

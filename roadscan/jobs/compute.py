@@ -1,0 +1,120 @@
+"""Where tasks run: in this process, on an embedded Dask cluster, or on a scheduler's."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+from roadscan.model.errors import RoadscanError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Done(Generic[T, R]):
+    """A task that ended: with a result, or with the error that stopped it."""
+
+    task: T
+    result: R | None
+    error: Exception | None
+
+
+class Compute(Protocol):
+    """Runs a function over tasks; results come in any order."""
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        """Run all tasks; an error of one does not stop the others."""
+        ...
+
+
+class Inline:
+    """Runs tasks one after another in this process (tests, debugging, one tile)."""
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        """Run all tasks in order."""
+        for task in tasks:
+            try:
+                yield Done(task, function(task), None)
+            except Exception as error:  # noqa: BLE001  one unit's fault must not stop the others
+                yield Done(task, None, error)
+
+
+class OnDask:
+    """Runs tasks on a Dask cluster; a bounded number is handed out at a time."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        """Run all tasks, most of them at the same time; a task is tried once more if its worker dies."""
+        from distributed import as_completed  # slow to import
+
+        threads = sum(self._client.nthreads().values())
+        waiting = iter(tasks)
+        running: dict[Any, T] = {}
+        queue = as_completed()
+
+        def hand_out() -> None:
+            with contextlib.suppress(StopIteration):
+                task = next(waiting)
+                future = self._client.submit(function, task, pure=False, retries=0)
+                running[future.key] = task
+                queue.add(future)
+
+        for _ in range(2 * max(threads, 1)):
+            hand_out()
+        for future in queue:
+            task = running.pop(future.key)
+            error = future.exception()
+            result = None if error is not None else future.result()
+            future.release()
+            hand_out()
+            yield Done(task, result, error)
+
+
+@contextlib.contextmanager
+def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iterator[Compute]:
+    """Compute on `scheduler` (an address) or on an embedded cluster of `workers` processes.
+
+    Parameters
+    ----------
+    workers : number of worker processes; 0 computes in this process; None takes one a core.
+    scheduler : address such as ``tcp://host:8786``.
+    """
+    if scheduler is None and workers == 0:
+        yield Inline()
+        return
+    import dask
+    from distributed import Client, LocalCluster
+
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout="30s")
+        except OSError as error:
+            raise RoadscanError(
+                f"no Dask scheduler answers at {scheduler}", expected="tcp://host:port", change=str(error)
+            ) from error
+        with client:
+            yield OnDask(client)
+        return
+    # A worker's memory is bounded by the size of its blocks, so Dask's spilling and pausing stay out of the way.
+    settings = {
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+        "distributed.comm.timeouts.connect": "60s",
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=workers or dask.system.CPU_COUNT,
+            threads_per_worker=1,
+            dashboard_address=None,
+            silence_logs="ERROR",
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield OnDask(client)

@@ -1,0 +1,32 @@
+"""Keys: short hashes of everything that an output depends on."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import roadscan
+
+_SHAPING = ("model", "kernels", "navigation", "points", "tiles")
+"""Layers whose code shapes points and cells; a change in them makes every output stale."""
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hexadecimal digits over JSON-like values (order matters, dictionaries are sorted)."""
+    text = json.dumps(parts, sort_keys=True, default=str, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+@functools.cache
+def code_version() -> str:
+    """Version of the code that shapes points and cells: release and hash of its sources."""
+    root = Path(roadscan.__file__).parent
+    digest = hashlib.blake2b(roadscan.__version__.encode(), digest_size=8)
+    for layer in _SHAPING:
+        for file in sorted((root / layer).glob("*.py")):
+            digest.update(file.name.encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,165 @@
+"""The plan of a survey: sources of readings, ground, passes; everything a stage starts from."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from roadscan.jobs.fingerprint import code_version, key_of
+from roadscan.jobs.ingest import DATA_TABLES, survey_records
+from roadscan.jobs.readings import (
+    CORRECTIONS,
+    MOUNTINGS,
+    Ground,
+    RawSlice,
+    ReadingSource,
+    TrajectorySource,
+    load_mountings,
+)
+from roadscan.model.errors import ConfigError, RunError
+from roadscan.model.gpstime import utc_from_gps_ns
+from roadscan.model.ids import LanePass, RunId
+from roadscan.model.rig import Mounting
+from roadscan.model.survey import Survey
+from roadscan.points.place import HeightLimits
+from roadscan.tables.logs import DataFile, LogRecord
+from roadscan.tables.store import Store, file_digest
+from roadscan.tiles.grid import TileGrid
+
+_UNMOUNTED = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class SurveyPlan:
+    """What stages after ingest know of a survey."""
+
+    survey: Survey
+    store: Store
+    records: tuple[LogRecord, ...]
+    ground: Ground
+    sources: tuple[tuple[ReadingSource, tuple[DataFile, ...]], ...]
+    """Each sensor's readings in each run, with their data files."""
+    passes: tuple[LanePass, ...]
+    tile_key: str
+    """Hash of all that shapes any tile, beside its readings."""
+
+    @property
+    def raw_bytes(self) -> int:
+        """Compressed bytes of all readings."""
+        return sum(f.bytes for _, files in self.sources for f in files)
+
+    @property
+    def date(self) -> dt.date:
+        """UTC date of the first reading."""
+        return utc_from_gps_ns(min(p.start_gps_ns for p in self.passes)).date()
+
+    def centre_line(self) -> Path | None:
+        """Vector layer of the centre lines, where points are cut to their buffer."""
+        layer = self.survey.config.filters.centre_line
+        return None if layer is None else self.survey.resolve(layer)
+
+    def slices(self) -> list[RawSlice]:
+        """All data files, whole."""
+        return [
+            RawSlice(source, f.path, tuple(range(len(f.group_rows))), f.group_spans, f.bytes)
+            for source, files in self.sources
+            for f in files
+        ]
+
+
+def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
+    """Put together what the tables and the survey file say; reads no readings."""
+    records = tuple(survey_records(survey, store))
+    config = survey.config
+    f = config.filters
+    unlimited = float("inf")
+    heights = HeightLimits(
+        -unlimited if f.height_min_m is None else f.height_min_m,
+        unlimited if f.height_max_m is None else f.height_max_m,
+        -unlimited if f.above_body_min_m is None else f.above_body_min_m,
+        unlimited if f.above_body_max_m is None else f.above_body_max_m,
+    )
+    ground = Ground(
+        config.map.frame(), TileGrid(config.tiles.size_m, config.tiles.cell_m), heights, config.navigation.max_gap_s
+    )
+    sources = tuple(_sources(survey, store, records, ground))
+    if not sources:
+        raise RunError(
+            "the survey has no readings", expected="at least one log of scans, returns or points with rows in it"
+        )
+    passes = tuple(_passes(survey, sources))
+    layer = survey.resolve(f.centre_line) if f.centre_line is not None else None
+    if layer is not None and not layer.exists():
+        raise ConfigError("the centre-line layer does not exist", change="check filters.centre_line", file=layer)
+    tile_key = key_of(
+        code_version(),
+        config.tiles.cell_m,
+        [(p.id, p.run, p.start, p.end) for p in config.passes] or [r.id for r in config.runs],
+        None if layer is None else [file_digest(layer), f.centre_line_buffer_m],
+    )
+    return SurveyPlan(survey, store, records, ground, sources, passes, tile_key)
+
+
+def _sources(
+    survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground
+) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
+    calibrated = load_mountings(store)
+    adjusted = key_of(*(store.read_bytes(t).hex() if store.exists(t) else None for t in (CORRECTIONS, MOUNTINGS)))
+    found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
+    for record in records:
+        for table in DATA_TABLES:
+            files = record.tables.get(table, ())
+            if not files:
+                continue
+            trajectory = None if table == "cloud" else _trajectory(record.run, records)
+            sensor = survey.rig.sensors.get(record.sensor)
+            mounting = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor))
+            mounting = mounting or (sensor.mounting() if sensor else _UNMOUNTED)
+            limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
+            key = key_of(
+                code_version(),
+                adjusted,
+                mounting,
+                limits,
+                None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
+                record.attributes,
+                survey.config.map.model_dump(mode="json"),
+                asdict(ground.heights),
+                ground.max_gap_s,
+                ground.grid.size_m,
+                record.run,
+                record.sensor,
+            )
+            source = ReadingSource(
+                record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mounting,
+                *limits, key,
+            )  # fmt: skip
+            found.append((source, files))
+    return found
+
+
+def _trajectory(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
+    own = [r for r in records if r.run == run and r.tables.get("trajectory")]
+    worlds = {r.attributes["world_frame"] for r in own}
+    if len(worlds) != 1:
+        raise ConfigError(
+            f"run '{run}' has " + ("no trajectory" if not worlds else "trajectories in different world frames"),
+            expected="one trajectory log, or several in one datum",
+        )
+    files = tuple(f for r in own for f in r.tables["trajectory"])
+    return TrajectorySource(run, worlds.pop(), files)
+
+
+def _passes(
+    survey: Survey, sources: Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
+) -> list[LanePass]:  # fmt: skip
+    spans: dict[RunId, tuple[int, int]] = {}
+    for source, files in sources:
+        run = RunId(source.run)
+        for span in (f.span for f in files):
+            if span is not None:
+                before = spans.get(run, span)
+                spans[run] = (min(before[0], span[0]), max(before[1], span[1]))
+    return survey.passes(spans)

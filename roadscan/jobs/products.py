@@ -1,0 +1,167 @@
+"""Products over many tiles, made from the tiles' cells. One task a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from roadscan.jobs.compute import Compute
+from roadscan.jobs.fingerprint import key_of
+from roadscan.jobs.plan import SurveyPlan
+from roadscan.jobs.tiles import TILE, WantedProduct, read_cells, summary_of
+from roadscan.model.errors import RoadscanError
+from roadscan.model.ids import TileId
+from roadscan.model.strict import Strict
+from roadscan.model.survey import Survey
+from roadscan.products.base import (
+    LoadCells,
+    Output,
+    Product,
+    ProductContext,
+    SurveyProduct,
+    TileProduct,
+    TileSummary,
+    product_named,
+    products,
+    source_digest,
+)
+from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.store import Store, file_digest
+from roadscan.tiles.cells import TileCells
+
+
+@dataclass(frozen=True)
+class OutputTask:
+    """One file of a survey product."""
+
+    store: Store
+    product: SurveyProduct
+    options: Strict
+    context: ProductContext
+    output: Output
+    key: str
+    summaries: tuple[TileSummary, ...]
+    cells: tuple[OutputRecord, ...]
+    """Records of the cells that the output may read."""
+
+    @property
+    def target(self) -> str:
+        """Where the file goes, relative to the survey's root."""
+        return f"products/{self.product.name}/{self.output.name}"
+
+
+def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
+    """Products that the survey file asks for, with their checked settings."""
+    config = survey.config.products
+    names = config.make if config.make is not None else [n for n, p in products().items() if p.default]
+    for name in config.options:
+        product_named(name)
+    return [(p, p.options.parse(config.options.get(p.name, {}))) for p in (product_named(n) for n in names)]
+
+
+def product_context(plan: SurveyPlan) -> ProductContext:
+    """What products know of the survey."""
+    config = plan.survey.config
+    return ProductContext(config.id, config.title, plan.ground.map, plan.ground.grid, plan.passes, plan.date)
+
+
+def wanted_tile_products(survey: Survey, context: ProductContext) -> list[WantedProduct]:
+    """Tile products of the survey with the keys of what shapes them beside the tile."""
+    return [
+        WantedProduct(p, o, _product_key(p, o, context))
+        for p, o in wanted_products(survey)
+        if isinstance(p, TileProduct)
+    ]
+
+
+def make_products(
+    plan: SurveyPlan,
+    manifest: Manifest,
+    compute: Compute,
+    report: Callable[[int, int], None] = lambda _a, _b: None,
+) -> list[tuple[str, str]]:
+    """Make the survey products that are missing or stale; remove those no longer due. Returns the failures."""
+    context = product_context(plan)
+    records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
+    summaries = [s for s in map(summary_of, records) if s is not None]
+    stages = [
+        _tasks(product, options, plan, context, records, summaries)
+        for product, options in wanted_products(plan.survey)
+        if isinstance(product, SurveyProduct)
+    ]
+    due = {(t.product.name, t.output.name) for tasks in stages for t in tasks}
+    kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
+    manifest.remove(r for r in manifest.all() if r.product in kinds and (r.product, r.unit) not in due)
+    stale = [t for tasks in stages for t in tasks if not manifest.is_current(t.product.name, t.output.name, t.key)]
+    failures: list[tuple[str, str]] = []
+    report(0, len(stale))
+    for number, done in enumerate(compute.map(write_output, stale), 1):
+        if done.result is not None:
+            manifest.add([done.result])
+        else:
+            reason = str(done.error) if isinstance(done.error, RoadscanError) else repr(done.error)
+            failures.append((f"{done.task.product.name}/{done.task.output.name}", reason))
+        report(number, len(stale))
+    return failures
+
+
+def write_output(task: OutputTask) -> OutputRecord:
+    """Write one file of a survey product (runs on a worker)."""
+    with task.store.scratch() as folder:
+        path = folder / Path(task.output.name).name
+        task.product.write(
+            task.output, task.summaries, cell_loader(task.store, task.cells, task.context), task.options,
+            task.context, path,
+        )  # fmt: skip
+        size, digest = path.stat().st_size, file_digest(path)
+        task.store.publish(path, task.target)
+    return OutputRecord(task.product.name, task.output.name, task.key, task.target, size, digest)
+
+
+def cell_loader(store: Store, records: Sequence[OutputRecord], context: ProductContext) -> LoadCells:
+    """Cells by tile, from the store."""
+    by_unit = {r.unit: r for r in records}
+
+    def load(tile: TileId) -> TileCells | None:
+        record = by_unit.get(str(tile))
+        return None if record is None else read_cells(store, record, context.grid.cells_per_edge)
+
+    return load
+
+
+def _tasks(
+    product: SurveyProduct,
+    options: Strict,
+    plan: SurveyPlan,
+    context: ProductContext,
+    records: Sequence[OutputRecord],
+    summaries: Sequence[TileSummary],
+) -> list[OutputTask]:
+    by_tile = {TileId.parse(r.unit): r for r in records}
+    tasks: list[OutputTask] = []
+    for output in product.outputs(summaries, options, context) if summaries else []:
+        own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
+        key = key_of(_product_key(product, options, context), output.name, [(r.unit, r.digest, r.detail) for r in own])
+        wanted = set(output.tiles)
+        tasks.append(
+            OutputTask(
+                plan.store,
+                product,
+                options,
+                context,
+                output,
+                key,
+                tuple(s for s in summaries if s.tile in wanted),
+                own,
+            )
+        )
+    return tasks
+
+
+def _product_key(product: Product, options: Strict, context: ProductContext) -> str:
+    stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
+    return key_of(
+        product.name, product.version, options.model_dump(mode="json"), source_digest(product),
+        context.survey_id, context.title, context.map, context.grid, stated,
+    )  # fmt: skip

@@ -1,0 +1,240 @@
+"""Raw readings and what places them: loaded for a span of time, never more."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.model.crs import MapFrame
+from roadscan.model.errors import ConfigError, NavigationError, StoreError
+from roadscan.model.frames import rotation_from_quaternion
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.rig import Mounting
+from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
+from roadscan.points.charts import Charts, charts_along
+from roadscan.points.place import CloudFrame, HeightLimits, Placed, Placement, Window, place_cloud
+from roadscan.points.readings import ScanGeometry
+from roadscan.tables.logs import DataFile
+from roadscan.tables.store import Store
+from roadscan.tiles.grid import TileGrid
+
+CORRECTIONS: str = "tables/corrections/part-00000.parquet"
+MOUNTINGS: str = "tables/mountings/part-00000.parquet"
+
+_CHUNK_READINGS = 1 << 20
+_POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz"]
+
+
+@dataclass(frozen=True)
+class TrajectorySource:
+    """Where the poses of a run lie."""
+
+    run: str
+    world: str
+    files: tuple[DataFile, ...]
+
+
+@dataclass(frozen=True)
+class ReadingSource:
+    """One sensor's readings in one run, and how they are placed. Sent to workers: it holds no data."""
+
+    run: str
+    sensor: str
+    table: str
+    attributes: tuple[tuple[str, Any], ...]
+    """What the readings need to be understood: scan geometry, or the cloud's CRS."""
+    trajectory: TrajectorySource | None
+    """None for clouds, which are placed already."""
+    mounting: Mounting
+    range_min_m: float
+    range_max_m: float
+    key: str
+    """Hash of all that places the readings: poses, corrections, mounting, range limits, map, grid, code."""
+
+    @property
+    def attribute(self) -> dict[str, Any]:
+        """Attributes by name."""
+        return dict(self.attributes)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where points go: the map, its grid, and which heights count."""
+
+    map: MapFrame
+    grid: TileGrid
+    heights: HeightLimits
+    max_gap_s: float
+
+
+@dataclass(frozen=True)
+class RawSlice:
+    """Row groups of one data file."""
+
+    source: ReadingSource
+    file: str
+    groups: tuple[int, ...]
+    spans: tuple[tuple[int, int], ...]
+    """First and last epoch (GPS ns) of each group."""
+    bytes: int
+    """Compressed bytes of the groups, about."""
+
+
+def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[str] | None = None) -> pa.Table:
+    """Row groups of a data file."""
+    try:
+        with store.fs.open(store.path(file), "rb") as stream:
+            return pq.ParquetFile(stream).read_row_groups(list(groups), columns=columns, use_threads=False)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise StoreError(
+            f"ingested rows cannot be read ({error})",
+            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
+            file=file,
+            record=f"row groups {groups[0]}–{groups[-1]}",
+        ) from error
+
+
+class Placer:
+    """Places the readings of slices: loads the poses they need, once for each source."""
+
+    def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice]) -> None:
+        self._store = store
+        self._ground = ground
+        self._placements: dict[str, Placement] = {}
+        spans: dict[str, list[tuple[int, int]]] = {}
+        sources: dict[str, ReadingSource] = {}
+        for one in slices:
+            spans.setdefault(one.source.key, []).extend(one.spans)
+            sources[one.source.key] = one.source
+        for key, source in sources.items():
+            if source.trajectory is not None:
+                self._placements[key] = self._placement(source, spans[key])
+
+    def place(self, one: RawSlice, window: Window) -> Iterator[tuple[int, Placed]]:
+        """Points of a slice, chunk by chunk, with the row group each chunk starts with."""
+        for groups in _chunks(one):
+            rows = read_groups(self._store, one.file, groups).combine_chunks()
+            for batch in rows.to_batches():
+                yield groups[0], self._place_batch(one.source, batch, window)
+
+    def place_group(self, one: RawSlice, group: int, window: Window) -> Placed:
+        """Points of one row group."""
+        rows = read_groups(self._store, one.file, [group]).combine_chunks()
+        return self._place_batch(one.source, rows.to_batches()[0], window)
+
+    def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window) -> Placed:
+        if source.table == "cloud":
+            attributes = source.attribute
+            cloud = CloudFrame(attributes["crs"], attributes["height"], attributes.get("geoid"))
+            ground = self._ground
+            return place_cloud(batch, cloud, ground.map, ground.heights, ground.grid.size_quanta, window)
+        placement = self._placements[source.key]
+        if source.table == "scans":
+            return placement.profiles(batch, _geometry(source), window)
+        return placement.returns(batch, window)
+
+    def _placement(self, source: ReadingSource, spans: list[tuple[int, int]]) -> Placement:
+        if source.trajectory is None:
+            raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
+        trajectory = load_trajectory(self._store, source.trajectory, spans, self._ground.max_gap_s)
+        return Placement(
+            trajectory=trajectory,
+            charts=_charts(self._ground.map, trajectory),
+            mounting=source.mounting,
+            range_min_m=source.range_min_m,
+            range_max_m=source.range_max_m,
+            heights=self._ground.heights,
+            tile_quanta=self._ground.grid.size_quanta,
+        )
+
+
+def load_trajectory(
+    store: Store, source: TrajectorySource, spans: Sequence[tuple[int, int]], max_gap_s: float
+) -> Trajectory:
+    """Poses of a run around spans of time, corrected.
+
+    As much is read beyond each span as interpolation looks at, so poses do not depend on what was asked for.
+    """
+    pad = round(STENCIL_KNOTS * max_gap_s * NS_PER_S)
+    wanted = [(a - pad, b + pad) for a, b in spans]
+    parts: list[pa.Table] = []
+    for file in source.files:
+        groups = [k for k, span in enumerate(file.group_spans) if any(span[0] <= b and span[1] >= a for a, b in wanted)]
+        if groups:
+            parts.append(read_groups(store, file.path, groups, _POSE_COLUMNS))
+    if not parts:
+        empty = np.zeros(0, np.int64)
+        return Trajectory(source.world, empty, np.zeros((0, 3)), np.zeros((0, 4)), max_gap_s)
+    rows = pa.concat_tables(parts)
+    column = {name: rows.column(name).to_numpy() for name in _POSE_COLUMNS}
+    trajectory = Trajectory.of(
+        source.world,
+        column["epoch_gps_ns"],
+        np.stack([column[f"{a}_world_m"] for a in "xyz"], axis=-1),
+        np.stack([column[a] for a in ("qw", "qx", "qy", "qz")], axis=-1),
+        max_gap_s,
+    )
+    return trajectory.corrected(load_corrections(store, source.run))
+
+
+def load_corrections(store: Store, run: str) -> Corrections | None:
+    """Corrections of a run's trajectory, None where no adjustment wrote any."""
+    if not store.exists(CORRECTIONS):
+        return None
+    rows = _small_table(store, CORRECTIONS)
+    rows = rows.filter(pa.compute.equal(rows.column("run"), run))
+    if rows.num_rows == 0:
+        return None
+    return Corrections(
+        rows.column("epoch_gps_ns").to_numpy(),
+        np.stack([rows.column(c).to_numpy() for c in ("north_m", "east_m", "down_m")], axis=-1),
+        np.stack([rows.column(c).to_numpy() for c in ("roll_rad", "pitch_rad", "heading_rad")], axis=-1),
+    )
+
+
+def load_mountings(store: Store) -> dict[tuple[str, str], Mounting]:
+    """Calibrated mountings by run ('*' for all) and sensor."""
+    if not store.exists(MOUNTINGS):
+        return {}
+    found: dict[tuple[str, str], Mounting] = {}
+    for row in _small_table(store, MOUNTINGS).to_pylist():
+        rotation = rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
+        rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
+        lever = (row["lever_forward_m"], row["lever_right_m"], row["lever_down_m"])
+        found[(row["run"], row["sensor"])] = Mounting(lever, rows)
+    return found
+
+
+def _small_table(store: Store, path: str) -> pa.Table:
+    return pq.read_table(pa.BufferReader(store.read_bytes(path)))
+
+
+def _charts(frame: MapFrame, trajectory: Trajectory) -> Charts:
+    if trajectory.epochs_gps_ns.size == 0:
+        return Charts(np.ones(4), np.full((1, 1, 1), -1, np.int32), np.zeros((1, 3)), np.zeros((1, 3, 10)))
+    return charts_along(frame, trajectory.world, trajectory.position_world_m)
+
+
+@functools.lru_cache(maxsize=64)
+def _geometry_of(items: tuple[tuple[str, Any], ...]) -> ScanGeometry:
+    return ScanGeometry.parse(dict(items))
+
+
+def _geometry(source: ReadingSource) -> ScanGeometry:
+    stated = source.attribute.get("scan_geometry")
+    if stated is None:
+        raise ConfigError(f"the scans of {source.run}/{source.sensor} state no geometry", expected="scan_geometry")
+    return _geometry_of(tuple(sorted(stated.items())))
+
+
+def _chunks(one: RawSlice) -> Iterator[list[int]]:
+    """Row groups in pieces that fit the working arrays: whole profiles' groups singly, small groups together."""
+    step = 1 if one.source.table == "scans" else max(_CHUNK_READINGS // 8192, 1)
+    for start in range(0, len(one.groups), step):
+        yield list(one.groups[start : start + step])

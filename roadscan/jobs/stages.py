@@ -1,0 +1,150 @@
+"""The stages of a run, in their order: the one list that the command line and the flows wrap."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from roadscan.jobs.compute import Compute
+from roadscan.jobs.footprints import Footprints, index_footprints, load_footprints
+from roadscan.jobs.ingest import ingest
+from roadscan.jobs.plan import SurveyPlan, plan_survey
+from roadscan.jobs.products import make_products, product_context, wanted_products, wanted_tile_products
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.tiles import TILE, BlockTask, block_tasks, plan_tiles, run_blocks, stale_tiles
+from roadscan.model.errors import RunError
+from roadscan.model.survey import Survey
+from roadscan.products.base import TileProduct, products
+from roadscan.tables.manifest import Manifest, OutputRecord, write_failures
+from roadscan.tables.store import Store
+
+
+class Reporter:
+    """Hears what a run does; the command line shows it as bars or lines."""
+
+    def line(self, text: str) -> None:
+        """One thing that happened."""
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """So many units of a stage are done."""
+
+
+@dataclass
+class Run:
+    """A run of a survey: what the stages share."""
+
+    survey: Survey
+    store: Store
+    compute: Compute
+    selection: Selection | None = None
+    """Only these tiles, and these whether stale or not."""
+    reporter: Reporter = field(default_factory=Reporter)
+    failures: list[tuple[str, str, str]] = field(default_factory=list)
+    """Stage, unit and reason of everything that failed."""
+    raw_bytes_read: int = 0
+    """Compressed bytes of readings that the tiles stage asked for."""
+
+    def failed(self, stage: str, found: Sequence[tuple[str, object]]) -> None:
+        """Keep failures of a stage."""
+        for unit, reason in found:
+            self.failures.append((stage, unit, str(reason)))
+            self.reporter.line(f"failed: {stage} {unit}: {reason}")
+
+
+def run_ingest(run: Run) -> None:
+    """Raw logs → tables."""
+    ingest(run.survey, run.store, run.reporter.line)
+
+
+def run_footprints(run: Run) -> None:
+    """Which raw block touches which tile."""
+    plan = plan_survey(run.survey, run.store)
+    found = index_footprints(plan, Manifest(run.store), run.compute, _bar(run, "footprints"))
+    run.failed("footprints", found)
+
+
+def run_tiles(run: Run) -> None:
+    """Readings → points → cells and tile products."""
+    plan = plan_survey(run.survey, run.store)
+    manifest = Manifest(run.store)
+    tasks, gone = tile_tasks(run, plan, manifest, load_footprints(plan, manifest))
+    manifest.remove(gone)
+    run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
+    run.failed("tiles", run_blocks(tasks, manifest, run.compute, _bar(run, "tiles")))
+
+
+def run_products(run: Run) -> None:
+    """Cells → mosaics, pictures, tables."""
+    plan = plan_survey(run.survey, run.store)
+    manifest = Manifest(run.store)
+    run.failed("products", make_products(plan, manifest, run.compute, _bar(run, "products")))
+    manifest.compact()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a run."""
+
+    name: str
+    title: str
+    run: Callable[[Run], None]
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("ingest", "raw logs into tables", run_ingest),
+    Stage("footprints", "which raw block touches which tile", run_footprints),
+    Stage("tiles", "readings into points, cells and tile files", run_tiles),
+    Stage("products", "mosaics, pictures and tables over all tiles", run_products),
+)
+
+
+def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
+    """Run stages in their order, then close the run.
+
+    Raises
+    ------
+    RunError
+        at the end, if any unit failed; all others are finished and kept.
+    """
+    with run.store.lock():
+        for stage in stages:
+            started = time.perf_counter()
+            stage.run(run)
+            run.reporter.line(f"{stage.name}: {time.perf_counter() - started:.1f} s")
+        close_run(run)
+
+
+def close_run(run: Run) -> None:
+    """Keep the list of failures for `roadscan status`, and raise if there are any."""
+    write_failures(run.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in run.failures])
+    if run.failures:
+        listed = "; ".join(f"{s} {u}: {r}" for s, u, r in run.failures[:10])
+        more = f"; and {len(run.failures) - 10} more (`roadscan status`)" if len(run.failures) > 10 else ""
+        raise RunError(
+            f"{len(run.failures)} units failed: {listed}{more}",
+            change="everything else is finished; the next run does only these",
+        )
+
+
+def tile_tasks(
+    run: Run, plan: SurveyPlan, manifest: Manifest, footprints: Footprints
+) -> tuple[list[BlockTask], list[OutputRecord]]:
+    """Blocks of work that a run has to do now, and records of tiles that no reading touches any more."""
+    context = product_context(plan)
+    wanted = wanted_tile_products(run.survey, context)
+    tiles = plan_tiles(footprints, plan)
+    if run.selection is not None:
+        chosen = run.selection.tiles(tiles, footprints, plan.ground.grid)
+    else:
+        chosen = stale_tiles(tiles, wanted, manifest)
+    units = {str(t) for t in tiles}
+    names = {p.name for p, _ in wanted_products(run.survey)}
+    dropped = {n for n, p in products().items() if isinstance(p, TileProduct) and n not in names}
+    per_tile = {TILE, *(n for n, p in products().items() if isinstance(p, TileProduct))}
+    gone = [r for r in manifest.all() if r.product in per_tile and (r.unit not in units or r.product in dropped)]
+    return block_tasks(chosen, tiles, footprints, plan, wanted, context), gone
+
+
+def _bar(run: Run, stage: str) -> Callable[[int, int], None]:
+    return lambda done, total: run.reporter.progress(stage, done, total)

@@ -1,0 +1,151 @@
+"""What the store holds, what is stale, what failed; and whether every file is whole."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.jobs.compute import Inline
+from roadscan.jobs.footprints import PRODUCT, load_footprints, reading_fates
+from roadscan.jobs.ingest import plan_logs
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.stages import Run, tile_tasks
+from roadscan.jobs.tiles import TILE
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
+from roadscan.products.base import products
+from roadscan.tables.logs import has_log, read_log_records
+from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
+from roadscan.tables.store import Store, file_digest
+
+
+@dataclass
+class Status:
+    """State of a survey."""
+
+    logs: list[dict[str, Any]] = field(default_factory=list)
+    """Logs of the survey file: run, sensor, path, format, rows, rejected, state."""
+    unused_logs: list[str] = field(default_factory=list)
+    """Logs in the store that the survey file no longer lists."""
+    readings: dict[str, int] = field(default_factory=dict)
+    """Readings by fate."""
+    tiles_current: int = 0
+    tiles_stale: int = 0
+    outputs: dict[str, int] = field(default_factory=dict)
+    """Finished files by product."""
+    failures: list[dict[str, str]] = field(default_factory=list)
+    """What failed in the last run."""
+    next_run: dict[str, int] = field(default_factory=dict)
+    """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
+
+    @property
+    def is_complete(self) -> bool:
+        """True if nothing is missing, stale or failed."""
+        ingested = all(log["state"] == "ingested" for log in self.logs)
+        return ingested and not self.tiles_stale and not self.failures
+
+
+BYTES_PER_READING = 110
+"""Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
+WORKER_BASE_BYTES = 350 << 20
+"""Memory of a worker before its first block: Python and its libraries."""
+
+
+def survey_status(survey: Survey, store: Store) -> Status:
+    """Look at everything the manifest says; reads no readings."""
+    status = Status(failures=read_failures(store))
+    planned = plan_logs(survey, store)
+    for log in planned:
+        ingested = has_log(store, log.key)
+        record = read_log_records(store, [log.key])[0] if ingested else None
+        status.logs.append(
+            {
+                "run": log.run,
+                "sensor": log.sensor,
+                "path": str(log.config.path),
+                "format": log.format.name,
+                "rows": record.rows if record else 0,
+                "rejected": record.rejected if record else 0,
+                "state": "ingested" if record else "waiting",
+                "bytes": log.bytes,
+            }
+        )
+    keys = {log.key for log in planned}
+    status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in read_log_records(store) if r.key not in keys]
+    manifest = Manifest(store)
+    status.outputs = dict(Counter(r.product for r in manifest.all() if r.path and r.product != PRODUCT))
+    if any(log["state"] == "waiting" for log in status.logs):
+        status.next_run = {"logs": sum(log["state"] == "waiting" for log in status.logs)}
+        return status
+    _tile_status(status, survey, store, manifest)
+    return status
+
+
+def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifest) -> None:
+    plan = plan_survey(survey, store)
+    status.readings = reading_fates(plan, manifest)
+    if not any(manifest.of(PRODUCT)):
+        status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}
+        return
+    tasks, _ = tile_tasks(Run(survey, store, Inline()), plan, manifest, load_footprints(plan, manifest))
+    stale = {str(tile) for t in tasks for tile in t.block.tiles}
+    status.tiles_stale = len(stale)
+    status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)
+    largest = max((t.readings for t in tasks), default=0)
+    status.next_run = {
+        "tasks": len(tasks),
+        "tiles": len(stale),
+        "raw_bytes": sum(t.raw_bytes for t in tasks),
+        "worker_memory_bytes": WORKER_BASE_BYTES + BYTES_PER_READING * largest if tasks else 0,
+    }
+
+
+def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> list[str]:
+    """Read every file the store should hold and compare it with what was recorded; returns the faults."""
+    faults: list[str] = []
+    manifest = Manifest(store)
+    data = [f for r in read_log_records(store) for own in r.tables.values() for f in own]
+    outputs = [r for r in manifest.all() if r.path]
+    total = len(data) + len(outputs)
+    with store.scratch() as folder:
+        for number, file in enumerate(data, 1):
+            fault = _check_digest(store, folder, file.path, file.bytes, file.digest)
+            faults += [fault] if fault else []
+            report(number, total)
+        for number, record in enumerate(outputs, len(data) + 1):
+            fault = _check_output(store, folder, record)
+            faults += [fault] if fault else []
+            report(number, total)
+    return faults
+
+
+def _check_digest(store: Store, folder: Path, path: str, size: int, digest: str) -> str | None:
+    found = store.size(path)
+    if found is None:
+        return f"{path}: missing"
+    if found != size:
+        return f"{path}: {found} bytes, expected {size}"
+    if file_digest(store.local_copy(path, folder)) != digest:
+        return f"{path}: the content has changed (digest differs)"
+    return None
+
+
+def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
+    fault = _check_digest(store, folder, record.path, record.bytes, record.digest)
+    if fault is not None:
+        return fault
+    local = store.local_copy(record.path, folder)
+    try:
+        if record.product in products():
+            products()[record.product].check(local)
+        else:
+            pq.read_table(local, partitioning=None)
+    except (RoadscanError, OSError, pa.ArrowInvalid) as error:
+        return f"{record.path}: {error}"
+    return None

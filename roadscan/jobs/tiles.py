@@ -1,0 +1,405 @@
+"""Tiles: raw readings → points → cells and tile products. One task a block."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.jobs.compute import Compute
+from roadscan.jobs.fingerprint import key_of
+from roadscan.jobs.footprints import Footprints
+from roadscan.jobs.plan import SurveyPlan
+from roadscan.jobs.readings import Ground, Placer, RawSlice
+from roadscan.model.errors import RoadscanError
+from roadscan.model.gpstime import utc_from_gps_ns
+from roadscan.model.ids import LanePass, TileId
+from roadscan.model.strict import Strict
+from roadscan.points.centre_line import CentreLineBuffer
+from roadscan.points.cloud import QUANTUM_M, TilePoints
+from roadscan.points.order import canonical_order
+from roadscan.points.place import EXTRA_COLUMNS, Placed, Window, passes_of
+from roadscan.products.base import ProductContext, Tile, TileProduct, TileSummary
+from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import Store, file_digest
+from roadscan.tables.writer import write_parquet
+from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.statistics import cells_of
+
+TILE = "tile"
+"""Manifest name of a tile as a whole; its file holds the cells."""
+
+
+@dataclass(frozen=True)
+class WantedProduct:
+    """A tile product with its settings and the key of its inputs beside the tile's own."""
+
+    product: TileProduct
+    options: Strict
+    key: str
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """Everything a worker needs to compute a block; it holds no data."""
+
+    store: Store
+    ground: Ground
+    block: Block
+    keys: tuple[str, ...]
+    """Key of each core tile."""
+    slices: tuple[RawSlice, ...]
+    """Raw blocks that touch the block, sorted by run, sensor and time."""
+    readings: int
+    """Readings expected."""
+    passes: tuple[LanePass, ...]
+    centre_line: tuple[Path, float] | None
+    products: tuple[WantedProduct, ...]
+    context: ProductContext
+
+    @property
+    def raw_bytes(self) -> int:
+        """Compressed bytes to read, about."""
+        return sum(s.bytes for s in self.slices)
+
+    def single_tiles(self) -> list[BlockTask]:
+        """The same work, tile by tile: used when the block as a whole failed."""
+        return [
+            dataclasses.replace(self, block=Block((tile,), self.block.halo_tiles), keys=(key,))
+            for tile, key in zip(self.block.tiles, self.keys, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class BlockResult:
+    """What a worker did."""
+
+    records: tuple[OutputRecord, ...]
+    failures: tuple[tuple[str, str], ...]
+    """Tiles that failed, with the reason."""
+
+
+def plan_tiles(footprints: Footprints, plan: SurveyPlan) -> dict[TileId, tuple[str, int]]:
+    """Key and expected readings of every tile that a raw block touches."""
+    order = np.lexsort((footprints.row_group, footprints.slice_index, footprints.tile_column, footprints.tile_row))
+    column, row = footprints.tile_column[order], footprints.tile_row[order]
+    starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))
+    digests = {f.path: f.digest for _, files in plan.sources for f in files}
+    names = [(s.source.key, digests[s.file]) for s in footprints.slices]
+    tiles: dict[TileId, tuple[str, int]] = {}
+    for start, end in zip(starts, np.append(starts[1:], order.size), strict=True):
+        part = order[start:end]
+        blocks = zip(footprints.slice_index[part].tolist(), footprints.row_group[part].tolist(), strict=True)
+        key = key_of(plan.tile_key, [(*names[s], g) for s, g in blocks])
+        tile = TileId(int(column[start]), int(row[start]))
+        tiles[tile] = (key, int(footprints.readings[part].sum()))
+    return tiles
+
+
+def stale_tiles(
+    tiles: dict[TileId, tuple[str, int]], products: Sequence[WantedProduct], manifest: Manifest
+) -> list[TileId]:
+    """Tiles that are missing, changed, or lack a wanted product."""
+    return [tile for tile, (key, _) in tiles.items() if not _is_current(tile, key, products, manifest)]
+
+
+def block_tasks(
+    chosen: Sequence[TileId],
+    tiles: dict[TileId, tuple[str, int]],
+    footprints: Footprints,
+    plan: SurveyPlan,
+    products: Sequence[WantedProduct],
+    context: ProductContext,
+) -> list[BlockTask]:
+    """Blocks of work over the chosen tiles."""
+    config = plan.survey.config
+    readings = {tile: tiles[tile][1] for tile in chosen}
+    blocks = cut_blocks(readings, config.tiles.block_tiles, config.tiles.max_block_readings)
+    layer = plan.centre_line()
+    centre_line = None if layer is None else (layer, config.filters.centre_line_buffer_m)
+    by_tile = _rows_by_tile(footprints, frozenset(chosen))
+    return [
+        BlockTask(
+            store=plan.store,
+            ground=plan.ground,
+            block=block,
+            keys=tuple(tiles[t][0] for t in block.tiles),
+            slices=_slices_of(block, by_tile, footprints),
+            readings=sum(readings[t] for t in block.tiles),
+            passes=plan.passes,
+            centre_line=centre_line,
+            products=tuple(products),
+            context=context,
+        )
+        for block in blocks
+    ]
+
+
+def run_blocks(
+    tasks: Sequence[BlockTask],
+    manifest: Manifest,
+    compute: Compute,
+    report: Callable[[int, int], None] = lambda _a, _b: None,
+) -> list[tuple[str, str]]:
+    """Compute blocks; a block that fails as a whole is tried again tile by tile. Returns the failures."""
+    total = sum(len(t.block.tiles) for t in tasks)
+    finished = 0
+    failures: list[tuple[str, str]] = []
+    again: list[BlockTask] = []
+    report(0, total)
+    for round_tasks in (tasks, again):
+        for done in compute.map(compute_block, list(round_tasks)):
+            if done.result is not None:
+                manifest.add(done.result.records)
+                failures.extend(done.result.failures)
+            elif len(done.task.block.tiles) > 1:
+                again.extend(done.task.single_tiles())
+                continue
+            else:
+                failures.append((str(done.task.block.tiles[0]), _reason(done.error)))
+            finished += len(done.task.block.tiles)
+            report(finished, total)
+    return failures
+
+
+def compute_block(task: BlockTask) -> BlockResult:
+    """Compute the tiles of a block and write their files (runs on a worker)."""
+    points = load_points(task)
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    for tile, key in zip(task.block.tiles, task.keys, strict=True):
+        try:
+            records += _write_tile(task, key, points.pop(tile, None), tile)
+        except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
+            failures.append((str(tile), _reason(error)))
+    return BlockResult(tuple(records), tuple(failures))
+
+
+def load_points(task: BlockTask) -> dict[TileId, TilePoints]:
+    """Points of every tile of the block and its halo, filtered and in canonical order."""
+    box = task.block.box()
+    window = Window(*box)
+    placer = Placer(task.store, task.ground, task.slices)
+    buffer = None
+    if task.centre_line is not None:
+        buffer = CentreLineBuffer.load(*task.centre_line, task.ground.map)
+    parts: list[Placed] = []
+    passes: list[npt.NDArray[np.uint16]] = []
+    sources: list[npt.NDArray[np.uint16]] = []
+    numbers: dict[str, int] = {}
+    profiles: list[bool] = []
+    for one in task.slices:
+        number = numbers.setdefault(one.source.key, len(numbers))
+        if number == len(profiles):
+            profiles.append(one.source.table == "scans")
+        own = [p for p in task.passes if p.run == one.source.run]
+        for _, placed in placer.place(one, window):
+            if placed.epoch_gps_ns.size:
+                parts.append(placed)
+                passes.append(passes_of(placed.epoch_gps_ns, own))
+                sources.append(np.full(placed.epoch_gps_ns.size, number, np.uint16))
+    if not parts:
+        return {}
+    return dict(_split(task, box, parts, np.concatenate(passes), np.concatenate(sources), np.array(profiles), buffer))
+
+
+def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
+    """Cells of a finished tile."""
+    rows = pq.read_table(io.BytesIO(store.read_bytes(record.path)))
+    passes = rows.column("passes").combine_chunks()
+    plain = {n: rows.column(n).to_numpy() for n in rows.column_names if n != "passes"}
+    return TileCells(
+        tile=TileId.parse(record.unit),
+        cells_per_edge=cells_per_edge,
+        pass_offsets=passes.offsets.to_numpy(),
+        pass_ids=passes.values.to_numpy(),
+        **plain,
+    )
+
+
+def summary_of(record: OutputRecord) -> TileSummary | None:
+    """Figures of a finished tile; None where it holds no point."""
+    figures = record.figures()
+    if not figures.get("points"):
+        return None
+    figures["passes"] = tuple(figures["passes"])
+    return TileSummary(tile=TileId.parse(record.unit), **figures)
+
+
+def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> bool:
+    if not manifest.is_current(TILE, str(tile), key):
+        return False
+    record = manifest.get(TILE, str(tile))
+    if record is not None and not record.path:
+        return True  # without points there are no files
+    return all(manifest.is_current(w.product.name, str(tile), key_of(key, w.key)) for w in products)
+
+
+def _rows_by_tile(footprints: Footprints, chosen: frozenset[TileId]) -> dict[TileId, npt.NDArray[np.int64]]:
+    order = np.lexsort((footprints.tile_column, footprints.tile_row))
+    column, row = footprints.tile_column[order], footprints.tile_row[order]
+    starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))
+    ends = np.append(starts[1:], order.size)
+    tiles = (TileId(int(column[s]), int(row[s])) for s in starts)
+    return {t: order[s:e] for t, s, e in zip(tiles, starts, ends, strict=True) if t in chosen}
+
+
+def _slices_of(
+    block: Block, by_tile: dict[TileId, npt.NDArray[np.int64]], footprints: Footprints
+) -> tuple[RawSlice, ...]:
+    rows = np.concatenate([by_tile[t] for t in block.with_halo() if t in by_tile])
+    pairs = np.unique(np.column_stack([footprints.slice_index[rows], footprints.row_group[rows]]), axis=0)
+    out: list[RawSlice] = []
+    for index in np.unique(pairs[:, 0]):
+        whole = footprints.slices[index]
+        groups = pairs[pairs[:, 0] == index, 1]
+        ordered = [g for _, g in sorted((whole.spans[g], g) for g in groups.tolist())]
+        share = whole.bytes * len(ordered) // max(len(whole.groups), 1)
+        out.append(RawSlice(whole.source, whole.file, tuple(ordered), tuple(whole.spans[g] for g in ordered), share))
+    return tuple(out)
+
+
+def _split(
+    task: BlockTask,
+    box: tuple[int, int, int, int],
+    parts: list[Placed],
+    passes: npt.NDArray[np.uint16],
+    sources: npt.NDArray[np.uint16],
+    profiles: npt.NDArray[np.bool_],
+    buffer: CentreLineBuffer | None,
+) -> Iterator[tuple[TileId, TilePoints]]:
+    """Sort placed points into tiles."""
+    joined = _Joined(parts, passes, sources)
+    width = box[2] - box[0]
+    local = (joined.tiles[:, 1] - box[1]) * width + (joined.tiles[:, 0] - box[0])
+    order = np.argsort(local.astype(np.uint16), kind="stable")  # 16 bits: a radix sort
+    ends = np.cumsum(np.bincount(local, minlength=width * (box[3] - box[1])))
+    for tile in sorted(task.block.with_halo(), key=lambda t: (t.row, t.column)):
+        index = (tile.row - box[1]) * width + (tile.column - box[0])
+        rows = order[ends[index - 1] if index else 0 : ends[index]]
+        rows = rows[passes[rows] > 0]
+        if buffer is not None and rows.size:
+            rows = rows[_near(tile, joined.quanta[rows], buffer, task.ground)]
+        if rows.size:
+            yield tile, joined.tile(tile, rows, profiles)
+
+
+class _Joined:
+    """Placed parts of a block as one set of arrays."""
+
+    def __init__(self, parts: list[Placed], passes: npt.NDArray[np.uint16], sources: npt.NDArray[np.uint16]) -> None:
+        self.tiles = np.concatenate([p.tiles for p in parts])
+        self.quanta = np.concatenate([p.quanta for p in parts])
+        self.epoch = np.concatenate([p.epoch_gps_ns for p in parts])
+        self.intensity = np.concatenate([p.intensity for p in parts])
+        self.classification = np.concatenate([p.classification for p in parts])
+        self.passes = passes
+        self.sources = sources
+        self.extra = {c: v for c in EXTRA_COLUMNS if (v := _joined_extra(parts, c)) is not None}
+
+    def tile(self, tile: TileId, rows: npt.NDArray[np.int64], profiles: npt.NDArray[np.bool_]) -> TilePoints:
+        """Points of one tile, in canonical order."""
+        ties = [self.extra[c][rows] for c in self.extra]
+        ties += [self.quanta[rows], self.intensity[rows], self.classification[rows]]
+        order = canonical_order(self.sources[rows], self.epoch[rows], profiles[self.sources[rows]], ties)
+        if order is not None:
+            rows = rows[order]
+        quanta = self.quanta[rows]
+        return TilePoints(
+            tile=tile,
+            x_quanta=np.ascontiguousarray(quanta[:, 0]),
+            y_quanta=np.ascontiguousarray(quanta[:, 1]),
+            height_quanta=np.ascontiguousarray(quanta[:, 2]),
+            epoch_gps_ns=self.epoch[rows],
+            intensity=self.intensity[rows],
+            classification=self.classification[rows],
+            pass_id=self.passes[rows],
+            extra={c: v[rows] for c, v in self.extra.items()},
+        )
+
+
+def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
+    known = [p.extra[column] for p in parts if column in p.extra]
+    if not known:
+        return None
+    fill = {"return_number": 1, "number_of_returns": 1}.get(column, 0)
+    return np.concatenate([p.extra.get(column, np.full(p.epoch_gps_ns.size, fill, known[0].dtype)) for p in parts])
+
+
+def _near(
+    tile: TileId, quanta: npt.NDArray[np.int32], buffer: CentreLineBuffer, ground: Ground
+) -> npt.NDArray[np.bool_]:
+    b = ground.grid.bounds(tile)
+    easting = b.easting_min_m + quanta[:, 0].astype(np.float64) * QUANTUM_M
+    northing = b.northing_min_m + quanta[:, 1].astype(np.float64) * QUANTUM_M
+    return buffer.keeps(easting, northing, (b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m))
+
+
+def _write_tile(task: BlockTask, key: str, points: TilePoints | None, tile: TileId) -> list[OutputRecord]:
+    if points is None:
+        return [OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0}))]
+    cells = cells_of(points, task.ground.grid)
+    context = dataclasses.replace(task.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
+    records: list[OutputRecord] = []
+    with task.store.scratch() as folder:
+        for wanted in task.products:
+            suffix = wanted.product.suffix_for(wanted.options)
+            path = folder / f"tile{suffix}"
+            wanted.product.write(Tile(points, cells), wanted.options, context, path)
+            target = f"tiles/{wanted.product.name}/{tile}{suffix}"
+            own_key = key_of(key, wanted.key)
+            records.append(_publish(task.store, path, target, wanted.product.name, str(tile), own_key))
+        path = folder / "cells.parquet"
+        write_parquet(path, cells_table(cells), table_schema("cells"))
+        detail = json.dumps(_figures(points, cells))
+        records.append(
+            _publish(task.store, path, f"tiles/cells/{tile}.parquet", TILE, str(tile), key, detail)
+        )  # last: a tile is current only with all its files
+    return records
+
+
+def cells_table(cells: TileCells) -> pa.Table:
+    """Cells as rows of ``schemas/cells.toml``."""
+    schema = table_schema("cells").arrow()
+    passes = pa.ListArray.from_arrays(cells.pass_offsets, cells.pass_ids, type=schema.field("passes").type)
+    return pa.table([passes if n == "passes" else getattr(cells, n) for n in schema.names], schema=schema)
+
+
+def _figures(points: TilePoints, cells: TileCells) -> dict[str, Any]:
+    return {
+        "points": len(points),
+        "cells": len(cells),
+        "height_min_m": float(cells.height_min_m.min()),
+        "height_mean_m": float(cells.height_robust_m.mean()),
+        "height_max_m": float(cells.height_max_m.max()),
+        "height_std_median_m": float(np.median(cells.height_std_m)),
+        "intensity_mean": float(points.intensity.mean(dtype=np.float64)),
+        "passes": np.unique(points.pass_id).tolist(),
+        "first_epoch_gps_ns": int(points.epoch_gps_ns.min()),
+        "last_epoch_gps_ns": int(points.epoch_gps_ns.max()),
+    }
+
+
+def _publish(
+    store: Store, path: Path, target: str, product: str, unit: str, key: str, detail: str = ""
+) -> OutputRecord:
+    size, digest = path.stat().st_size, file_digest(path)
+    store.publish(path, target)
+    return OutputRecord(product, unit, key, target, size, digest, detail)
+
+
+def _reason(error: Exception | None) -> str:
+    if error is None:
+        return "the worker gave no result"
+    return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"

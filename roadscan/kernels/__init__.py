@@ -1,0 +1,1 @@
+"""The loops: Numba on NumPy arrays, nothing else."""

@@ -1,0 +1,1 @@
+"""Poses at any epoch: corrections and mountings are applied here and nowhere else."""

@@ -1,0 +1,232 @@
+"""Readings of a batch become points: pose, mounting, map, filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.kernels.georeference import FATES, georeference_profiles, georeference_returns
+from roadscan.model.crs import Geoid, MapFrame, world_frame_of
+from roadscan.model.errors import CrsError
+from roadscan.model.ids import LanePass
+from roadscan.model.rig import Mounting
+from roadscan.navigation.trajectory import Trajectory
+from roadscan.points.charts import Charts
+from roadscan.points.cloud import QUANTA_PER_M
+from roadscan.points.readings import ScanGeometry
+
+Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
+Int64 = npt.NDArray[np.int64]
+
+EIGHT_TO_SIXTEEN_BITS: Final = 257
+"""An 8-bit intensity of 255 becomes 65,535."""
+
+EXTRA_COLUMNS: Final = (
+    "return_number", "number_of_returns", "scan_angle_deg", "flags", "user_data", "point_source_id",
+    "red", "green", "blue",
+)  # fmt: skip
+
+FATE_NAMES: Final = ("kept", "no_pose", "range", "height", "outside", "no_return", "outside_pass", "centre_line")
+"""What can become of a reading; the first six in the kernels' order."""
+
+
+@dataclass(frozen=True)
+class HeightLimits:
+    """Unrealistic heights are left out; infinite where not limited."""
+
+    height_min_m: float = -np.inf
+    height_max_m: float = np.inf
+    above_body_min_m: float = -np.inf
+    above_body_max_m: float = np.inf
+
+
+@dataclass(frozen=True)
+class Window:
+    """Tiles whose points are wanted: columns and rows, end exclusive."""
+
+    first_column: int
+    first_row: int
+    end_column: int
+    end_row: int
+
+    def array(self) -> Int64:
+        """(4,) int64 for the kernels."""
+        return np.array([self.first_column, self.first_row, self.end_column, self.end_row], dtype=np.int64)
+
+
+EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Points of one batch of readings, in the order of the batch."""
+
+    tiles: Int32
+    """(n, 2) column and row."""
+    quanta: Int32
+    """(n, 3) x and y from the tile's south-west corner, height; 10 µm."""
+    epoch_gps_ns: Int64
+    intensity: npt.NDArray[np.uint16]
+    classification: npt.NDArray[np.uint8]
+    fates: Int64
+    """(6,) counts of readings by fate."""
+    extra: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How the readings of one sensor in one run become points."""
+
+    trajectory: Trajectory
+    charts: Charts
+    mounting: Mounting
+    range_min_m: float
+    range_max_m: float
+    heights: HeightLimits
+    tile_quanta: int
+
+    def _common(self) -> tuple[Any, ...]:
+        rotation, lever = self.mounting.arrays()
+        coefficients, valid = self.trajectory.intervals
+        mounting = np.ascontiguousarray(np.column_stack([rotation, lever]))
+        return (
+            mounting, self.trajectory.epochs_gps_ns, coefficients, valid,
+            self.charts.lattice, self.charts.table, self.charts.centres, self.charts.coefficients,
+            self._limits(), float(QUANTA_PER_M), self.tile_quanta,
+        )  # fmt: skip
+
+    def _limits(self) -> Float64:
+        h = self.heights
+        return np.array(
+            [
+                self.range_min_m, self.range_max_m,
+                h.height_min_m, h.height_max_m, h.above_body_min_m, h.above_body_max_m,
+            ]
+        )  # fmt: skip
+
+    def returns(self, batch: pa.RecordBatch, window: Window) -> Placed:
+        """Place rows of the table ``returns``."""
+        n = batch.num_rows
+        xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
+        rows, tiles = np.empty(n, np.int32), np.empty((n, 2), np.int32)
+        quanta, fates = np.empty((n, 3), np.int32), np.zeros(FATES, np.int64)
+        made = georeference_returns(
+            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), window.array(), rows, tiles, quanta, fates
+        )
+        kept = rows[:made]
+        return Placed(
+            tiles[:made],
+            quanta[:made],
+            _numpy(batch, "epoch_gps_ns")[kept],
+            _numpy(batch, "intensity")[kept],
+            np.ones(made, np.uint8),
+            fates,
+        )
+
+    def profiles(self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window) -> Placed:
+        """Place rows of the table ``scans``."""
+        n, m = batch.num_rows, geometry.readings
+        epochs = _numpy(batch, "epoch_gps_ns")
+        origins, directions = geometry.rays()
+        rows, readings = np.empty(n * m, np.int32), np.empty(n * m, np.int32)
+        tiles, quanta = np.empty((n * m, 2), np.int32), np.empty((n * m, 3), np.int32)
+        fates = np.zeros(FATES, np.int64)
+        made = georeference_profiles(
+            epochs, _lists(batch, "range", m), origins, directions,
+            np.array([geometry.range_offset_m, geometry.range_step_m]), geometry.reading_period_ns,
+            *self._common(), window.array(), rows, readings, tiles, quanta, fates,
+        )  # fmt: skip
+        row, reading = rows[:made], readings[:made]
+        epoch = epochs[row]
+        if geometry.reading_period_ns:
+            epoch = epoch + np.floor(reading * geometry.reading_period_ns + 0.5).astype(np.int64)
+        intensity = np.zeros(made, np.uint16)
+        if batch.column("intensity").null_count == 0:
+            intensity = _lists(batch, "intensity", m)[row, reading].astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
+        return Placed(
+            tiles[:made].copy(), quanta[:made].copy(), epoch, intensity, np.ones(made, np.uint8), fates
+        )  # the working arrays are far larger where a window keeps little
+
+
+def place_cloud(
+    batch: pa.RecordBatch, cloud: CloudFrame, frame: MapFrame, heights: HeightLimits, tile_quanta: int, window: Window
+) -> Placed:
+    """Place rows of the table ``cloud``: points that are already georeferenced."""
+    enh = cloud.to_map(np.stack([_numpy(batch, f"{a}_m") for a in "xyz"], axis=-1), frame)
+    whole = np.floor(enh * QUANTA_PER_M + 0.5).astype(np.int64)
+    tiles = whole[:, :2] // tile_quanta
+    high = (enh[:, 2] >= heights.height_min_m) & (enh[:, 2] <= heights.height_max_m)
+    wanted = (
+        (tiles[:, 0] >= window.first_column) & (tiles[:, 0] < window.end_column)
+        & (tiles[:, 1] >= window.first_row) & (tiles[:, 1] < window.end_row)
+    )  # fmt: skip
+    keep = high & wanted
+    quanta = np.column_stack([whole[:, :2] - tiles * tile_quanta, whole[:, 2]])[keep].astype(np.int32)
+    fates = np.array([keep.sum(), 0, 0, (~high).sum(), (high & ~wanted).sum(), 0], dtype=np.int64)
+    return Placed(
+        tiles[keep].astype(np.int32),
+        quanta,
+        _numpy(batch, "epoch_gps_ns")[keep],
+        _numpy(batch, "intensity")[keep],
+        _numpy(batch, "classification")[keep],
+        fates,
+        {c: _numpy(batch, c)[keep] for c in EXTRA_COLUMNS if batch.column(c).null_count == 0},
+    )
+
+
+@dataclass(frozen=True)
+class CloudFrame:
+    """What the coordinates of a vendor's cloud are."""
+
+    crs: str
+    height: str
+    geoid: str | None = None
+
+    def to_map(self, xyz_m: Float64, frame: MapFrame) -> Float64:
+        """Easting, northing, height (n, 3) in the survey's map, metres."""
+        same_height = self.height == frame.height
+        if (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height:
+            return xyz_m
+        if self.height == "orthometric" and self.geoid is None:
+            raise CrsError(
+                f"the cloud has orthometric heights in {self.crs}, the map {frame.height} heights in {frame.crs}",
+                expected="the geoid that the cloud's heights were made with",
+                change="name it as geoid of the log, or choose the cloud's own CRS and height for the map",
+            )
+        own = MapFrame(
+            crs=self.crs,
+            height="orthometric" if self.height == "orthometric" else "ellipsoidal",
+            geoid=Geoid(self.geoid) if self.geoid else None,
+        )
+        world = world_frame_of(self.crs)
+        return frame.map_from_world(world, own.world_from_map(world, xyz_m))
+
+
+def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[np.uint16]:
+    """Pass of each epoch, (n,), 0 where none: `passes` are those of one run."""
+    out = np.zeros(epochs_gps_ns.size, dtype=np.uint16)
+    for one in passes:
+        out[(epochs_gps_ns >= one.start_gps_ns) & (epochs_gps_ns < one.end_gps_ns)] = one.pass_id
+    return out
+
+
+def fate_counts(fates: Int64) -> Mapping[str, int]:
+    """Counts by name of the kernels' fates."""
+    return {name: int(count) for name, count in zip(FATE_NAMES, fates, strict=False)}
+
+
+def _numpy(batch: pa.RecordBatch, column: str) -> npt.NDArray[Any]:
+    values: npt.NDArray[Any] = batch.column(column).to_numpy(zero_copy_only=False)
+    return values
+
+
+def _lists(batch: pa.RecordBatch, column: str, size: int) -> npt.NDArray[Any]:
+    """(n, size) view of a fixed-size list column."""
+    flat: npt.NDArray[Any] = batch.column(column).flatten().to_numpy(zero_copy_only=False)
+    return flat.reshape(batch.num_rows, size)

@@ -1,0 +1,76 @@
+"""DuckDB over a store: every table as a view, and spans of time that touch only their partitions."""
+
+from __future__ import annotations
+
+import duckdb
+import pyarrow as pa
+
+from roadscan.model.errors import RoadscanError, StoreError
+from roadscan.tables.logs import DataFile, read_log_records
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import Store
+
+
+def connect(store: Store) -> duckdb.DuckDBPyConnection:
+    """A DuckDB connection with one view a table and, for tables in time, one macro a table.
+
+    ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
+    the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
+    ``tiles``, ``cells``, ``outputs`` and ``logs`` are there once a run has made them.
+    """
+    connection = duckdb.connect()
+    if not store.is_folder:
+        connection.register_filesystem(store.fs)
+    files: dict[str, list[DataFile]] = {}
+    for record in read_log_records(store):
+        for table, own in record.tables.items():
+            files.setdefault(table, []).extend(own)
+    for table, held in files.items():
+        _view(connection, table, [_url(store, f.path) for f in held])
+        partition_s = table_schema(table).partition_s
+        if partition_s is not None:
+            connection.execute(
+                f"CREATE MACRO {table}_between(first_gps_ns, last_gps_ns) AS TABLE SELECT * FROM {table} "
+                f"WHERE gps_bin_s BETWEEN first_gps_ns // 1000000000 // {partition_s} * {partition_s} "
+                "AND last_gps_ns // 1000000000 "
+                "AND epoch_gps_ns BETWEEN first_gps_ns AND last_gps_ns"
+            )
+    for name, folder in (("footprints", "tables/footprints"), ("outputs", "manifest/outputs")):
+        found = store.files(folder, ".parquet")
+        if found:
+            _view(connection, name, [_url(store, f) for f in found], hive=False)
+    cells = store.files("tiles/cells", ".parquet")
+    if cells:
+        _view(connection, "cells", [_url(store, f) for f in cells], hive=False, filename=True)
+    tiles = store.files("products/tile_table", ".parquet")
+    if tiles:
+        _view(connection, "tiles", [_url(store, f) for f in tiles], hive=False)
+    return connection
+
+
+def query(store: Store, statement: str) -> pa.Table:
+    """Run one SQL statement over the store's views."""
+    with connect(store) as connection:
+        try:
+            return connection.execute(statement).to_arrow_table()
+        except duckdb.Error as error:
+            raise RoadscanError(
+                f"the query failed: {error}", change="`roadscan sql 'SHOW TABLES'` lists what there is"
+            ) from error
+
+
+def _view(
+    connection: duckdb.DuckDBPyConnection, name: str, urls: list[str], *, hive: bool = True, filename: bool = False
+) -> None:
+    listed = ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls))
+    options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
+    if filename:
+        options += ", filename = true"
+    try:
+        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet([{listed}], {options})")
+    except duckdb.Error as error:
+        raise StoreError(f"table '{name}' cannot be opened: {error}") from error
+
+
+def _url(store: Store, path: str) -> str:
+    return store.path(path) if store.is_folder else store.fs.unstrip_protocol(store.path(path))

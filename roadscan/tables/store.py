@@ -1,0 +1,202 @@
+"""The store: one survey's tables, tiles, products and manifest below one root.
+
+    <store>/survey=<id>/tables/<table>/run=<run>/sensor=<sensor>/log=<key>/gps_bin_s=<start>/part-<k>.parquet
+    <store>/survey=<id>/tiles/<product>/<column>_<row><suffix>
+    <store>/survey=<id>/products/<product>/<file>
+    <store>/survey=<id>/manifest/…
+
+A store is a folder or an object-store URL (fsspec). A file is written under a temporary name, then
+published by rename (folder) or by one upload (object store); readers never see half of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import socket
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import fsspec
+
+from roadscan.model.errors import StoreError
+
+_STAGING: Final = ".staging"
+_CHUNK: Final = 1 << 22
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE2b-128 of a file's bytes, hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    with path.open("rb") as stream:
+        while chunk := stream.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+class Store:
+    """One survey's place; cheap to make, safe to send to a worker."""
+
+    def __init__(self, url: str, survey_id: str) -> None:
+        self.url = url
+        self.survey_id = survey_id
+        self.fs, base = fsspec.core.url_to_fs(url)
+        self.root = f"{base.rstrip('/')}/survey={survey_id}"
+        self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Workers open the file system themselves."""
+        return (Store, (self.url, self.survey_id))
+
+    def path(self, relative: str) -> str:
+        """Full path, for the file system `fs`, of one below the root."""
+        return f"{self.root}/{relative}"
+
+    def exists(self, relative: str) -> bool:
+        """True if the file or folder is there."""
+        return bool(self.fs.exists(self.path(relative)))
+
+    def size(self, relative: str) -> int | None:
+        """Bytes of a file, None where it is missing."""
+        try:
+            return int(self.fs.size(self.path(relative)))
+        except FileNotFoundError:
+            return None
+
+    def files(self, relative: str, suffix: str = "") -> list[str]:
+        """Files below a folder, relative to the root, sorted."""
+        if not self.exists(relative):
+            return []
+        found = self.fs.find(self.path(relative))
+        start = len(self.fs._strip_protocol(self.root)) + 1
+        return sorted(f[start:] for f in found if f.endswith(suffix))
+
+    def read_bytes(self, relative: str) -> bytes:
+        """Content of a small file."""
+        try:
+            return bytes(self.fs.cat_file(self.path(relative)))
+        except FileNotFoundError as error:
+            raise StoreError("the file is missing from the store", file=self.path(relative)) from error
+
+    def write_bytes(self, relative: str, content: bytes) -> None:
+        """Write a small file at once."""
+        with self.scratch() as folder:
+            temporary = folder / "content"
+            temporary.write_bytes(content)
+            self.publish(temporary, relative)
+
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A temporary local folder, on the store's own disk where it is a folder."""
+        if self.is_folder:
+            parent = Path(self.path(_STAGING))
+            parent.mkdir(parents=True, exist_ok=True)
+            folder = parent / f"{os.getpid()}-{uuid.uuid4().hex}"
+            folder.mkdir()
+        else:
+            folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def publish(self, local: Path, relative: str) -> None:
+        """Move a finished local file into the store under its final name."""
+        target = self.path(relative)
+        if self.is_folder:
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
+            local.replace(target)
+        else:
+            self.fs.put_file(str(local), target)
+            local.unlink()
+
+    def publish_folder(self, local: Path, relative: str) -> None:
+        """Move a finished local folder into the store, in place of one of that name."""
+        if self.is_folder:
+            target = Path(self.path(relative))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists():
+                self.remove(relative)
+            local.rename(target)
+            return
+        self.remove(relative)
+        for file in sorted(p for p in local.rglob("*") if p.is_file()):
+            self.fs.put_file(str(file), f"{self.path(relative)}/{file.relative_to(local).as_posix()}")
+
+    def remove(self, relative: str) -> None:
+        """Remove a file or folder if it is there; a folder vanishes at once."""
+        if not self.exists(relative):
+            return
+        if self.is_folder:
+            doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+            doomed.parent.mkdir(parents=True, exist_ok=True)
+            Path(self.path(relative)).rename(doomed)
+            if doomed.is_dir():
+                shutil.rmtree(doomed, ignore_errors=True)
+            else:
+                doomed.unlink()
+        else:
+            self.fs.rm(self.path(relative), recursive=True)
+
+    def local_copy(self, relative: str, folder: Path) -> Path:
+        """Path of a local file with the content of a stored one (itself, where the store is a folder)."""
+        if self.is_folder:
+            return Path(self.path(relative))
+        target = folder / Path(relative).name
+        self.fs.get_file(self.path(relative), str(target))
+        return target
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second run out of a folder store; leftovers of dead runs are cleared."""
+        if not self.is_folder:
+            yield
+            return
+        file = Path(self.path("manifest/lock"))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._take(file)
+        try:
+            self._clear_staging()
+            yield
+        finally:
+            file.unlink(missing_ok=True)
+
+    def _take(self, file: Path) -> None:
+        me = f"{socket.gethostname()} {os.getpid()}"
+        for _ in range(2):
+            try:
+                with file.open("x") as stream:
+                    stream.write(me)
+                return
+            except FileExistsError:
+                owner = file.read_text().split()
+                if len(owner) == 2 and (owner[0] != socket.gethostname() or _alive(int(owner[1]))):
+                    raise StoreError(
+                        f"process {owner[1]} on {owner[0]} is working on this store",
+                        expected="one run at a time",
+                        change=f"wait for it, or remove {file} if that process is gone",
+                    ) from None
+                file.unlink(missing_ok=True)
+        raise StoreError("the store's lock cannot be taken", file=file)
+
+    def _clear_staging(self) -> None:
+        parent = Path(self.path(_STAGING))
+        for folder in parent.glob("*-*") if parent.is_dir() else ():
+            if not _alive(int(folder.name.split("-")[0])):
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.unlink(missing_ok=True) if folder.is_file() else None
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

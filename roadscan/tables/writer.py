@@ -1,0 +1,189 @@
+"""Rows in, sorted partitions of GPS time out, in bounded memory."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.tables.logs import DataFile, log_folder
+from roadscan.tables.schema import TableSchema, table_schema
+from roadscan.tables.store import Store, file_digest
+
+BUDGET_BYTES: Final = 128 << 20
+"""Rows held in memory before the fullest partitions are written out."""
+
+
+@dataclass
+class _Bin:
+    batches: list[pa.RecordBatch] = field(default_factory=list)
+    bytes: int = 0
+    parts: list[tuple[Path, int, int]] = field(default_factory=list)
+    """Written parts with their first and last epoch."""
+
+
+class LogWriter:
+    """Writes the rows of one log; nothing is visible before :meth:`publish`."""
+
+    def __init__(self, folder: Path, list_size: int | None) -> None:
+        self._folder = folder
+        self._list_size = list_size
+        self._bins: dict[tuple[str, int], _Bin] = defaultdict(_Bin)
+        self._held = 0
+        self.rows: Counter[str] = Counter()
+        self.reject_reasons: Counter[str] = Counter()
+
+    def add(self, table: str, batch: pa.RecordBatch) -> list[tuple[npt.NDArray[np.int64], str]]:
+        """Take rows of a table; returns the rows refused, with their reasons."""
+        schema = table_schema(table)
+        rows = schema.conform(batch, self._list_size)
+        faults = schema.faults(rows)
+        if faults:
+            good = np.ones(rows.num_rows, dtype=bool)
+            for bad, _ in faults:
+                good[bad] = False
+            rows = rows.filter(pa.array(good))
+        for start, part in _by_bin(schema, rows):
+            held = self._bins[(table, start)]
+            held.batches.append(part)
+            held.bytes += part.nbytes
+            self._held += part.nbytes
+        self.rows[table] += rows.num_rows
+        while self._held > BUDGET_BYTES:
+            self._flush(max(self._bins, key=lambda k: self._bins[k].bytes))
+        return faults
+
+    def reject(self, file: str, record: int, offset: int, records: int, reason: str) -> None:
+        """List a record that could not be used."""
+        row = {"file": [file], "record": [record], "offset": [offset], "records": [records], "reason": [reason]}
+        self.add("rejects", pa.RecordBatch.from_pydict(row))
+        self.reject_reasons[reason] += records
+
+    def finish(self) -> None:
+        """Write what is held and merge parts that overlap in time."""
+        for key in sorted(self._bins):
+            self._flush(key)
+        for (table, start), held in sorted(self._bins.items()):
+            if _overlap(held.parts):
+                held.parts = [self._merge(table, start, held)]
+
+    def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
+        """Move the finished tables into the store, each at once."""
+        out: dict[str, tuple[DataFile, ...]] = {}
+        for table in sorted({t for t, _ in self._bins}):
+            local = self._folder / table
+            target = log_folder(table, run, sensor, key)
+            out[table] = tuple(
+                _describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in sorted(local.rglob("*.parquet"))
+            )
+        for table in out:
+            store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+        return out
+
+    def _flush(self, key: tuple[str, int]) -> None:
+        held = self._bins[key]
+        if not held.batches:
+            return
+        table, start = key
+        rows = pa.Table.from_batches(held.batches)
+        self._held -= held.bytes
+        held.batches, held.bytes = [], 0
+        held.parts.append(self._write(table, start, len(held.parts), rows))
+
+    def _merge(self, table: str, start: int, held: _Bin) -> tuple[Path, int, int]:
+        rows = pa.concat_tables([pq.read_table(p, partitioning=None) for p, _, _ in held.parts])
+        for path, _, _ in held.parts:
+            path.unlink()
+        return self._write(table, start, 0, rows)
+
+    def _write(self, table: str, start: int, number: int, rows: pa.Table) -> tuple[Path, int, int]:
+        schema = table_schema(table)
+        folder = self._folder / table
+        if schema.partition_s is not None:
+            folder = folder / f"gps_bin_s={start}"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"part-{number:05d}.parquet"
+        rows = sorted_rows(schema, rows)
+        write_parquet(path, rows, schema)
+        if schema.partition_s is None:
+            return path, number, number
+        epochs = rows.column("epoch_gps_ns")
+        return path, epochs[0].as_py(), epochs[-1].as_py()
+
+
+def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
+    """Write rows in the encodings that measured best for their kind; same rows, same bytes."""
+    encodings: dict[str, str] = {}
+    strings: list[str] = []
+    for column in schema.columns:
+        leaf = f"{column.name}.list.element" if column.is_list else column.name
+        kind = column.type[5:-1] if column.is_list else column.type
+        if kind == "string":
+            strings.append(leaf)
+        elif kind.startswith("float"):
+            encodings[leaf] = "BYTE_STREAM_SPLIT"
+        elif kind != "uint8" and not column.variable:
+            encodings[leaf] = "DELTA_BINARY_PACKED"
+    pq.write_table(
+        rows,
+        path,
+        row_group_size=schema.row_group_rows,
+        compression="zstd",
+        compression_level=1,
+        use_dictionary=strings,
+        column_encoding=encodings,
+        write_statistics=[c.name for c in schema.columns if not c.is_list],
+    )
+
+
+def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
+    """Rows in the schema's order; equal keys keep the order they came in."""
+    keys = [rows.column(name).to_numpy() for name in schema.sort]
+    if len(keys) == 1 and (keys[0][1:] >= keys[0][:-1]).all():
+        return rows
+    if keys[0].dtype.kind != "O" and (keys[0][1:] > keys[0][:-1]).all():
+        return rows
+    order = np.lexsort(keys[::-1])
+    return rows if np.array_equal(order, np.arange(order.size)) else rows.take(pa.array(order))
+
+
+def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.RecordBatch]]:
+    if rows.num_rows == 0:
+        return []
+    if schema.partition_s is None:
+        return [(0, rows)]
+    seconds = rows.column("epoch_gps_ns").to_numpy() // NS_PER_S
+    starts = seconds // schema.partition_s * schema.partition_s
+    if starts[0] == starts[-1] and (starts == starts[0]).all():
+        return [(int(starts[0]), rows)]
+    return [(int(s), rows.filter(pa.array(starts == s))) for s in np.unique(starts)]
+
+
+def _overlap(parts: list[tuple[Path, int, int]]) -> bool:
+    return any(later[1] < earlier[2] for earlier, later in itertools.pairwise(parts))
+
+
+def _describe(path: Path, relative: str) -> DataFile:
+    metadata = pq.read_metadata(path)
+    groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
+    spans: list[tuple[int, int]] = []
+    if metadata.num_row_groups and "epoch_gps_ns" in metadata.schema.names:
+        column = metadata.schema.names.index("epoch_gps_ns")
+        statistics: list[Any] = [g.column(column).statistics for g in groups]
+        spans = [(int(s.min), int(s.max)) for s in statistics]
+    return DataFile(
+        path=relative,
+        rows=metadata.num_rows,
+        bytes=path.stat().st_size,
+        digest=file_digest(path),
+        group_rows=tuple(g.num_rows for g in groups),
+        group_spans=tuple(spans),
+    )

@@ -67,7 +67,8 @@ def rph_from_rotation(level_from_body: Float64) -> tuple[Float64, Float64, Float
     roll = np.arctan2(r[..., 2, 1], r[..., 2, 2])
     pitch = -np.arcsin(np.clip(r[..., 2, 0], -1.0, 1.0))
     heading = np.mod(np.arctan2(r[..., 1, 0], r[..., 0, 0]), 2 * np.pi)
-    return roll, pitch, heading
+    # The remainder of a tiny negative angle rounds up to the full turn itself.
+    return roll, pitch, np.where(heading < 2 * np.pi, heading, 0.0)
 
 
 def ecef_from_ned(latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Float64:

@@ -52,7 +52,8 @@ def query(store: Store, statement: str) -> pa.Table:
     """Run one SQL statement over the store's views."""
     with connect(store) as connection:
         try:
-            return connection.execute(statement).to_arrow_table()
+            relation = connection.sql(statement)
+            return pa.table({}) if relation is None else relation.to_arrow_table()
         except duckdb.Error as error:
             raise RoadscanError(
                 f"the query failed: {error}", change="`roadscan sql 'SHOW TABLES'` lists what there is"

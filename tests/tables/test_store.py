@@ -1,0 +1,175 @@
+"""The store: nothing half-written is seen, nothing is read twice, a second of an hour is one partition."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from roadscan.model.errors import StoreError
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.tables.logs import DataFile, LogRecord, read_log_records, write_log_record
+from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.sql import connect, query
+from roadscan.tables.store import Store
+from roadscan.tables.writer import LogWriter
+
+START = 1_400_000_000
+
+
+@pytest.fixture(params=["folder", "memory"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
+    return Store(str(tmp_path) if request.param == "folder" else f"memory://{tmp_path.name}", "s1")
+
+
+def returns(epochs_ns: np.ndarray) -> pa.RecordBatch:
+    n = epochs_ns.size
+    return pa.RecordBatch.from_pydict(
+        {
+            "epoch_gps_ns": epochs_ns,
+            "pose_epoch_gps_ns": epochs_ns,
+            "x_sensor_m": np.arange(n, dtype=np.float32) % 100,
+            "y_sensor_m": np.zeros(n, np.float32),
+            "z_sensor_m": np.zeros(n, np.float32),
+            "intensity": np.ones(n, np.uint16),
+            "laser": np.zeros(n, np.uint8),
+            "sweep": np.zeros(n, np.int32),
+        }
+    )
+
+
+def write(store: Store, batches: list[pa.RecordBatch], key: str = "abc") -> dict[str, tuple[DataFile, ...]]:
+    with store.scratch() as folder:
+        writer = LogWriter(folder, None)
+        for batch in batches:
+            for rows, reason in writer.add("returns", batch):
+                writer.reject("", int(rows[0]), -1, rows.size, reason)
+        writer.finish()
+        tables = writer.publish(store, "r", "lidar", key)
+    record = LogRecord(key, "r", "lidar", "test", "x", "c", 1, tables, {}, sum(writer.rows.values()), 0, {})
+    write_log_record(store, record)
+    return tables
+
+
+def test_rows_are_partitioned_and_sorted_whatever_their_order(store: Store) -> None:
+    epochs = START * NS_PER_S + np.arange(40_000, dtype=np.int64) * 1_000_000
+    shuffled = np.random.default_rng(0).permutation(epochs)
+    files = write(store, [returns(part) for part in np.array_split(shuffled, 7)])["returns"]
+    assert [f.path.split("/")[5] for f in files] == [f"gps_bin_s={START + 10 * k}" for k in range(4)]
+    seen = []
+    for f in files:
+        with store.fs.open(store.path(f.path)) as stream:
+            own = pq.ParquetFile(stream).read().column("epoch_gps_ns").to_numpy()
+        assert (np.diff(own) > 0).all()
+        assert f.span == (own[0], own[-1])
+        seen.append(own)
+    assert np.array_equal(np.concatenate(seen), epochs)
+
+
+def test_parts_of_a_partition_that_overlap_are_merged(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 20_000)
+    epochs = START * NS_PER_S + np.arange(3000, dtype=np.int64) * 1_000_000
+    in_turn = write(store, [returns(p) for p in np.split(epochs, 10)], "one")["returns"]
+    assert len(in_turn) > 1
+    swapped = write(store, [returns(p) for p in np.split(epochs, 10)[::-1]], "two")["returns"]
+    assert len(swapped) == 1
+    assert sum(f.rows for f in in_turn) == swapped[0].rows == 3000
+
+
+def test_rows_that_break_the_schema_cost_themselves(store: Store) -> None:
+    batch = returns(START * NS_PER_S + np.arange(5, dtype=np.int64))
+    x = np.array([1, np.nan, 3, 99_999, 5], np.float32)
+    batch = batch.set_column(2, "x_sensor_m", pa.array(x))
+    tables = write(store, [batch])
+    assert tables["returns"][0].rows == 3
+    with store.fs.open(store.path(tables["rejects"][0].path)) as stream:
+        rejects = pq.ParquetFile(stream).read().to_pylist()
+    assert [(r["record"], r["reason"]) for r in rejects] == [
+        (1, "x_sensor_m is not a finite number"),
+        (3, "x_sensor_m is above 10000"),
+    ]
+
+
+def test_log_record_comes_back_as_it_was(store: Store) -> None:
+    tables = write(store, [returns(START * NS_PER_S + np.arange(5, dtype=np.int64))])
+    (record,) = read_log_records(store)
+    assert record.tables == tables
+    assert record.span("returns") == (START * NS_PER_S, START * NS_PER_S + 4)
+
+
+def test_one_second_of_an_hour_touches_its_partition_only(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s1")
+    epochs = START * NS_PER_S + np.arange(36_000, dtype=np.int64) * 100_000_000
+    files = write(store, [returns(epochs)])["returns"]
+    assert len(files) == 360
+    first = (START + 1234) * NS_PER_S
+    statement = f"SELECT count(*) AS n FROM returns_between({first}, {first + NS_PER_S - 1})"
+    assert query(store, statement).to_pylist() == [{"n": 10}]
+    with connect(store) as connection:
+        plan = "\n".join(r[1] for r in connection.sql("EXPLAIN ANALYZE " + statement).fetchall())
+    assert "Scanning Files: 1/360" in plan or "Total Files Read: 1" in plan, plan
+
+
+def test_tables_open_without_roadscan(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s1")
+    write(store, [returns(START * NS_PER_S + np.arange(20, dtype=np.int64) * NS_PER_S)])
+    pattern = f"{tmp_path}/survey=*/tables/returns/**/*.parquet"
+    statement = f"SELECT count(*), min(run), count(DISTINCT gps_bin_s) FROM read_parquet('{pattern}')"
+    (row,) = duckdb.sql(statement).fetchall()
+    assert row == (20, "r", 2)
+
+
+def test_manifest_survives_and_forgets(store: Store) -> None:
+    manifest = Manifest(store)
+    for k in range(70):
+        store.write_bytes(f"tiles/las/{k}_0.laz", b"x" * k)
+        manifest.add([OutputRecord("las", f"{k}_0", f"key{k}", f"tiles/las/{k}_0.laz", k, "d")])
+    again = Manifest(store)
+    assert len(again.of("las")) == 70
+    assert again.is_current("las", "5_0", "key5")
+    assert not again.is_current("las", "5_0", "other")
+    store.write_bytes("tiles/las/5_0.laz", b"short")
+    assert again.is_current("las", "5_0", "key5")
+    store.write_bytes("tiles/las/5_0.laz", b"longer than recorded")
+    assert not again.is_current("las", "5_0", "key5")
+    again.remove([again.of("las")["6_0"]])
+    assert not store.exists("tiles/las/6_0.laz")
+    assert Manifest(store).get("las", "6_0") is None
+    again.compact()
+    assert len(Manifest(store).of("las")) == 69
+
+
+def test_second_run_is_kept_out_and_a_dead_one_forgotten(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s1")
+    with store.lock(), pytest.raises(StoreError, match=rf"process {os.getpid()} on .* is working"), store.lock():
+        pass
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    pid = int(dead.stdout)
+    lock = Path(store.path("manifest/lock"))
+    lock.write_text(f"{os.uname().nodename} {pid}")
+    leftover = Path(store.path(f".staging/{pid}-abc"))
+    leftover.mkdir(parents=True)
+    with store.lock():
+        assert not leftover.exists()
+    assert not lock.exists()
+
+
+def test_publishing_a_folder_replaces_it_at_once(store: Store) -> None:
+    for content in (b"old", b"new"):
+        with store.scratch() as folder:
+            (folder / "t").mkdir()
+            (folder / "t" / content.decode()).write_bytes(content)
+            store.publish_folder(folder / "t", "tables/t")
+    assert store.files("tables/t") == ["tables/t/new"]
+
+
+def test_missing_file_is_named(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"manifest/none.json: the file is missing"):
+        store.read_bytes("manifest/none.json")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from prefect import flow, get_run_logger, task
+from prefect import Task, flow, get_run_logger
+from prefect.cache_policies import NO_CACHE
 
 from roadscan.jobs.compute import compute_on
 from roadscan.jobs.selection import Selection
@@ -39,16 +40,18 @@ def run_flow(
     with compute_on(workers, scheduler) as compute, store.lock():
         run = Run(loaded, store, compute, selection, FlowReporter())
         for stage in STAGES:
-            _stage_task(stage)(run)
+            stage_task(stage, run)()
         close_run(run)
     return {"raw_bytes_read": float(run.raw_bytes_read)}
 
 
-def _stage_task(stage: Stage):  # type: ignore[no-untyped-def]  # noqa: ANN202  Prefect's Task is generic over it
-    def step(run: Run) -> None:
+def stage_task(stage: Stage, run: Run) -> Task[[], None]:
+    """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
+
+    def step() -> None:
         stage.run(run)
 
-    return task(step, name=stage.name, persist_result=False, cache_policy=None, task_run_name=stage.name)
+    return Task(step, name=stage.name, task_run_name=stage.name, cache_policy=NO_CACHE, persist_result=False)
 
 
 @flow(name="survey", log_prints=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -193,12 +194,12 @@ def demo(
     workers: Workers = None,
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
-    from roadscan.jobs.demo import compare_with_truth, prepare_demo
+    from roadscan.jobs.demo import prepare_demo, summarise
     from roadscan.jobs.stages import STAGES
 
     survey_file = prepare_demo(out, typer.echo)
     _run(survey_file, STAGES, workers, None)
-    for line in compare_with_truth(survey_file):
+    for line in summarise(survey_file).lines():
         typer.echo(line)
 
 
@@ -305,7 +306,7 @@ def _print_status(found: Status, survey_file: Path) -> None:
         typer.echo("next run: " + ", ".join(f"{n.replace('_', ' ')} {c:,}" for n, c in found.next_run.items()))
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
     widths = [max(len(str(r[i])) for r in [head, *rows]) for i in range(len(head))]
     for row in [head, tuple("─" * w for w in widths), *rows]:
         typer.echo("  ".join(str(v).ljust(w) for v, w in zip(row, widths, strict=True)).rstrip())

@@ -87,8 +87,12 @@ def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iter
     if scheduler is None and workers == 0:
         yield Inline()
         return
+    import logging
+
     import dask
     from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # a run says itself what failed and why
 
     if scheduler is not None:
         try:

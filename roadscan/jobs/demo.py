@@ -1,0 +1,101 @@
+"""The demo: simulate a small survey, run it, compare the surface with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.tiles import TILE, read_cells
+from roadscan.model.survey import Survey
+from roadscan.simulate import load_scene, load_truth, simulate
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.store import Store
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DemoSummary:
+    """What came out of a simulated survey."""
+
+    readings: int
+    """Raw readings (profile readings and lidar returns)."""
+    tiles: int
+    cells: int
+    area_m2: float
+    height_error_m: Float64
+    """(n,) robust height of each compared cell minus the true height at its centre."""
+    products: Path
+    """Folder with the products."""
+
+    def lines(self) -> list[str]:
+        """The summary as text."""
+        e = self.height_error_m * 1e3
+        middle = np.median(e)
+        return [
+            f"readings      {self.readings:,}",
+            f"tiles         {self.tiles:,}",
+            f"area          {self.area_m2:,.1f} m² in {self.cells:,} cells",
+            f"height error  median {middle:+.2f} mm, 1.4826 MAD {1.4826 * np.median(np.abs(e - middle)):.2f} mm, "
+            f"95 % within {np.percentile(np.abs(e), 95):.2f} mm (cell against truth, {e.size:,} cells)",
+            f"files         {self.products}",
+        ]
+
+
+def prepare_demo(folder: Path, report: Callable[[str], None], scene: str = "demo") -> Path:
+    """Write the demo's raw logs, unless they are there; returns the survey file."""
+    survey_file = folder / "SURVEY.toml"
+    if survey_file.exists():
+        report(f"raw logs are there: {folder}")
+        return survey_file
+    report(f"simulating the scene '{scene}' into {folder}")
+    return Path(simulate(load_scene(scene), folder).survey_file)
+
+
+def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
+    """Compare a simulated survey's cells, tile by tile, with the truth written beside its logs.
+
+    Parameters
+    ----------
+    min_count : cells with fewer points are not compared.
+    """
+    survey = Survey.load(survey_file)
+    store = Store(survey.store_url, survey.config.id)
+    plan = plan_survey(survey, store)
+    truth = load_truth(survey_file.parent / "truth")
+    grid = plan.ground.grid
+    errors: list[Float64] = []
+    tiles = [r for r in Manifest(store).of(TILE).values() if r.path]
+    count = 0
+    for record in tiles:
+        cells = read_cells(store, record, grid.cells_per_edge)
+        box = grid.bounds(cells.tile)
+        easting = box.easting_min_m + (cells.column + 0.5) * grid.cell_m
+        northing = box.northing_min_m + (cells.row + 0.5) * grid.cell_m
+        error = cells.height_robust_m - truth.height_m(easting, northing)
+        errors.append(error[(cells.count >= min_count) & np.isfinite(error)])
+        count += len(cells)
+    return DemoSummary(
+        readings=_readings(store),
+        tiles=len(tiles),
+        cells=count,
+        area_m2=count * grid.cell_m**2,
+        height_error_m=np.concatenate(errors),
+        products=Path(store.path("products")),
+    )
+
+
+def _readings(store: Store) -> int:
+    total = 0
+    for record in read_log_records(store):
+        for table, files in record.tables.items():
+            each = record.attributes.get("scan_geometry", {}).get("readings", 1) if table == "scans" else 1
+            if table in ("scans", "returns", "cloud"):
+                total += each * sum(f.rows for f in files)
+    return total

@@ -1,0 +1,234 @@
+"""Documentation: generated pages are current, links lead somewhere, and every example runs."""
+
+from __future__ import annotations
+
+import datetime as dt
+import re
+import runpy
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from typer.testing import CliRunner
+
+from docs import generate
+from roadscan.cli import app
+from roadscan.model.crs import MapFrame
+from roadscan.model.errors import StoreError
+from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.products.base import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
+from roadscan.sensors.base import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.tables.schema import table_schema
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import TileGrid
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+# --- pages --------------------------------------------------------------------------------------
+
+
+def test_generated_pages_are_current() -> None:
+    assert generate.stale(generate.pages()) == [], "run `make docs` and commit the result"
+
+
+def test_a_changed_page_is_noticed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(generate, "DOCS", tmp_path / "docs")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "page.md").write_text("old")
+    monkeypatch.setattr(generate, "pages", lambda: {tmp_path / "docs" / "page.md": "new"})
+    assert generate.main(["--check"]) == 1
+    assert generate.main([]) == 0
+    assert (tmp_path / "docs" / "page.md").read_text() == "new"
+    assert generate.main(["--check"]) == 0
+
+
+def test_tables_page_holds_every_column() -> None:
+    page = (ROOT / "docs" / "tables.md").read_text()
+    sections = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", page, flags=re.MULTILINE | re.DOTALL))
+    for name in generate.schema_names():
+        listed = re.findall(r"^\| `(\w+)` \|", sections[name], flags=re.MULTILINE)
+        assert listed == [c.name for c in table_schema(name).columns]
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), target
+        if anchor:
+            assert anchor in anchors(there), target
+
+
+# --- the worked examples ------------------------------------------------------------------------
+
+
+def test_the_complete_survey_and_rig_files_load() -> None:
+    survey = Survey.load(ROOT / "docs" / "examples" / "SURVEY.toml")
+    assert sorted(survey.rig.sensors) == ["camera", "left", "right", "roof"]
+    assert {log.sensor for run in survey.config.runs for log in run.logs} == {None, "left", "roof"}
+    assert set(survey.config.products.make or ()) <= set(products())
+    for name, options in survey.config.products.options.items():
+        product_named(name).options.parse(options)
+
+
+def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(ROOT / "docs" / "examples" / "survey_from_arrays.py"))
+    outcome = CliRunner().invoke(app, ["run", "array-survey/SURVEY.toml", "--workers", "0"])
+    assert outcome.exit_code == 0, outcome.output
+    with rasterio.open("array-survey/store/survey=arrays/products/mosaic/height.tif") as raster:
+        heights = raster.read(1)
+        rows, columns = np.nonzero(np.isfinite(heights))
+        easting, northing = rasterio.transform.xy(raster.transform, rows, columns)
+    # Across the line of driving (to the north-east through 500000, 5300000), right positive.
+    east, north = np.array(easting) - 500_000, np.array(northing) - 5_300_000
+    across = (east - north) * np.sqrt(0.5)
+    along = (east + north) * np.sqrt(0.5)
+    expected = 100.0 - 0.012 * np.exp(-(((across - 0.8) / 0.2) ** 2))
+    inside = (along > 5.3) & (along < 54.6)
+    assert inside.sum() > 70_000
+    # A cell is 5 cm wide and the rut's wall falls 5 cm a metre: half a cell is 1.3 mm at the steepest.
+    assert np.abs(heights[rows, columns] - expected)[inside].max() < 0.0015
+
+
+# --- the examples of CONTRIBUTING.md ------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The examples, installed as another package that adds them through entry points."""
+    folder = tmp_path_factory.mktemp("plugin")
+    blocks = re.findall(
+        r"```python\n# roadscan/(\w+)/(\w+)\.py\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.DOTALL
+    )
+    entries: dict[str, list[str]] = {}
+    for group, module, code in blocks:
+        (folder / f"contributed_{module}.py").write_text(code)
+        name = re.findall(r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct)\)", code, flags=re.MULTILINE)[0]
+        entry = f"{module} = contributed_{module}:{name}"
+        entries.setdefault({"sensors": "roadscan.formats"}.get(group, f"roadscan.{group}"), []).append(entry)
+    info = folder / "contributed-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: contributed\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("\n".join(f"[{g}]\n" + "\n".join(e) for g, e in entries.items()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        log_formats.cache_clear()
+        products.cache_clear()
+        yield folder
+    log_formats.cache_clear()
+    products.cache_clear()
+
+
+def test_the_contributed_format(plugin: Path, tmp_path: Path) -> None:
+    start = dt.datetime(2026, 5, 4, 9, 30, tzinfo=dt.UTC)
+    dtype = np.dtype([("stamp", "<i8"), ("xyz_m", "<f4", 3), ("intensity", "<u2"), ("laser", "u1")])
+    records = np.zeros(5, dtype)
+    records["stamp"] = int(start.timestamp()) * 10**6 + np.arange(5) * 50
+    records["stamp"][2] = -(2**62)
+    records["xyz_m"] = np.arange(15).reshape(5, 3)
+    log = tmp_path / "drive.bin"
+    log.write_bytes(b"BOXLOG1\0" + records.tobytes() + b"torn")
+
+    reader = format_of(log)
+    assert reader.name == "boxlog"
+    source = LogSource(log, reader.options(), Clock(TimeSystem.UNIX_UTC, unit="us"))
+    header = reader.header(source)
+    items = list(reader.read(source, header))
+    batches = [item.batch for item in items if isinstance(item, Rows)]
+    rejects = [item for item in items if isinstance(item, Reject)]
+    assert [(r.record, r.offset, r.records) for r in rejects] == [(2, 8 + 2 * 23, 1), (5, 8 + 5 * 23, 1)]
+    rows = table_schema("returns").conform(batches[0])
+    assert table_schema("returns").faults(rows) == []
+    epochs = [gps_ns_from_utc(start) + i * 50_000 for i in (0, 1, 3, 4)]
+    assert rows.column("epoch_gps_ns").to_pylist() == epochs
+    assert rows.column("y_sensor_m").to_pylist() == [1.0, 4.0, 10.0, 13.0]
+
+
+CONTEXT = ProductContext("demo", "", MapFrame("EPSG:25832"), TileGrid(10.0, 0.5), (), dt.date(2026, 5, 4))
+
+
+def chessboard(tile: TileId, step_m: float) -> TileCells:
+    """A full tile on a sloping plane whose cells stand alternately `step_m` above and below it."""
+    edge = 20
+    row, column = (a.ravel() for a in np.indices((edge, edge)))
+    sign = np.where((row + column) % 2, 1.0, -1.0)
+    height = 100.0 + 0.02 * column * 0.5 - 0.03 * row * 0.5 + sign * step_m
+    ones = np.ones(edge * edge)
+    return TileCells(
+        tile=tile,
+        cells_per_edge=edge,
+        column=column.astype(np.uint16),
+        row=row.astype(np.uint16),
+        count=ones.astype(np.uint32),
+        height_mean_m=height,
+        height_robust_m=height,
+        height_min_m=height,
+        height_max_m=height,
+        height_std_m=np.zeros(edge * edge, np.float32),
+        intensity_mean=ones.astype(np.float32),
+        pass_count=ones.astype(np.uint16),
+        pass_offsets=np.arange(edge * edge + 1, dtype=np.int32),
+        pass_ids=ones.astype(np.uint16),
+    )
+
+
+def test_the_contributed_product(plugin: Path, tmp_path: Path) -> None:
+    product = product_named("heights_csv")
+    assert isinstance(product, TileProduct)
+    assert not product.default
+    cells = chessboard(TileId(50_000, 530_000), 0.0)
+    file = tmp_path / "heights.csv"
+    product.write(Tile(None, cells), product.options.parse({"decimals": 3}), CONTEXT, file)  # type: ignore[arg-type]
+    product.check(file)
+    table = pd.read_csv(file)
+    assert table.iloc[0].tolist() == [500_000.25, 5_300_000.25, 100.0]
+    assert table.iloc[-1].tolist() == [500_009.75, 5_300_009.75, 99.905]  # 9.5 m · (0.02 − 0.03)
+    file.write_text("easting_m,northing_m,height_m\n1,2,three\n")
+    with pytest.raises(StoreError, match="not a table of heights"):
+        product.check(file)
+
+
+def test_the_contributed_index(plugin: Path, tmp_path: Path) -> None:
+    product = product_named("flatness")
+    assert isinstance(product, SurveyProduct)
+    steps_m = {TileId(1, 1): 0.0, TileId(1, 2): 0.004, TileId(2, 1): None}
+    output = product.outputs([], product.options(), CONTEXT)[0]
+    output = type(output)(output.name, tuple(steps_m))
+    file = tmp_path / output.name
+
+    def load(tile: TileId) -> TileCells | None:
+        step = steps_m[tile]
+        return None if step is None else chessboard(tile, step)
+
+    product.write(output, [], load, product.options(), CONTEXT, file)
+    product.check(file)
+    table = pd.read_csv(file)
+    assert table.tile.tolist() == ["1_1", "1_2"]
+    assert table.flatness_mm.tolist() == pytest.approx([0.0, 4.0], abs=1e-3)
+    file.write_text("a,b\n")
+    with pytest.raises(StoreError, match="not a table of flatness"):
+        product.check(file)
+
+
+def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
+    assert "boxlog" in log_formats()
+    assert "boxlog" not in generate.formats("")
+    assert "flatness" not in generate.product_list("")

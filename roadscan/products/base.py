@@ -132,7 +132,7 @@ class SurveyProduct(ABC):
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """Files to write, in order; a later one may read an earlier one beside its own path."""
+        """Files to write; none may read another."""
 
     @abstractmethod
     def write(
@@ -144,7 +144,11 @@ class SurveyProduct(ABC):
         context: ProductContext,
         path: Path,
     ) -> None:
-        """Write one file to `path` (a temporary name) in bounded memory, whatever the survey's length."""
+        """Write one file to `path` (a temporary name) in bounded memory, whatever the survey's length.
+
+        `tiles` holds at least those of `output`, and nothing written may depend on others. Helper files are
+        written beside `path`, their names start with its name, and they are removed.
+        """
 
     @abstractmethod
     def check(self, path: Path) -> None:

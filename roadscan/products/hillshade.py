@@ -1,0 +1,296 @@
+"""``hillshade``: the surface as light from the north-west would show it."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from pydantic import Field
+from rasterio.shutil import copy as translate
+from rasterio.windows import Window
+
+from roadscan.model.errors import StoreError
+from roadscan.model.ids import TileId
+from roadscan.model.strict import Strict
+from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+from roadscan.products.raster import (
+    Band,
+    CellBox,
+    SparseRaster,
+    cell_image,
+    paste_tile,
+    raster_settings,
+    without_place_warning,
+)
+from roadscan.products.sheets import (
+    Sheet,
+    cells_of,
+    check_sheet,
+    cut_sheets,
+    dated,
+    index_name,
+    index_output,
+    sheet_of,
+    unknown_output,
+    write_index,
+)
+
+Float64 = npt.NDArray[np.float64]
+
+_STEM: Final = "hillshade"
+_PICTURE: Final = "hillshade.png"
+_EMPTY: Final = 0
+_STRIP_ROWS: Final = 128
+_BAND: Final = Band("hillshade", "")
+_PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+
+
+class HillshadeOptions(Strict):
+    """Settings of the hillshade."""
+
+    azimuth_deg: float = Field(default=315.0, ge=0, lt=360)
+    """Where the light comes from, clockwise from map north (degrees)."""
+    altitude_deg: float = Field(default=45.0, gt=0, le=90)
+    """Height of the light above the horizon (degrees)."""
+    z_factor: float = Field(default=3.0, gt=0)
+    """Exaggeration: heights are multiplied by this (ruts and cracks are flat things)."""
+    picture_px: int = Field(default=2000, ge=16, le=20_000)
+    """Longest edge of the PNG picture (pixels), before empty margins are cut off; a pixel is a whole number of
+    cells."""
+    sheet_m: float | None = Field(default=None, gt=0)
+    """Edge of a sheet (m), rounded down to whole tiles; a survey no larger than that is one file. Left out, an
+    edge has 20,000 cells: 1000 m at cells of 5 cm."""
+
+
+class Hillshade(SurveyProduct):
+    """8-bit hillshade (Horn 1981) as a cloud-optimised GeoTIFF, and a PNG picture of the whole survey.
+
+    Values are 1 (in the shade) to 255 (facing the light); 0, transparent in the picture, is empty. Slopes
+    across the borders of tiles and sheets use the neighbour's cells, so no seam shows. In the picture a
+    pixel of several cells is the mean of their heights, shaded after the averaging.
+    """
+
+    name: ClassVar[str] = "hillshade"
+    title: ClassVar[str] = "shaded relief of the surface, as a GeoTIFF and as a picture for pages and reports"
+    options: ClassVar[type[Strict]] = HillshadeOptions
+
+    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+        """Sheets, the index that joins them, and the picture."""
+        sheet_m = cast(HillshadeOptions, options).sheet_m
+        sheets = cut_sheets(_STEM, (t.tile for t in tiles), sheet_m, context.grid)
+        everything = tuple(sorted(t.tile for t in tiles))
+        found = [Output(sheet.name, _with_neighbours(sheet, everything)) for sheet in sheets]
+        found += index_output(_STEM, sheets)
+        return [*found, Output(_PICTURE, everything)] if everything else []
+
+    def write(
+        self,
+        output: Output,
+        tiles: Sequence[TileSummary],
+        load_cells: LoadCells,
+        options: Strict,
+        context: ProductContext,
+        path: Path,
+    ) -> None:
+        """Write one sheet, the index, or the picture."""
+        settings = cast(HillshadeOptions, options)
+        sheet = sheet_of(_STEM, output, settings.sheet_m, context.grid)
+        if output.name == index_name(_STEM):
+            write_index(path, cut_sheets(_STEM, output.tiles, settings.sheet_m, context.grid), _BAND, "uint8", context)
+        elif output.name == _PICTURE:
+            _write_picture(sorted(output.tiles), load_cells, settings, context, path)
+        elif sheet is not None:
+            members = set(output.tiles)
+            base_m = float(math.floor(min(t.height_min_m for t in tiles if t.tile in members)))
+            surface = Surface(output.tiles, base_m, load_cells)
+            _write_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
+        else:
+            raise unknown_output(output)
+
+    def check(self, path: Path) -> None:
+        """Decode all of a sheet or picture; of an index, check its geometry."""
+        with path.open("rb") as stream:
+            start = stream.read(1)
+        if start == _PNG_SIGNATURE[:1]:
+            _check_picture(path)
+        else:
+            check_sheet(path, "uint8")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Tiles whose heights are drawn, counted from a base near them to keep float arithmetic fine."""
+
+    tiles: Sequence[TileId]
+    base_m: float
+    load_cells: LoadCells
+
+    def images(self) -> Iterator[tuple[TileId, Float64]]:
+        """Tile and its (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
+        for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
+            cells = cells_of(tile, self.load_cells)
+            yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
+
+
+def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
+    """Slopes towards east and north of the inner cells of a north-up raster.
+
+    The weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), eq. for
+    the third-order finite difference with weights 1, 2, 1. A missing neighbour is the continuation of the
+    opposite one through the centre, or level with the centre where that is missing too.
+
+    Parameters
+    ----------
+    heights_m : (rows + 2, columns + 2), NaN where unknown.
+    cell_m : edge of a cell (m).
+
+    Returns
+    -------
+    east, north : (rows, columns) metres a metre, NaN where the centre is unknown.
+    """
+    north_west, north, north_east = (_neighbour(heights_m, -1, c) for c in (-1, 0, 1))
+    west, east = _neighbour(heights_m, 0, -1), _neighbour(heights_m, 0, 1)
+    south_west, south, south_east = (_neighbour(heights_m, 1, c) for c in (-1, 0, 1))
+    to_east = (north_east + 2 * east + south_east) - (north_west + 2 * west + south_west)
+    to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
+    return to_east / (8 * cell_m), to_north / (8 * cell_m)
+
+
+def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
+    rows, columns = heights_m.shape
+    centre = heights_m[1:-1, 1:-1]
+    near = heights_m[1 + down : rows - 1 + down, 1 + right : columns - 1 + right]
+    missing = np.isnan(near)
+    if not missing.any():
+        return near
+    opposite = heights_m[1 - down : rows - 1 - down, 1 - right : columns - 1 - right]
+    continued = np.where(np.isnan(opposite), centre, 2 * centre - opposite)
+    return np.where(missing, continued, near)
+
+
+def shade(heights_m: Float64, cell_m: float, options: HillshadeOptions) -> npt.NDArray[np.uint8]:
+    """Shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where the height is unknown.
+
+    The brightness of a matt surface: the cosine between its normal and the direction of the light.
+    """
+    east, north = horn_slopes(heights_m, cell_m)
+    east *= options.z_factor
+    north *= options.z_factor
+    azimuth, altitude = math.radians(options.azimuth_deg), math.radians(options.altitude_deg)
+    horizontal = math.cos(altitude)
+    towards_light = math.sin(altitude) - horizontal * (math.sin(azimuth) * east + math.cos(azimuth) * north)
+    brightness = np.maximum(towards_light / np.sqrt(1.0 + east * east + north * north), 0.0)
+    grey = np.rint(1.0 + 254.0 * brightness)
+    return np.where(np.isnan(grey), _EMPTY, grey).astype(np.uint8)
+
+
+def _with_neighbours(sheet: Sheet, everything: Iterable[TileId]) -> tuple[TileId, ...]:
+    """Tiles of a sheet and those of the survey that touch one of them, in order."""
+    around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
+    return tuple(sorted(around & set(everything)))
+
+
+def _write_sheet(
+    sheet: Sheet, surface: Surface, options: HillshadeOptions, context: ProductContext, path: Path
+) -> None:
+    box = CellBox.around(sheet.tiles, context.grid)
+    shaded = SparseRaster(box, _BAND, "uint8", _EMPTY, context)
+    with raster_settings(), shaded.cog(path) as raster, _heights(surface, box, context, path) as heights:
+        for block in box.blocks_under(sheet.tiles, context.grid.cells_per_edge):
+            halo = Window(block.col_off, block.row_off, block.width + 2, block.height + 2)
+            raster.write(shade(heights.read(1, window=halo), context.grid.cell_m, options), 1, window=block)
+
+
+@contextmanager
+def _heights(surface: Surface, box: CellBox, context: ProductContext, path: Path) -> Iterator[Any]:
+    """Heights over `box` and one cell around it, in a scratch raster."""
+    around = SparseRaster(box.grown(1), Band("height", "metre"), "float64", np.nan, context)
+    with around.scratch(path.with_name(path.name + ".heights.scratch")) as raster:
+        for tile, image in surface.images():
+            paste_tile(raster, around.box, tile, image)
+        yield raster
+
+
+def _write_picture(
+    tiles: Sequence[TileId], load_cells: LoadCells, options: HillshadeOptions, context: ProductContext, path: Path
+) -> None:
+    box = CellBox.around(tiles, context.grid)
+    step = -(-max(box.width, box.height) // options.picture_px)
+    heights_m = _trimmed(_mean_heights(tiles, load_cells, box, step))
+    grey = _shade_in_strips(heights_m, step * context.grid.cell_m, options)
+    opaque = np.where(grey == _EMPTY, 0, 255).astype(np.uint8)
+    with raster_settings(), without_place_warning(), _picture_in_memory(grey, opaque) as picture:
+        translate(picture, str(path), driver="PNG", zlevel=6)
+
+
+def _shade_in_strips(heights_m: Float64, cell_m: float, options: HillshadeOptions) -> npt.NDArray[np.uint8]:
+    """Shade of (rows, columns) heights, few rows at a time to save memory."""
+    around = np.pad(heights_m, 1, constant_values=np.nan)
+    rows = heights_m.shape[0]
+    strips = [shade(around[top : top + _STRIP_ROWS + 2], cell_m, options) for top in range(0, rows, _STRIP_ROWS)]
+    return np.concatenate(strips)
+
+
+@contextmanager
+def _picture_in_memory(*bands: npt.NDArray[np.uint8]) -> Iterator[Any]:
+    rows, columns = bands[0].shape
+    with rasterio.open(
+        "picture", "w+", driver="MEM", width=columns, height=rows, count=len(bands), dtype="uint8"
+    ) as raster:
+        for number, band in enumerate(bands, start=1):
+            raster.write(band, number)
+        yield raster
+
+
+def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> Float64:
+    """(rows, columns) mean of the heights in pixels of `step` squared cells, north up, NaN where empty."""
+    rows, columns = -(-box.height // step), -(-box.width // step)
+    total, count = np.zeros(rows * columns), np.zeros(rows * columns)
+    for tile in tiles:
+        cells = cells_of(tile, load_cells)
+        edge = cells.cells_per_edge
+        column = (tile.column * edge - box.west + cells.column.astype(np.int64)) // step
+        row = (box.north - 1 - tile.row * edge - cells.row.astype(np.int64)) // step
+        pixel, inverse = np.unique(row * columns + column, return_inverse=True)
+        total[pixel] += np.bincount(inverse, weights=cells.height_robust_m)
+        count[pixel] += np.bincount(inverse)
+    with np.errstate(invalid="ignore"):
+        return (total / count).reshape(rows, columns)
+
+
+def _trimmed(heights_m: Float64) -> Float64:
+    """The raster without empty rows and columns at its edges."""
+    known = ~np.isnan(heights_m)
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    return heights_m[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+def _check_picture(path: Path) -> None:
+    """Read a PNG chunk by chunk (W3C, *Portable Network Graphics*, 5): GDAL shows damaged ones without a word."""
+    content, at = path.read_bytes(), len(_PNG_SIGNATURE)
+    if not content.startswith(_PNG_SIGNATURE):
+        raise StoreError("the picture is no PNG", change="make it again", file=path)
+    parts: dict[bytes, bytes] = {}
+    try:
+        while at < len(content):
+            (length,) = struct.unpack_from(">I", content, at)
+            body = content[at + 4 : at + 8 + length]
+            if struct.unpack_from(">I", content, at + 8 + length) != (zlib.crc32(body),):
+                raise StoreError("a part of the picture is damaged", change="make it again", file=path, record=at)
+            parts[body[:4]] = parts.get(body[:4], b"") + body[4:]
+            at += 12 + length
+        columns, rows, bits, colours = struct.unpack_from(">IIBB", parts[b"IHDR"])
+        pixels = zlib.decompress(parts[b"IDAT"])
+    except (struct.error, KeyError, zlib.error) as error:
+        raise StoreError("the picture is cut short", change="make it again", file=path, record=at) from error
+    if b"IEND" not in parts or (bits, colours) != (8, 4) or len(pixels) != rows * (1 + 2 * columns):
+        raise StoreError("the picture is not whole", expected="8 bits of grey and of opacity", file=path)

@@ -1,0 +1,355 @@
+"""``las``: the points of a tile as LAS 1.4 or LAZ."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Final, cast
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+from laspy.header import GpsTimeType
+from laspy.vlrs.known import WktCoordinateSystemVlr
+from lazrs import LazrsError
+from pydantic import Field
+from pyproj.exceptions import CRSError
+
+from roadscan.model.crs import MapFrame
+from roadscan.model.errors import ConfigError, CrsError, StoreError
+from roadscan.model.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
+from roadscan.model.strict import Strict
+from roadscan.points.cloud import QUANTA_PER_M, TilePoints
+from roadscan.products.base import ProductContext, Tile, TileProduct
+from roadscan.products.raster import SOFTWARE
+from roadscan.tiles.grid import TileGrid
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+VLR_USER_ID: Final = "roadscan"
+VLR_RECORD_ID: Final = 1
+
+_SCAN_ANGLE_STEP_DEG: Final = 0.006
+_ONE_OF_ONE: Final = 0x11
+_CHUNK_POINTS: Final = 1_000_000
+_INT32_MAX: Final = 2**31 - 1
+
+_FLAG_BITS: Final = {
+    "scan_direction_flag": 1,
+    "edge_of_flight_line": 2,
+    "synthetic": 4,
+    "key_point": 8,
+    "withheld": 16,
+    "overlap": 32,
+}
+"""LAS dimension by bit of the column ``flags``."""
+
+_AS_RECORDED: Final = ("return_number", "number_of_returns", "user_data", "red", "green", "blue")
+_HANDLED: Final = (*_AS_RECORDED, "flags", "scan_angle_deg")
+_RENAMED: Final = {"point_source_id": "recorded_source_id"}
+
+
+class LasOptions(Strict):
+    """Settings of the point files."""
+
+    compress: bool = True
+    """Write LAZ; otherwise LAS."""
+    scale_m: float = Field(default=1e-4, ge=1e-5, le=0.1)
+    """Step of the stored coordinates (m). In a CRS in feet the next finer of 1, 2 or 5 × 10ⁿ feet is taken."""
+    spacing_m: float | None = Field(default=None, ge=1e-3)
+    """Thin the points out to one in each square of this edge (m), which divides the tile's edge: the point
+    at the lower median of the square's heights. What covers less than half of a square's points, such as
+    loose aggregate or a crack, is not reported. All points are kept where this is left out."""
+
+
+class Las(TileProduct):
+    """LAS 1.4 with point format 6 (7 where the points have colours), usually compressed to LAZ.
+
+    The CRS is stated as WKT, coordinates are in its own unit, time is adjusted standard GPS time, and
+    point_source_id is the pass; what a vendor's program recorded otherwise comes back unchanged (its own
+    source numbers as the extra dimension ``recorded_source_id``). A variable-length record of the user
+    ``roadscan`` holds JSON: survey, tile, thinning, the largest rounding errors, and a digest of the points.
+
+    A point that is kept when the others are thinned out is a recorded one, with its own position, time and
+    pass; of several at the median height it is the first one recorded.
+    """
+
+    name: ClassVar[str] = "las"
+    title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
+    suffix: ClassVar[str] = ".laz"
+    options: ClassVar[type[Strict]] = LasOptions
+
+    def suffix_for(self, options: Strict) -> str:
+        """``.laz`` or ``.las``."""
+        return ".laz" if cast(LasOptions, options).compress else ".las"
+
+    def check_options(self, options: Strict, context: ProductContext) -> None:
+        """Refuse a spacing that does not divide the tile."""
+        spacing_m = cast(LasOptions, options).spacing_m
+        if spacing_m is not None:
+            _squares_per_edge(spacing_m, context.grid)
+
+    def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's points."""
+        settings = cast(LasOptions, options)
+        points = tile.points if settings.spacing_m is None else thin_out(tile.points, settings.spacing_m, context.grid)
+        axes = _axes(points, settings.scale_m, context)
+        header = _header(points, axes, context)
+        record = _record(points, axes, header)
+        digest = _Digest(header)
+        digest.add(record.array)
+        facts = _facts(points, tile.points, axes, digest.text(), settings, context)
+        header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, "survey, tile, rounding", facts))
+        backend = laspy.LazBackend.Lazrs if settings.compress else None
+        with path.open("wb") as stream:
+            writer = laspy.LasWriter(stream, header, do_compress=settings.compress, laz_backend=backend, closefd=False)
+            writer.write_points(record)
+            writer.close()
+
+    def check(self, path: Path) -> None:
+        """Decode every point and compare number, box and digest with what the header states."""
+        try:
+            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
+                _check_points(reader, path)
+        except (laspy.LaspyException, LazrsError, OSError, ValueError, EOFError) as error:
+            raise StoreError(f"the point file cannot be read: {error}", change="make it again", file=path) from error
+
+
+def thin_out(points: TilePoints, spacing_m: float, grid: TileGrid) -> TilePoints:
+    """One point in each square of `spacing_m`: the one at the lower median of the square's heights.
+
+    The squares are counted from the tile's south-west corner. Of several points at the median height the
+    first in canonical order is kept; the kept points stay in canonical order.
+    """
+    per_edge = _squares_per_edge(spacing_m, grid)
+    edge = grid.size_quanta // per_edge
+    square = (points.y_quanta // edge).astype(np.int64) * per_edge + points.x_quanta // edge
+    order = np.lexsort((points.height_quanta, square))  # stable: equal heights stay in canonical order
+    square, height = square[order], points.height_quanta[order]
+    new_square = np.diff(square, prepend=-1) != 0
+    first_of_height = np.flatnonzero(new_square | (np.diff(height, prepend=0) != 0))
+    start = np.flatnonzero(new_square)
+    size = np.diff(start, append=square.size)
+    median = start + (size - 1) // 2
+    first_at_median = first_of_height[np.searchsorted(first_of_height, median, side="right") - 1]
+    return _selected(points, np.sort(order[first_at_median]))
+
+
+def _squares_per_edge(spacing_m: float, grid: TileGrid) -> int:
+    squares = round(grid.size_m / spacing_m)
+    if squares < 1 or abs(squares * spacing_m - grid.size_m) > 1e-9 or grid.size_quanta % squares:
+        raise ConfigError(
+            f"las.spacing_m = {spacing_m:g}",
+            expected=f"a spacing of whole 10 µm that divides the tile's edge of {grid.size_m:g} m",
+            change="choose for example 0.1",
+        )
+    return squares
+
+
+def _selected(points: TilePoints, kept: Int64) -> TilePoints:
+    return replace(
+        points,
+        **{
+            name: getattr(points, name)[kept]
+            for name in (
+                "x_quanta",
+                "y_quanta",
+                "height_quanta",
+                "epoch_gps_ns",
+                "intensity",
+                "classification",
+                "pass_id",
+            )
+        },
+        extra={name: values[kept] for name, values in points.extra.items()},
+    )
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One coordinate as LAS stores it: value = stored · scale + offset, in the CRS's unit."""
+
+    stored: npt.NDArray[np.int32]
+    scale: float
+    offset: float
+    error_max_m: float
+    """Largest difference between a point and what a reader gets back (m)."""
+
+
+def _axes(points: TilePoints, scale_m: float, context: ProductContext) -> tuple[_Axis, _Axis, _Axis]:
+    size, frame = context.grid.size_quanta, context.map
+    horizontal_m, vertical_m = frame.horizontal_unit_m, frame.vertical_unit_m
+    return (
+        _axis(points.x_quanta, points.tile.column * size, scale_m, horizontal_m),
+        _axis(points.y_quanta, points.tile.row * size, scale_m, horizontal_m),
+        _axis(points.height_quanta, 0, scale_m, vertical_m),
+    )
+
+
+def _axis(quanta: npt.NDArray[np.int32], corner_quanta: int, scale_m: float, unit_m: float) -> _Axis:
+    """Store `quanta` from `corner_quanta`; offsets are whole units, so that all tiles share one lattice."""
+    unit_quanta = QUANTA_PER_M * unit_m
+    scale = _scale(scale_m, unit_m)
+    offset = float(math.floor(corner_quanta / unit_quanta))
+    steps = np.rint((quanta + (corner_quanta - offset * unit_quanta)) / (unit_quanta * scale))
+    if steps.size and np.abs(steps).max() > _INT32_MAX:
+        raise ConfigError(f"las.scale_m = {scale_m:g} is too fine for these coordinates", change="make it larger")
+    true_m = (quanta.astype(np.float64) + corner_quanta) / QUANTA_PER_M
+    error_m = np.abs((steps * scale + offset) * unit_m - true_m)
+    return _Axis(steps.astype(np.int32), scale, offset, float(error_m.max(initial=0.0)))
+
+
+def _scale(scale_m: float, unit_m: float) -> float:
+    if unit_m == 1.0:
+        return scale_m
+    exponent = math.floor(math.log10(scale_m / unit_m))
+    leading = scale_m / unit_m / 10.0**exponent
+    step = max(digit for digit in (1, 2, 5) if digit <= leading or digit == 1)
+    return float(f"{step}e{exponent}")
+
+
+def _header(points: TilePoints, axes: tuple[_Axis, _Axis, _Axis], context: ProductContext) -> laspy.LasHeader:
+    header = laspy.LasHeader(version="1.4", point_format=7 if "red" in points.extra else 6)
+    header.scales = np.array([axis.scale for axis in axes])
+    header.offsets = np.array([axis.offset for axis in axes])
+    header.creation_date = context.date
+    header.generating_software = SOFTWARE
+    header.system_identifier = "OTHER"
+    header.global_encoding.gps_time_type = GpsTimeType.STANDARD
+    header.global_encoding.wkt = True
+    header.vlrs.append(WktCoordinateSystemVlr(_wkt1(context.map)))
+    for column in _further(points):
+        header.add_extra_dim(
+            laspy.ExtraBytesParams(_RENAMED.get(column, column), points.extra[column].dtype, "as recorded")
+        )
+    return header
+
+
+def _wkt1(frame: MapFrame) -> str:
+    try:
+        return frame.wkt("WKT1_GDAL")
+    except CRSError as error:
+        raise CrsError(
+            f"map.crs '{frame.crs}' cannot be written as WKT 1",
+            expected="a CRS that LAS 1.4 can state (WKT of OGC 01-009)",
+            change="choose another CRS, or leave the product 'las' out",
+        ) from error
+
+
+def _further(points: TilePoints) -> list[str]:
+    """Recorded columns that LAS has no dimension for."""
+    return sorted(name for name in points.extra if name not in _HANDLED)
+
+
+def _record(points: TilePoints, axes: tuple[_Axis, _Axis, _Axis], header: laspy.LasHeader) -> Any:
+    record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+    for name, axis in zip("XYZ", axes, strict=True):
+        record[name] = axis.stored
+    record["intensity"] = points.intensity
+    record["classification"] = points.classification
+    record["point_source_id"] = points.pass_id
+    record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
+    record.array["bit_fields"] = _ONE_OF_ONE
+    _copy_recorded(record, points)
+    return record
+
+
+def _copy_recorded(record: Any, points: TilePoints) -> None:
+    extra = points.extra
+    for name in _AS_RECORDED:
+        if name in extra:
+            record[name] = extra[name]
+    if "scan_angle_deg" in extra:
+        steps = np.rint(np.nan_to_num(extra["scan_angle_deg"].astype(np.float64)) / _SCAN_ANGLE_STEP_DEG)
+        record["scan_angle"] = np.clip(steps, -30_000, 30_000).astype(np.int16)
+    if "flags" in extra:
+        for name, bit in _FLAG_BITS.items():
+            record[name] = (extra["flags"] & bit) != 0
+    for column in _further(points):
+        record[_RENAMED.get(column, column)] = extra[column]
+
+
+def adjusted_gps_s(epoch_gps_ns: Int64) -> Float64:
+    """Adjusted standard GPS time (s): the double nearest to GPS seconds minus 1e9 (LAS 1.4 R15, 2.4)."""
+    whole = epoch_gps_ns // NS_PER_S
+    return (whole - ADJUSTED_OFFSET_S) + (epoch_gps_ns - whole * NS_PER_S) / NS_PER_S
+
+
+def _gps_time_step_ns(points: TilePoints) -> float:
+    """Distance of the doubles that hold the last epoch (ns): twice the largest rounding error of time."""
+    last = adjusted_gps_s(points.epoch_gps_ns.max(keepdims=True))
+    return round(float(np.spacing(np.abs(last))[0]) * NS_PER_S, 3)
+
+
+def _facts(
+    points: TilePoints,
+    all_points: TilePoints,
+    axes: tuple[_Axis, _Axis, _Axis],
+    blake2b: str,
+    options: LasOptions,
+    context: ProductContext,
+) -> bytes:
+    facts = {
+        "survey": context.survey_id,
+        "tile": str(points.tile),
+        "height": context.map.height,
+        "points_of_tile": len(all_points),
+        "spacing_m": options.spacing_m,
+        "rounding_error_max_m": {name: round(axis.error_max_m, 9) for name, axis in zip("xyz", axes, strict=True)},
+        "gps_time_step_ns": _gps_time_step_ns(points),
+        "blake2b": blake2b,
+    }
+    return json.dumps(facts, sort_keys=True).encode("ascii")
+
+
+class _Digest:
+    """BLAKE2b (128 bits) of point records as they lie in a LAS file, and of what gives them their place."""
+
+    def __init__(self, header: laspy.LasHeader) -> None:
+        self._state = hashlib.blake2b(digest_size=16)
+        wkt = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
+        self._state.update(repr((header.scales.tolist(), header.offsets.tolist(), wkt)).encode())
+
+    def add(self, records: npt.NDArray[np.void]) -> None:
+        self._state.update(np.ascontiguousarray(records).view(np.uint8).data)
+
+    def text(self) -> str:
+        return self._state.hexdigest()
+
+
+def _check_points(reader: laspy.LasReader, path: Path) -> None:
+    header = reader.header
+    stated = _stated_facts(header, path)
+    digest, count = _Digest(header), 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for chunk in _chunks(reader):
+        count += len(chunk)
+        digest.add(chunk.array)
+        xyz = np.stack([chunk.x, chunk.y, chunk.z])
+        low, high = np.minimum(low, xyz.min(axis=1)), np.maximum(high, xyz.max(axis=1))
+    if count != header.point_count or count == 0:
+        raise StoreError(f"{count} points", expected=f"the {header.point_count} of the header", file=path)
+    if not (np.allclose(low, header.mins, atol=1e-9) and np.allclose(high, header.maxs, atol=1e-9)):
+        raise StoreError("points lie outside the header's box", change="make the file again", file=path)
+    if digest.text() != stated.get("blake2b"):
+        raise StoreError("the points do not match their digest", change="make the file again", file=path)
+
+
+def _chunks(reader: laspy.LasReader) -> Iterator[Any]:
+    for chunk in reader.chunk_iterator(_CHUNK_POINTS):
+        if len(chunk) == 0:
+            return
+        yield chunk
+
+
+def _stated_facts(header: laspy.LasHeader, path: Path) -> dict[str, Any]:
+    records = [v for v in header.vlrs if v.user_id == VLR_USER_ID and v.record_id == VLR_RECORD_ID]
+    if not records or not header.global_encoding.wkt:
+        raise StoreError("the file has no CRS or no record of roadscan", change="make the file again", file=path)
+    facts: dict[str, Any] = json.loads(records[0].record_data)
+    return facts

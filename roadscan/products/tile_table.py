@@ -1,0 +1,139 @@
+"""``tile_table``: which tiles there are and what lies in them, for SQL and GIS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+
+from roadscan.model.crs import crs_from_text
+from roadscan.model.errors import StoreError
+from roadscan.model.strict import Strict
+from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+
+_FILE: Final = "tiles.parquet"
+_OUTLINE: Final = "outline"
+_ROW_GROUP_ROWS: Final = 65_536
+
+_COLUMNS: Final = pa.schema(
+    [
+        pa.field("tile", pa.string(), nullable=False),
+        pa.field("tile_column", pa.int32(), nullable=False),
+        pa.field("tile_row", pa.int32(), nullable=False),
+        pa.field("easting_min_m", pa.float64(), nullable=False),
+        pa.field("northing_min_m", pa.float64(), nullable=False),
+        pa.field("points", pa.int64(), nullable=False),
+        pa.field("cells", pa.int64(), nullable=False),
+        pa.field("area_m2", pa.float64(), nullable=False),
+        pa.field("height_min_m", pa.float64(), nullable=False),
+        pa.field("height_mean_m", pa.float64(), nullable=False),
+        pa.field("height_max_m", pa.float64(), nullable=False),
+        pa.field("height_std_median_m", pa.float64(), nullable=False),
+        pa.field("intensity_mean", pa.float64(), nullable=False),
+        pa.field("passes", pa.list_(pa.field("element", pa.uint16(), nullable=False)), nullable=False),
+        pa.field("first_epoch_gps_ns", pa.int64(), nullable=False),
+        pa.field("last_epoch_gps_ns", pa.int64(), nullable=False),
+    ]
+)
+"""Types of ``schemas/tiles.toml``; a test compares them."""
+
+
+class TileTable(SurveyProduct):
+    """GeoParquet 1.1 of the table ``tiles`` with each tile's outline.
+
+    The plain columns (metres) suffice for SQL without a spatial extension; the outline is in the map's
+    CRS and its own unit. A local frame states no CRS.
+    """
+
+    name: ClassVar[str] = "tile_table"
+    title: ClassVar[str] = "table of the tiles with their outlines (GeoParquet), for DuckDB, pandas and GIS"
+
+    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+        """One file."""
+        return [Output(_FILE, tuple(sorted(t.tile for t in tiles)))]
+
+    def write(
+        self,
+        output: Output,
+        tiles: Sequence[TileSummary],
+        load_cells: LoadCells,
+        options: Strict,
+        context: ProductContext,
+        path: Path,
+    ) -> None:
+        """Write the table, sorted by column and row of the tile."""
+        rows = sorted(tiles, key=lambda t: t.tile)
+        outlines = _outlines(rows, context)
+        table = pa.Table.from_pylist([_row(one, context) for one in rows], schema=_COLUMNS)
+        table = table.append_column(
+            pa.field(_OUTLINE, pa.binary(), nullable=False), pa.array(shapely.to_wkb(outlines), pa.binary())
+        )
+        table = table.replace_schema_metadata({"geo": json.dumps(_geo_metadata(outlines, context), sort_keys=True)})
+        pq.write_table(
+            table, path, compression="zstd", row_group_size=_ROW_GROUP_ROWS, write_page_checksum=True, version="2.6"
+        )
+
+    def check(self, path: Path) -> None:
+        """Decode every column, page checksums included, and every outline."""
+        try:
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                table = file.read()
+            metadata = json.loads((table.schema.metadata or {})[b"geo"])
+            outlines = shapely.from_wkb(table[metadata["primary_column"]].to_numpy())
+        except (OSError, pa.ArrowException, KeyError, ValueError, shapely.errors.ShapelyError) as error:
+            raise StoreError(f"the tile table cannot be read: {error}", change="make it again", file=path) from error
+        missing = [name for name in _COLUMNS.names if name not in table.column_names]
+        if missing:
+            raise StoreError(f"the tile table lacks '{missing[0]}'", change="make it again", file=path)
+        if not bool(np.all(shapely.is_valid(outlines))):
+            raise StoreError("an outline of the tile table is not valid", change="make it again", file=path)
+
+
+def _row(one: TileSummary, context: ProductContext) -> dict[str, Any]:
+    box = context.grid.bounds(one.tile)
+    return {
+        "tile": str(one.tile),
+        "tile_column": one.tile.column,
+        "tile_row": one.tile.row,
+        "easting_min_m": box.easting_min_m,
+        "northing_min_m": box.northing_min_m,
+        "points": one.points,
+        "cells": one.cells,
+        "area_m2": one.cells * context.grid.cell_m**2,
+        "height_min_m": one.height_min_m,
+        "height_mean_m": one.height_mean_m,
+        "height_max_m": one.height_max_m,
+        "height_std_median_m": one.height_std_median_m,
+        "intensity_mean": one.intensity_mean,
+        "passes": list(one.passes),
+        "first_epoch_gps_ns": one.first_epoch_gps_ns,
+        "last_epoch_gps_ns": one.last_epoch_gps_ns,
+    }
+
+
+def _outlines(rows: Sequence[TileSummary], context: ProductContext) -> Any:
+    """(n,) polygons in the CRS's own unit, counter-clockwise."""
+    boxes = [context.grid.bounds(one.tile) for one in rows]
+    edges = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
+    return shapely.box(*(edges.reshape(-1, 4) / context.map.horizontal_unit_m).T, ccw=True)
+
+
+def _geo_metadata(outlines: Any, context: ProductContext) -> dict[str, Any]:
+    """Metadata of GeoParquet 1.1 (OGC)."""
+    crs = None if context.map.crs is None else crs_from_text(context.map.crs).to_json_dict()
+    column: dict[str, Any] = {
+        "encoding": "WKB",
+        "geometry_types": ["Polygon"],
+        "crs": crs,
+        "orientation": "counterclockwise",
+        "edges": "planar",
+    }
+    if outlines.size:
+        column["bbox"] = [float(v) for v in shapely.total_bounds(outlines)]
+    return {"version": "1.1.0", "primary_column": _OUTLINE, "columns": {_OUTLINE: column}}

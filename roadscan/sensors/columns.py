@@ -1,0 +1,237 @@
+"""Named columns with units: which column of a file is which quantity, and in what unit.
+
+A column is found by a name that carries its unit (``latitude_deg``, ``height_m``); any other name
+has to be mapped, with its unit, in the log's options. Nothing is guessed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
+from roadscan.model.gpstime import UNIT_NS, Clock
+from roadscan.model.strict import Strict
+
+Dimension: TypeAlias = Literal["angle", "length", "time", "text"]
+
+UNITS: Final[dict[Dimension, dict[str, float]]] = {
+    "angle": {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10_800, "arcsec": math.pi / 648_000},
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "ft_us": 1200 / 3937},
+    "time": {unit: scale / 1e9 for unit, scale in UNIT_NS.items()} | {"utc": 1.0},
+    "text": {"": 1.0},
+}
+"""Units by dimension and their size in radians, metres or seconds; `utc` is ISO 8601 text."""
+
+
+class ColumnOption(Strict):
+    """One column as the survey file states it."""
+
+    name: str
+    """Name of the column in the file."""
+    unit: str | None = None
+    """Its unit: deg, rad, arcmin, arcsec; m, mm, cm, km, ft, ft_us (US survey foot). Needed unless
+    the name ends in it."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a column can hold."""
+
+    name: str
+    dimension: Dimension
+    also: tuple[str, ...] = ()
+    """Other names it is known by."""
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """The column of a quantity."""
+
+    column: str
+    scale: float
+    """Radians, metres or seconds in one unit of the column."""
+    unit: str
+    """Unit as named, "" where the name of a time column says none."""
+
+
+def find_columns(
+    quantities: Iterable[Quantity],
+    names: tuple[str, ...],
+    stated: Mapping[str, ColumnOption],
+    file: Path,
+    units_of_crs: Mapping[str, float] | None = None,
+) -> dict[str, Found]:
+    """Find the column of each quantity.
+
+    Parameters
+    ----------
+    names : names of the file's columns.
+    stated : columns as the log's options state them, by quantity.
+    units_of_crs : size in radians or metres of the unit in which columns that bear just the
+        quantity's name are taken, for quantities whose unit the stated CRS fixes.
+
+    Raises
+    ------
+    ConfigError
+        if an option names an unknown quantity, column or unit.
+    FormatError
+        if a column is missing, comes twice, or has no known unit.
+    """
+    known = {q.name: q for q in quantities}
+    check_keys(stated, known, file)
+    found: dict[str, Found] = {}
+    for quantity in known.values():
+        option = stated.get(quantity.name)
+        one = (
+            _by_name(quantity, names, file, units_of_crs or {})
+            if option is None
+            else _by_option(quantity, option, names, file)
+        )
+        if one is not None:
+            found[quantity.name] = one
+        elif not quantity.optional:
+            raise _missing(quantity, names, file)
+    return found
+
+
+def fits(quantities: Iterable[Quantity], names: Iterable[str], plain: Iterable[str] = ()) -> bool:
+    """True if every needed quantity has a column whose name carries its unit (or stands in `plain`)."""
+    lower = [n.lower() for n in names]
+    return all(
+        q.optional or any(n in _spellings(q) for n in lower) or (q.name in plain and _plain(q, lower))
+        for q in quantities
+    )
+
+
+def need_stamp_unit(column: Found, clock: Clock, file: Path) -> None:
+    """Refuse a time column whose name carries another unit than the stated clock's."""
+    if column.unit in UNIT_NS and column.unit != clock.unit:
+        raise TimeSystemError(
+            f"time column '{column.column}' is in {column.unit} by its name, the clock says {clock.unit}",
+            expected="one unit",
+            change=f'set clock.unit = "{column.unit}", or map the column under another name',
+            file=file,
+        )
+
+
+def unit_in_name(name: str, dimension: Dimension) -> str:
+    """Unit that ends a column's name (``timestamp_ns`` → ``ns``), "" for none."""
+    ends = [unit for unit in UNITS[dimension] if unit and name.lower().endswith("_" + unit)]
+    return max(ends, key=len, default="")
+
+
+def _spellings(quantity: Quantity) -> dict[str, str]:
+    """Lower-case column names that carry the quantity's unit, and that unit."""
+    stems = (quantity.name, *quantity.also)
+    return {f"{stem}_{unit}" if unit else stem: unit for stem in stems for unit in UNITS[quantity.dimension]}
+
+
+def _plain(quantity: Quantity, lower: list[str]) -> list[str]:
+    return [stem for stem in (quantity.name, *quantity.also) if stem in lower]
+
+
+def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, units_of_crs: Mapping[str, float]) -> Found | None:
+    spellings = _spellings(quantity)
+    fitting = [n for n in names if n.lower() in spellings]
+    if len(fitting) > 1:
+        raise FormatError(
+            f"columns '{fitting[0]}' and '{fitting[1]}' both hold the {quantity.name}",
+            change=f'state which: columns = {{ {quantity.name} = {{ name = "{fitting[0]}" }} }}',
+            file=file,
+        )
+    if fitting:
+        unit = spellings[fitting[0].lower()]
+        return Found(fitting[0], UNITS[quantity.dimension][unit], unit)
+    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    if plain and quantity.name in units_of_crs:
+        return Found(plain[0], units_of_crs[quantity.name], "of the CRS")
+    return None
+
+
+def _by_option(quantity: Quantity, option: ColumnOption, names: tuple[str, ...], file: Path) -> Found:
+    if option.name not in names:
+        raise ConfigError(
+            f"options.columns.{quantity.name} names the column '{option.name}', which the file does not have"
+            + nearest(option.name, names),
+            expected="one of: " + ", ".join(names),
+            file=file,
+        )
+    units = UNITS[quantity.dimension]
+    unit = option.unit if option.unit is not None else unit_in_name(option.name, quantity.dimension)
+    if quantity.dimension == "time" and not unit:
+        return Found(option.name, 1.0, "")  # the clock states it
+    if unit not in units:
+        raise ConfigError(
+            f"the unit of column '{option.name}' ({quantity.name}) is "
+            + (f"'{unit}'{nearest(unit, units)}" if unit else "not stated"),
+            expected="one of: " + ", ".join(u for u in units if u),
+            change=f'columns = {{ {quantity.name} = {{ name = "{option.name}", unit = "…" }} }}',
+            file=file,
+        )
+    return Found(option.name, units[unit], unit)
+
+
+def _missing(quantity: Quantity, names: tuple[str, ...], file: Path) -> FormatError:
+    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    arrived = f"column '{plain[0]}' says no unit" if plain else f"no column holds the {quantity.name}"
+    example = plain[0] if plain else names[0] if names else "…"
+    unit = next(u for u in (*UNITS[quantity.dimension], "…"))
+    return FormatError(
+        arrived,
+        expected="a column called " + " or ".join(f"'{s}'" for s in list(_spellings(quantity))[:4]),
+        change=f'or state it: columns = {{ {quantity.name} = {{ name = "{example}", unit = "{unit}" }} }}',
+        file=file,
+    )
+
+
+def check_keys(stated: Iterable[str], known: Iterable[str], file: Path) -> None:
+    """Refuse an option that maps a column to an unknown quantity."""
+    allowed = list(known)
+    for key in stated:
+        if key not in allowed:
+            raise ConfigError(
+                f"options.columns names the unknown quantity '{key}'{nearest(key, allowed)}",
+                expected="one of: " + ", ".join(allowed),
+                file=file,
+            )
+
+
+def named_column(what: str, stated: str | None, known: Iterable[str], names: tuple[str, ...], file: Path) -> str:
+    """Name of the column that holds `what`: the stated one, or the one called as in `known`.
+
+    Raises
+    ------
+    ConfigError
+        if the stated column does not exist.
+    FormatError
+        if none, or more than one, of `known` exists.
+    """
+    if stated is not None:
+        if stated not in names:
+            raise ConfigError(
+                f"options name the column '{stated}' ({what}), which the file does not have{nearest(stated, names)}",
+                expected="one of: " + ", ".join(names),
+                file=file,
+            )
+        return stated
+    spellings = list(known)
+    fitting = [name for name in names if name in spellings]
+    if len(fitting) == 1:
+        return fitting[0]
+    raise FormatError(
+        f"columns {', '.join(fitting)} all hold {what}" if fitting else f"no column holds {what}",
+        expected="one column called " + " or ".join(spellings),
+        change="state the column in options",
+        file=file,
+    )
+
+
+def stamp_column(stated: str | None, names: tuple[str, ...], known: tuple[str, ...], file: Path) -> Found:
+    """Column of numeric time stamps, see :func:`named_column`, with the unit that its name ends in."""
+    column = named_column("the time stamps", stated, known, names, file)
+    return Found(column, 1.0, unit_in_name(column, "time"))

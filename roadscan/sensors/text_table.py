@@ -1,0 +1,406 @@
+"""Tables in text files: CSV and its kin, read in blocks, where a damaged line costs that line.
+
+A record is one line. Blocks are parsed by Arrow; only a block in which Arrow stumbles is parsed
+line by line, which finds the lines at fault. Files compressed with gzip, bzip2 or xz are read as
+they are; offsets then count bytes of the text.
+"""
+
+from __future__ import annotations
+
+import bz2
+import csv
+import gzip
+import lzma
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Final, Literal, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from roadscan.model.errors import ConfigError, FormatError
+from roadscan.model.strict import Strict
+from roadscan.sensors.base import Reject
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+BLOCK_BYTES: Final = 1 << 20
+LINE_BYTES_MAX: Final = 1 << 16
+"""A line without an end for so long is no text line."""
+HEAD_BYTES: Final = 1 << 16
+"""The column names have to stand in so many bytes."""
+
+Kind: TypeAlias = Literal["number", "integer", "text"]
+"""Type of a column: float64, int64 or text. An empty number is NaN, an empty whole number is a fault."""
+
+_ARROW_TYPES: Final[dict[Kind, pa.DataType]] = {"number": pa.float64(), "integer": pa.int64(), "text": pa.string()}
+_DELIMITERS: Final = (",", ";", "\t", "|")
+_DAMAGE: Final = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, OSError)
+
+
+class TextOptions(Strict):
+    """Settings of a text file with columns."""
+
+    delimiter: str | None = None
+    """Character between columns: "," ";" "|", a tabulator, or " " for any run of blanks. Found from
+    the line of column names where left out."""
+    comment: str = "#"
+    """Lines that start with this character are skipped; "" for none."""
+    skip_lines: int = 0
+    """Lines above the line of column names."""
+    names: list[str] | None = None
+    """Names of the columns, for a file without a line of names."""
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """How a text table is laid out."""
+
+    names: tuple[str, ...]
+    delimiter: str
+    """One character; a blank stands for any run of blanks."""
+    comment: str
+    data_offset: int
+    """Byte at which the first line behind the names starts."""
+
+
+@dataclass(frozen=True)
+class TextBlock:
+    """Sound lines of a block."""
+
+    columns: dict[str, pa.Array]
+    """Columns asked for, by name."""
+    records: Int64
+    """(n,) record numbers; the first line behind the names is 0, comments and blank lines do not count."""
+    offsets: Int64
+    """(n,) byte offset of each line in the text."""
+
+    def number(self, name: str) -> Float64:
+        """Column of kind "number" as float64 (n,), NaN where empty."""
+        return np.asarray(self.columns[name].to_numpy(zero_copy_only=False), dtype=np.float64)
+
+    def stamps(self, name: str) -> npt.NDArray[np.generic]:
+        """Column of kind "number" (float64) or "integer" (int64), (n,)."""
+        return np.asarray(self.columns[name].to_numpy(zero_copy_only=False))
+
+    def text(self, name: str) -> list[str]:
+        """Column of kind "text", blanks around the words removed."""
+        return [str(word).strip() for word in self.columns[name].to_pylist()]
+
+
+def open_text(path: Path) -> IO[bytes]:
+    """Open a text file, decompressing gzip, bzip2 and xz (told by their first bytes)."""
+    raw = path.open("rb")
+    magic = raw.read(6)
+    raw.close()
+    if magic.startswith(b"\x1f\x8b"):
+        return cast(IO[bytes], gzip.open(path, "rb"))
+    if magic.startswith(b"BZh"):
+        return cast(IO[bytes], bz2.open(path, "rb"))
+    if magic == b"\xfd7zXZ\x00":
+        return cast(IO[bytes], lzma.open(path, "rb"))
+    return path.open("rb")
+
+
+def head_of(path: Path, size: int = HEAD_BYTES) -> bytes:
+    """First bytes of a text file (decompressed, up to any damage); b"" where it cannot be read."""
+    head = b""
+    try:
+        with open_text(path) as stream:
+            while len(head) < size and (part := cast(Any, stream).read1(size - len(head))):
+                head += part
+    except _DAMAGE:
+        pass  # the reader will say what is wrong behind the head
+    return head
+
+
+def sniff_layout(path: Path) -> TextLayout | None:
+    """Layout as a plain file with column names, or None where it is no such file. Never raises."""
+    try:
+        return text_layout(path, TextOptions())
+    except (FormatError, ConfigError):
+        return None
+
+
+def text_layout(path: Path, options: TextOptions) -> TextLayout:
+    """Find delimiter, column names and the first data line.
+
+    Raises
+    ------
+    FormatError
+        where no line of column names is found.
+    ConfigError
+        where an option is no single character.
+    """
+    line, here, behind = _first_line(path, options)
+    delimiter = options.delimiter or _delimiter_of(line)
+    given = options.names
+    names = tuple(name.strip() for name in (_fields(line, delimiter) if given is None else given))
+    if len(set(names)) < len(names):
+        twice = next(n for n in names if names.count(n) > 1)
+        raise FormatError(f"two columns are called '{twice}'", change="rename one, or state names", file=path)
+    return TextLayout(names, delimiter, options.comment, behind if given is None else here)
+
+
+def first_words(path: Path, options: TextOptions) -> tuple[str, list[str]]:
+    """Delimiter and fields of the first line that counts, names or not. Raises as :func:`text_layout`."""
+    line, _, _ = _first_line(path, options)
+    delimiter = options.delimiter or _delimiter_of(line)
+    return delimiter, _fields(line, delimiter)
+
+
+def _first_line(path: Path, options: TextOptions) -> tuple[str, int, int]:
+    """First line that is neither skipped, blank nor a comment; the bytes where it starts and ends."""
+    for name, value in (("delimiter", options.delimiter), ("comment", options.comment)):
+        if value and (len(value) > 1 or not value.isascii() or value in '"\r\n'):
+            raise ConfigError(f"{name} = {value!r}", expected="one character, no quote or line end", file=path)
+    head = head_of(path)
+    if not head or b"\x00" in head:
+        raise FormatError("the file holds no text", expected="lines with columns", file=path)
+    offset = 3 if head.startswith(b"\xef\xbb\xbf") else 0
+    skip = options.skip_lines
+    for raw in head[offset:].splitlines(keepends=True):
+        line = raw.strip()
+        comment = bool(options.comment) and line.startswith(options.comment.encode())
+        if skip <= 0 and line and not comment:
+            try:
+                return line.decode("utf-8"), offset, offset + len(raw)
+            except UnicodeDecodeError as error:
+                raise FormatError("the line of column names is not UTF-8", expected="text", file=path) from error
+        skip -= 1
+        offset += len(raw)
+    raise FormatError("the file holds no line of column names", expected="names, then records", file=path)
+
+
+def _delimiter_of(line: str) -> str:
+    counts = {delimiter: line.count(delimiter) for delimiter in _DELIMITERS}
+    most = max(_DELIMITERS, key=lambda delimiter: counts[delimiter])
+    return most if counts[most] else " "
+
+
+def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[str]]:
+    """Fields of the first `lines` lines that have as many fields as there are names."""
+    found: list[list[str]] = []
+    for raw in head_of(path, layout.data_offset + HEAD_BYTES)[layout.data_offset :].splitlines():
+        if len(found) == lines:
+            break
+        text = raw.decode("utf-8", errors="replace").strip()
+        fields = _fields(text, layout.delimiter)
+        if len(fields) == len(layout.names) and not (layout.comment and text.startswith(layout.comment)):
+            found.append(fields)
+    return found
+
+
+def stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
+    """Kind of a column of time stamps, from its first sound value: integer, number or text."""
+    column = layout.names.index(name)
+    for fields in first_fields(path, layout, 20):
+        word = fields[column].strip()
+        if word.lstrip("+-").isdigit():
+            return "integer"
+        if not math.isnan(_number(word)):
+            return "number"
+        if word:
+            return "text"
+    return "number"
+
+
+def number_stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
+    """As :func:`stamp_kind`, for formats whose stamps are numbers."""
+    kind = stamp_kind(path, layout, name)
+    if kind == "text":
+        raise FormatError(f"time stamps in column '{name}' are text", expected="numbers", file=path)
+    return kind
+
+
+def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> Iterator[TextBlock | Reject]:
+    """Read the columns `kinds` in blocks of whole lines; lines at fault become rejects.
+
+    A compressed stream that breaks off costs what lies behind the break. Memory is bounded by
+    a block of some 1 MB of text.
+    """
+    record = 0
+    for offset, data in _line_blocks(path, layout.data_offset):
+        if isinstance(data, Reject):
+            yield Reject(data.reason, record, offset)
+            record += 1
+            continue
+        starts, ends = _lines(data, layout.comment)
+        if starts.size == 0:
+            continue
+        records = record + np.arange(starts.size, dtype=np.int64)
+        record += starts.size
+        whole = int((ends - starts).sum()) == len(data)
+        table = _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
+        if table is not None:
+            yield TextBlock(table, records, offset + starts)
+        else:
+            yield from _parse_lines(data, starts, ends, layout, kinds, records, offset)
+
+
+def _line_blocks(path: Path, start: int) -> Iterator[tuple[int, bytes | Reject]]:
+    """Pieces of whole lines from byte `start` of the text on, each with its offset."""
+    carry, offset, skipping = b"", 0, False
+    for chunk in _pieces(path):
+        if isinstance(chunk, Reject):
+            yield offset, chunk
+            return
+        data = carry + chunk
+        if offset < start:
+            cut = min(start - offset, len(data))
+            data, offset = data[cut:], offset + cut
+        if skipping:
+            end = data.find(b"\n") + 1
+            offset += end or len(data)
+            data, skipping = data[end:] if end else b"", not end
+        end = data.rfind(b"\n") + 1
+        if end:
+            yield offset, data[:end]
+        carry, offset = data[end:], offset + end
+        if len(carry) > LINE_BYTES_MAX:
+            yield offset, Reject(f"a line longer than {LINE_BYTES_MAX} bytes")
+            offset, carry, skipping = offset + len(carry), b"", True
+    if carry:
+        yield offset, carry
+
+
+def _pieces(path: Path) -> Iterator[bytes | Reject]:
+    """Pieces of the text of up to some 1 MB; a last reject where a compressed stream breaks off."""
+    with open_text(path) as stream:
+        packed = isinstance(stream, gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile)
+        parts: list[bytes] = []
+        broken: Reject | None = None
+        while True:
+            try:
+                part = cast(Any, stream).read1(BLOCK_BYTES)
+            except _DAMAGE as error:
+                if not packed:
+                    raise FormatError(f"the file cannot be read: {error}", file=path) from error
+                part, broken = b"", Reject(f"the compressed file is damaged from here on: {error}")
+            parts.append(part)
+            if not part or sum(map(len, parts)) >= BLOCK_BYTES:
+                yield b"".join(parts)
+                parts = []
+            if not part:
+                break
+        if broken is not None:
+            yield broken
+
+
+def _lines(data: bytes, comment: str) -> tuple[Int64, Int64]:
+    """Start and end (n,) of each line that is neither blank nor a comment."""
+    letters = np.frombuffer(data, dtype=np.uint8)
+    ends = np.flatnonzero(letters == ord("\n")) + 1
+    if ends.size == 0 or ends[-1] < letters.size:
+        ends = np.append(ends, letters.size)
+    starts = np.concatenate([[0], ends[:-1]])
+    first = letters[starts]
+    keep = (first != ord("\n")) & (first != ord("\r"))
+    if comment:
+        keep &= first != ord(comment)
+    return starts[keep].astype(np.int64), ends[keep].astype(np.int64)
+
+
+def _joined(data: bytes, starts: Int64, ends: Int64) -> bytes:
+    return b"".join(data[a:b] for a, b in zip(starts, ends, strict=True))
+
+
+def _parse(data: bytes, layout: TextLayout, kinds: Mapping[str, Kind], lines: int) -> dict[str, pa.Array] | None:
+    """Columns of a block without faults, parsed by Arrow; None where a line is at fault."""
+    if b'"' in data:
+        return None  # a stray quote must not swallow its neighbours
+    if layout.delimiter == " ":
+        data = b"\n".join(b" ".join(line.split()) for line in data.splitlines())
+    try:
+        table = pa_csv.read_csv(
+            pa.BufferReader(data),
+            read_options=pa_csv.ReadOptions(
+                column_names=list(layout.names), use_threads=False, block_size=len(data) + 1
+            ),
+            parse_options=pa_csv.ParseOptions(delimiter=layout.delimiter, quote_char=False, ignore_empty_lines=False),
+            convert_options=pa_csv.ConvertOptions(
+                include_columns=list(kinds),
+                column_types={name: _ARROW_TYPES[kind] for name, kind in kinds.items()},
+                null_values=[""],
+                strings_can_be_null=False,
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    columns = {name: table.column(name).combine_chunks() for name in kinds}
+    missing = any(columns[name].null_count for name, kind in kinds.items() if kind == "integer")
+    return None if table.num_rows != lines or missing else columns
+
+
+def _parse_lines(
+    data: bytes,
+    starts: Int64,
+    ends: Int64,
+    layout: TextLayout,
+    kinds: Mapping[str, Kind],
+    records: Int64,
+    offset: int,
+) -> Iterator[TextBlock | Reject]:
+    """A block with faults, line by line."""
+    where = {name: layout.names.index(name) for name in kinds}
+    kept: list[int] = []
+    values: dict[str, list[Any]] = {name: [] for name in kinds}
+    for i, (a, b) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        try:
+            fields = _fields(data[a:b].decode("utf-8").rstrip("\r\n"), layout.delimiter)
+            if len(fields) != len(layout.names):
+                raise ValueError(f"{len(fields)} fields, expected {len(layout.names)}")
+            row = {name: _value(name, fields[where[name]], kind) for name, kind in kinds.items()}
+        except UnicodeDecodeError:
+            yield Reject("the line is not UTF-8 text", int(records[i]), offset + a)
+            continue
+        except ValueError as error:
+            yield Reject(str(error), int(records[i]), offset + a)
+            continue
+        kept.append(i)
+        for name, value in row.items():
+            values[name].append(value)
+    if kept:
+        columns = {name: pa.array(values[name], type=_ARROW_TYPES[kind]) for name, kind in kinds.items()}
+        yield TextBlock(columns, records[kept], offset + starts[kept])
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    try:
+        rows = list(csv.reader([line], delimiter=delimiter))
+    except csv.Error:  # a carriage return in the middle, a field without end
+        return []
+    return rows[0] if len(rows) == 1 else []
+
+
+def _value(name: str, word: str, kind: Kind) -> float | int | str | None:
+    """One field, or ValueError saying what is wrong with it."""
+    if kind == "text":
+        return word
+    word = word.strip()
+    if kind == "number":
+        if not word:
+            return None
+        value = _number(word)
+        if math.isnan(value) and word.lower().lstrip("+-") != "nan":
+            raise ValueError(f"{name} '{word[:40]}' is not a number")
+        return value
+    if not (word.isascii() and word.lstrip("+-").isdigit() and len(word) < 20 and -(2**63) <= int(word) < 2**63):
+        raise ValueError(f"{name} '{word[:40]}' is not a whole number")
+    return int(word)
+
+
+def _number(word: str) -> float:
+    """Number of a word as written in data files, NaN for anything else."""
+    try:
+        return float(word) if "_" not in word and word.isascii() else math.nan
+    except ValueError:
+        return math.nan

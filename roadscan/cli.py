@@ -181,10 +181,10 @@ def simulate(
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
 ) -> None:
     """Write a survey with known truth as raw logs."""
-    from roadscan.simulate import load_scene
+    from roadscan.simulate import Scene
     from roadscan.simulate import simulate as write
 
-    made = write(load_scene(scene), out)
+    made = write(Scene.load(scene), out, progress=typer.echo)
     typer.echo(f"survey file: {made.survey_file}")
 
 

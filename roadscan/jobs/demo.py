@@ -12,7 +12,7 @@ import numpy.typing as npt
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.tiles import TILE, read_cells
 from roadscan.model.survey import Survey
-from roadscan.simulate import load_scene, load_truth, simulate
+from roadscan.simulate import Scene, simulate, truth
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.store import Store
@@ -55,7 +55,7 @@ def prepare_demo(folder: Path, report: Callable[[str], None], scene: str = "demo
         report(f"raw logs are there: {folder}")
         return survey_file
     report(f"simulating the scene '{scene}' into {folder}")
-    return Path(simulate(load_scene(scene), folder).survey_file)
+    return simulate(Scene.load(scene), folder, progress=report).survey_file
 
 
 def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
@@ -68,7 +68,7 @@ def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
     survey = Survey.load(survey_file)
     store = Store(survey.store_url, survey.config.id)
     plan = plan_survey(survey, store)
-    truth = load_truth(survey_file.parent / "truth")
+    true = truth.load(survey_file.parent)
     grid = plan.ground.grid
     errors: list[Float64] = []
     tiles = [r for r in Manifest(store).of(TILE).values() if r.path]
@@ -78,7 +78,7 @@ def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
         box = grid.bounds(cells.tile)
         easting = box.easting_min_m + (cells.column + 0.5) * grid.cell_m
         northing = box.northing_min_m + (cells.row + 0.5) * grid.cell_m
-        error = cells.height_robust_m - truth.height_m(easting, northing)
+        error = cells.height_robust_m - true.height_m(easting, northing)
         errors.append(error[(cells.count >= min_count) & np.isfinite(error)])
         count += len(cells)
     return DemoSummary(

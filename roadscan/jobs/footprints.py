@@ -16,7 +16,7 @@ from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
-from roadscan.points.place import EVERYWHERE, FATE_NAMES
+from roadscan.points.place import FATE_NAMES
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, file_digest
@@ -83,9 +83,9 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
     columns: dict[str, list[npt.NDArray[np.int64]]] = {n: [] for n in ("column", "row", "count", "group")}
     fates = np.zeros(len(FATE_NAMES), np.int64)
     for group in task.slice.groups:
-        placed = placer.place_group(task.slice, group, EVERYWHERE)
-        fates[: placed.fates.size] += placed.fates
-        column, row, count = count_tiles(placed.tiles)
+        tiles, own = placer.touched(task.slice, group)
+        fates[: own.size] += own
+        column, row, count = count_tiles(tiles)
         for name, values in (("column", column), ("row", row), ("count", count)):
             columns[name].append(values)
         columns["group"].append(np.full(column.size, group, np.int64))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -18,7 +19,7 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
-from roadscan.points.place import CloudFrame, HeightLimits, Placed, Placement, Window, place_cloud
+from roadscan.points.place import EVERYWHERE, CloudFrame, HeightLimits, Placed, Placement, Window, place_cloud
 from roadscan.points.readings import ScanGeometry
 from roadscan.tables.logs import DataFile
 from roadscan.tables.store import Store
@@ -123,10 +124,14 @@ class Placer:
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window)
 
-    def place_group(self, one: RawSlice, group: int, window: Window) -> Placed:
-        """Points of one row group."""
-        rows = read_groups(self._store, one.file, [group]).combine_chunks()
-        return self._place_batch(one.source, rows.to_batches()[0], window)
+    def touched(self, one: RawSlice, group: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+        """Tiles (n, 2) of the points of one row group, and the fates of its readings."""
+        batch = read_groups(self._store, one.file, [group]).combine_chunks().to_batches()[0]
+        if one.source.table == "cloud":
+            placed = self._place_batch(one.source, batch, EVERYWHERE)
+            return placed.tiles, placed.fates
+        geometry = _geometry(one.source) if one.source.table == "scans" else None
+        return self._placements[one.source.key].touched(batch, geometry)
 
     def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window) -> Placed:
         if source.table == "cloud":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -12,10 +13,11 @@ from roadscan.jobs.ingest import ingest
 from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_products, wanted_tile_products
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.tiles import TILE, BlockTask, block_tasks, plan_tiles, run_blocks, stale_tiles
+from roadscan.jobs.tiles import TILE, BlockTask, WantedProduct, block_tasks, plan_tiles, run_blocks, stale_tiles
 from roadscan.model.errors import RunError
+from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
-from roadscan.products.base import TileProduct, products
+from roadscan.products.base import ProductContext, TileProduct, products
 from roadscan.tables.manifest import Manifest, OutputRecord, write_failures
 from roadscan.tables.store import Store
 
@@ -66,12 +68,13 @@ def run_footprints(run: Run) -> None:
 
 def run_tiles(run: Run) -> None:
     """Readings → points → cells and tile products."""
-    plan = plan_survey(run.survey, run.store)
     manifest = Manifest(run.store)
-    tasks, gone = tile_tasks(run, plan, manifest, load_footprints(plan, manifest))
-    manifest.remove(gone)
+    work = plan_tile_work(run, manifest)
+    manifest.remove(work.gone)
+    tasks = work.tasks(work.chosen)
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
-    run.failed("tiles", run_blocks(tasks, manifest, run.compute, _bar(run, "tiles")))
+    singly = functools.partial(work.tasks, edge_tiles=1)
+    run.failed("tiles", run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles")))
 
 
 def run_products(run: Run) -> None:
@@ -127,10 +130,30 @@ def close_run(run: Run) -> None:
         )
 
 
-def tile_tasks(
-    run: Run, plan: SurveyPlan, manifest: Manifest, footprints: Footprints
-) -> tuple[list[BlockTask], list[OutputRecord]]:
-    """Blocks of work that a run has to do now, and records of tiles that no reading touches any more."""
+@dataclass(frozen=True)
+class TileWork:
+    """What the tiles stage has to do."""
+
+    plan: SurveyPlan
+    footprints: Footprints
+    tiles: dict[TileId, tuple[str, int]]
+    """Key and expected readings of every tile of the survey."""
+    chosen: list[TileId]
+    """Tiles to compute now."""
+    gone: list[OutputRecord]
+    """Files of tiles that no reading touches any more, and of products no longer wanted."""
+    products: list[WantedProduct]
+    context: ProductContext
+
+    def tasks(self, tiles: Sequence[TileId], edge_tiles: int | None = None) -> list[BlockTask]:
+        """Blocks of work over some tiles."""
+        return block_tasks(tiles, self.tiles, self.footprints, self.plan, self.products, self.context, edge_tiles)
+
+
+def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
+    """Compare what there is with what there should be."""
+    plan = plan_survey(run.survey, run.store)
+    footprints = load_footprints(plan, manifest)
     context = product_context(plan)
     wanted = wanted_tile_products(run.survey, context)
     tiles = plan_tiles(footprints, plan)
@@ -138,12 +161,13 @@ def tile_tasks(
         chosen = run.selection.tiles(tiles, footprints, plan.ground.grid)
     else:
         chosen = stale_tiles(tiles, wanted, manifest)
+    per_tile = {n for n, p in products().items() if isinstance(p, TileProduct)}
+    dropped = per_tile - {p.name for p, _ in wanted_products(run.survey)}
     units = {str(t) for t in tiles}
-    names = {p.name for p, _ in wanted_products(run.survey)}
-    dropped = {n for n, p in products().items() if isinstance(p, TileProduct) and n not in names}
-    per_tile = {TILE, *(n for n, p in products().items() if isinstance(p, TileProduct))}
-    gone = [r for r in manifest.all() if r.product in per_tile and (r.unit not in units or r.product in dropped)]
-    return block_tasks(chosen, tiles, footprints, plan, wanted, context), gone
+    gone = [
+        r for r in manifest.all() if r.product in {TILE, *per_tile} and (r.unit not in units or r.product in dropped)
+    ]
+    return TileWork(plan, footprints, tiles, chosen, gone, wanted, context)
 
 
 def _bar(run: Run, stage: str) -> Callable[[int, int], None]:

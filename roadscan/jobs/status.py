@@ -12,10 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.footprints import PRODUCT, load_footprints, reading_fates
+from roadscan.jobs.footprints import PRODUCT, reading_fates
 from roadscan.jobs.ingest import plan_logs
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.stages import Run, tile_tasks
+from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.tiles import TILE
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
@@ -93,7 +93,8 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     if not any(manifest.of(PRODUCT)):
         status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}
         return
-    tasks, _ = tile_tasks(Run(survey, store, Inline()), plan, manifest, load_footprints(plan, manifest))
+    work = plan_tile_work(Run(survey, store, Inline()), manifest)
+    tasks = work.tasks(work.chosen)
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)

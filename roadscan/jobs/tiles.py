@@ -73,13 +73,6 @@ class BlockTask:
         """Compressed bytes to read, about."""
         return sum(s.bytes for s in self.slices)
 
-    def single_tiles(self) -> list[BlockTask]:
-        """The same work, tile by tile: used when the block as a whole failed."""
-        return [
-            dataclasses.replace(self, block=Block((tile,), self.block.halo_tiles), keys=(key,))
-            for tile, key in zip(self.block.tiles, self.keys, strict=True)
-        ]
-
 
 @dataclass(frozen=True)
 class BlockResult:
@@ -121,11 +114,12 @@ def block_tasks(
     plan: SurveyPlan,
     products: Sequence[WantedProduct],
     context: ProductContext,
+    edge_tiles: int | None = None,
 ) -> list[BlockTask]:
-    """Blocks of work over the chosen tiles."""
+    """Blocks of work over the chosen tiles, of at most `edge_tiles`² tiles (the survey file's number)."""
     config = plan.survey.config
     readings = {tile: tiles[tile][1] for tile in chosen}
-    blocks = cut_blocks(readings, config.tiles.block_tiles, config.tiles.max_block_readings)
+    blocks = cut_blocks(readings, edge_tiles or config.tiles.block_tiles, config.tiles.max_block_readings)
     layer = plan.centre_line()
     centre_line = None if layer is None else (layer, config.filters.centre_line_buffer_m)
     by_tile = _rows_by_tile(footprints, frozenset(chosen))
@@ -148,27 +142,39 @@ def block_tasks(
 
 def run_blocks(
     tasks: Sequence[BlockTask],
+    singly: Callable[[Sequence[TileId]], list[BlockTask]],
     manifest: Manifest,
     compute: Compute,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
-    """Compute blocks; a block that fails as a whole is tried again tile by tile. Returns the failures."""
+    """Compute blocks; returns the failures.
+
+    A block that fails as a whole (a damaged raw block, a worker out of memory) is tried again tile by tile,
+    with the tasks that `singly` makes of its tiles, so that only the tiles at fault are lost.
+    """
     total = sum(len(t.block.tiles) for t in tasks)
     finished = 0
     failures: list[tuple[str, str]] = []
-    again: list[BlockTask] = []
+    again: list[TileId] = []
     report(0, total)
-    for round_tasks in (tasks, again):
-        for done in compute.map(compute_block, list(round_tasks)):
+
+    def rounds() -> Iterator[Sequence[BlockTask]]:
+        yield tasks
+        if again:
+            yield singly(again)
+
+    for round_tasks in rounds():
+        for done in compute.map(compute_block, round_tasks):
+            tiles = done.task.block.tiles
             if done.result is not None:
                 manifest.add(done.result.records)
                 failures.extend(done.result.failures)
-            elif len(done.task.block.tiles) > 1:
-                again.extend(done.task.single_tiles())
+            elif len(tiles) > 1:
+                again.extend(tiles)
                 continue
             else:
-                failures.append((str(done.task.block.tiles[0]), _reason(done.error)))
-            finished += len(done.task.block.tiles)
+                failures.append((str(tiles[0]), _reason(done.error)))
+            finished += len(tiles)
             report(finished, total)
     return failures
 

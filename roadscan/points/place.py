@@ -112,46 +112,79 @@ class Placement:
 
     def returns(self, batch: pa.RecordBatch, window: Window) -> Placed:
         """Place rows of the table ``returns``."""
-        n = batch.num_rows
-        xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
-        rows, tiles = np.empty(n, np.int32), np.empty((n, 2), np.int32)
-        quanta, fates = np.empty((n, 3), np.int32), np.zeros(FATES, np.int64)
-        made = georeference_returns(
-            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), window.array(), rows, tiles, quanta, fates
-        )
-        kept = rows[:made]
+        work = self._place_returns(batch, window)
+        kept = work.rows
         return Placed(
-            tiles[:made],
-            quanta[:made],
+            work.tiles,
+            work.quanta,
             _numpy(batch, "epoch_gps_ns")[kept],
             _numpy(batch, "intensity")[kept],
-            np.ones(made, np.uint8),
-            fates,
+            np.ones(kept.size, np.uint8),
+            work.fates,
         )
 
     def profiles(self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window) -> Placed:
         """Place rows of the table ``scans``."""
-        n, m = batch.num_rows, geometry.readings
-        epochs = _numpy(batch, "epoch_gps_ns")
-        origins, directions = geometry.rays()
-        rows, readings = np.empty(n * m, np.int32), np.empty(n * m, np.int32)
-        tiles, quanta = np.empty((n * m, 2), np.int32), np.empty((n * m, 3), np.int32)
-        fates = np.zeros(FATES, np.int64)
-        made = georeference_profiles(
-            epochs, _lists(batch, "range", m), origins, directions,
-            np.array([geometry.range_offset_m, geometry.range_step_m]), geometry.reading_period_ns,
-            *self._common(), window.array(), rows, readings, tiles, quanta, fates,
-        )  # fmt: skip
-        row, reading = rows[:made], readings[:made]
-        epoch = epochs[row]
+        work = self._place_profiles(batch, geometry, window)
+        row, reading = work.rows, work.readings
+        epoch = _numpy(batch, "epoch_gps_ns")[row]
         if geometry.reading_period_ns:
             epoch = epoch + np.floor(reading * geometry.reading_period_ns + 0.5).astype(np.int64)
-        intensity = np.zeros(made, np.uint16)
+        intensity = np.zeros(row.size, np.uint16)
         if batch.column("intensity").null_count == 0:
-            intensity = _lists(batch, "intensity", m)[row, reading].astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
-        return Placed(
-            tiles[:made].copy(), quanta[:made].copy(), epoch, intensity, np.ones(made, np.uint8), fates
-        )  # the working arrays are far larger where a window keeps little
+            digital = _lists(batch, "intensity", geometry.readings)[row, reading]
+            intensity = digital.astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
+        # Copies: the working arrays are far larger where a window keeps little.
+        return Placed(work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates)
+
+    def touched(self, batch: pa.RecordBatch, geometry: ScanGeometry | None) -> tuple[Int32, Int64]:
+        """Tiles (n, 2) of all points of a batch, and the fates of its readings; `geometry` for scans."""
+        if geometry is None:
+            work = self._place_returns(batch, EVERYWHERE)
+        else:
+            work = self._place_profiles(batch, geometry, EVERYWHERE)
+        return work.tiles, work.fates
+
+    def _place_returns(self, batch: pa.RecordBatch, window: Window) -> _Work:
+        n = batch.num_rows
+        xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
+        work = _Work.of(n)
+        made = georeference_returns(
+            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), window.array(),
+            work.rows, work.tiles, work.quanta, work.fates,
+        )  # fmt: skip
+        return work.first(made)
+
+    def _place_profiles(self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window) -> _Work:
+        origins, directions = geometry.rays()
+        work = _Work.of(batch.num_rows * geometry.readings)
+        made = georeference_profiles(
+            _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
+            np.array([geometry.range_offset_m, geometry.range_step_m]), geometry.reading_period_ns,
+            *self._common(), window.array(), work.rows, work.readings, work.tiles, work.quanta, work.fates,
+        )  # fmt: skip
+        return work.first(made)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """The kernels' output arrays."""
+
+    rows: Int32
+    readings: Int32
+    tiles: Int32
+    quanta: Int32
+    fates: Int64
+
+    @classmethod
+    def of(cls, n: int) -> _Work:
+        return cls(
+            np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 3), np.int32),
+            np.zeros(FATES, np.int64),
+        )  # fmt: skip
+
+    def first(self, n: int) -> _Work:
+        return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates)
 
 
 def place_cloud(

@@ -86,13 +86,17 @@ class Manifest:
         return not record.path or self._store.size(record.path) == record.bytes
 
     def add(self, records: Iterable[OutputRecord]) -> None:
-        """Record finished outputs; durable when this returns."""
+        """Record finished outputs; durable when this returns. A file under an older name is removed."""
         added = list(records)
         if not added:
             return
+        known = [self.get(r.product, r.unit) for r in added]
         for r in added:
             self._records[(r.product, r.unit)] = r
         self._append(added)
+        for old, new in zip(known, added, strict=True):
+            if old is not None and old.path not in ("", new.path):
+                self._store.remove(old.path)
 
     def remove(self, records: Iterable[OutputRecord]) -> None:
         """Forget outputs and remove their files."""

@@ -1,0 +1,5 @@
+"""``python -m roadscan``."""
+
+from roadscan.cli import main
+
+main()

@@ -1,0 +1,95 @@
+"""A small simulated survey, written and run once for all tests of the jobs."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from roadscan.jobs.compute import Compute, Inline
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.stages import STAGES, Reporter, Run, run_stages
+from roadscan.model.survey import Survey
+from roadscan.simulate import Scene, simulate
+from roadscan.tables.store import Store
+
+
+class Lines(Reporter):
+    """Remembers what a run said."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+
+@dataclass
+class Simulated:
+    """A simulated survey and its store."""
+
+    survey_file: Path
+
+    def store(self, name: str = "store") -> Store:
+        survey = Survey.load(self.survey_file)
+        return Store(str(self.survey_file.parent / name), survey.config.id)
+
+    def run(
+        self,
+        name: str = "store",
+        compute: Compute | None = None,
+        selection: Selection | None = None,
+        **changes: object,
+    ) -> Run:
+        """Run all stages into the store `name`, with dotted settings changed (``tiles__block_tiles=1``)."""
+        survey = changed(Survey.load(self.survey_file), changes)
+        run = Run(survey, self.store(name), compute or Inline(), selection, Lines())
+        run_stages(run, STAGES)
+        return run
+
+    def copy_to(self, folder: Path) -> Simulated:
+        shutil.copytree(self.survey_file.parent, folder, ignore=shutil.ignore_patterns("store*"))
+        return Simulated(folder / self.survey_file.name)
+
+
+def changed(survey: Survey, changes: dict[str, object]) -> Survey:
+    """The survey with settings changed."""
+    values = survey.config.model_dump()
+    values["rig"] = survey.rig.model_dump()
+    for dotted, value in changes.items():
+        *path, last = dotted.split("__")
+        place = values
+        for part in path:
+            place = place[part]
+        place[last] = value
+    return Survey.parse(values, folder=survey.folder)
+
+
+def outputs(store: Store) -> dict[str, bytes]:
+    """Every product file of a store."""
+    paths = [p for top in ("tiles", "products") for p in store.files(top)]
+    return {p: store.read_bytes(p) for p in paths}
+
+
+def small_scene(**changes: object) -> Scene:
+    """24 m of the demo's road, coarse, with both kinds of sensors."""
+    scene = Scene.load("demo").changed(
+        length_m=24.0, profilers={"spacing_m": 0.1, "readings": 200}, lidar={"range_max_m": 12.0}
+    )
+    return scene.changed(**changes) if changes else scene
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    """Two passes of a short road, raw logs only."""
+    folder = tmp_path_factory.mktemp("simulated") / "survey"
+    return Simulated(simulate(small_scene(), folder).survey_file)
+
+
+@pytest.fixture(scope="session")
+def finished(simulated: Simulated) -> Simulated:
+    """The same, run once in this process into the store ``store``."""
+    simulated.run()
+    return simulated

@@ -1,0 +1,276 @@
+"""Whole runs: the same bytes whatever the batching, nothing done twice, one fault costs one unit."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import duckdb
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import rasterio
+
+from roadscan.jobs.compute import compute_on
+from roadscan.jobs.ingest import ingest
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.status import survey_status, verify_store
+from roadscan.model.errors import ConfigError, RunError
+from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.sql import query
+from roadscan.tables.store import Store
+from roadscan.tiles.grid import Bounds
+
+from .conftest import Simulated, outputs
+
+
+def assert_same_files(a: Store, b: Store) -> None:
+    one, other = outputs(a), outputs(b)
+    assert sorted(one) == sorted(other)
+    assert [p for p in one if one[p] != other[p]] == []
+
+
+@pytest.mark.parametrize(("edge", "limit"), [(1, 20_000_000), (3, 20_000_000), (16, 100_000)])
+def test_block_size_changes_no_byte(finished: Simulated, edge: int, limit: int) -> None:
+    name = f"store-{edge}-{limit}"
+    finished.run(name, tiles__block_tiles=edge, tiles__max_block_readings=limit)
+    assert_same_files(finished.store(), finished.store(name))
+
+
+def test_number_of_workers_changes_no_byte(finished: Simulated) -> None:
+    for workers in (1, 2):
+        with compute_on(workers) as compute:
+            finished.run(f"store-w{workers}", compute)
+        assert_same_files(finished.store(), finished.store(f"store-w{workers}"))
+
+
+def test_shuffled_row_groups_change_no_byte(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    for file in copy.survey_file.parent.glob("raw/*/profiler_*.parquet"):
+        source = pq.ParquetFile(file)
+        rows = source.read()
+        parts = [rows.slice(k, 32) for k in range(0, rows.num_rows, 32)]
+        random.Random(3).shuffle(parts)
+        with pq.ParquetWriter(file, rows.schema) as writer:
+            for part in parts:
+                writer.write_table(part)
+    copy.run()
+    assert_same_files(finished.store(), copy.store())
+
+
+def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, tmp_path: Path) -> None:
+    """Ties included: a whole sweep of returns is put at one epoch before."""
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    survey = Survey.load(copy.survey_file)
+    results = []
+    for name, shuffled in (("a", False), ("b", True)):
+        store = copy.store(f"store-{name}")
+        ingest(survey, store)
+        for record in read_log_records(store):
+            for file in record.tables.get("returns", ()):
+                path = store.path(file.path)
+                rows = pq.read_table(path, partitioning=None)
+                tied = rows.column("epoch_gps_ns").to_numpy() // 50_000_000 * 50_000_000
+                rows = rows.set_column(0, rows.schema.field(0), [tied])
+                if shuffled:
+                    rows = rows.take(np.random.default_rng(0).permutation(rows.num_rows))
+                    rows = rows.take(np.argsort(rows.column("epoch_gps_ns").to_numpy(), kind="stable"))
+                pq.write_table(rows, path, row_group_size=file.group_rows[0])
+        copy.run(f"store-{name}")
+        results.append(outputs(store))
+    assert results[0] == results[1]
+
+
+def test_killed_and_resumed_at_random_points(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    command = [sys.executable, "-m", "roadscan", "run", str(copy.survey_file), "--workers", "0"]
+    chance = random.Random(11)
+    kills = 0
+    for _ in range(40):
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+        try:
+            process.wait(timeout=chance.uniform(1.0, 3.5))
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.communicate()
+            kills += 1
+            _nothing_half_written(copy.store())
+            continue
+        assert process.communicate()[1] is not None and process.returncode == 0
+        if kills >= 10:
+            break
+        copy.store().remove("manifest/outputs")  # finished too soon: begin again, to be killed ten times in all
+    assert kills >= 10
+    copy.run()
+    assert_same_files(finished.store(), copy.store())
+    assert verify_store(copy.store()) == []
+
+
+def _nothing_half_written(store: Store) -> None:
+    """Every visible table and product opens; what the manifest lists is there in its size."""
+    for path in store.files("tiles/cells", ".parquet") + store.files("tables", ".parquet"):
+        pq.read_metadata(store.path(path))
+    for path in store.files("tiles/las"):
+        with laspy.open(store.path(path)) as reader:
+            assert reader.header.point_count > 0
+    for record in Manifest(store).all():
+        if record.path:
+            assert store.size(record.path) == record.bytes
+
+
+def test_second_run_does_nothing(finished: Simulated) -> None:
+    store = finished.store()
+    before = {p: store.fs.modified(store.path(p)) for p in outputs(store)}
+    run = finished.run()
+    assert run.raw_bytes_read == 0
+    assert all(line.startswith(("known:", "ingest:", "footprints:", "tiles:", "products:")) for line in _lines(run))
+    assert {p: store.fs.modified(store.path(p)) for p in outputs(store)} == before
+    assert survey_status(Survey.load(finished.survey_file), store).is_complete
+
+
+def test_reprocessing_a_tile_reads_little_and_gives_the_same_bytes(finished: Simulated) -> None:
+    store = finished.store()
+    before = outputs(store)
+    tiles = [TileId.parse(u) for u, r in Manifest(store).of("tile").items() if r.path]
+    run = finished.run(selection=Selection(named=(tiles[0],)))
+    whole = sum(f.bytes for r in read_log_records(store) for t in r.tables for f in r.tables[t])
+    assert 0 < run.raw_bytes_read < whole
+    assert outputs(store) == before
+
+
+def test_selections(finished: Simulated) -> None:
+    store = finished.store()
+    tile = TileId.parse(next(u for u, r in Manifest(store).of("tile").items() if r.path))
+    inner = Bounds(tile.column * 10 + 1, tile.row * 10 + 1, tile.column * 10 + 2, tile.row * 10 + 2)
+    assert finished.run(selection=Selection(box=inner)).raw_bytes_read > 0
+    with pytest.raises(ConfigError, match="no reading touches tile 1_1"):
+        finished.run(selection=Selection(named=(TileId(1, 1),)))
+    with pytest.raises(ConfigError, match="no tile with readings"):
+        finished.run(selection=Selection(span_gps_ns=(0, 1)))
+
+
+def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    store = copy.store()
+    record = next(r for r in read_log_records(store) if r.sensor == "profiler_left")
+    path = Path(store.path(record.tables["scans"][0].path))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:3000] + bytes(500) + whole[3500:])
+    assert any("the content has changed" in f for f in verify_store(store))
+    store.remove("tiles/las")
+    with pytest.raises(RunError, match=r"units failed: tiles \d+_\d+: .*profiler_left.*cannot be read") as caught:
+        copy.run()
+    assert "the next run does only these" in str(caught.value)
+    status = survey_status(Survey.load(copy.survey_file), store)
+    assert 0 < status.tiles_stale < status.tiles_current + status.tiles_stale
+    assert len(status.failures) == status.tiles_stale
+    path.write_bytes(whole)
+    copy.run()
+    assert_same_files(finished.store(), store)
+    assert verify_store(store) == []
+
+
+def test_a_changed_setting_makes_stale_what_depends_on_it(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    store = copy.store()
+    before = outputs(store)
+    run = copy.run(products__options={"las": {"compress": False}})
+    assert run.raw_bytes_read > 0
+    after = outputs(store)
+    assert not any(p.endswith(".laz") for p in after)
+    cells = [p for p in before if p.startswith("tiles/cells")]
+    assert all(after[p] == before[p] for p in cells)
+
+
+def test_ingesting_twice_adds_nothing_and_a_new_clock_replaces(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    survey = Survey.load(copy.survey_file)
+    store = copy.store()
+    assert all(r.fresh for r in ingest(survey, store))
+    files = store.files("tables")
+    assert not any(r.fresh for r in ingest(survey, store))
+    assert store.files("tables") == files
+    text = copy.survey_file.read_text()
+    late = text.replace('system = "utc_hour"', 'system = "utc_hour", offset_s = 0.25')
+    copy.survey_file.write_text(late)
+    again = ingest(Survey.load(copy.survey_file), store)
+    moved = [r.record for r in again if r.fresh]
+    assert {r.format for r in moved} == {"velodyne_pcap"}
+    assert len(read_log_records(store)) == len(again)
+    assert store.files("superseded/manifest/logs")
+
+
+def test_files_open_with_other_programs(finished: Simulated) -> None:
+    store = finished.store()
+    table = duckdb.sql(f"SELECT count(*), sum(points) FROM '{store.path('products/tile_table')}/*.parquet'").fetchall()[
+        0
+    ]
+    counts = []
+    for path in store.files("tiles/las"):
+        las = laspy.read(store.path(path))
+        counts.append(las.header.point_count)
+        assert str(las.header.version) == "1.4"
+        assert set(np.unique(las.point_source_id)) <= {1, 2}
+        assert las.header.parse_crs().to_epsg() == 32632
+    assert table == (len(counts), sum(counts))
+    with rasterio.open(store.path("products/mosaic/height.tif")) as raster:
+        assert raster.crs.to_epsg() == 32632
+        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        heights = raster.read(1)
+    cells = query(store, "SELECT count(*) AS n, avg(height_robust_m) AS h FROM cells").to_pylist()[0]
+    assert np.isfinite(heights).sum() == cells["n"]
+    assert np.nanmean(heights.astype(np.float64)) == pytest.approx(cells["h"], abs=1e-4)
+
+
+def test_las_and_cells_agree(finished: Simulated) -> None:
+    """The same points, counted and averaged once more by NumPy from the LAS file (written to 10 µm for this)."""
+    finished.run("store-fine", products__make=["las"], products__options={"las": {"scale_m": 0.00001}})
+    store = finished.store("store-fine")
+    unit = max((r for r in Manifest(store).of("tile").values() if r.path), key=lambda r: r.figures()["points"]).unit
+    las = laspy.read(next(store.path(p) for p in store.files("tiles/las") if unit in p))
+    column, row = (int(v) for v in unit.split("_"))
+    x, y, z = (np.rint(np.array(v) * 1e5).astype(np.int64) for v in (las.x, las.y, las.z))
+    cell = (y - row * 1_000_000) // 5000 * 200 + (x - column * 1_000_000) // 5000
+    cells = pq.read_table(store.path(f"tiles/cells/{unit}.parquet"))
+    flat = cells.column("row").to_numpy().astype(int) * 200 + cells.column("column").to_numpy()
+    counts = np.bincount(cell, minlength=40_000)
+    assert np.array_equal(np.flatnonzero(counts), flat)
+    assert np.array_equal(counts[flat], cells.column("count").to_numpy())
+    sums = np.bincount(cell, weights=z - z.min(), minlength=40_000)[flat]
+    mean = (z.min() + sums / counts[flat]) * 1e-5
+    np.testing.assert_allclose(mean, cells.column("height_mean_m").to_numpy(), rtol=0, atol=1e-8)
+
+
+def test_run_keeps_a_second_one_out(finished: Simulated) -> None:
+    command = [sys.executable, "-m", "roadscan", "run", str(finished.survey_file), "--workers", "0"]
+    with finished.store().lock():
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert "is working on this store" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_help_is_quick() -> None:
+    """The bar is 0.5 s; imports are counted instead of seconds, which a busy machine stretches."""
+    script = "import sys, roadscan.cli; print([m for m in sys.modules if m in ('numpy', 'pyarrow', 'dask', 'prefect')])"
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+    started = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "roadscan", "--help"], capture_output=True, check=True)
+    assert time.perf_counter() - started < 10
+
+
+def _lines(run: object) -> list[str]:
+    return run.reporter.lines  # type: ignore[attr-defined]

@@ -82,7 +82,11 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
         unlimited if f.above_body_max_m is None else f.above_body_max_m,
     )
     ground = Ground(
-        config.map.frame(), TileGrid(config.tiles.size_m, config.tiles.cell_m), heights, config.navigation.max_gap_s
+        map=config.map.frame(),
+        grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
+        heights=heights,
+        max_gap_s=config.navigation.max_gap_s,
+        grids=None if config.map.grids is None else str(survey.resolve(config.map.grids)),
     )
     sources = tuple(_sources(survey, store, records, ground))
     if not sources:

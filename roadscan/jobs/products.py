@@ -67,12 +67,13 @@ def product_context(plan: SurveyPlan) -> ProductContext:
 
 
 def wanted_tile_products(survey: Survey, context: ProductContext) -> list[WantedProduct]:
-    """Tile products of the survey with the keys of what shapes them beside the tile."""
-    return [
-        WantedProduct(p, o, _product_key(p, o, context))
-        for p, o in wanted_products(survey)
-        if isinstance(p, TileProduct)
-    ]
+    """Tile products of the survey, their settings checked, with the keys of what shapes them beside the tile."""
+    wanted: list[WantedProduct] = []
+    for product, options in wanted_products(survey):
+        if isinstance(product, TileProduct):
+            product.check_options(options, context)
+            wanted.append(WantedProduct(product, options, _product_key(product, options, context)))
+    return wanted
 
 
 def make_products(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.model.crs import MapFrame
+from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
@@ -72,6 +72,8 @@ class Ground:
     grid: TileGrid
     heights: HeightLimits
     max_gap_s: float
+    grids: str | None = None
+    """Folder with geoid grids."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ class Placer:
     """Places the readings of slices: loads the poses they need, once for each source."""
 
     def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice]) -> None:
+        if ground.grids is not None:
+            add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
         self._store = store
         self._ground = ground
         self._placements: dict[str, Placement] = {}

@@ -1,0 +1,78 @@
+"""What all flows share: the stages as tasks of the current flow run, one Prefect task a stage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from prefect import Task, get_run_logger
+from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.objects import State
+from prefect.runtime import flow_run
+from prefect.states import Completed, Failed
+
+from roadscan.jobs.compute import compute_on
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.stages import STAGES, Run, Stage, close_run
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
+from roadscan.progress import LineReporter
+from roadscan.tables.store import Store
+
+
+class FlowReporter(LineReporter):
+    """Sends a run's news to the flow run's log; progress at most twice a minute."""
+
+    def __init__(self) -> None:
+        super().__init__(every_s=30.0)
+        self._logger = get_run_logger()
+
+    def line(self, text: str) -> None:
+        """Log one line."""
+        self._logger.info(text)
+
+
+def run_name() -> str:
+    """Name of a flow run: its survey file and that file's folder, such as `city/SURVEY.toml`."""
+    return "/".join(Path(flow_run.parameters["survey_file"]).parts[-2:])
+
+
+def conduct(
+    survey_file: str, workers: int | None, scheduler: str | None, selection: Selection | None = None
+) -> State[Any]:
+    """Run all stages; returns the flow run's final state.
+
+    An error that the user can mend makes the run Failed with the error's own words; any other keeps its traceback.
+    """
+    try:
+        survey = Survey.load(survey_file)
+        store = Store(survey.store_url, survey.config.id)
+        with store.lock(), compute_on(workers, scheduler) as compute:
+            run = Run(survey, store, compute, selection, FlowReporter())
+            for stage in STAGES:
+                stage_task(stage, run)()
+            close_run(run)
+    except RoadscanError as error:
+        return failed(error)
+    return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})
+
+
+def stage_task(stage: Stage, run: Run) -> Task[[], None]:
+    """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
+
+    def step() -> None:
+        stage.run(run)
+
+    return Task(
+        step,
+        name=stage.name,
+        description=stage.title,
+        task_run_name=stage.name,
+        cache_policy=NO_CACHE,
+        persist_result=False,
+    )
+
+
+def failed(error: RoadscanError) -> State[Any]:
+    """Final state of what failed for a reason that the user can mend; whoever called it gets the error raised."""
+    return Failed(message=str(error), data=error)

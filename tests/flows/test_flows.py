@@ -1,0 +1,159 @@
+"""The flows, run through a real Prefect server on a tiny simulated survey."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import laspy
+import pytest
+import rasterio
+from prefect.client.orchestration import SyncPrefectClient, get_client
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
+from prefect.client.schemas.objects import FlowRun, State, StateType
+
+from flows.reprocess import reprocess
+from flows.survey import survey
+from roadscan.model.errors import ConfigError, RoadscanError, RunError
+from roadscan.simulate import SimulatedSurvey
+
+pytestmark = pytest.mark.usefixtures("prefect_api")
+
+TILE = "69100_533500"
+"""The tile with the road's start at (691000, 5335000), where both profilers pass."""
+LEFT_ONLY = "69099_533500"
+"""A tile of which the right profiler saw nothing."""
+
+
+@pytest.fixture(scope="module")
+def finished(simulated: SimulatedSurvey, tmp_path_factory: pytest.TempPathFactory, prefect_api: object) -> Path:
+    """Survey file of a survey that the flow has run once."""
+    folder = tmp_path_factory.mktemp("finished") / "city"
+    shutil.copytree(simulated.folder, folder)
+    survey(str(folder / simulated.survey_file.name), workers=0)
+    return folder / simulated.survey_file.name
+
+
+@pytest.fixture
+def rerun(finished: Path, tmp_path: Path) -> Path:
+    """Survey file of a copy of the finished survey."""
+    shutil.copytree(finished.parent, tmp_path / "city")
+    return tmp_path / "city" / finished.name
+
+
+@pytest.fixture
+def client() -> Iterator[SyncPrefectClient]:
+    with get_client(sync_client=True) as opened:
+        yield opened
+
+
+def files(survey_file: Path, folder: str) -> dict[str, Path]:
+    root = survey_file.parent / "store" / "survey=city"
+    return {p.relative_to(root).as_posix(): p for p in sorted((root / folder).rglob("*")) if p.is_file()}
+
+
+def contents(survey_file: Path) -> dict[str, bytes]:
+    """All tables, tiles and products."""
+    return {n: p.read_bytes() for f in ("tables", "tiles", "products") for n, p in files(survey_file, f).items()}
+
+
+def written(survey_file: Path, folder: str) -> dict[str, tuple[int, int]]:
+    """Which file each is: it changes where a file is written anew, even with the same bytes."""
+    return {n: (p.stat().st_ino, p.stat().st_mtime_ns) for n, p in files(survey_file, folder).items()}
+
+
+def recorded(client: SyncPrefectClient, state: State[Any]) -> FlowRun:
+    """The flow run as the server knows it."""
+    assert state.state_details.flow_run_id is not None
+    return client.read_flow_run(state.state_details.flow_run_id)
+
+
+def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurvey, client: SyncPrefectClient) -> None:
+    state = survey(str(survey_file), workers=0, return_state=True)
+    run = recorded(client, state)
+    assert run.state is not None
+    assert run.state.type is StateType.COMPLETED
+    assert run.name == "city/SURVEY.toml"
+    ids = FlowRunFilter(id=FlowRunFilterId(any_=[run.id]))
+    tasks = sorted(client.read_task_runs(flow_run_filter=ids), key=lambda t: t.expected_start_time)
+    assert [t.name for t in tasks] == ["ingest", "footprints", "tiles", "products"]
+
+    clouds = files(survey_file, "tiles/las").values()
+    assert sum(laspy.read(cloud).header.point_count for cloud in clouds) == simulated.readings
+    assert TILE in {cloud.stem for cloud in clouds}
+    with rasterio.open(files(survey_file, "products/mosaic")["products/mosaic/count.tif"]) as count:
+        assert count.read(1, masked=True).sum() == simulated.readings
+
+
+def test_second_run_does_nothing(rerun: Path) -> None:
+    before = {f: written(rerun, f) for f in ("tables", "tiles", "products")}
+    assert all(before.values())
+    assert survey(str(rerun), workers=0) == {"raw_bytes_read": 0.0}
+    assert {f: written(rerun, f) for f in before} == before
+
+
+DAY = {"start": "2026-05-04T00:00:00Z", "end": "2026-05-05T00:00:00Z"}
+OTHER_DAY = {"start": "2026-05-05T00:00:00Z", "end": "2026-05-06T00:00:00Z"}
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [{"tiles": [TILE]}, {"box_m": (691002.0, 5335002.0, 691003.0, 5335003.0)}, DAY],
+    ids=["tile", "box", "time"],
+)
+def test_reprocess_writes_the_same_bytes_again(rerun: Path, choice: dict[str, Any]) -> None:
+    bytes_before, before = contents(rerun), written(rerun, "tiles")
+    assert reprocess(str(rerun), **choice)["raw_bytes_read"] > 0
+    assert contents(rerun) == bytes_before
+    after = written(rerun, "tiles")
+    chosen = {n for n in before if choice is DAY or Path(n).stem == TILE}
+    assert {n for n in before if after[n] != before[n]} == chosen
+
+
+def test_damaged_data_fails_the_run_and_names_the_tiles(rerun: Path, client: SyncPrefectClient) -> None:
+    (damaged,) = (p for n, p in files(rerun, "tables/scans").items() if "profiler_right" in n)
+    damaged.write_bytes(bytes(damaged.stat().st_size))
+    before = written(rerun, "tiles")
+    state = reprocess(str(rerun), **DAY, return_state=True)
+    run = recorded(client, state)
+    assert run.state is not None
+    assert run.state.type is StateType.FAILED
+    # The tile that only the other profiler touches is finished all the same; the run names all others.
+    after = written(rerun, "tiles")
+    assert {Path(n).stem for n in before if after[n] != before[n]} == {LEFT_ONLY}
+    failed = {Path(n).stem for n in before} - {LEFT_ONLY}
+    assert TILE in failed
+    assert all(f"tiles {tile}: " in run.state.message for tile in failed)
+    assert "profiler_right" in run.state.message
+    with pytest.raises(RunError, match=TILE):
+        state.result()
+
+
+@pytest.mark.parametrize(
+    ("choice", "error", "words"),
+    [
+        ({"start": DAY["start"]}, ConfigError, "expected start and end"),
+        ({"tiles": ["here"]}, ConfigError, "COLUMN_ROW"),
+        ({"tiles": ["1_1"]}, ConfigError, "no reading touches tile 1_1"),
+        (OTHER_DAY, ConfigError, "no tile with readings"),
+    ],
+)
+def test_a_choice_that_cannot_be_met_fails(
+    rerun: Path, choice: dict[str, Any], error: type[RoadscanError], words: str
+) -> None:
+    before = written(rerun, "tiles")
+    with pytest.raises(error, match=words):
+        reprocess(str(rerun), **choice)
+    assert written(rerun, "tiles") == before
+
+
+def test_an_upload_without_one_log_fails_and_names_it(survey_file: Path) -> None:
+    missing = survey_file.parent / "raw" / "run-1" / "profiler_left.parquet"
+    log = missing.read_bytes()
+    missing.unlink()
+    with pytest.raises(RoadscanError, match=r"profiler_left\.parquet: the log does not exist"):
+        survey(str(survey_file), workers=0)
+    missing.write_bytes(log)  # the upload goes on, and the next run succeeds
+    assert survey(str(survey_file), workers=0)["raw_bytes_read"] > 0

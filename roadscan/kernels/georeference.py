@@ -15,35 +15,51 @@ import math
 import numpy as np
 
 from roadscan.kernels.options import inlined, kernel
-from roadscan.kernels.poses import attitude_at, find_interval, position_at
+from roadscan.kernels.poses import NO_INTERVAL, attitude_at, find_interval, interval, position_at
 
 KEPT, NO_POSE, RANGE, HEIGHT, OUTSIDE, NO_RETURN = 0, 1, 2, 3, 4, 5
 """Fates of a reading, the indices of the kernels' `fates` counters."""
 FATES = 6
 
-NO_FORMS = ((0.0,) * 6,) * 4
-"""Forms of a profile without a pose."""
-
 LIMITS = ("range_min", "range_max", "height_min", "height_max", "above_body_min", "above_body_max")
 """Order of the `limits` array (m)."""
 
+NO_CHART = ((0.0,) * 10,) * 3
+NO_FORMS = ((0.0,) * 6,) * 4
+"""Chart and forms of a reading without a pose."""
+
 
 @inlined
-def chart_index(px, py, pz, lattice, table):
-    """Chart of the lattice box that holds a world position, −1 where none was made.
+def box_of(px, py, pz, lattice):
+    """Indices of the lattice box that holds a world position (m); lattice: (edge, first x, first y, first z)."""
+    return (
+        np.int64(math.floor(px / lattice[0]) - lattice[1]),
+        np.int64(math.floor(py / lattice[0]) - lattice[2]),
+        np.int64(math.floor(pz / lattice[0]) - lattice[3]),
+    )
 
-    lattice : (4,) float64 box edge (m) and the indices of the first box; table : (nx, ny, nz) int32.
-    """
-    ix = int(math.floor(px / lattice[0]) - lattice[1])
-    iy = int(math.floor(py / lattice[0]) - lattice[2])
-    iz = int(math.floor(pz / lattice[0]) - lattice[3])
-    inside = 0 <= ix < table.shape[0] and 0 <= iy < table.shape[1] and 0 <= iz < table.shape[2]
-    return table[ix, iy, iz] if inside else -1
+
+@inlined
+def chart_index(box, table):
+    """Chart of a box, −1 where none was made; table: (nx, ny, nz) int32."""
+    x, y, z = box
+    inside = 0 <= x < table.shape[0] and 0 <= y < table.shape[1] and 0 <= z < table.shape[2]
+    return table[x, y, z] if inside else np.int32(-1)
+
+
+@inlined
+def expansion(charts, k, a):
+    """Coefficients of map coordinate `a` in chart `k`: 1, x, y, z, xx, xy, xz, yy, yz, zz."""
+    c = charts
+    return (
+        c[k, a, 0], c[k, a, 1], c[k, a, 2], c[k, a, 3], c[k, a, 4],
+        c[k, a, 5], c[k, a, 6], c[k, a, 7], c[k, a, 8], c[k, a, 9],
+    )  # fmt: skip
 
 
 @inlined
 def map_value(c, dx, dy, dz):
-    """One map coordinate (m) at an offset (m) from the chart's centre; c: (10,) coefficients."""
+    """One map coordinate (m) at an offset (m) from the chart's centre, with its expansion `c`."""
     return (
         c[0]
         + dx * (c[1] + c[4] * dx + c[5] * dy + c[6] * dz)
@@ -60,18 +76,27 @@ def passes_heights(height, body_height, limits):
 
 
 @inlined
-def write_point(east, north, height, quanta_per_m, tile_quanta, window, tiles, quanta, at):
-    """Write a point (m) as tile and quanta at index `at`; False where its tile is not wanted."""
-    x, y = math.floor(east * quanta_per_m + 0.5), math.floor(north * quanta_per_m + 0.5)
-    column, row = x // tile_quanta, y // tile_quanta
-    wanted = window[0] <= column < window[2] and window[1] <= row < window[3]
-    if wanted:
-        tiles[at, 0] = column
-        tiles[at, 1] = row
-        quanta[at, 0] = x - column * tile_quanta
-        quanta[at, 1] = y - row * tile_quanta
-        quanta[at, 2] = math.floor(height * quanta_per_m + 0.5)
-    return wanted
+def tile_and_rest(value_m, quanta_per_m, tile_quanta):
+    """Tile number of a coordinate (m), and its quanta from the tile's edge.
+
+    A floored division without the slow instruction: multiply, then mend the last unit.
+    """
+    quanta = np.int64(math.floor(value_m * quanta_per_m + 0.5))
+    tile = np.int64(math.floor(quanta * (1.0 / tile_quanta)))
+    rest = quanta - tile * tile_quanta
+    if rest < 0:
+        tile -= 1
+        rest += tile_quanta
+    elif rest >= tile_quanta:
+        tile += 1
+        rest -= tile_quanta
+    return tile, rest
+
+
+@inlined
+def is_wanted(column, row, window):
+    """True for a tile inside the window (first column, first row, end column, end row)."""
+    return window[0] <= column < window[2] and window[1] <= row < window[3]
 
 
 @kernel
@@ -85,12 +110,12 @@ def georeference_returns(
     ----------
     pose_epochs : (n,) int64, GPS ns of the pose that places each return.
     xyz : (n, 3) float32, sensor frame, m.
-    mounting : (3, 4) float64, body from sensor | lever arm (m).
+    mounting : (12,) tuple, body from sensor (row by row), lever arm (m).
     knots, coefficients, valid : the trajectory (``kernels.poses``).
-    lattice, table : see :func:`chart_index`; centres : (c, 3); charts : (c, 3, 10).
-    limits : (6,) float64, see LIMITS.
+    lattice : (4,) tuple, see :func:`box_of`; table : (nx, ny, nz) int32; centres : (c, 3); charts : (c, 3, 10).
+    limits : (6,) tuple of float64, see LIMITS.
     quanta_per_m : float64; tile_quanta : int64, edge of a tile.
-    window : (4,) int64, first column, first row, end column, end row of the tiles wanted.
+    window : (4,) tuple of int64, first column, first row, end column, end row of the tiles wanted.
     rows : (n,) int32, out, index of the return; tiles : (n, 2) int32, out, column and row;
     quanta : (n, 3) int32, out, x and y from the tile's south-west corner, and height.
     fates : (6,) int64, in/out, counts by fate.
@@ -101,43 +126,69 @@ def georeference_returns(
     """
     made = 0
     k = 0
+    start, end = np.int64(1), np.int64(0)
+    usable = False
+    c = NO_INTERVAL
+    box = (np.int64(-1), np.int64(-1), np.int64(-1))
+    chart = np.int32(-1)
+    east_chart, north_chart, height_chart = NO_CHART
+    cx, cy, cz = 0.0, 0.0, 0.0
+    b = mounting
     for i in range(pose_epochs.size):
-        x, y, z = float(xyz[i, 0]), float(xyz[i, 1]), float(xyz[i, 2])
+        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
         distance2 = x * x + y * y + z * z
         if not (limits[0] * limits[0] <= distance2 <= limits[1] * limits[1]):
             fates[RANGE] += 1
             continue
-        k = find_interval(pose_epochs[i], knots, k)
-        if k < 0 or not valid[k]:
+        epoch = pose_epochs[i]
+        if not (start <= epoch < end):
+            k = find_interval(epoch, knots, k)
+            usable = k >= 0 and valid[k]
+            start, end = np.int64(1), np.int64(0)
+            if usable:
+                c = interval(coefficients, k)
+                start, end = knots[k], knots[k + 1]
+        if not usable:
             fates[NO_POSE] += 1
             continue
-        c = coefficients[k]
-        u = (pose_epochs[i] - knots[k]) / (knots[k + 1] - knots[k])
+        u = (epoch - start) / (end - start)
         px, py, pz = position_at(c, u)
-        chart = chart_index(px, py, pz, lattice, table)
-        if chart < 0:
-            fates[NO_POSE] += 1
-            continue
+        here = box_of(px, py, pz, lattice)
+        if here != box or chart < 0:
+            box = here
+            chart = chart_index(box, table)
+            if chart < 0:
+                fates[NO_POSE] += 1
+                continue
+            cx, cy, cz = centres[chart, 0], centres[chart, 1], centres[chart, 2]
+            east_chart = expansion(charts, chart, 0)
+            north_chart = expansion(charts, chart, 1)
+            height_chart = expansion(charts, chart, 2)
         r = attitude_at(c, u)
-        bx = mounting[0, 0] * x + mounting[0, 1] * y + mounting[0, 2] * z + mounting[0, 3]
-        by = mounting[1, 0] * x + mounting[1, 1] * y + mounting[1, 2] * z + mounting[1, 3]
-        bz = mounting[2, 0] * x + mounting[2, 1] * y + mounting[2, 2] * z + mounting[2, 3]
-        px -= centres[chart, 0]
-        py -= centres[chart, 1]
-        pz -= centres[chart, 2]
+        bx = b[0] * x + b[1] * y + b[2] * z + b[9]
+        by = b[3] * x + b[4] * y + b[5] * z + b[10]
+        bz = b[6] * x + b[7] * y + b[8] * z + b[11]
+        px -= cx
+        py -= cy
+        pz -= cz
         dx = px + (r[0] * bx + r[1] * by + r[2] * bz)
         dy = py + (r[3] * bx + r[4] * by + r[5] * bz)
         dz = pz + (r[6] * bx + r[7] * by + r[8] * bz)
-        height = map_value(charts[chart, 2], dx, dy, dz)
-        if not passes_heights(height, map_value(charts[chart, 2], px, py, pz), limits):
+        height = map_value(height_chart, dx, dy, dz)
+        if not passes_heights(height, map_value(height_chart, px, py, pz), limits):
             fates[HEIGHT] += 1
             continue
-        east = map_value(charts[chart, 0], dx, dy, dz)
-        north = map_value(charts[chart, 1], dx, dy, dz)
-        if not write_point(east, north, height, quanta_per_m, tile_quanta, window, tiles, quanta, made):
+        column, east = tile_and_rest(map_value(east_chart, dx, dy, dz), quanta_per_m, tile_quanta)
+        row, north = tile_and_rest(map_value(north_chart, dx, dy, dz), quanta_per_m, tile_quanta)
+        if not is_wanted(column, row, window):
             fates[OUTSIDE] += 1
             continue
         rows[made] = i
+        tiles[made, 0] = column
+        tiles[made, 1] = row
+        quanta[made, 0] = east
+        quanta[made, 1] = north
+        quanta[made, 2] = math.floor(height * quanta_per_m + 0.5)
         made += 1
         fates[KEPT] += 1
     return made
@@ -147,7 +198,7 @@ def georeference_returns(
 def profile_form(c, ox, oy, oz, axis_y, axis_z):
     """A map coordinate over the profile's plane: (constant, y, z, y², y z, z²) coefficients.
 
-    c : (10,) chart; ox, oy, oz : sensor origin from the chart's centre (m);
+    c : expansion of the coordinate; ox, oy, oz : sensor origin from the chart's centre (m);
     axis_y, axis_z : the sensor's y and z axes in the world (its x does not occur in a profile).
     """
     gx = c[1] + 2.0 * c[4] * ox + c[5] * oy + c[6] * oz
@@ -183,10 +234,10 @@ def profile_forms(epoch, k, mounting, knots, coefficients, valid, lattice, table
     """
     if k < 0 or not valid[k]:
         return False, NO_FORMS
-    c = coefficients[k]
+    c = interval(coefficients, k)
     u = (epoch - knots[k]) / (knots[k + 1] - knots[k])
     px, py, pz = position_at(c, u)
-    chart = chart_index(px, py, pz, lattice, table)
+    chart = chart_index(box_of(px, py, pz, lattice), table)
     if chart < 0:
         return False, NO_FORMS
     r = attitude_at(c, u)
@@ -194,24 +245,25 @@ def profile_forms(epoch, k, mounting, knots, coefficients, valid, lattice, table
     py -= centres[chart, 1]
     pz -= centres[chart, 2]
     b = mounting
-    ox = px + (r[0] * b[0, 3] + r[1] * b[1, 3] + r[2] * b[2, 3])
-    oy = py + (r[3] * b[0, 3] + r[4] * b[1, 3] + r[5] * b[2, 3])
-    oz = pz + (r[6] * b[0, 3] + r[7] * b[1, 3] + r[8] * b[2, 3])
+    ox = px + (r[0] * b[9] + r[1] * b[10] + r[2] * b[11])
+    oy = py + (r[3] * b[9] + r[4] * b[10] + r[5] * b[11])
+    oz = pz + (r[6] * b[9] + r[7] * b[10] + r[8] * b[11])
     axis_y = (
-        r[0] * b[0, 1] + r[1] * b[1, 1] + r[2] * b[2, 1],
-        r[3] * b[0, 1] + r[4] * b[1, 1] + r[5] * b[2, 1],
-        r[6] * b[0, 1] + r[7] * b[1, 1] + r[8] * b[2, 1],
+        r[0] * b[1] + r[1] * b[4] + r[2] * b[7],
+        r[3] * b[1] + r[4] * b[4] + r[5] * b[7],
+        r[6] * b[1] + r[7] * b[4] + r[8] * b[7],
     )
     axis_z = (
-        r[0] * b[0, 2] + r[1] * b[1, 2] + r[2] * b[2, 2],
-        r[3] * b[0, 2] + r[4] * b[1, 2] + r[5] * b[2, 2],
-        r[6] * b[0, 2] + r[7] * b[1, 2] + r[8] * b[2, 2],
+        r[0] * b[2] + r[1] * b[5] + r[2] * b[8],
+        r[3] * b[2] + r[4] * b[5] + r[5] * b[8],
+        r[6] * b[2] + r[7] * b[5] + r[8] * b[8],
     )
+    height_chart = expansion(charts, chart, 2)
     return True, (
-        profile_form(charts[chart, 0], ox, oy, oz, axis_y, axis_z),
-        profile_form(charts[chart, 1], ox, oy, oz, axis_y, axis_z),
-        profile_form(charts[chart, 2], ox, oy, oz, axis_y, axis_z),
-        (map_value(charts[chart, 2], px, py, pz), 0.0, 0.0, 0.0, 0.0, 0.0),
+        profile_form(expansion(charts, chart, 0), ox, oy, oz, axis_y, axis_z),
+        profile_form(expansion(charts, chart, 1), ox, oy, oz, axis_y, axis_z),
+        profile_form(height_chart, ox, oy, oz, axis_y, axis_z),
+        (map_value(height_chart, px, py, pz), 0.0, 0.0, 0.0, 0.0, 0.0),
     )
 
 
@@ -232,7 +284,7 @@ def georeference_profiles(
     epochs : (n,) int64, GPS ns of each profile's first reading.
     ranges : (n, m) uint16, raw, 0 no return.
     origins, directions : (m, 3) float64, sensor frame, m; x is 0 (``ScanGeometry.rays``).
-    scale : (2,) float64, range_offset_m, range_step_m.
+    scale : (2,) tuple, range_offset_m, range_step_m.
     reading_period_ns : float64.
     rows : (n·m,) int32, out, index of the profile; readings : (n·m,) int32, out, index in the profile.
     Others as in :func:`georeference_returns`.
@@ -270,12 +322,18 @@ def georeference_profiles(
             if not passes_heights(height, forms[3][0], limits):
                 fates[HEIGHT] += 1
                 continue
-            east, north = form_value(forms[0], y, z), form_value(forms[1], y, z)
-            if not write_point(east, north, height, quanta_per_m, tile_quanta, window, tiles, quanta, made):
+            column, east = tile_and_rest(form_value(forms[0], y, z), quanta_per_m, tile_quanta)
+            row, north = tile_and_rest(form_value(forms[1], y, z), quanta_per_m, tile_quanta)
+            if not is_wanted(column, row, window):
                 fates[OUTSIDE] += 1
                 continue
             rows[made] = i
             readings[made] = j
+            tiles[made, 0] = column
+            tiles[made, 1] = row
+            quanta[made, 0] = east
+            quanta[made, 1] = north
+            quanta[made, 2] = math.floor(height * quanta_per_m + 0.5)
             made += 1
             fates[KEPT] += 1
     return made

@@ -22,5 +22,5 @@ def kernel(function: Kernel) -> Kernel:
 
 def inlined(function: Kernel) -> Kernel:
     """Compile a piece of a kernel into its callers."""
-    compiled: Kernel = numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")(function)
+    compiled: Kernel = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)(function)
     return compiled

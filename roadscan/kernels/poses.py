@@ -176,9 +176,27 @@ def find_interval(epoch, epochs, k):
     return found
 
 
+NO_INTERVAL = (0.0,) * COEFFICIENTS
+
+
+@inlined
+def interval(coefficients, k):
+    """Coefficients of interval `k` as a tuple.
+
+    Loops keep the tuple of the current interval: handing an array to a function costs two atomic
+    operations for its reference count, more than the arithmetic of a reading.
+    """
+    c = coefficients
+    return (
+        c[k, 0], c[k, 1], c[k, 2], c[k, 3], c[k, 4], c[k, 5], c[k, 6], c[k, 7], c[k, 8], c[k, 9], c[k, 10], c[k, 11],
+        c[k, 12], c[k, 13], c[k, 14], c[k, 15], c[k, 16], c[k, 17], c[k, 18], c[k, 19], c[k, 20],
+        c[k, 21], c[k, 22], c[k, 23], c[k, 24],
+    )  # fmt: skip
+
+
 @inlined
 def attitude_at(c, u):
-    """World-from-body matrix, row by row, at part `u` of an interval with coefficients `c`."""
+    """World-from-body matrix, row by row, at part `u` of an interval with coefficients `c`, a tuple."""
     vx = u * (c[12] + u * (c[13] + u * c[14]))
     vy = u * (c[15] + u * (c[16] + u * c[17]))
     vz = u * (c[18] + u * (c[19] + u * c[20]))
@@ -204,7 +222,7 @@ def attitude_at(c, u):
 
 @inlined
 def position_at(c, u):
-    """World position (m) at part `u` of an interval with coefficients `c`."""
+    """World position (m) at part `u` of an interval with coefficients `c`, a tuple."""
     return (
         c[0] + u * (c[1] + u * (c[2] + u * c[3])),
         c[4] + u * (c[5] + u * (c[6] + u * c[7])),
@@ -225,14 +243,22 @@ def interpolate(queries, epochs, coefficients, valid, positions, rotations, foun
     found : (m,) bool, out; False where the trajectory has no pose (gap, or outside its span).
     """
     k = 0
+    start, end = np.int64(1), np.int64(0)
+    usable = False
+    c = NO_INTERVAL
     for i in range(queries.size):
-        k = find_interval(queries[i], epochs, k)
-        found[i] = k >= 0 and valid[k]
-        if not found[i]:
-            continue
-        c = coefficients[k]
-        u = (queries[i] - epochs[k]) / (epochs[k + 1] - epochs[k])
-        positions[i, 0], positions[i, 1], positions[i, 2] = position_at(c, u)
-        r = attitude_at(c, u)
-        for a in range(9):
-            rotations[i, a] = r[a]
+        epoch = queries[i]
+        if not (start <= epoch < end):
+            k = find_interval(epoch, epochs, k)
+            usable = k >= 0 and valid[k]
+            start, end = np.int64(1), np.int64(0)
+            if usable:
+                c = interval(coefficients, k)
+                start, end = epochs[k], epochs[k + 1]
+        found[i] = usable
+        if usable:
+            u = (epoch - start) / (end - start)
+            positions[i, 0], positions[i, 1], positions[i, 2] = position_at(c, u)
+            r = attitude_at(c, u)
+            for a in range(9):
+                rotations[i, a] = r[a]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -55,10 +55,6 @@ class Window:
     end_column: int
     end_row: int
 
-    def array(self) -> Int64:
-        """(4,) int64 for the kernels."""
-        return np.array([self.first_column, self.first_row, self.end_column, self.end_row], dtype=np.int64)
-
 
 EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
 
@@ -94,20 +90,17 @@ class Placement:
     def _common(self) -> tuple[Any, ...]:
         rotation, lever = self.mounting.arrays()
         coefficients, valid = self.trajectory.intervals
-        mounting = np.ascontiguousarray(np.column_stack([rotation, lever]))
         return (
-            mounting, self.trajectory.epochs_gps_ns, coefficients, valid,
-            self.charts.lattice, self.charts.table, self.charts.centres, self.charts.coefficients,
+            (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
+            tuple(self.charts.lattice.tolist()), self.charts.table, self.charts.centres, self.charts.coefficients,
             self._limits(), float(QUANTA_PER_M), self.tile_quanta,
         )  # fmt: skip
 
-    def _limits(self) -> Float64:
+    def _limits(self) -> tuple[float, ...]:
         h = self.heights
-        return np.array(
-            [
-                self.range_min_m, self.range_max_m,
-                h.height_min_m, h.height_max_m, h.above_body_min_m, h.above_body_max_m,
-            ]
+        return (
+            float(self.range_min_m), float(self.range_max_m), float(h.height_min_m), float(h.height_max_m),
+            float(h.above_body_min_m), float(h.above_body_max_m),
         )  # fmt: skip
 
     def returns(self, batch: pa.RecordBatch, window: Window) -> Placed:
@@ -150,7 +143,7 @@ class Placement:
         xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
         work = _Work.of(n)
         made = georeference_returns(
-            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), window.array(),
+            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), astuple(window),
             work.rows, work.tiles, work.quanta, work.fates,
         )  # fmt: skip
         return work.first(made)
@@ -160,8 +153,8 @@ class Placement:
         work = _Work.of(batch.num_rows * geometry.readings)
         made = georeference_profiles(
             _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
-            np.array([geometry.range_offset_m, geometry.range_step_m]), geometry.reading_period_ns,
-            *self._common(), window.array(), work.rows, work.readings, work.tiles, work.quanta, work.fates,
+            (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns,
+            *self._common(), astuple(window), work.rows, work.readings, work.tiles, work.quanta, work.fates,
         )  # fmt: skip
         return work.first(made)
 

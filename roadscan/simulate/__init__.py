@@ -1,0 +1,6 @@
+"""A survey with known truth, written as raw logs. It shares no geometry code with the pipeline."""
+
+from roadscan.simulate.run import SimulatedSurvey, simulate
+from roadscan.simulate.scene import Scene, shipped_scenes
+
+__all__ = ["Scene", "SimulatedSurvey", "shipped_scenes", "simulate"]

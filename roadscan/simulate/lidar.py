@@ -1,0 +1,203 @@
+"""The spinning lidar: firings of a Velodyne HDL-32E and its PCAP log.
+
+32 lasers fire one after another 1.152 µs apart, a cycle each 46.08 µs, 12 cycles a packet, while the head turns.
+The beams' elevations and the heights of their origins are those of the maker's drawing 86-0106.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.simulate import kernels
+from roadscan.simulate.drive import RUN_UP_S, Drive
+from roadscan.simulate.earth import LocalMap
+from roadscan.simulate.noise import stream
+from roadscan.simulate.pcap import PcapWriter
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+LASERS: Final = 32
+CYCLES: Final = 12
+FIRING_NS: Final = 1_152
+CYCLE_NS: Final = 46_080
+PACKET_NS: Final = CYCLES * CYCLE_NS
+RANGE_STEP_M: Final = 0.002
+RANGE_MIN_M: Final = 0.9
+BLOCK_PACKETS: Final = 128
+"""Packets measured at once: the noise is drawn by the block, so this changes bytes."""
+BODY_FROM_AXES: Final = np.diag([1.0, -1.0, -1.0])
+"""Axes flu: x forward, y left, z up."""
+REFLECTIVITY: Final = 0.35
+"""Lidar intensity for one digital number of a profiler."""
+
+_LOWEST_DEG: Final = -92.0 / 3.0
+_LOWER_HALF_RISE_MM: Final = (
+    17.17, 16.27, 15.40, 14.54, 13.71, 12.89, 12.09, 11.31, 10.54, 9.78, 9.04, 8.30, 7.58, 6.86, 6.15, 5.45,
+)  # fmt: skip
+_UPPER_HALF_RISE_MM: Final = (
+    4.76, 4.07, 3.38, 2.70, 2.02, 1.35, 0.67, 0.0, -0.67, -1.35, -2.02, -2.70, -3.38, -4.07, -4.76, -5.45,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Geometry of the lasers in firing order (32,): even ones look lower, odd ones higher."""
+
+    elevation_deg: Float64
+    rise_m: Float64
+    """Height of a beam's origin along the sensor's z."""
+
+
+def hdl32e_beams() -> Beams:
+    """Elevations −30.67° … +10.67° in firing order, to the hundredth as the maker prints them."""
+    ascending = np.round(_LOWEST_DEG + 4.0 / 3.0 * np.arange(LASERS), 2)
+    elevation, rise = np.empty(LASERS), np.empty(LASERS)
+    elevation[0::2], elevation[1::2] = ascending[:16], ascending[16:]
+    rise[0::2], rise[1::2] = _LOWER_HALF_RISE_MM, _UPPER_HALF_RISE_MM
+    return Beams(elevation, rise / 1000.0)
+
+
+@dataclass(frozen=True)
+class Packets:
+    """A block of p packets as the head measured them."""
+
+    epoch_gps_ns: Int64
+    """(p,) first firing of each packet."""
+    block_azimuth: npt.NDArray[np.uint16]
+    """(p, 12) hundredths of a degree at each cycle's first firing, as stated."""
+    azimuth_deg: Float64
+    """(p, 12, 32) true azimuth of each firing, clockwise from the sensor's x, seen from above."""
+    found: Float64
+    """(p, 12, 32, 5) exact range, easting, northing, height (m) of the hit, intensity; range NaN: none."""
+    ranges: npt.NDArray[np.uint16]
+    """(p, 12, 32) units of 2 mm, 0: no return."""
+    intensity: npt.NDArray[np.uint8]
+    """(p, 12, 32)"""
+
+    def firing_gps_ns(self) -> Int64:
+        """Epoch of each firing (p, 12, 32)."""
+        offsets = CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)
+        out: Int64 = self.epoch_gps_ns[:, None, None] + offsets
+        return out
+
+
+def write_lidar(scene: Scene, surface: Surface, drive: Drive, file: Path, hits_file: Path | None) -> Iterator[int]:
+    """Write the capture of one pass, a block of packets a step; yields the returns of each."""
+    hits = pq.ParquetWriter(hits_file, _HITS_SCHEMA, use_dictionary=False) if hits_file else None
+    with PcapWriter(file, drive) as capture:
+        for block in measure(scene, surface, drive):
+            capture.write(block.epoch_gps_ns, block.block_azimuth, block.ranges, block.intensity)
+            if hits is not None:
+                hits.write_batch(_hits(block))
+            yield int(np.count_nonzero(block.ranges))
+    if hits is not None:
+        hits.close()
+
+
+def measure(scene: Scene, surface: Surface, drive: Drive) -> Iterator[Packets]:
+    """Packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
+    first = drive.start_gps_ns - round(RUN_UP_S / 2 * 1e9)
+    span = drive.duration_s + RUN_UP_S
+    count = math.ceil(span * 1e9 / PACKET_NS)
+    start_deg = float(stream(scene.seed, drive.number, "lidar head").integers(0, 36_000)) / 100.0
+    for block, packet in enumerate(range(0, count, BLOCK_PACKETS)):
+        numbers = np.arange(packet, min(packet + BLOCK_PACKETS, count))
+        yield _measure_block(scene, surface, drive, first, start_deg, numbers, block)
+
+
+def _measure_block(
+    scene: Scene, surface: Surface, drive: Drive, first_gps_ns: int, start_deg: float, numbers: Int64, block: int
+) -> Packets:
+    epochs = first_gps_ns + numbers * PACKET_NS
+    ends = np.append(epochs, epochs[-1] + PACKET_NS)
+    origins, rotations = drive.poses(ends).sensor(scene.lidar.mount, BODY_FROM_AXES)
+    local = LocalMap.around(drive.earth, origins[origins.shape[0] // 2], surface.origin_enh_m, scene.lidar.range_max_m)
+    stated, azimuth_deg = _azimuths(scene, start_deg, numbers)
+    beams = hdl32e_beams()
+    elevation = np.radians(beams.elevation_deg)
+    found = np.zeros((*azimuth_deg.shape, 5))
+    node = (drive.station_m(ends) - surface.arrays.nodes[0, 12]) / kernels.NODE_STEP_M
+    kernels.fire_lidar(
+        surface.arrays,
+        local.bases,
+        local.enu_from_ecef(origins),
+        np.einsum("ki,pkj->pij", local.ecef_from_enu, rotations),
+        node.astype(np.int64),
+        np.stack([np.sin(elevation), np.cos(elevation), beams.rise_m], axis=-1),
+        np.radians(azimuth_deg),
+        (CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)) / PACKET_NS,
+        np.array([RANGE_MIN_M, scene.lidar.range_max_m]),
+        np.full((LASERS, 3), np.nan),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        found,
+    )
+    found[..., 1:4] += surface.origin_enh_m
+    ranges, intensity = _recorded(scene, drive, block, found)
+    return Packets(epochs, stated, azimuth_deg, found, ranges, intensity)
+
+
+def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:
+    """Azimuth that each cycle states (p, 12), hundredths, and that of each firing (p, 12, 32), degrees."""
+    per_cycle = scene.lidar.turns_per_s * 36_000.0 * CYCLE_NS * 1e-9
+    cycle = numbers[:, None] * CYCLES + np.arange(CYCLES)
+    share = FIRING_NS / CYCLE_NS * np.arange(LASERS)
+    if scene.lidar.on_azimuth_grid:
+        per_cycle = float(round(per_cycle))
+        begins = np.rint(start_deg * 100.0) + per_cycle * cycle
+        hundredths = begins[:, :, None] + np.floor(per_cycle * share + 0.5)
+    else:
+        begins = start_deg * 100.0 + per_cycle * cycle
+        hundredths = begins[:, :, None] + per_cycle * share
+    stated = np.mod(np.rint(begins).astype(np.int64), 36_000).astype(np.uint16)
+    return stated, np.mod(hundredths, 36_000.0) / 100.0
+
+
+def _recorded(
+    scene: Scene, drive: Drive, block: int, found: Float64
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
+    """Ranges and intensities with noise, as whole numbers."""
+    rng = stream(scene.seed, drive.number, "lidar", block)
+    shape = found.shape[:3]
+    noise = scene.noise
+    range_m = found[..., 0] + noise.lidar_range_m * rng.standard_normal(shape, dtype=np.float32)
+    value = REFLECTIVITY * (found[..., 4] + noise.intensity * rng.standard_normal(shape, dtype=np.float32))
+    seen = np.isfinite(range_m)
+    if noise.dropout > 0.0:
+        seen &= rng.random(shape, dtype=np.float32) >= noise.dropout
+    units = np.rint(np.where(seen, range_m, 0.0) / RANGE_STEP_M)
+    ranges = np.clip(units, 0, 65_535).astype(np.uint16)
+    return ranges, np.where(seen, np.clip(np.rint(value), 1, 100), 0).astype(np.uint8)
+
+
+_HITS_SCHEMA: Final = pa.schema(
+    [
+        pa.field("epoch_gps_ns", pa.int64()),
+        pa.field("laser", pa.uint8()),
+        pa.field("azimuth_deg", pa.float64()),
+        pa.field("range_m", pa.float64()),
+        pa.field("easting_m", pa.float64()),
+        pa.field("northing_m", pa.float64()),
+        pa.field("height_m", pa.float64()),
+    ]
+)
+
+
+def _hits(block: Packets) -> pa.RecordBatch:
+    """Where the returns of a block come from, one row a return that was recorded."""
+    seen = block.ranges > 0
+    laser = np.broadcast_to(np.arange(LASERS, dtype=np.uint8), seen.shape)
+    columns = [block.firing_gps_ns()[seen], laser[seen], block.azimuth_deg[seen], *block.found[seen][:, :4].T]
+    return pa.RecordBatch.from_arrays([pa.array(np.ascontiguousarray(c)) for c in columns], schema=_HITS_SCHEMA)

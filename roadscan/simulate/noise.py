@@ -1,0 +1,38 @@
+"""Random numbers: one independent stream for each purpose and block, so that no result depends on chunks."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+Float64 = npt.NDArray[np.float64]
+
+
+def stream(seed: int, run: int, purpose: str, block: int = 0) -> np.random.Generator:
+    """Generator for one purpose ("profiler_left", "lidar" …) of one block of one run."""
+    key = (run, zlib.crc32(purpose.encode()), block)
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
+
+
+class GaussMarkov:
+    """First-order Gauss–Markov process, continued from call to call.
+
+    x(t + dt) = e^(−dt/τ) · x(t) + σ · sqrt(1 − e^(−2dt/τ)) · w  (Gelb 1974, 3.8).
+    """
+
+    def __init__(self, rng: np.random.Generator, sigma: Float64, time_constant_s: float, step_s: float) -> None:
+        self._rng = rng
+        self._sigma = sigma
+        self._keep = float(np.exp(-step_s / time_constant_s))
+        self._last = sigma * rng.standard_normal(sigma.size)
+
+    def take(self, count: int) -> Float64:
+        """The next (count, k) values, for k components of standard deviation `sigma` (k,)."""
+        steps = self._sigma * np.sqrt(1.0 - self._keep**2) * self._rng.standard_normal((count, self._sigma.size))
+        out, _ = lfilter([1.0], [1.0, -self._keep], steps, axis=0, zi=self._keep * self._last[None])
+        self._last = out[-1]
+        values: Float64 = out
+        return values

@@ -1,0 +1,262 @@
+"""The triangulation pair: profiles of the road as ``scans`` Parquet, one file a head and run."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.simulate import kernels
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.noise import stream
+from roadscan.simulate.scene import Mount, Profilers, Scene
+from roadscan.simulate.surface import Surface
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+BLOCK_PROFILES: Final = 512
+"""Profiles measured at once and a Parquet row group: the noise is drawn by the block, so this changes bytes."""
+_BENT_M: Final = 1e-7
+GEOMETRY_KEY: Final = "roadscan.scan_geometry"
+BODY_FROM_AXES: Final = np.eye(3)
+"""Axes frd: y to the right, z down along the range."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """One profiler head on one drive."""
+
+    name: str
+    mount: Mount
+    settings: Profilers
+
+    @property
+    def y_sensor_m(self) -> Float64:
+        """Transverse position of the readings (n,)."""
+        first, step = self.first_step_m
+        return np.asarray(first + step * np.arange(self.settings.readings, dtype=np.float64))
+
+    @property
+    def first_step_m(self) -> tuple[float, float]:
+        """Transverse position of the first reading and the step from reading to reading (m)."""
+        return -self.settings.width_m / 2, self.settings.width_m / (self.settings.readings - 1)
+
+    def geometry(self) -> dict[str, object]:
+        """How the readings lie in the sensor's frame, as the log's metadata state it."""
+        first, step = self.first_step_m
+        return {
+            "kind": "cartesian",
+            "readings": self.settings.readings,
+            "first": first,
+            "step": step,
+            "range_offset_m": self.settings.range_offset_m,
+            "range_step_m": self.settings.range_step_m,
+            "reading_period_ns": 0.0,
+        }
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """A block of measured profiles."""
+
+    epoch_gps_ns: Int64
+    encoder_ticks: Int64
+    ranges: npt.NDArray[np.uint16]
+    """(p, n)"""
+    intensity: npt.NDArray[np.uint8]
+    """(p, n)"""
+    hits: Float64
+    """(p, n, 4) easting, northing, height in the map, and exact range (m); (0, 0, 0) if not wanted."""
+
+
+def heads(settings: Profilers) -> list[Head]:
+    """The heads of the rig; none where they are switched off."""
+    if not settings.on:
+        return []
+    return [Head("profiler_left", settings.left, settings), Head("profiler_right", settings.right, settings)]
+
+
+def write_profiles(
+    scene: Scene, surface: Surface, drive: Drive, head: Head, file: Path, hits_file: Path | None
+) -> Iterator[int]:
+    """Write the profiles of one head, a row group a step; yields the readings of each."""
+    readings = head.settings.readings
+    schema = _scans_schema(head)
+    hits_schema = _hits_schema(readings)
+    hits_writer = pq.ParquetWriter(hits_file, hits_schema, use_dictionary=False) if hits_file else None
+    with pq.ParquetWriter(
+        file,
+        schema,
+        compression="NONE",
+        use_dictionary=False,
+        column_encoding={
+            "epoch_gps_ns": "DELTA_BINARY_PACKED",
+            "range.list.element": "DELTA_BINARY_PACKED",
+            "intensity.list.element": "DELTA_BINARY_PACKED",
+            "encoder_ticks": "DELTA_BINARY_PACKED",
+        },
+        write_statistics=["epoch_gps_ns", "encoder_ticks"],
+    ) as writer:
+        for block in measure(scene, surface, drive, head, with_hits=hits_file is not None):
+            columns = [
+                pa.array(block.epoch_gps_ns),
+                _lists(block.ranges, schema.field("range").type),
+                _lists(block.intensity, schema.field("intensity").type),
+                pa.array(block.encoder_ticks),
+            ]
+            writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema), row_group_size=BLOCK_PROFILES)
+            if hits_writer is not None:
+                kind = hits_schema.field("easting_m").type
+                places = [_lists(np.ascontiguousarray(block.hits[:, :, i]), kind) for i in range(4)]
+                hits_writer.write_batch(
+                    pa.RecordBatch.from_arrays([pa.array(block.epoch_gps_ns), *places], schema=hits_schema)
+                )
+            yield block.ranges.size
+    if hits_writer is not None:
+        hits_writer.close()
+
+
+def measure(scene: Scene, surface: Surface, drive: Drive, head: Head, *, with_hits: bool = False) -> Iterator[Profiles]:
+    """Profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
+    spacing = head.settings.spacing_m
+    count = math.floor(drive.length_m / spacing + 1e-9) + 1
+    for block, first in enumerate(range(0, count, BLOCK_PROFILES)):
+        driven = np.asarray(spacing * np.arange(first, min(first + BLOCK_PROFILES, count), dtype=np.float64))
+        yield _measure_block(scene, surface, drive, head, driven, block, with_hits)
+
+
+def _measure_block(
+    scene: Scene, surface: Surface, drive: Drive, head: Head, driven_m: Float64, block: int, with_hits: bool
+) -> Profiles:
+    settings = head.settings
+    epochs = drive.epoch_gps_ns(driven_m)
+    origins, rotations = drive.poses(epochs).sensor(head.mount, BODY_FROM_AXES)
+    y = head.y_sensor_m
+    guess = np.full(epochs.size, scene.vehicle.imu_height_m - head.mount.lever_arm_body_m[2])
+    planes = _planes(surface, drive, origins, rotations, float(y[-1]), float(guess[0]))
+    shape = (epochs.size, y.size)
+    noise, bits = _errors(scene, drive, head, block, shape)
+    ranges, intensity = np.empty(shape, np.uint16), np.empty(shape, np.uint8)
+    true_range = np.empty(shape if with_hits else (0, 0))
+    scale = np.array([settings.range_offset_m, settings.range_step_m, scene.noise.dropout, scene.noise.intensity])
+    beam = np.empty((3, 3))
+    kernels.scan_profiles(
+        surface.arrays,
+        planes.in_road,
+        planes.in_map,
+        planes.is_bent,
+        y,
+        guess,
+        scale,
+        noise,
+        bits,
+        beam,
+        ranges,
+        intensity,
+        true_range,
+    )
+    ticks = np.floor(drive.driven_m(epochs) * scene.vehicle.ticks_per_m + 0.5).astype(np.int64)
+    hits = _hits(drive, origins, rotations, y, true_range) if with_hits else np.empty((0, 0, 0))
+    return Profiles(epochs, ticks, ranges, intensity, hits)
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """The planes of p profiles as polynomials of a reading's y and range."""
+
+    in_road: Float64
+    """(p, 3, 9) station, offset, height, see `kernels.road_beam`."""
+    in_map: Float64
+    """(p, 3, 6) easting, northing, height, see `kernels.map_beam`; what they leave out is below 10⁻¹¹ m."""
+    is_bent: npt.NDArray[np.bool_]
+    """(p,) whether `in_road` leaves out more than 0.1 µm: the road's curvature changes quickly here."""
+
+
+def _planes(
+    surface: Surface, drive: Drive, origins: Float64, rotations: Float64, half_width_m: float, range_m: float
+) -> _Planes:
+    """Fit the planes to 15 exact points of each."""
+    unit_y, unit_r = (a.ravel() for a in np.meshgrid([-1.0, -0.6, 0.0, 0.6, 1.0], [0.0, 1.0, 2.0], indexing="ij"))
+    points = np.stack([np.zeros_like(unit_y), half_width_m * unit_y, range_m * unit_r], axis=-1)
+    ecef = origins[:, None] + np.einsum("pij,kj->pki", rotations, points)
+    in_map = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(-1, unit_y.size, 3) - surface.origin_enh_m
+    easting, northing = np.ascontiguousarray(in_map[:, :, 0]), np.ascontiguousarray(in_map[:, :, 1])
+    in_road = np.empty((*easting.shape, 3))
+    in_road[:, :, 2] = in_map[:, :, 2]
+    middle = unit_y.size // 2
+    near = surface.nearest_node(
+        easting[:, middle] + surface.origin_enh_m[0], northing[:, middle] + surface.origin_enh_m[1]
+    )
+    kernels.survey_planes(surface.arrays.nodes, easting, northing, near, in_road)
+
+    def fitted(values: Float64, powers: tuple[tuple[int, int], ...]) -> tuple[Float64, Float64]:
+        terms = np.stack([unit_y**m * unit_r**n for m, n in powers], axis=-1)
+        units = np.array([half_width_m**m * range_m**n for m, n in powers])
+        coefficients = np.einsum("ck,pki->pic", np.linalg.pinv(terms), values)
+        left = values - np.einsum("kc,pic->pki", terms, coefficients)
+        return np.ascontiguousarray(coefficients / units), np.abs(left).max(axis=(1, 2))
+
+    road, left = fitted(in_road, ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (0, 1), (1, 1), (2, 1), (0, 2)))
+    exact, _ = fitted(in_map, ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2)))
+    return _Planes(road, exact, left > _BENT_M)
+
+
+def _hits(drive: Drive, origins: Float64, rotations: Float64, y_sensor_m: Float64, range_m: Float64) -> Float64:
+    """Map coordinates and ranges (p, n, 4) of the points at true ranges (p, n), by the exact projection."""
+    sensor = np.zeros((*range_m.shape, 3))
+    sensor[:, :, 1] = y_sensor_m
+    sensor[:, :, 2] = range_m
+    ecef = origins[:, None] + np.einsum("pij,pnj->pni", rotations, sensor)
+    with np.errstate(invalid="ignore"):  # PROJ answers NaN with infinity
+        enh = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(ecef.shape)
+    enh[np.isnan(range_m)] = np.nan
+    return np.concatenate([enh, range_m[:, :, None]], axis=-1)
+
+
+def _errors(
+    scene: Scene, drive: Drive, head: Head, block: int, shape: tuple[int, int]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+    """Range noise (m), and random bits for losses and intensity noise, of a block; empty where there is none."""
+    rng = stream(scene.seed, drive.number, head.name, block)
+    noise, bits = np.empty((0, 0), np.float32), np.empty((0, 0), np.uint32)
+    if scene.noise.profiler_range_m > 0.0:
+        noise = rng.standard_normal(shape, dtype=np.float32) * np.float32(scene.noise.profiler_range_m)
+    if scene.noise.dropout > 0.0 or scene.noise.intensity > 0.0:
+        bits = rng.integers(0, 2**32, shape, dtype=np.uint32)
+    return noise, bits
+
+
+def _scans_schema(head: Head) -> pa.Schema:
+    size = head.settings.readings
+    return pa.schema(
+        [
+            pa.field("epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field("range", _list_of(pa.uint16(), size), nullable=False),
+            pa.field("intensity", _list_of(pa.uint8(), size)),
+            pa.field("encoder_ticks", pa.int64()),
+        ],
+        metadata={GEOMETRY_KEY: json.dumps(head.geometry())},
+    )
+
+
+def _hits_schema(readings: int) -> pa.Schema:
+    lists = _list_of(pa.float64(), readings)
+    names = ("easting_m", "northing_m", "height_m", "range_m")
+    return pa.schema([pa.field("epoch_gps_ns", pa.int64()), *(pa.field(name, lists) for name in names)])
+
+
+def _list_of(kind: pa.DataType, size: int) -> pa.DataType:
+    return pa.list_(pa.field("element", kind, nullable=False), size)
+
+
+def _lists(values: npt.NDArray[np.generic], kind: pa.DataType) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), type=kind)

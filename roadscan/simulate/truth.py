@@ -1,0 +1,86 @@
+"""The truth beside a simulated survey: the scene it was made from, and with it every height on the road."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from roadscan.model.errors import FormatError
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+
+Float64 = npt.NDArray[np.float64]
+
+TRUTH_FOLDER: Final = "truth"
+SCENE_FILE: Final = "scene.json"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a simulated survey."""
+
+    scene: Scene
+    surface: Surface
+    folder: Path
+    """Folder with ``scene.json``, the true trajectories and, if they were asked for, the true hits."""
+
+    def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
+        """True ellipsoidal height at map points (any shape, m); NaN where there is no road or verge."""
+        return self.surface.height_m(easting_m, northing_m)
+
+    def intensity(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
+        """True brightness at map points (any shape), digital numbers of a profiler."""
+        return self.surface.intensity(easting_m, northing_m)
+
+    def station_offset_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
+        """Station and offset from the reference line (right positive) of map points (any shape, m)."""
+        return self.surface.station_offset_m(easting_m, northing_m)
+
+    def trajectory_file(self, run: str) -> Path:
+        """Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
+        return self.folder / "trajectory" / f"{run}.parquet"
+
+    def hits_file(self, run: str, sensor: str) -> Path:
+        """Parquet file of the points that a sensor's beams hit in a run."""
+        return self.folder / "hits" / run / f"{sensor}.parquet"
+
+
+def load(folder: str | Path) -> Truth:
+    """Truth of the simulated survey in `folder` (or of its folder ``truth``).
+
+    Raises
+    ------
+    FormatError
+        where the folder holds no truth, or one written by another version.
+    """
+    given = Path(folder)
+    truth = given if (given / SCENE_FILE).is_file() else given / TRUTH_FOLDER
+    file = truth / SCENE_FILE
+    if not file.is_file():
+        raise FormatError(
+            "there is no truth here",
+            expected=f"the folder of a simulated survey, with {TRUTH_FOLDER}/{SCENE_FILE} in it",
+            file=given,
+        )
+    try:
+        scene = Scene.model_validate_json(file.read_bytes())
+    except ValidationError as error:
+        raise FormatError(
+            f"the scene cannot be read: {error.errors()[0]['msg']}",
+            expected="a scene written by this version of roadscan",
+            change="simulate the survey again",
+            file=file,
+        ) from error
+    return Truth(scene, Surface(scene), truth)
+
+
+def save(scene: Scene, folder: Path) -> None:
+    """Write the scene into the truth folder of the survey in `folder`."""
+    target = folder / TRUTH_FOLDER / SCENE_FILE
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(scene.model_dump_json(indent=1) + "\n", encoding="utf-8")

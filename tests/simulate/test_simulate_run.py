@@ -1,0 +1,124 @@
+"""Same scene, same bytes, in bounded memory, and never over somebody's files."""
+
+from __future__ import annotations
+
+import hashlib
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from roadscan.model.errors import ConfigError, FormatError
+from roadscan.simulate import Scene, profiler, simulate, trajectory, truth
+
+TINY = Scene.load("demo").changed(
+    length_m=20.0,
+    passes=[{"lane": 2}],
+    profilers={"spacing_m": 0.05, "readings": 200},
+    lidar={"on": False},
+)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    files = (f for f in sorted(folder.rglob("*")) if f.is_file())
+    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+
+
+def test_same_seed_same_bytes(tmp_path: Path):
+    scene = TINY.changed(length_m=4.0, lidar={"on": True}, passes=[{"lane": 2}, {"lane": 1, "direction": "backward"}])
+    simulate(scene, tmp_path / "a", write_hits=True)
+    simulate(scene, tmp_path / "b", write_hits=True)
+    first = hashes(tmp_path / "a")
+    assert len(first) == 4 + 2 * (4 + 1 + 3)
+    assert first == hashes(tmp_path / "b")
+    # Again into the same folder: the same files.
+    simulate(scene, tmp_path / "a", write_hits=True)
+    assert hashes(tmp_path / "a") == first
+
+
+def test_another_seed_makes_other_bytes(tmp_path: Path):
+    simulate(TINY, tmp_path / "a")
+    simulate(TINY.changed(seed=2), tmp_path / "b")
+    a, b = hashes(tmp_path / "a"), hashes(tmp_path / "b")
+    for name in ("raw/run-1/trajectory.sbet", "raw/run-1/profiler_left.parquet", "control.csv"):
+        assert a[name] != b[name]
+
+
+def test_chunks_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    simulate(TINY, tmp_path / "a")
+    monkeypatch.setattr(trajectory, "CHUNK_POSES", 100)
+    simulate(TINY, tmp_path / "b")
+    for name in ("trajectory.sbet", "profiler_left.parquet"):
+        a, b = ((tmp_path / folder / "raw" / "run-1" / name).read_bytes() for folder in "ab")
+        assert a == b
+    # Noise is drawn by the block of profiles; without it, blocks change no range either.
+    monkeypatch.setattr(profiler, "BLOCK_PROFILES", 512)
+    quiet = TINY.noiseless()
+    whole = _ranges(quiet)
+    monkeypatch.setattr(profiler, "BLOCK_PROFILES", 37)
+    assert _ranges(quiet) == whole
+
+
+def _ranges(scene: Scene) -> bytes:
+    from roadscan.simulate.drive import Drive
+    from roadscan.simulate.earth import Earth
+    from roadscan.simulate.surface import Surface
+
+    surface = Surface(scene)
+    drive = Drive(scene, 0, Earth(scene.map.crs), Surface(scene, ride=True))
+    head = profiler.heads(scene.profilers)[1]
+    return b"".join(block.ranges.tobytes() for block in profiler.measure(scene, surface, drive, head))
+
+
+def test_row_groups_and_encoding(tmp_path: Path):
+    import pyarrow.parquet as pq
+
+    survey = simulate(TINY.changed(length_m=40.0, passes=[{"lane": 1}]), tmp_path / "survey")
+    profiles = survey.profiles // 2
+    assert profiles == pytest.approx(40.0 / 0.05 + 1, abs=8)  # the lane is a little longer or shorter than the line
+    log = pq.ParquetFile(tmp_path / "survey" / "raw" / "run-1" / "profiler_left.parquet")
+    assert [log.metadata.row_group(i).num_rows for i in range(log.num_row_groups)] == [512, profiles - 512]
+    assert survey.readings == 2 * profiles * 200
+    column = log.metadata.row_group(0).column(1)
+    assert column.path_in_schema == "range.list.element"
+    assert "DELTA_BINARY_PACKED" in column.encodings
+    assert not column.has_dictionary_page
+    assert column.total_compressed_size < 0.6 * 2 * 512 * 200
+
+
+def test_memory_does_not_grow_with_the_road(tmp_path: Path):
+    peaks = []
+    for length in (1_000.0, 4_000.0):
+        scene = TINY.changed(length_m=length, profilers={"spacing_m": 0.5, "readings": 400})
+        tracemalloc.start()
+        simulate(scene, tmp_path / f"{length:.0f}")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0] + 8e6, [f"{p / 1e6:.1f} MB" for p in peaks]
+
+
+def test_refuses_what_is_not_its_own(tmp_path: Path):
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "dear.txt").write_text("…")
+    with pytest.raises(ConfigError, match="not empty and holds no simulated survey"):
+        simulate(TINY, tmp_path / "letters")
+    simulate(TINY, tmp_path / "survey")
+    with pytest.raises(ConfigError, match="survey of another scene"):
+        simulate(TINY.changed(seed=99), tmp_path / "survey")
+    with pytest.raises(FormatError, match="there is no truth here"):
+        truth.load(tmp_path / "letters")
+    with pytest.raises(ConfigError, match="not known to PROJ"):
+        simulate(TINY.changed(map={"crs": "EPSG:1"}), tmp_path / "nowhere")
+
+
+def test_progress_names_each_log(tmp_path: Path):
+    seen: list[str] = []
+    simulate(TINY, tmp_path / "survey", progress=seen.append)
+    assert seen == ["run-1/trajectory.sbet", "run-1/profiler_left.parquet", "run-1/profiler_right.parquet"]
+
+
+def test_truth_is_the_scene_itself(tmp_path: Path):
+    survey = simulate(TINY, tmp_path / "survey")
+    known = truth.load(survey.folder)
+    assert known.scene == TINY
+    assert truth.load(survey.truth_folder).scene == TINY

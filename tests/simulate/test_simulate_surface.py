@@ -1,0 +1,155 @@
+"""The road's height against its description, by formulas written again here."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from roadscan.model.errors import ConfigError
+from roadscan.simulate.scene import Crack, Element, Marking, Pothole, Rut, Scene, Wave, shipped_scenes
+from roadscan.simulate.surface import Surface
+
+FLAT = Scene().changed(road={"cross_slope": 0.0, "grade": 0.0, "verge_slope": 0.0})
+
+
+def height_at(surface: Surface, station, offset):
+    easting, northing, _ = surface.place(station, offset)
+    return surface.height_m(easting, northing) - surface.origin_enh_m[2]
+
+
+def test_crown_grade_and_verge():
+    surface = Surface(Scene().changed(road={"grade": 0.02, "cross_slope": 0.025, "verge_slope": 0.07}))
+    station = np.array([0.0, 10.0, 33.3, 80.0])
+    for offset in (-3.0, -1.0, 0.5, 2.0):
+        np.testing.assert_allclose(height_at(surface, station, offset), 0.02 * station - 0.025 * abs(offset), atol=1e-9)
+    # At the crown itself the rounding of 0.2 m takes off half of what the slope would lose over it.
+    assert height_at(surface, 5.0, 0.0) == pytest.approx(0.1 - 0.025 * 0.1, abs=1e-9)
+    for offset in (-8.0, 6.5):
+        fall = 0.025 * 3.5 + 0.07 * (abs(offset) - 3.5)
+        np.testing.assert_allclose(height_at(surface, station, offset), 0.02 * station - fall, atol=1e-9)
+
+
+def test_rut_pothole_and_crack_have_their_depths():
+    surface = Surface(
+        FLAT.changed(
+            road={
+                "ruts": [Rut(offset_m=1.0, width_m=0.8, depth_m=0.012)],
+                "potholes": [Pothole(station_m=20.0, offset_m=-1.5, radius_m=0.3, depth_m=0.05)],
+                "cracks": [Crack(points_m=[(40.0, -2.0), (44.0, -1.0)], width_m=0.01, depth_m=0.02)],
+            }
+        )
+    )
+    assert height_at(surface, 63.0, 1.0) == pytest.approx(-0.012, abs=1e-9)
+    assert height_at(surface, 63.0, 1.4) == pytest.approx(0.0, abs=1e-9)
+    assert height_at(surface, 63.0, 1.2) == pytest.approx(-0.012 * 0.75**3, abs=1e-9)
+    assert height_at(surface, 20.0, -1.5) == pytest.approx(-0.05, abs=1e-9)
+    assert height_at(surface, 20.15, -1.5) == pytest.approx(-0.05 * (1 - 0.5**4) ** 2, abs=1e-8)
+    assert height_at(surface, 20.3, -1.5) == pytest.approx(0.0, abs=1e-9)
+    assert height_at(surface, 42.0, -1.5) == pytest.approx(-0.02, abs=1e-9)
+    across = np.array([1.0, -4.0]) / math.hypot(1.0, 4.0)  # at right angles to the crack, in station and offset
+    for distance, depth in ((0.0025, 0.02 * 0.75**2), (-0.0025, 0.02 * 0.75**2), (0.0051, 0.0)):
+        station, offset = np.array([42.0, -1.5]) + distance * across
+        assert height_at(surface, station, offset) == pytest.approx(-depth, abs=1e-7)
+
+
+def test_defects_repeat():
+    hole = Pothole(station_m=20.0, offset_m=0.5, radius_m=0.2, depth_m=0.03)
+    crack = Crack(points_m=[(5.0, -1.0), (6.0, -1.0)], depth_m=0.01)
+    surface = Surface(FLAT.changed(length_m=160.0, road={"potholes": [hole], "cracks": [crack], "repeat_m": 50.0}))
+    np.testing.assert_allclose(height_at(surface, np.array([20.0, 70.0, 120.0]), 0.5), -0.03, atol=1e-9)
+    np.testing.assert_allclose(height_at(surface, np.array([5.5, 55.5, 155.5]), -1.0), -0.01, atol=1e-9)
+    assert height_at(surface, 45.0, 0.5) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_profile_is_the_sum_of_its_waves():
+    waves = [Wave(wavelength_m=2.0, amplitude_m=0.001, phase_deg=40.0), Wave(wavelength_m=23.0, amplitude_m=0.03)]
+    surface = Surface(FLAT.changed(road={"waves": waves}))
+    station = np.linspace(-20.0, 110.0, 997)
+    expected = 0.001 * np.sin(2 * np.pi * station / 2.0 + np.radians(40.0)) + 0.03 * np.sin(2 * np.pi * station / 23.0)
+    np.testing.assert_allclose(height_at(surface, station, 1.0), expected, atol=1e-6)
+
+
+def test_alignment_is_the_integral_of_its_curvature():
+    pieces = [
+        Element(kind="straight", length_m=10.0),
+        Element(kind="spiral", length_m=20.0),
+        Element(kind="arc", length_m=30.0, radius_m=40.0),
+        Element(kind="spiral", length_m=20.0),
+    ]
+    surface = Surface(Scene().changed(length_m=80.0, map={"azimuth_deg": 10.0}, road={"alignment": pieces}))
+
+    def turned(s: float) -> float:  # of a clothoid of 20 m into and out of a radius of 40 m, written out by hand
+        spiral = min(max(s - 10.0, 0.0), 20.0) ** 2 / 1600.0
+        arc = min(max(s - 30.0, 0.0), 30.0) / 40.0
+        rest = min(max(s - 60.0, 0.0), 20.0)
+        return spiral + arc + rest / 40.0 - rest**2 / 1600.0
+
+    for s in (7.0, 25.0, 30.0, 47.3, 71.0, 80.0):
+        breaks = [b for b in (10.0, 30.0, 60.0) if b < s]
+        east = quad(lambda x: math.sin(math.radians(10.0) + turned(x)), 0.0, s, points=breaks, epsabs=1e-12)[0]
+        north = quad(lambda x: math.cos(math.radians(10.0) + turned(x)), 0.0, s, points=breaks, epsabs=1e-12)[0]
+        easting, northing, heading = surface.place(s, 0.0)
+        np.testing.assert_allclose([easting - 691_000.0, northing - 5_335_000.0], [east, north], atol=2e-5)
+        assert heading == pytest.approx(math.radians(10.0) + turned(s), abs=1e-6)
+    # On the arc, the inside edge runs 1 / radius shorter for each metre of offset.
+    e, n, _ = surface.place(np.array([35.0, 36.0]), 3.0)
+    assert math.hypot(e[1] - e[0], n[1] - n[0]) == pytest.approx(37.0 * 2 * math.sin(1 / 80.0), abs=1e-6)
+
+
+def test_station_and_offset_come_back():
+    surface = Surface(Scene.load("demo"))
+    rng = np.random.default_rng(3)
+    station, offset = rng.uniform(-40.0, 220.0, 2000), rng.uniform(-8.4, 8.4, 2000)
+    easting, northing, _ = surface.place(station, offset)
+    again = surface.station_offset_m(easting, northing)
+    np.testing.assert_allclose(again, [station, offset], atol=2e-9)
+
+
+def test_no_height_beside_the_verge_and_beyond_the_ends():
+    scene = Scene()
+    surface = Surface(scene)
+    easting, northing, _ = surface.place(np.array([10.0, 10.0, 10.0]), np.array([10.4, 10.6, -10.6]))
+    assert list(np.isnan(surface.height_m(easting, northing))) == [False, True, True]
+    easting, northing, _ = surface.place(np.array([-44.9, -45.2, 145.2]), 0.0)
+    assert list(np.isnan(surface.height_m(easting, northing))) == [False, True, True]
+
+
+def test_intensity_tells_markings_and_defects():
+    scene = Scene().changed(
+        road={
+            "markings": [Marking(offset_m=0.0, width_m=0.1, dash_m=3.0, gap_m=6.0), Marking(offset_m=3.2)],
+            "potholes": [Pothole(station_m=20.0, offset_m=1.0, radius_m=0.2, depth_m=0.02)],
+            "brightness": {"asphalt": 60.0, "marking": 200.0, "defect": 30.0, "verge": 90.0},
+        }
+    )
+    surface = Surface(scene)
+    places = [(1.0, 0.0), (4.0, 0.0), (4.0, 3.2), (20.0, 1.1), (7.0, 2.0), (7.0, 5.0), (10.0, 0.04), (-1.0, 0.0)]
+    easting, northing, _ = surface.place(*np.array(places).T)
+    assert list(surface.intensity(easting, northing)) == [200.0, 60.0, 200.0, 30.0, 60.0, 90.0, 200.0, 60.0]
+
+
+def test_scenes_that_cannot_be():
+    for change, words in (
+        ({"passes": [{"lane": 3}]}, "lane 3 of a road with 2"),
+        ({"road": {"alignment": [{"kind": "arc", "length_m": 5.0}]}}, "an arc needs radius_m"),
+        ({"road": {"alignment": [{"kind": "arc", "length_m": 5.0, "radius_m": 5.0}]}}, "tighter than 20 m"),
+        ({"vehicle": {"speed_m_per_s": 45.0}}, "lead_m"),
+        ({"lidar": {"turns_per_second": 10.0}}, "did you mean 'turns_per_s'"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            Scene().changed(**change)
+    with pytest.raises(ConfigError, match="did you mean 'demo'"):
+        Scene.load("demos")
+
+
+def test_changed_merges_and_shipped_scenes_load():
+    assert "demo" in shipped_scenes()
+    demo = Scene.load("demo")
+    other = demo.changed(length_m=20.0, lidar={"on": False})
+    assert (other.length_m, other.lidar.on) == (20.0, False)
+    assert other.lidar.range_max_m == demo.lidar.range_max_m
+    assert other.road == demo.road
+    assert demo.noiseless().noise.lidar_range_m == 0.0

@@ -22,6 +22,7 @@ from roadscan.points.charts import Charts, charts_along
 from roadscan.points.place import EVERYWHERE, CloudFrame, HeightLimits, Placed, Placement, Window, place_cloud
 from roadscan.points.readings import ScanGeometry
 from roadscan.tables.logs import DataFile
+from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
 
@@ -243,7 +244,10 @@ def _geometry(source: ReadingSource) -> ScanGeometry:
 
 
 def _chunks(one: RawSlice) -> Iterator[list[int]]:
-    """Row groups in pieces that fit the working arrays: whole profiles' groups singly, small groups together."""
-    step = 1 if one.source.table == "scans" else max(_CHUNK_READINGS // 8192, 1)
+    """Row groups in pieces of about a million readings, which the working arrays are made for."""
+    readings = table_schema(one.source.table).row_group_rows
+    if one.source.table == "scans":
+        readings *= _geometry(one.source).readings
+    step = max(_CHUNK_READINGS // readings, 1)
     for start in range(0, len(one.groups), step):
         yield list(one.groups[start : start + step])

@@ -80,7 +80,7 @@ class Drive:
         """Path length driven at epochs (n,): the inverse of :meth:`epoch_gps_ns`, by Newton's method."""
         time_s = self._seconds(epoch_gps_ns)
         driven = time_s * self._vehicle.speed_m_per_s
-        for _ in range(8):
+        for _ in range(5):
             driven = driven - (self._time_s(driven) - time_s) / self._slowness(driven)
         return driven
 

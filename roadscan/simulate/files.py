@@ -72,7 +72,10 @@ def write_rig(scene: Scene, file: Path) -> None:
 
 
 def write_control(scene: Scene, surface: Surface, file: Path) -> None:
-    """Write control points along both edges of the lanes: every third one is a check point."""
+    """Write control points along both edges of the lanes: every third one is a check point.
+
+    The stated σ is the true one, or a millimetre where the points have no error: no surveyor states zero.
+    """
     spacing = scene.control.spacing_m
     stations = np.arange(min(spacing, scene.length_m) / 2, scene.length_m, spacing)
     offset = scene.road.half_width_m - scene.control.inset_m
@@ -80,6 +83,7 @@ def write_control(scene: Scene, surface: Surface, file: Path) -> None:
     easting, northing, _ = surface.place(places[:, 0], places[:, 1])
     true = np.stack([easting, northing, surface.height_m(easting, northing)], axis=-1)
     sigma = scene.noise.control_m
+    stated_sigma = max(sigma, 0.001)
     stated = true + sigma * stream(scene.seed, 0, "control").standard_normal(true.shape)
     with file.open("w", encoding="utf-8", newline="") as out:
         rows = csv.writer(out, lineterminator="\n")
@@ -87,7 +91,7 @@ def write_control(scene: Scene, surface: Surface, file: Path) -> None:
         rows.writerow(header.split(","))
         for i, enh in enumerate(stated):
             role, letter = ("check", "C") if i % 3 == 2 else ("gcp", "G")
-            numbers = [f"{value:.4f}" for value in (*enh, sigma, sigma)]
+            numbers = [f"{value:.4f}" for value in (*enh, stated_sigma, stated_sigma)]
             rows.writerow([f"{letter}{i + 1:03d}", "PAINT", role, *numbers])
 
 

@@ -372,8 +372,8 @@ def survey_planes(nodes: Float64, easting: Float64, northing: Float64, near: Int
 def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
     """Beam of the reading at transverse position `y` of profile `p`, in road coordinates.
 
-    planes : (p, 3, 9) for station, offset and height the coefficients of 1, y, y², y³, y⁴, r, y·r, y²·r, r²;
-    beam : (3, 3), out.
+    planes : (p, 3, 9) for station, offset and height the coefficients of 1, y, y², y³, y⁴, r, y·r, y²·r, r², where r
+    counts from the plane's middle range; beam : (3, 3), out.
     """
     for axis in range(3):
         beam[axis, 0] = planes[p, axis, 0] + y * (
@@ -402,7 +402,6 @@ def scan_profiles(
     map_planes: Float64,
     is_bent: Flags,
     y_sensor_m: Float64,
-    guess_m: Float64,
     scale: Float64,
     noise_m: Float32,
     bits: UInt32,
@@ -418,8 +417,8 @@ def scan_profiles(
     road_planes, map_planes : (p, 3, 9), see :func:`road_beam`, and (p, 3, 6), see :func:`map_beam`.
     is_bent : (p,) whether the road bends so much here that `road_planes` are only a first approximation.
     y_sensor_m : (n,) transverse positions of the readings.
-    guess_m : (p,) a range to start from.
-    scale : (4,) range of raw 0 (m), range step (m), share of lost readings, intensity noise.
+    scale : (5,) middle range of the planes (m), range of raw 0 (m), range step (m), share of lost readings,
+        intensity noise.
     noise_m : (p, n) range noise, or (0, 0) for none.
     bits : (p, n) random bits for losses and intensity noise, or (0, 0) for none of both.
     beam : (3, 3) scratch.
@@ -427,10 +426,11 @@ def scan_profiles(
     true_range_m : (p, n), out; NaN where the beam misses. (0, 0): not wanted.
     """
     nodes, section, defects, paint = road
-    lost_below = scale[2] * 65536.0
-    jitter = scale[3] / BYTES_SIGMA
+    middle_range = scale[0]
+    lost_below = scale[3] * 65536.0
+    jitter = scale[4] / BYTES_SIGMA
     for p in range(road_planes.shape[0]):
-        before = guess_m[p]
+        before = 0.0
         r = before
         fall = 1.0
         for i in range(y_sensor_m.size):
@@ -442,7 +442,7 @@ def scan_profiles(
             if is_bent[p]:
                 map_beam(map_planes, p, y, beam)
                 r, k, u, offset = polished_range(nodes, section, beam, r, fall, k)
-            found = r
+            found = middle_range + r
             depth = 0.0
             if nodes[k, 13] < nodes[k, 14]:
                 depth, _ = defect_depth(nodes, defects, k, u, offset)
@@ -450,7 +450,7 @@ def scan_profiles(
                     map_beam(map_planes, p, y, beam)
                     turn_to_road(nodes, beam, r, 0.02, k)
                     further, depth = into_defect(nodes, section, defects, beam, 0.0, fall)
-                    found = r + further
+                    found += further
             seen = on_surface(nodes, section, k, u, offset)
             if true_range_m.size:
                 true_range_m[p, i] = found if seen else np.nan
@@ -460,7 +460,7 @@ def scan_profiles(
                 value += jitter * (float(bits[p, i] & 255) + float((bits[p, i] >> 8) & 255) - 255.0)
             if noise_m.size:
                 found += noise_m[p, i]
-            raw = math.floor((found - scale[0]) / scale[1] + 0.5)
+            raw = math.floor((found - scale[1]) / scale[2] + 0.5)
             seen = seen and 1.0 <= raw <= 65535.0
             ranges[p, i] = int(raw) if seen else 0
             intensity[p, i] = int(min(max(value, 0.0), 255.0)) if seen else 0

@@ -35,6 +35,7 @@ CYCLE_NS: Final = 46_080
 PACKET_NS: Final = CYCLES * CYCLE_NS
 RANGE_STEP_M: Final = 0.002
 RANGE_MIN_M: Final = 0.9
+_LONGEST_RAW: Final = 65_535
 BLOCK_PACKETS: Final = 128
 """Packets measured at once: the noise is drawn by the block, so this changes bytes."""
 BODY_FROM_AXES: Final = np.diag([1.0, -1.0, -1.0])
@@ -133,7 +134,7 @@ def _measure_block(
         surface.arrays,
         local.bases,
         local.enu_from_ecef(origins),
-        np.einsum("ki,pkj->pij", local.ecef_from_enu, rotations),
+        local.ecef_from_enu.T @ rotations,
         node.astype(np.int64),
         np.stack([np.sin(elevation), np.cos(elevation), beams.rise_m], axis=-1),
         np.radians(azimuth_deg),
@@ -170,16 +171,17 @@ def _recorded(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
     """Ranges and intensities with noise, as whole numbers."""
     rng = stream(scene.seed, drive.number, "lidar", block)
-    shape = found.shape[:3]
     noise = scene.noise
-    range_m = found[..., 0] + noise.lidar_range_m * rng.standard_normal(shape, dtype=np.float32)
-    value = REFLECTIVITY * (found[..., 4] + noise.intensity * rng.standard_normal(shape, dtype=np.float32))
-    seen = np.isfinite(range_m)
+    seen = np.isfinite(found[..., 0])
     if noise.dropout > 0.0:
-        seen &= rng.random(shape, dtype=np.float32) >= noise.dropout
-    units = np.rint(np.where(seen, range_m, 0.0) / RANGE_STEP_M)
-    ranges = np.clip(units, 0, 65_535).astype(np.uint16)
-    return ranges, np.where(seen, np.clip(np.rint(value), 1, 100), 0).astype(np.uint8)
+        seen &= rng.random(seen.shape, dtype=np.float32) >= noise.dropout
+    errors = rng.standard_normal((2, np.count_nonzero(seen)), dtype=np.float32)
+    ranges, intensity = np.zeros(seen.shape, np.uint16), np.zeros(seen.shape, np.uint8)
+    units = np.rint((found[..., 0][seen] + noise.lidar_range_m * errors[0]) / RANGE_STEP_M)
+    ranges[seen] = np.clip(units, 1, _LONGEST_RAW)
+    value = REFLECTIVITY * (found[..., 4][seen] + noise.intensity * errors[1])
+    intensity[seen] = np.clip(np.rint(value), 1, 100)
+    return ranges, intensity
 
 
 _HITS_SCHEMA: Final = pa.schema(

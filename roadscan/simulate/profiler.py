@@ -26,6 +26,9 @@ Int64 = npt.NDArray[np.int64]
 BLOCK_PROFILES: Final = 512
 """Profiles measured at once and a Parquet row group: the noise is drawn by the block, so this changes bytes."""
 _BENT_M: Final = 1e-7
+"""Planes that miss their points in road coordinates by more are followed in the map, which takes longer."""
+_REACH_M: Final = 0.3
+"""The planes are fitted within this of their middle range."""
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 BODY_FROM_AXES: Final = np.eye(3)
 """Axes frd: y to the right, z down along the range."""
@@ -141,13 +144,14 @@ def _measure_block(
     epochs = drive.epoch_gps_ns(driven_m)
     origins, rotations = drive.poses(epochs).sensor(head.mount, BODY_FROM_AXES)
     y = head.y_sensor_m
-    guess = np.full(epochs.size, scene.vehicle.imu_height_m - head.mount.lever_arm_body_m[2])
-    planes = _planes(surface, drive, origins, rotations, float(y[-1]), float(guess[0]))
+    middle = scene.vehicle.imu_height_m - head.mount.lever_arm_body_m[2]
+    planes = _planes(surface, drive, origins, rotations, float(y[-1]), middle)
     shape = (epochs.size, y.size)
     noise, bits = _errors(scene, drive, head, block, shape)
     ranges, intensity = np.empty(shape, np.uint16), np.empty(shape, np.uint8)
     true_range = np.empty(shape if with_hits else (0, 0))
-    scale = np.array([settings.range_offset_m, settings.range_step_m, scene.noise.dropout, scene.noise.intensity])
+    noises = (scene.noise.dropout, scene.noise.intensity)
+    scale = np.array([middle, settings.range_offset_m, settings.range_step_m, *noises])
     beam = np.empty((3, 3))
     kernels.scan_profiles(
         surface.arrays,
@@ -155,7 +159,6 @@ def _measure_block(
         planes.in_map,
         planes.is_bent,
         y,
-        guess,
         scale,
         noise,
         bits,
@@ -171,7 +174,7 @@ def _measure_block(
 
 @dataclass(frozen=True)
 class _Planes:
-    """The planes of p profiles as polynomials of a reading's y and range."""
+    """The planes of p profiles as polynomials of a reading's y and its range from their middle."""
 
     in_road: Float64
     """(p, 3, 9) station, offset, height, see `kernels.road_beam`."""
@@ -182,12 +185,12 @@ class _Planes:
 
 
 def _planes(
-    surface: Surface, drive: Drive, origins: Float64, rotations: Float64, half_width_m: float, range_m: float
+    surface: Surface, drive: Drive, origins: Float64, rotations: Float64, half_width_m: float, middle_m: float
 ) -> _Planes:
-    """Fit the planes to 15 exact points of each."""
-    unit_y, unit_r = (a.ravel() for a in np.meshgrid([-1.0, -0.6, 0.0, 0.6, 1.0], [0.0, 1.0, 2.0], indexing="ij"))
-    points = np.stack([np.zeros_like(unit_y), half_width_m * unit_y, range_m * unit_r], axis=-1)
-    ecef = origins[:, None] + np.einsum("pij,kj->pki", rotations, points)
+    """Fit the planes to 15 exact points of each, around their middle range."""
+    unit_y, unit_r = (a.ravel() for a in np.meshgrid([-1.0, -0.6, 0.0, 0.6, 1.0], [-1.0, 0.0, 1.0], indexing="ij"))
+    points = np.stack([np.zeros_like(unit_y), half_width_m * unit_y, middle_m + _REACH_M * unit_r], axis=-1)
+    ecef = origins[:, None] + points @ rotations.swapaxes(1, 2)
     in_map = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(-1, unit_y.size, 3) - surface.origin_enh_m
     easting, northing = np.ascontiguousarray(in_map[:, :, 0]), np.ascontiguousarray(in_map[:, :, 1])
     in_road = np.empty((*easting.shape, 3))
@@ -200,10 +203,10 @@ def _planes(
 
     def fitted(values: Float64, powers: tuple[tuple[int, int], ...]) -> tuple[Float64, Float64]:
         terms = np.stack([unit_y**m * unit_r**n for m, n in powers], axis=-1)
-        units = np.array([half_width_m**m * range_m**n for m, n in powers])
-        coefficients = np.einsum("ck,pki->pic", np.linalg.pinv(terms), values)
-        left = values - np.einsum("kc,pic->pki", terms, coefficients)
-        return np.ascontiguousarray(coefficients / units), np.abs(left).max(axis=(1, 2))
+        units = np.array([half_width_m**m * _REACH_M**n for m, n in powers])
+        coefficients = np.linalg.pinv(terms) @ values
+        left = values - terms @ coefficients
+        return np.ascontiguousarray(coefficients.swapaxes(1, 2) / units), np.abs(left).max(axis=(1, 2))
 
     road, left = fitted(in_road, ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (0, 1), (1, 1), (2, 1), (0, 2)))
     exact, _ = fitted(in_map, ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2)))
@@ -215,7 +218,7 @@ def _hits(drive: Drive, origins: Float64, rotations: Float64, y_sensor_m: Float6
     sensor = np.zeros((*range_m.shape, 3))
     sensor[:, :, 1] = y_sensor_m
     sensor[:, :, 2] = range_m
-    ecef = origins[:, None] + np.einsum("pij,pnj->pni", rotations, sensor)
+    ecef = origins[:, None] + sensor @ rotations.swapaxes(1, 2)
     with np.errstate(invalid="ignore"):  # PROJ answers NaN with infinity
         enh = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(ecef.shape)
     enh[np.isnan(range_m)] = np.nan

@@ -51,9 +51,9 @@ class Status:
         return ingested and not self.tiles_stale and not self.failures
 
 
-BYTES_PER_READING = 110
+BYTES_PER_READING = 100
 """Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
-WORKER_BASE_BYTES = 350 << 20
+WORKER_BASE_BYTES = 400 << 20
 """Memory of a worker before its first block: Python and its libraries."""
 
 
@@ -81,7 +81,13 @@ def survey_status(survey: Survey, store: Store) -> Status:
     manifest = Manifest(store)
     status.outputs = dict(Counter(r.product for r in manifest.all() if r.path and r.product != PRODUCT))
     if any(log["state"] == "waiting" for log in status.logs):
-        status.next_run = {"logs": sum(log["state"] == "waiting" for log in status.logs)}
+        waiting = [log for log in status.logs if log["state"] == "waiting"]
+        status.next_run = {
+            "logs": len(waiting),
+            "raw_bytes": sum(log["bytes"] for log in waiting),
+            "worker_memory_bytes_at_most": WORKER_BASE_BYTES
+            + BYTES_PER_READING * survey.config.tiles.max_block_readings,
+        }
         return status
     _tile_status(status, survey, store, manifest)
     return status

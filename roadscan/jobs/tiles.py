@@ -19,7 +19,7 @@ from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.footprints import Footprints
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.readings import Ground, Placer, RawSlice
+from roadscan.jobs.readings import Ground, Placer, RawSlice, ReadingSource
 from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, TileId
@@ -181,43 +181,51 @@ def run_blocks(
 
 def compute_block(task: BlockTask) -> BlockResult:
     """Compute the tiles of a block and write their files (runs on a worker)."""
-    points = load_points(task)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
-    for tile, key in zip(task.block.tiles, task.keys, strict=True):
+    waiting = dict(zip(task.block.tiles, task.keys, strict=True))
+    for tile, points in load_points(task):
+        key = waiting.pop(tile, None)
+        if key is None:
+            continue  # a tile of the halo
         try:
-            records += _write_tile(task, key, points.pop(tile, None), tile)
+            records += _write_tile(task, key, points)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), _reason(error)))
+    for tile, key in waiting.items():
+        records.append(OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0})))
     return BlockResult(tuple(records), tuple(failures))
 
 
-def load_points(task: BlockTask) -> dict[TileId, TilePoints]:
-    """Points of every tile of the block and its halo, filtered and in canonical order."""
+def load_points(task: BlockTask) -> Iterator[tuple[TileId, TilePoints]]:
+    """Points of every tile of the block and its halo that holds any: filtered, in canonical order, tile by tile."""
     box = task.block.box()
-    window = Window(*box)
-    placer = Placer(task.store, task.ground, task.slices)
     buffer = None
     if task.centre_line is not None:
         buffer = CentreLineBuffer.load(*task.centre_line, task.ground.map)
-    parts: list[Placed] = []
-    passes: list[npt.NDArray[np.uint16]] = []
-    sources: list[npt.NDArray[np.uint16]] = []
-    numbers: dict[str, int] = {}
-    profiles: list[bool] = []
+    parts = _Parts()
+    placer = Placer(task.store, task.ground, task.slices)
     for one in task.slices:
-        number = numbers.setdefault(one.source.key, len(numbers))
-        if number == len(profiles):
-            profiles.append(one.source.table == "scans")
         own = [p for p in task.passes if p.run == one.source.run]
-        for _, placed in placer.place(one, window):
+        for _, placed in placer.place(one, Window(*box)):
             if placed.epoch_gps_ns.size:
-                parts.append(placed)
-                passes.append(passes_of(placed.epoch_gps_ns, own))
-                sources.append(np.full(placed.epoch_gps_ns.size, number, np.uint16))
-    if not parts:
-        return {}
-    return dict(_split(task, box, parts, np.concatenate(passes), np.concatenate(sources), np.array(profiles), buffer))
+                parts.add(one.source, placed, passes_of(placed.epoch_gps_ns, own))
+    if not parts.placed:
+        return
+    joined = parts.join()
+    width = box[2] - box[0]
+    local = (joined.tiles[:, 1] - box[1]) * width + (joined.tiles[:, 0] - box[0])
+    order = np.argsort(local.astype(np.uint16), kind="stable").astype(np.int32)  # 16 bits: a radix sort
+    ends = np.cumsum(np.bincount(local, minlength=width * (box[3] - box[1])))
+    del local
+    for tile in sorted(task.block.with_halo(), key=lambda t: (t.row, t.column)):
+        index = (tile.row - box[1]) * width + (tile.column - box[0])
+        rows = order[ends[index - 1] if index else 0 : ends[index]]
+        rows = rows[joined.passes[rows] > 0]
+        if buffer is not None and rows.size:
+            rows = rows[_near(tile, joined.quanta[rows], buffer, task.ground)]
+        if rows.size:
+            yield tile, joined.tile(tile, rows)
 
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
@@ -276,49 +284,64 @@ def _slices_of(
     return tuple(out)
 
 
-def _split(
-    task: BlockTask,
-    box: tuple[int, int, int, int],
-    parts: list[Placed],
-    passes: npt.NDArray[np.uint16],
-    sources: npt.NDArray[np.uint16],
-    profiles: npt.NDArray[np.bool_],
-    buffer: CentreLineBuffer | None,
-) -> Iterator[tuple[TileId, TilePoints]]:
-    """Sort placed points into tiles."""
-    joined = _Joined(parts, passes, sources)
-    width = box[2] - box[0]
-    local = (joined.tiles[:, 1] - box[1]) * width + (joined.tiles[:, 0] - box[0])
-    order = np.argsort(local.astype(np.uint16), kind="stable")  # 16 bits: a radix sort
-    ends = np.cumsum(np.bincount(local, minlength=width * (box[3] - box[1])))
-    for tile in sorted(task.block.with_halo(), key=lambda t: (t.row, t.column)):
-        index = (tile.row - box[1]) * width + (tile.column - box[0])
-        rows = order[ends[index - 1] if index else 0 : ends[index]]
-        rows = rows[passes[rows] > 0]
-        if buffer is not None and rows.size:
-            rows = rows[_near(tile, joined.quanta[rows], buffer, task.ground)]
-        if rows.size:
-            yield tile, joined.tile(tile, rows, profiles)
+class _Parts:
+    """Placed readings of a block as they come, with their pass and source."""
+
+    def __init__(self) -> None:
+        self.placed: list[Placed] = []
+        self._passes: list[npt.NDArray[np.uint16]] = []
+        self._sources: list[npt.NDArray[np.uint16]] = []
+        self._numbers: dict[str, int] = {}
+        self._profiles: list[bool] = []
+
+    def add(self, source: ReadingSource, placed: Placed, passes: npt.NDArray[np.uint16]) -> None:
+        """Take a chunk of one source; sources are numbered as they come."""
+        number = self._numbers.setdefault(source.key, len(self._numbers))
+        if number == len(self._profiles):
+            self._profiles.append(source.table == "scans")
+        self.placed.append(placed)
+        self._passes.append(passes)
+        self._sources.append(np.full(passes.size, number, np.uint16))
+
+    def join(self) -> _Joined:
+        """All chunks as one set of arrays; the chunks are given up, so that memory holds each point once."""
+        placed, self.placed = self.placed, []
+        extra = {c: v for c in EXTRA_COLUMNS if (v := _joined_extra(placed, c)) is not None}
+        columns: dict[str, npt.NDArray[Any]] = {}
+        for name in ("tiles", "quanta", "epoch_gps_ns", "intensity", "classification"):
+            columns[name] = np.concatenate([getattr(p, name) for p in placed])
+        placed.clear()
+        return _Joined(
+            passes=np.concatenate(self._passes),
+            sources=np.concatenate(self._sources),
+            profiles=np.array(self._profiles),
+            extra=extra,
+            **columns,
+        )
 
 
+@dataclass(frozen=True)
 class _Joined:
-    """Placed parts of a block as one set of arrays."""
+    """Placed readings of a block, in the order they were loaded."""
 
-    def __init__(self, parts: list[Placed], passes: npt.NDArray[np.uint16], sources: npt.NDArray[np.uint16]) -> None:
-        self.tiles = np.concatenate([p.tiles for p in parts])
-        self.quanta = np.concatenate([p.quanta for p in parts])
-        self.epoch = np.concatenate([p.epoch_gps_ns for p in parts])
-        self.intensity = np.concatenate([p.intensity for p in parts])
-        self.classification = np.concatenate([p.classification for p in parts])
-        self.passes = passes
-        self.sources = sources
-        self.extra = {c: v for c in EXTRA_COLUMNS if (v := _joined_extra(parts, c)) is not None}
+    tiles: npt.NDArray[np.int32]
+    quanta: npt.NDArray[np.int32]
+    epoch_gps_ns: npt.NDArray[np.int64]
+    intensity: npt.NDArray[np.uint16]
+    classification: npt.NDArray[np.uint8]
+    passes: npt.NDArray[np.uint16]
+    sources: npt.NDArray[np.uint16]
+    profiles: npt.NDArray[np.bool_]
+    """(sources,) True for scans."""
+    extra: dict[str, npt.NDArray[Any]]
 
-    def tile(self, tile: TileId, rows: npt.NDArray[np.int64], profiles: npt.NDArray[np.bool_]) -> TilePoints:
+    def tile(self, tile: TileId, rows: npt.NDArray[np.integer[Any]]) -> TilePoints:
         """Points of one tile, in canonical order."""
-        ties = [self.extra[c][rows] for c in self.extra]
-        ties += [self.quanta[rows], self.intensity[rows], self.classification[rows]]
-        order = canonical_order(self.sources[rows], self.epoch[rows], profiles[self.sources[rows]], ties)
+        sources = self.sources[rows]
+        content = [*self.extra.values(), self.quanta, self.intensity, self.classification]
+        order = canonical_order(
+            sources, self.epoch_gps_ns[rows], self.profiles[sources], lambda: [c[rows] for c in content]
+        )
         if order is not None:
             rows = rows[order]
         quanta = self.quanta[rows]
@@ -327,7 +350,7 @@ class _Joined:
             x_quanta=np.ascontiguousarray(quanta[:, 0]),
             y_quanta=np.ascontiguousarray(quanta[:, 1]),
             height_quanta=np.ascontiguousarray(quanta[:, 2]),
-            epoch_gps_ns=self.epoch[rows],
+            epoch_gps_ns=self.epoch_gps_ns[rows],
             intensity=self.intensity[rows],
             classification=self.classification[rows],
             pass_id=self.passes[rows],
@@ -352,9 +375,8 @@ def _near(
     return buffer.keeps(easting, northing, (b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m))
 
 
-def _write_tile(task: BlockTask, key: str, points: TilePoints | None, tile: TileId) -> list[OutputRecord]:
-    if points is None:
-        return [OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0}))]
+def _write_tile(task: BlockTask, key: str, points: TilePoints) -> list[OutputRecord]:
+    tile = points.tile
     cells = cells_of(points, task.ground.grid)
     context = dataclasses.replace(task.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
     records: list[OutputRecord] = []

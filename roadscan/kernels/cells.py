@@ -97,7 +97,7 @@ def cell_statistics(
             above = group[i] - group[0]
             total += above
             squares += above * above
-            light += lights[a + i]
+            light += np.int64(lights[a + i])
         column[cell] = k % edge
         row[cell] = k // edge
         count[cell] = size

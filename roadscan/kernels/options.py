@@ -2,11 +2,17 @@
 
 Kernels are serial and release the GIL: parallelism comes from Dask over blocks. `fastmath` stays off,
 so that the order of operations, and with it every bit of the result, is the same everywhere.
+
+Compiled code is cached on disk, in a folder named after the hash of all kernels' sources: Numba itself looks
+only at the file a function stands in, and would keep a kernel whose inlined parts have changed elsewhere.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -16,11 +22,31 @@ Kernel = Callable[..., Any]
 
 def kernel(function: Kernel) -> Kernel:
     """Compile a loop over arrays once per machine, without the GIL."""
-    compiled: Kernel = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
-    return compiled
+    return _compiled(function, forceinline=False)
 
 
 def inlined(function: Kernel) -> Kernel:
-    """Compile a piece of a kernel into its callers."""
-    compiled: Kernel = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=True)(function)
+    """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Kernel, *, forceinline: bool) -> Kernel:
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _CACHE_FOLDER  # read when the function is decorated
+    try:
+        decorate = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=forceinline)
+        compiled: Kernel = decorate(function)
+    finally:
+        numba.config.CACHE_DIR = before
     return compiled
+
+
+def _cache_folder() -> str:
+    digest = hashlib.blake2b(digest_size=6)
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return str(Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}")
+
+
+_CACHE_FOLDER = _cache_folder()

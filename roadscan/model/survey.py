@@ -210,8 +210,9 @@ class TileConfig(Strict):
     """Edge of a cell (m); divides the tile's edge."""
     block_tiles: int = Field(default=8, ge=1, le=64)
     """Edge of the largest block of work, in tiles; changes no result."""
-    max_block_readings: int = Field(default=20_000_000, ge=1)
-    """A block expected to hold more readings is cut into smaller ones; changes no result."""
+    max_block_readings: int = Field(default=10_000_000, ge=1)
+    """A block expected to hold more readings is cut into smaller ones, down to single tiles; a worker needs
+    about 400 MB and 100 bytes a reading. Changes no result."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

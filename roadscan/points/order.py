@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ def canonical_order(
     source: npt.NDArray[np.integer[Any]],
     epoch_gps_ns: npt.NDArray[np.int64],
     whole_profiles: npt.NDArray[np.bool_],
-    ties: list[npt.NDArray[Any]],
+    content: Callable[[], list[npt.NDArray[Any]]],
 ) -> npt.NDArray[np.int64] | None:
     """Order by source, epoch and, where epochs repeat, by content; None where the points are in order.
 
@@ -21,7 +22,8 @@ def canonical_order(
     source : (n,) number of the sensor and run, ascending as loaded.
     epoch_gps_ns : (n,).
     whole_profiles : (n,) True where equal epochs mean readings of one profile, already in their order.
-    ties : arrays (n, …) that tell points of equal epoch apart; points equal in all of them are interchangeable.
+    content : gives arrays (n, …) that tell points of equal epoch apart, asked only where there are any;
+        points equal in all of them are interchangeable.
     """
     same = source[1:] == source[:-1]
     step = np.diff(epoch_gps_ns)
@@ -29,6 +31,6 @@ def canonical_order(
     tied = same & (step == 0) & ~whole_profiles[1:]
     if not falls.any() and not tied.any():
         return None
-    keys = [k for tie in reversed(ties) for k in (tie.T[::-1] if tie.ndim == 2 else [tie])]
+    keys = [k for tie in reversed(content()) for k in (tie.T[::-1] if tie.ndim == 2 else [tie])]
     order: npt.NDArray[np.int64] = np.lexsort([*keys, epoch_gps_ns, source])
     return order

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import random
 import signal
@@ -17,10 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 import rasterio
 
-from roadscan.jobs.compute import compute_on
+from roadscan.jobs.compute import Inline, compute_on
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.selection import Selection
+from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.status import survey_status, verify_store
+from roadscan.jobs.tiles import load_points
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -28,6 +31,7 @@ from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
+from roadscan.tiles.blocks import Block
 from roadscan.tiles.grid import Bounds
 
 from .conftest import Simulated, outputs
@@ -232,6 +236,22 @@ def test_files_open_with_other_programs(finished: Simulated) -> None:
     cells = query(store, "SELECT count(*) AS n, avg(height_robust_m) AS h FROM cells").to_pylist()[0]
     assert np.isfinite(heights).sum() == cells["n"]
     assert np.nanmean(heights.astype(np.float64)) == pytest.approx(cells["h"], abs=1e-4)
+
+
+def test_a_halo_adds_neighbours_and_changes_no_core_tile(finished: Simulated) -> None:
+    work = plan_tile_work(
+        Run(Survey.load(finished.survey_file), finished.store(), Inline()), Manifest(finished.store())
+    )
+    inner = next(t for t in work.tiles if TileId(t.column + 1, t.row) in work.tiles)
+    (alone,) = work.tasks([inner])
+    (whole,) = work.tasks(list(work.tiles), edge_tiles=64)
+    with_halo = dataclasses.replace(whole, block=Block((inner,), halo_tiles=1), keys=alone.keys)
+    a, b = dict(load_points(alone)), dict(load_points(with_halo))
+    assert list(a) == [inner]
+    assert TileId(inner.column + 1, inner.row) in b
+    for name, value in vars(a[inner]).items():
+        if isinstance(value, np.ndarray):
+            assert np.array_equal(value, getattr(b[inner], name)), name
 
 
 def test_las_and_cells_agree(finished: Simulated) -> None:

@@ -1,0 +1,18 @@
+"""Kernels as plain Python: what coverage, debuggers and other compilers see must say the same."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parents[2]
+
+
+def test_kernels_pass_their_tests_without_the_compiler() -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n0", "tests/tiles", "tests/navigation"]
+    places = ["tests/points/test_place.py", "-k", "not profiles_lie"]
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    found = subprocess.run([*command, *places], cwd=HERE, env=environment, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout[-3000:]

@@ -7,14 +7,16 @@ from typing import Any
 
 from prefect import Task, get_run_logger
 from prefect.cache_policies import NO_CACHE
+from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import State
 from prefect.runtime import flow_run
+from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed, Failed
 
 from roadscan.jobs.compute import compute_on
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import STAGES, Run, Stage, close_run
-from roadscan.model.errors import RoadscanError
+from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.survey import Survey
 from roadscan.progress import LineReporter
 from roadscan.tables.store import Store
@@ -76,3 +78,23 @@ def stage_task(stage: Stage, run: Run) -> Task[[], None]:
 def failed(error: RoadscanError) -> State[Any]:
     """Final state of what failed for a reason that the user can mend; whoever called it gets the error raised."""
     return Failed(message=str(error), data=error)
+
+
+def require_api() -> None:
+    """Check that the Prefect API answers, where one is configured.
+
+    Raises
+    ------
+    RunError
+        where none answers at that address.
+    """
+    url = PREFECT_API_URL.value()
+    if url is None:
+        return
+    with get_client(sync_client=True) as client:
+        fault = client.api_healthcheck()
+    if fault is not None:
+        raise RunError(
+            f"no Prefect API answers at {url} ({fault})",
+            change="start its server, or unset PREFECT_API_URL to run without Prefect",
+        )

@@ -43,8 +43,10 @@ def run(
         _print_status(_status(survey_file), survey_file)
         return
     if flow or os.environ.get("PREFECT_API_URL"):
+        from flows.conduct import require_api
         from flows.survey import survey
 
+        require_api()
         survey(str(survey_file), workers, scheduler)
         return
     from roadscan.jobs.stages import STAGES

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -157,3 +161,15 @@ def test_an_upload_without_one_log_fails_and_names_it(survey_file: Path) -> None
         survey(str(survey_file), workers=0)
     missing.write_bytes(log)  # the upload goes on, and the next run succeeds
     assert survey(str(survey_file), workers=0)["raw_bytes_read"] > 0
+
+
+def test_an_api_that_does_not_answer(survey_file: Path) -> None:
+    with socket.socket() as silent:  # bound, but nobody listens
+        silent.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/api"
+        command = [sys.executable, "-m", "roadscan", "run", str(survey_file)]
+        environment = os.environ | {"PREFECT_API_URL": url}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"roadscan: no Prefect API answers at {url}")
+    assert not (survey_file.parent / "store").exists()

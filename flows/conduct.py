@@ -15,7 +15,7 @@ from prefect.states import Completed, Failed
 
 from roadscan.jobs.compute import compute_on
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, Stage, close_run
+from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.survey import Survey
 from roadscan.progress import LineReporter
@@ -63,7 +63,7 @@ def stage_task(stage: Stage, run: Run) -> Task[[], None]:
     """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
 
     def step() -> None:
-        stage.run(run)
+        run_stage(run, stage)
 
     return Task(
         step,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -75,6 +76,25 @@ class OnDask:
             yield Done(task, result, error)
 
 
+class WhenNeeded:
+    """Opens the cluster at the first task: a run with nothing to do starts none."""
+
+    def __init__(self, stack: contextlib.ExitStack, workers: int | None, scheduler: str | None) -> None:
+        self._stack = stack
+        self._workers = workers
+        self._scheduler = scheduler
+        self._opened: OnDask | None = None
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        """Run all tasks on the cluster."""
+        if not tasks:
+            return
+        if self._opened is None:
+            client = _connect(self._scheduler) if self._scheduler is not None else _embedded(self._stack, self._workers)
+            self._opened = OnDask(self._stack.enter_context(client))
+        yield from self._opened.map(function, tasks)
+
+
 @contextlib.contextmanager
 def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iterator[Compute]:
     """Compute on `scheduler` (an address) or on an embedded cluster of `workers` processes.
@@ -87,38 +107,38 @@ def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iter
     if scheduler is None and workers == 0:
         yield Inline()
         return
-    import logging
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # a run says itself what failed and why
+    with contextlib.ExitStack() as stack:
+        yield WhenNeeded(stack, workers, scheduler)
 
+
+def _connect(scheduler: str) -> Any:
+    from distributed import Client  # slow to import
+
+    try:
+        return Client(scheduler, timeout="30s")
+    except (OSError, ValueError) as error:
+        raise RoadscanError(
+            f"no Dask scheduler answers at {scheduler}", expected="tcp://host:port", change=str(error)
+        ) from error
+
+
+def _embedded(stack: contextlib.ExitStack, workers: int | None) -> Any:
     import dask
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.ERROR)  # a run says itself what failed and why
-
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout="30s")
-        except OSError as error:
-            raise RoadscanError(
-                f"no Dask scheduler answers at {scheduler}", expected="tcp://host:port", change=str(error)
-            ) from error
-        with client:
-            yield OnDask(client)
-        return
     # A worker's memory is bounded by the size of its blocks, so Dask's spilling and pausing stay out of the way.
-    settings = {
-        "distributed.worker.memory.target": False,
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.pause": False,
-        "distributed.comm.timeouts.connect": "60s",
-    }
-    with (
-        dask.config.set(settings),
-        LocalCluster(
-            n_workers=workers or dask.system.CPU_COUNT,
-            threads_per_worker=1,
-            dashboard_address=None,
-            silence_logs="ERROR",
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield OnDask(client)
+    stack.enter_context(
+        dask.config.set(
+            {
+                "distributed.worker.memory.target": False,
+                "distributed.worker.memory.spill": False,
+                "distributed.worker.memory.pause": False,
+                "distributed.comm.timeouts.connect": "60s",
+            }
+        )
+    )
+    cluster = LocalCluster(
+        n_workers=workers or dask.system.CPU_COUNT, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR"
+    )
+    return Client(stack.enter_context(cluster))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.fingerprint import key_of
 from roadscan.model.crs import Geoid, add_grid_folder
-from roadscan.model.errors import RoadscanError, RunError
+from roadscan.model.errors import FormatError, RoadscanError, RunError
 from roadscan.model.survey import ControlConfig, LogConfig, Survey
 from roadscan.sensors.base import LogFormat, LogSource, Reject, Rows, format_named, format_of
 from roadscan.tables.logs import LogRecord, has_log, read_log_records, retire_log, write_log_record
@@ -53,15 +53,36 @@ class IngestResult:
     """False where the store already held it."""
 
 
-def plan_logs(survey: Survey, store: Store) -> list[PlannedLog]:
-    """All logs of the survey file, trajectories first, with their keys; reads bytes only to fingerprint them."""
+@dataclass(frozen=True)
+class UnplannedLog:
+    """A log of the survey file that cannot be planned, and why."""
+
+    run: str
+    path: str
+    error: RoadscanError
+
+
+def plan_logs(survey: Survey, store: Store) -> tuple[list[PlannedLog], list[UnplannedLog]]:
+    """All logs of the survey file, trajectories first, with their keys; and those that cannot be planned.
+
+    Bytes are read only to fingerprint them. A log that was ingested and then moved away keeps its fingerprint.
+    """
     if survey.config.map.grids is not None:
         add_grid_folder(survey.resolve(survey.config.map.grids))
     known = _Sources(store)
-    planned = [_plan_log(survey, run.id, log, known) for run in survey.config.runs for log in run.logs]
-    planned += [_plan_log(survey, CONTROL_RUN, control, known) for control in survey.config.control]
+    listed: list[tuple[str, LogConfig | ControlConfig]] = [
+        (run.id, log) for run in survey.config.runs for log in run.logs
+    ]
+    listed += [(CONTROL_RUN, control) for control in survey.config.control]
+    planned: list[PlannedLog] = []
+    unplanned: list[UnplannedLog] = []
+    for run, config in listed:
+        try:
+            planned.append(_plan_log(survey, run, config, known))
+        except RoadscanError as error:
+            unplanned.append(UnplannedLog(run, str(config.path), error))
     known.save()
-    return sorted(planned, key=lambda p: ("trajectory" not in p.format.yields, p.run, p.sensor, p.key))
+    return sorted(planned, key=lambda p: ("trajectory" not in p.format.yields, p.run, p.sensor, p.key)), unplanned
 
 
 def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda _: None) -> list[IngestResult]:
@@ -73,14 +94,14 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
         after all logs were tried, if any could not be read; the others are kept.
     """
     results: list[IngestResult] = []
-    failures: list[str] = []
+    planned, unplanned = plan_logs(survey, store)
+    failures = [str(u.error) for u in unplanned]
     spans: dict[str, tuple[int, int]] = {}
-    for log in plan_logs(survey, store):
+    for log in planned:
         try:
             result = ingest_log(store, log, spans.get(log.run))
         except RoadscanError as error:
             failures.append(str(error))
-            report(f"failed: {error}")
             continue
         results.append(result)
         span = result.record.span("trajectory")
@@ -88,6 +109,8 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
             before = spans.get(log.run, span)
             spans[log.run] = (min(before[0], span[0]), max(before[1], span[1]))
         report(_line(result))
+    for failure in failures:
+        report(f"failed: {failure}")
     if failures:
         raise RunError(
             f"{len(failures)} of {len(failures) + len(results)} logs could not be ingested: " + " | ".join(failures),
@@ -131,11 +154,12 @@ def ingest_log(store: Store, log: PlannedLog, trajectory_span: tuple[int, int] |
 
 def survey_records(survey: Survey, store: Store) -> list[LogRecord]:
     """Records of the survey file's logs; a log that was never ingested is an error."""
-    planned = plan_logs(survey, store)
-    missing = [p for p in planned if not has_log(store, p.key)]
+    planned, unplanned = plan_logs(survey, store)
+    missing = [str(u.error) for u in unplanned]
+    missing += [f"{p.config.path} is not ingested" for p in planned if not has_log(store, p.key)]
     if missing:
         raise RunError(
-            f"{len(missing)} logs are not ingested, the first is {missing[0].config.path}",
+            f"{len(missing)} logs are not in the store: " + " | ".join(missing),
             change="run `roadscan ingest` (or `roadscan run`) first",
         )
     return read_log_records(store, [p.key for p in planned])
@@ -170,9 +194,7 @@ def _consecutive(rows: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
 
 def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known: _Sources) -> PlannedLog:
     path = survey.resolve(config.path)
-    format_ = format_named(config.format) if config.format else format_of(path)
-    if not path.exists():
-        raise RoadscanError("the log does not exist", change="check its path in the survey file", file=path)
+    format_ = known.format(path, config.format)
     is_log = isinstance(config, LogConfig)
     sensor = config.sensor if isinstance(config, LogConfig) else None
     clock = config.clock.clock() if isinstance(config, LogConfig) and config.clock else None
@@ -181,7 +203,7 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
         raise RoadscanError(
             "the log names no sensor", expected=f"sensor = one of {', '.join(survey.rig.sensors)}", file=path
         )
-    content, size = known.digest(path, format_.files(path))
+    content, size = known.digest(path, format_)
     options = format_.options.parse(config.options, file=path)
     source = LogSource(
         path=path,
@@ -217,31 +239,48 @@ def _line(result: IngestResult) -> str:
 
 
 class _Sources:
-    """Digests of raw files; a file of unchanged size and time is not read again."""
+    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._before: dict[str, Any] = json.loads(store.read_bytes(_SOURCES)) if store.exists(_SOURCES) else {}
         self._now: dict[str, Any] = {}
 
-    def digest(self, path: Path, files: list[Path]) -> tuple[str, int]:
-        """Fingerprint over names and contents of a log's files, and their bytes in all."""
-        total = 0
-        combined = hashlib.blake2b(digest_size=16)
-        for file in files:
-            stat = file.stat()
-            total += stat.st_size
-            name = file.relative_to(path).as_posix() if file != path and path in file.parents else ""
-            combined.update(f"{name}\0{self._digest(file, stat.st_size, stat.st_mtime_ns)}\n".encode())
-        return combined.hexdigest(), total
+    def format(self, path: Path, stated: str | None) -> LogFormat:
+        """Format of a log: as stated, as remembered, or found from its bytes."""
+        if stated is None and not path.exists() and str(path) in self._before:
+            stated = str(self._before[str(path)]["format"])
+        return format_named(stated) if stated else format_of(path)
 
-    def _digest(self, file: Path, size: int, mtime_ns: int) -> str:
-        known = self._before.get(str(file))
-        if known is None or known[:2] != [size, mtime_ns]:
-            known = [size, mtime_ns, file_digest(file)]
-        self._now[str(file)] = known
-        return str(known[2])
+    def digest(self, path: Path, format_: LogFormat) -> tuple[str, int]:
+        """Fingerprint over names and contents of a log's files, and their bytes in all."""
+        before = self._before.get(str(path), {"files": {}})["files"]
+        if path.exists():
+            files = {
+                _name(file, path): _fingerprint(file, before.get(_name(file, path))) for file in format_.files(path)
+            }
+        elif before:
+            files = before
+        else:
+            raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
+        self._now[str(path)] = {"format": format_.name, "files": files}
+        combined = hashlib.blake2b(digest_size=16)
+        for name, (_, _, digest) in files.items():
+            combined.update(f"{name}\0{digest}\n".encode())
+        return combined.hexdigest(), sum(size for size, _, _ in files.values())
 
     def save(self) -> None:
-        if self._now != self._before:
-            self._store.write_bytes(_SOURCES, json.dumps(self._now).encode())
+        """Keep what was learnt; logs that are no longer listed stay known."""
+        if {**self._before, **self._now} != self._before:
+            self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
+
+
+def _name(file: Path, log: Path) -> str:
+    return file.relative_to(log).as_posix() if file != log and log in file.parents else ""
+
+
+def _fingerprint(file: Path, known: list[Any] | None) -> list[Any]:
+    stat = file.stat()
+    if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+        return known
+    return [stat.st_size, stat.st_mtime_ns, file_digest(file)]

@@ -14,7 +14,7 @@ from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_products, wanted_tile_products
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.tiles import TILE, BlockTask, WantedProduct, block_tasks, plan_tiles, run_blocks, stale_tiles
-from roadscan.model.errors import RunError
+from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext, TileProduct, products
@@ -74,7 +74,9 @@ def run_tiles(run: Run) -> None:
     tasks = work.tasks(work.chosen)
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
     singly = functools.partial(work.tasks, edge_tiles=1)
-    run.failed("tiles", run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles")))
+    failures = run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles"))
+    manifest.forget(TILE, [unit for unit, _ in failures])
+    run.failed("tiles", failures)
 
 
 def run_products(run: Run) -> None:
@@ -113,9 +115,19 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
     with run.store.lock():
         for stage in stages:
             started = time.perf_counter()
-            stage.run(run)
+            run_stage(run, stage)
             run.reporter.line(f"{stage.name}: {time.perf_counter() - started:.1f} s")
         close_run(run)
+
+
+def run_stage(run: Run, stage: Stage) -> None:
+    """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
+    try:
+        stage.run(run)
+    except RoadscanError as error:
+        if not run.failures:
+            raise
+        run.failed(stage.name, [("as a whole", error)])
 
 
 def close_run(run: Run) -> None:

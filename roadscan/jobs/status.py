@@ -60,7 +60,8 @@ WORKER_BASE_BYTES = 400 << 20
 def survey_status(survey: Survey, store: Store) -> Status:
     """Look at everything the manifest says; reads no readings."""
     status = Status(failures=read_failures(store))
-    planned = plan_logs(survey, store)
+    planned, unplanned = plan_logs(survey, store)
+    status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unplanned]
     for log in planned:
         ingested = has_log(store, log.key)
         record = read_log_records(store, [log.key])[0] if ingested else None
@@ -80,7 +81,7 @@ def survey_status(survey: Survey, store: Store) -> Status:
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in read_log_records(store) if r.key not in keys]
     manifest = Manifest(store)
     status.outputs = dict(Counter(r.product for r in manifest.all() if r.path and r.product != PRODUCT))
-    if any(log["state"] == "waiting" for log in status.logs):
+    if unplanned or any(log["state"] == "waiting" for log in status.logs):
         waiting = [log for log in status.logs if log["state"] == "waiting"]
         status.next_run = {
             "logs": len(waiting),

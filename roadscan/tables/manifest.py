@@ -110,6 +110,12 @@ class Manifest:
             if r.path:
                 self._store.remove(r.path)
 
+    def forget(self, product: str, units: Iterable[str]) -> None:
+        """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
+        known = [u for u in units if self._records.pop((product, u), None) is not None]
+        if known:
+            self._append([OutputRecord(product, u, "", "", 0, "") for u in known])
+
     def compact(self) -> None:
         """Bring all parts into one."""
         old = self._parts

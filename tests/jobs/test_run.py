@@ -294,3 +294,46 @@ def test_help_is_quick() -> None:
 
 def _lines(run: object) -> list[str]:
     return run.reporter.lines  # type: ignore[attr-defined]
+
+
+def test_one_missing_log_does_not_keep_the_others_out(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    lidar = copy.survey_file.parent / "raw/run-1/lidar.pcap"
+    lidar.rename(tmp_path / "elsewhere.pcap")
+    with pytest.raises(
+        RunError, match=r"1 of 9 logs could not be ingested: .*run-1/lidar.pcap: the log does not exist"
+    ):
+        copy.run()
+    assert len(read_log_records(copy.store())) == 8
+    assert not survey_status(Survey.load(copy.survey_file), copy.store()).is_complete
+    (tmp_path / "elsewhere.pcap").rename(lidar)
+    copy.run()
+    assert_same_files(finished.store(), copy.store())
+
+
+def test_raw_logs_may_be_archived_once_they_are_ingested(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    (copy.survey_file.parent / "raw").rename(tmp_path / "archive")
+    assert copy.run(products__make=["las", "tile_table"]).failures == []
+    assert survey_status(Survey.load(copy.survey_file), copy.store()).failures == []
+
+
+def test_a_tile_that_could_not_be_made_again_counts_as_stale(
+    finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    store = copy.store()
+    unit = next(u for u, r in Manifest(store).of("tile").items() if r.path)
+
+    def broken(*_: object) -> None:
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("roadscan.jobs.tiles.cells_of", broken)
+        with pytest.raises(RunError, match=rf"tiles {unit}: OSError: disk full"):
+            copy.run(selection=Selection(named=(TileId.parse(unit),)))
+    assert survey_status(Survey.load(copy.survey_file), store).tiles_stale == 1
+    copy.run()
+    assert_same_files(finished.store(), store)

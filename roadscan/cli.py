@@ -299,7 +299,11 @@ def _print_status(found: Status, survey_file: Path) -> None:
         typer.echo(f"in the store, not in the survey file: {log}")
     if found.readings:
         typer.echo("readings: " + ", ".join(f"{n.replace('_', ' ')} {c:,}" for n, c in found.readings.items()))
-    typer.echo(f"tiles: {found.tiles_current:,} current, {found.tiles_stale:,} to do")
+    typer.echo(
+        f"no tiles: {found.note}"
+        if found.note
+        else f"tiles: {found.tiles_current:,} current, {found.tiles_stale:,} to do"
+    )
     if found.outputs:
         typer.echo("files: " + ", ".join(f"{n} {c:,}" for n, c in sorted(found.outputs.items())))
     for failure in found.failures:
@@ -315,4 +319,5 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 60 else text[:59] + "…"

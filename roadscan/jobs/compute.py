@@ -139,6 +139,6 @@ def _embedded(stack: contextlib.ExitStack, workers: int | None) -> Any:
         )
     )
     cluster = LocalCluster(
-        n_workers=workers or dask.system.CPU_COUNT, threads_per_worker=1, dashboard_address=None, silence_logs="ERROR"
+        n_workers=workers or dask.system.CPU_COUNT, threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
     )
     return Client(stack.enter_context(cluster))

@@ -109,8 +109,6 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
             before = spans.get(log.run, span)
             spans[log.run] = (min(before[0], span[0]), max(before[1], span[1]))
         report(_line(result))
-    for failure in failures:
-        report(f"failed: {failure}")
     if failures:
         raise RunError(
             f"{len(failures)} of {len(failures) + len(results)} logs could not be ingested: " + " | ".join(failures),

@@ -43,12 +43,14 @@ class Status:
     """What failed in the last run."""
     next_run: dict[str, int] = field(default_factory=dict)
     """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
+    note: str = ""
+    """Why nothing can be said of tiles."""
 
     @property
     def is_complete(self) -> bool:
         """True if nothing is missing, stale or failed."""
         ingested = all(log["state"] == "ingested" for log in self.logs)
-        return ingested and not self.tiles_stale and not self.failures
+        return ingested and not self.tiles_stale and not self.failures and not self.note
 
 
 BYTES_PER_READING = 100
@@ -90,7 +92,10 @@ def survey_status(survey: Survey, store: Store) -> Status:
             + BYTES_PER_READING * survey.config.tiles.max_block_readings,
         }
         return status
-    _tile_status(status, survey, store, manifest)
+    try:
+        _tile_status(status, survey, store, manifest)
+    except RoadscanError as error:
+        status.note = str(error)  # a survey may hold tables only: poses without readings, readings without poses
     return status
 
 

@@ -158,7 +158,7 @@ class Clock:
             integral = stamps.astype(np.int64)
             limit = np.iinfo(np.int64).max // scale_ns
             if integral.size and (integral.max() > limit or integral.min() < -limit):
-                self._refuse(float(integral[np.argmax(np.abs(integral))]))
+                self._refuse(int(integral[np.argmax(np.abs(integral))]))
             ns = integral * scale_ns
         else:
             floating = stamps.astype(np.float64)
@@ -178,7 +178,7 @@ class Clock:
         if epochs.size and (int(epochs.min()) < EARLIEST_GPS_NS or int(epochs.max()) > LATEST_GPS_NS):
             bad = epochs[(epochs < EARLIEST_GPS_NS) | (epochs > LATEST_GPS_NS)]
             at = int(np.flatnonzero(epochs == bad[0])[0])
-            self._refuse(float(np.asarray(stamps[at], dtype=np.float64)))
+            self._refuse(int(ns[at]) // scale_ns if np.issubdtype(stamps.dtype, np.integer) else float(stamps[at]))
         return epochs
 
     def _scale(self, ns: Int64) -> Int64:
@@ -204,11 +204,12 @@ class Clock:
                 )
 
     def _refuse(self, stamp: float) -> None:
+        shown = str(stamp) if isinstance(stamp, int) else f"{stamp:.0f}"
         # Which unit would have made sense of this stamp? Say so instead of guessing.
         fits = [unit for unit, scale in UNIT_NS.items() if unit != self.unit and self._plausible(stamp, scale)]
         hint = f"as '{fits[0]}' it would fit: set clock.unit = \"{fits[0]}\" if that is so" if fits else ""
         raise TimeSystemError(
-            f"stamp {stamp:.0f} read as {self.unit} of '{self.system}' falls outside 1980–2080",
+            f"stamp {shown} read as {self.unit} of '{self.system}' falls outside 1980–2080",
             expected="a stamp inside that span",
             change=hint or "check clock.system, clock.unit and clock.offset_s of this log",
         )

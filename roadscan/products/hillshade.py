@@ -162,6 +162,8 @@ def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
     south_west, south, south_east = (_neighbour(heights_m, 1, c) for c in (-1, 0, 1))
     to_east = (north_east + 2 * east + south_east) - (north_west + 2 * west + south_west)
     to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
+    unknown = np.isnan(heights_m[1:-1, 1:-1])
+    to_east[unknown] = to_north[unknown] = np.nan  # eight neighbours would give the empty cell between them a slope
     return to_east / (8 * cell_m), to_north / (8 * cell_m)
 
 

@@ -354,5 +354,5 @@ def _describe(raster: Any, bands: Sequence[Band], context: ProductContext) -> No
         TIFFTAG_SOFTWARE=SOFTWARE,
         TIFFTAG_DATETIME=f"{context.date:%Y:%m:%d} 00:00:00",
         ROADSCAN_SURVEY=context.survey_id,
-        ROADSCAN_HEIGHT=context.map.height,
+        ROADSCAN_HEIGHT="local" if context.map.is_local else context.map.height,
     )

@@ -10,6 +10,9 @@ from roadscan.tables.logs import DataFile, read_log_records
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 
+_ALWAYS = ("rejects",)
+"""Tables that answer even before they have a row: no rejects is news too."""
+
 
 def connect(store: Store) -> duckdb.DuckDBPyConnection:
     """A DuckDB connection with one view a table and, for tables in time, one macro a table.
@@ -35,6 +38,9 @@ def connect(store: Store) -> duckdb.DuckDBPyConnection:
                 "AND last_gps_ns // 1000000000 "
                 "AND epoch_gps_ns BETWEEN first_gps_ns AND last_gps_ns"
             )
+    for table in _ALWAYS:
+        if table not in files:
+            connection.register(table, table_schema(table).arrow().empty_table())
     for name, folder in (("footprints", "tables/footprints"), ("outputs", "manifest/outputs")):
         found = store.files(folder, ".parquet")
         if found:

@@ -96,12 +96,15 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
     results: list[IngestResult] = []
     planned, unplanned = plan_logs(survey, store)
     failures = [str(u.error) for u in unplanned]
+    for failure in failures:
+        report(f"failed: {failure}")
     spans: dict[str, tuple[int, int]] = {}
     for log in planned:
         try:
             result = ingest_log(store, log, spans.get(log.run))
         except RoadscanError as error:
             failures.append(str(error))
+            report(f"failed: {error}")
             continue
         results.append(result)
         span = result.record.span("trajectory")

@@ -104,7 +104,10 @@ def reprocess(
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
     from roadscan.jobs.stages import STAGES
+    from roadscan.model.errors import ConfigError
 
+    if not (tiles or bbox or span):
+        raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
     done = _run(survey_file, STAGES, workers, scheduler, _selection(tiles, bbox, span))
     typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings")
 
@@ -142,12 +145,15 @@ def sql(
     csv: Annotated[bool, typer.Option("--csv", help="Print comma-separated values.")] = False,
 ) -> None:
     """Ask the tables a question."""
+    from roadscan.jobs.ingest import plan_logs
     from roadscan.model.survey import Survey
     from roadscan.tables.sql import query
     from roadscan.tables.store import Store
 
     loaded = Survey.load(survey_file)
-    result = query(Store(loaded.store_url, loaded.config.id), statement)
+    store = Store(loaded.store_url, loaded.config.id)
+    planned, _ = plan_logs(loaded, store)
+    result = query(store, statement, [log.key for log in planned])
     if csv:
         import pyarrow.csv
 

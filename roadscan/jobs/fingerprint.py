@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import roadscan
+from roadscan.model.crs import grid_folders
+from roadscan.tables.store import file_digest
 
-_SHAPING = ("model", "kernels", "navigation", "points", "tiles")
+_SHAPING = ("model", "kernels", "navigation", "points", "tiles", "jobs")
 """Layers whose code shapes points and cells; a change in them makes every output stale."""
 
 
@@ -18,6 +20,14 @@ def key_of(*parts: Any) -> str:
     """Sixteen hexadecimal digits over JSON-like values (order matters, dictionaries are sorted)."""
     text = json.dumps(parts, sort_keys=True, default=str, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def grid_digest(name: str | None) -> list[str] | None:
+    """Name and content of a geoid grid in the folders that PROJ looks in: a replaced grid is another grid."""
+    if name is None:
+        return None
+    found = [Path(folder) / name for folder in grid_folders()]
+    return [name, *(file_digest(f) for f in found if f.is_file())]
 
 
 @functools.cache

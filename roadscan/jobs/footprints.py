@@ -131,7 +131,9 @@ def count_tiles(tiles: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], ..
 
 def load_footprints(plan: SurveyPlan, manifest: Manifest) -> Footprints:
     """All current footprints; a data file without any is left out (its indexing failed)."""
-    slices = sorted(plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.spans[0] if s.spans else (0, 0)))
+    slices = sorted(
+        plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))
+    )
     tables: list[pa.Table] = []
     numbers: list[npt.NDArray[np.int32]] = []
     columns = ["tile_column", "tile_row", "row_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns"]

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.fingerprint import key_of
+from roadscan.jobs.fingerprint import grid_digest, key_of
 from roadscan.model.crs import Geoid, add_grid_folder
 from roadscan.model.errors import FormatError, RoadscanError, RunError
 from roadscan.model.survey import ControlConfig, LogConfig, Survey
@@ -82,7 +82,9 @@ def plan_logs(survey: Survey, store: Store) -> tuple[list[PlannedLog], list[Unpl
         except RoadscanError as error:
             unplanned.append(UnplannedLog(run, str(config.path), error))
     known.save()
-    return sorted(planned, key=lambda p: ("trajectory" not in p.format.yields, p.run, p.sensor, p.key)), unplanned
+    once = {log.key: log for log in reversed(planned)}  # a log listed twice is one log
+    ordered = sorted(once.values(), key=lambda p: ("trajectory" not in p.format.yields, p.run, p.sensor, p.key))
+    return ordered, unplanned
 
 
 def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda _: None) -> list[IngestResult]:
@@ -101,7 +103,7 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
     spans: dict[str, tuple[int, int]] = {}
     for log in planned:
         try:
-            result = ingest_log(store, log, spans.get(log.run))
+            result = ingest_log(store, log, spans.get(log.run), frozenset(p.key for p in planned))
         except RoadscanError as error:
             failures.append(str(error))
             report(f"failed: {error}")
@@ -120,8 +122,17 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
     return results
 
 
-def ingest_log(store: Store, log: PlannedLog, trajectory_span: tuple[int, int] | None = None) -> IngestResult:
-    """Bring one log into the tables, unless it is there already."""
+def ingest_log(
+    store: Store,
+    log: PlannedLog,
+    trajectory_span: tuple[int, int] | None = None,
+    listed: frozenset[str] = frozenset(),
+) -> IngestResult:
+    """Bring one log into the tables, unless it is there already.
+
+    The same bytes read before under other settings are retired, unless the survey file lists them so too (`listed`
+    keys: two layers of one file, say).
+    """
     if has_log(store, log.key):
         return IngestResult(read_log_records(store, [log.key])[0], fresh=False)
     source = _with_span(log.source, trajectory_span)
@@ -132,7 +143,7 @@ def ingest_log(store: Store, log: PlannedLog, trajectory_span: tuple[int, int] |
             _take(writer, item)
         writer.finish()
         for old in read_log_records(store):
-            if (old.run, old.sensor, old.content) == (log.run, log.sensor, log.content):
+            if old.key not in listed and (old.run, old.sensor, old.content) == (log.run, log.sensor, log.content):
                 retire_log(store, old)
         tables = writer.publish(store, log.run, log.sensor, log.key)
     record = LogRecord(
@@ -221,8 +232,8 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
     ]
     shaping = [
         format_.name, format_.version, content, options.model_dump(mode="json"), clock,
-        config.crs, config.height, config.geoid, run, sensor, schemas,
-        None if is_log else survey.config.map.model_dump(mode="json"),
+        config.crs, config.height, grid_digest(config.geoid), run, sensor, schemas,
+        None if is_log else [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)],
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from roadscan.jobs.fingerprint import code_version, key_of
+from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES, survey_records
 from roadscan.jobs.readings import (
     CORRECTIONS,
@@ -55,6 +56,11 @@ class SurveyPlan:
         """UTC date of the first reading."""
         return utc_from_gps_ns(min(p.start_gps_ns for p in self.passes)).date()
 
+    def pass_key(self, run: str) -> list[object]:
+        """What makes a run's tiles stale when its passes change: ids, and the spans that the survey file states."""
+        stated = [(p.id, p.start, p.end) for p in self.survey.config.passes if p.run == run]
+        return list(stated) or [p.pass_id for p in self.passes if p.run == run]
+
     def centre_line(self) -> Path | None:
         """Vector layer of the centre lines, where points are cut to their buffer."""
         layer = self.survey.config.filters.centre_line
@@ -100,7 +106,6 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
     tile_key = key_of(
         code_version(),
         config.tiles.cell_m,
-        [(p.id, p.run, p.start, p.end) for p in config.passes] or [r.id for r in config.runs],
         None if layer is None else [file_digest(layer), f.centre_line_buffer_m],
     )
     return SurveyPlan(survey, store, records, ground, sources, passes, tile_key)
@@ -130,6 +135,7 @@ def _sources(
                 None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
                 record.attributes,
                 survey.config.map.model_dump(mode="json"),
+                [grid_digest(survey.config.map.geoid), grid_digest(record.attributes.get("geoid"))],
                 asdict(ground.heights),
                 ground.max_gap_s,
                 ground.grid.size_m,
@@ -165,5 +171,11 @@ def _passes(
         for span in (f.span for f in files):
             if span is not None:
                 before = spans.get(run, span)
-                spans[run] = (min(before[0], span[0]), max(before[1], span[1]))
+                spans[run] = (min(before[0], span[0]), max(before[1], span[1] + _profile_ns(source)))
     return survey.passes(spans)
+
+
+def _profile_ns(source: ReadingSource) -> int:
+    """Time from a profile's epoch to that of its last reading (ns)."""
+    geometry = source.attribute.get("scan_geometry", {})
+    return math.ceil(float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)))

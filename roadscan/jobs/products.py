@@ -76,6 +76,23 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
     return wanted
 
 
+def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
+    """Files of survey products that are missing or stale, and records of those no longer due."""
+    context = product_context(plan)
+    records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
+    summaries = [s for s in map(summary_of, records) if s is not None]
+    tasks = [
+        task
+        for product, options in wanted_products(plan.survey)
+        if isinstance(product, SurveyProduct)
+        for task in _tasks(product, options, plan, context, records, summaries)
+    ]
+    due = {(t.product.name, t.output.name) for t in tasks}
+    kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
+    gone = [r for r in manifest.all() if r.product in kinds and (r.product, r.unit) not in due]
+    return [t for t in tasks if not manifest.is_current(t.product.name, t.output.name, t.key)], gone
+
+
 def make_products(
     plan: SurveyPlan,
     manifest: Manifest,
@@ -83,18 +100,8 @@ def make_products(
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
     """Make the survey products that are missing or stale; remove those no longer due. Returns the failures."""
-    context = product_context(plan)
-    records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
-    summaries = [s for s in map(summary_of, records) if s is not None]
-    stages = [
-        _tasks(product, options, plan, context, records, summaries)
-        for product, options in wanted_products(plan.survey)
-        if isinstance(product, SurveyProduct)
-    ]
-    due = {(t.product.name, t.output.name) for tasks in stages for t in tasks}
-    kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
-    manifest.remove(r for r in manifest.all() if r.product in kinds and (r.product, r.unit) not in due)
-    stale = [t for tasks in stages for t in tasks if not manifest.is_current(t.product.name, t.output.name, t.key)]
+    stale, gone = plan_outputs(plan, manifest)
+    manifest.remove(gone)
     failures: list[tuple[str, str]] = []
     report(0, len(stale))
     for number, done in enumerate(compute.map(write_output, stale), 1):

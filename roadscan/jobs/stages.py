@@ -76,6 +76,8 @@ def run_tiles(run: Run) -> None:
     singly = functools.partial(work.tasks, edge_tiles=1)
     failures = run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles"))
     manifest.forget(TILE, [unit for unit, _ in failures])
+    empty = {unit for unit, r in manifest.of(TILE).items() if not r.path}
+    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in tile_product_names()])
     run.failed("tiles", failures)
 
 
@@ -173,13 +175,18 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
         chosen = run.selection.tiles(tiles, footprints, plan.ground.grid)
     else:
         chosen = stale_tiles(tiles, wanted, manifest)
-    per_tile = {n for n, p in products().items() if isinstance(p, TileProduct)}
+    per_tile = tile_product_names()
     dropped = per_tile - {p.name for p, _ in wanted_products(run.survey)}
     units = {str(t) for t in tiles}
     gone = [
         r for r in manifest.all() if r.product in {TILE, *per_tile} and (r.unit not in units or r.product in dropped)
     ]
     return TileWork(plan, footprints, tiles, chosen, gone, wanted, context)
+
+
+def tile_product_names() -> set[str]:
+    """Names of all tile products there are."""
+    return {n for n, p in products().items() if isinstance(p, TileProduct)}
 
 
 def _bar(run: Run, stage: str) -> Callable[[int, int], None]:

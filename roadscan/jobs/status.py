@@ -15,6 +15,7 @@ from roadscan.jobs.compute import Inline
 from roadscan.jobs.footprints import PRODUCT, reading_fates
 from roadscan.jobs.ingest import plan_logs
 from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.products import plan_outputs
 from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.tiles import TILE
 from roadscan.model.errors import RoadscanError
@@ -37,6 +38,8 @@ class Status:
     """Readings by fate."""
     tiles_current: int = 0
     tiles_stale: int = 0
+    products_stale: int = 0
+    """Files of survey products that are missing or stale."""
     outputs: dict[str, int] = field(default_factory=dict)
     """Finished files by product."""
     failures: list[dict[str, str]] = field(default_factory=list)
@@ -50,7 +53,8 @@ class Status:
     def is_complete(self) -> bool:
         """True if nothing is missing, stale or failed."""
         ingested = all(log["state"] == "ingested" for log in self.logs)
-        return ingested and not self.tiles_stale and not self.failures and not self.note
+        done = not self.tiles_stale and not self.products_stale
+        return ingested and done and not self.failures and not self.note
 
 
 BYTES_PER_READING = 100
@@ -110,17 +114,27 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)
+    status.products_stale = len(plan_outputs(work.plan, manifest)[0])
     largest = max((t.readings for t in tasks), default=0)
     status.next_run = {
         "tasks": len(tasks),
         "tiles": len(stale),
+        "products": status.products_stale,
         "raw_bytes": sum(t.raw_bytes for t in tasks),
         "worker_memory_bytes": WORKER_BASE_BYTES + BYTES_PER_READING * largest if tasks else 0,
     }
 
 
 def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> list[str]:
-    """Read every file the store should hold and compare it with what was recorded; returns the faults."""
+    """Read every file the store should hold and compare it with what was recorded; returns the faults.
+
+    A product that is not whole counts as stale from then on: the next run makes it again.
+    """
+    with store.lock():
+        return _verify(store, report)
+
+
+def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
     faults: list[str] = []
     manifest = Manifest(store)
     data = [f for r in read_log_records(store) for own in r.tables.values() for f in own]
@@ -129,11 +143,14 @@ def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _
     with store.scratch() as folder:
         for number, file in enumerate(data, 1):
             fault = _check_digest(store, folder, file.path, file.bytes, file.digest)
-            faults += [fault] if fault else []
+            key = file.path.split("/log=")[1].split("/")[0]
+            faults += [f"{fault}; to ingest it again, remove manifest/logs/{key}.json"] if fault else []
             report(number, total)
         for number, record in enumerate(outputs, len(data) + 1):
             fault = _check_output(store, folder, record)
-            faults += [fault] if fault else []
+            if fault:
+                faults.append(f"{fault}; the next run makes it again")
+                manifest.forget(record.product, [record.unit])
             report(number, total)
     return faults
 

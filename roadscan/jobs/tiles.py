@@ -89,7 +89,7 @@ def plan_tiles(footprints: Footprints, plan: SurveyPlan) -> dict[TileId, tuple[s
     column, row = footprints.tile_column[order], footprints.tile_row[order]
     starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))
     digests = {f.path: f.digest for _, files in plan.sources for f in files}
-    names = [(s.source.key, digests[s.file]) for s in footprints.slices]
+    names = [(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in footprints.slices]
     tiles: dict[TileId, tuple[str, int]] = {}
     for start, end in zip(starts, np.append(starts[1:], order.size), strict=True):
         part = order[start:end]
@@ -307,6 +307,7 @@ class _Parts:
         """All chunks as one set of arrays; the chunks are given up, so that memory holds each point once."""
         placed, self.placed = self.placed, []
         extra = {c: v for c in EXTRA_COLUMNS if (v := _joined_extra(placed, c)) is not None}
+        lacking = {c: _lacks(placed, c) for c in extra if any(c not in p.extra for p in placed)}
         columns: dict[str, npt.NDArray[Any]] = {}
         for name in ("tiles", "quanta", "epoch_gps_ns", "intensity", "classification"):
             columns[name] = np.concatenate([getattr(p, name) for p in placed])
@@ -316,6 +317,7 @@ class _Parts:
             sources=np.concatenate(self._sources),
             profiles=np.array(self._profiles),
             extra=extra,
+            lacking=lacking,
             **columns,
         )
 
@@ -334,11 +336,15 @@ class _Joined:
     profiles: npt.NDArray[np.bool_]
     """(sources,) True for scans."""
     extra: dict[str, npt.NDArray[Any]]
+    lacking: dict[str, npt.NDArray[np.bool_]]
+    """(n,) True for points without a recorded value, for columns that some points lack."""
 
     def tile(self, tile: TileId, rows: npt.NDArray[np.integer[Any]]) -> TilePoints:
         """Points of one tile, in canonical order."""
         sources = self.sources[rows]
-        content = [*self.extra.values(), self.quanta, self.intensity, self.classification]
+        # A tile has the columns that its own points have, whatever else was loaded with it.
+        extra = {c: v for c, v in self.extra.items() if c not in self.lacking or not self.lacking[c][rows].all()}
+        content = [*extra.values(), self.quanta, self.intensity, self.classification]
         order = canonical_order(
             sources, self.epoch_gps_ns[rows], self.profiles[sources], lambda: [c[rows] for c in content]
         )
@@ -354,7 +360,7 @@ class _Joined:
             intensity=self.intensity[rows],
             classification=self.classification[rows],
             pass_id=self.passes[rows],
-            extra={c: v[rows] for c, v in self.extra.items()},
+            extra={c: v[rows] for c, v in extra.items()},
         )
 
 
@@ -364,6 +370,10 @@ def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
         return None
     fill = {"return_number": 1, "number_of_returns": 1}.get(column, 0)
     return np.concatenate([p.extra.get(column, np.full(p.epoch_gps_ns.size, fill, known[0].dtype)) for p in parts])
+
+
+def _lacks(parts: list[Placed], column: str) -> npt.NDArray[np.bool_]:
+    return np.concatenate([np.full(p.epoch_gps_ns.size, column not in p.extra) for p in parts])
 
 
 def _near(

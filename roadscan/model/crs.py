@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,6 +110,11 @@ def _grid_file(name: str) -> str:
     # PROJ's own list of folders belongs to a thread; a full path holds in all of them.
     found = (folder / name for folder in _grid_folders if (folder / name).is_file())
     return str(next(found, name))
+
+
+def grid_folders() -> list[Path]:
+    """Folders in which a geoid grid is looked for, in their order."""
+    return [*_grid_folders, *(Path(p) for p in pyproj.datadir.get_data_dir().split(os.pathsep))]
 
 
 @dataclass(frozen=True)

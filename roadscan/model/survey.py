@@ -153,7 +153,7 @@ class PassConfig(Strict):
     start: dt.datetime | None = None
     """First instant, with zone (2026-05-04T09:30:00Z); from the run's start where left out."""
     end: dt.datetime | None = None
-    """Last instant, with zone; to the run's end where left out."""
+    """First instant after it, with zone; to the run's end where left out."""
     lane: str = ""
     """Lane, as the road authority names it."""
     direction: str = ""

@@ -27,6 +27,9 @@ Int64 = npt.NDArray[np.int64]
 EIGHT_TO_SIXTEEN_BITS: Final = 257
 """An 8-bit intensity of 255 becomes 65,535."""
 
+FARTHEST_HEIGHT_M: Final = 21_000.0
+"""Heights beyond this are no heights (a vendor's −99,999, say)."""
+
 EXTRA_COLUMNS: Final = (
     "return_number", "number_of_returns", "scan_angle_deg", "flags", "user_data", "point_source_id",
     "red", "green", "blue",
@@ -44,6 +47,10 @@ class HeightLimits:
     height_max_m: float = np.inf
     above_body_min_m: float = -np.inf
     above_body_max_m: float = np.inf
+
+    def absolute(self) -> tuple[float, float]:
+        """Lowest and highest height kept (m), never beyond what 32 bits of 10 µm hold."""
+        return max(float(self.height_min_m), -FARTHEST_HEIGHT_M), min(float(self.height_max_m), FARTHEST_HEIGHT_M)
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,7 @@ class Placement:
     def _limits(self) -> tuple[float, ...]:
         h = self.heights
         return (
-            float(self.range_min_m), float(self.range_max_m), float(h.height_min_m), float(h.height_max_m),
+            float(self.range_min_m), float(self.range_max_m), *h.absolute(),
             float(h.above_body_min_m), float(h.above_body_max_m),
         )  # fmt: skip
 
@@ -187,7 +194,8 @@ def place_cloud(
     enh = cloud.to_map(np.stack([_numpy(batch, f"{a}_m") for a in "xyz"], axis=-1), frame)
     whole = np.floor(enh * QUANTA_PER_M + 0.5).astype(np.int64)
     tiles = whole[:, :2] // tile_quanta
-    high = (enh[:, 2] >= heights.height_min_m) & (enh[:, 2] <= heights.height_max_m)
+    lowest, highest = heights.absolute()
+    high = (enh[:, 2] >= lowest) & (enh[:, 2] <= highest)
     wanted = (
         (tiles[:, 0] >= window.first_column) & (tiles[:, 0] < window.end_column)
         & (tiles[:, 1] >= window.first_row) & (tiles[:, 1] < window.end_row)

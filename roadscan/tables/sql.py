@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import duckdb
 import pyarrow as pa
 
@@ -14,18 +16,22 @@ _ALWAYS = ("rejects",)
 """Tables that answer even before they have a row: no rejects is news too."""
 
 
-def connect(store: Store) -> duckdb.DuckDBPyConnection:
+def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyConnection:
     """A DuckDB connection with one view a table and, for tables in time, one macro a table.
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
-    ``tiles``, ``cells``, ``outputs`` and ``logs`` are there once a run has made them.
+    ``tiles``, ``cells``, ``footprints`` and ``outputs`` are there once a run has made them. `logs` are the keys of the
+    logs to show, all in the store where left out.
     """
     connection = duckdb.connect()
     if not store.is_folder:
         connection.register_filesystem(store.fs)
     files: dict[str, list[DataFile]] = {}
+    wanted = None if logs is None else set(logs)
     for record in read_log_records(store):
+        if wanted is not None and record.key not in wanted:
+            continue  # replaced by a newer version of the log, or no longer listed
         for table, own in record.tables.items():
             files.setdefault(table, []).extend(own)
     for table, held in files.items():
@@ -54,9 +60,9 @@ def connect(store: Store) -> duckdb.DuckDBPyConnection:
     return connection
 
 
-def query(store: Store, statement: str) -> pa.Table:
+def query(store: Store, statement: str, logs: Iterable[str] | None = None) -> pa.Table:
     """Run one SQL statement over the store's views."""
-    with connect(store) as connection:
+    with connect(store, logs) as connection:
         try:
             relation = connection.sql(statement)
             return pa.table({}) if relation is None else relation.to_arrow_table()

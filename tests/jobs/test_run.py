@@ -337,3 +337,81 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
     assert survey_status(Survey.load(copy.survey_file), store).tiles_stale == 1
     copy.run()
     assert_same_files(finished.store(), store)
+
+
+def test_a_log_listed_twice_adds_nothing(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    raw = copy.survey_file.parent / "raw/run-1"
+    (raw / "again.pcap").write_bytes((raw / "lidar.pcap").read_bytes())
+    survey = Survey.load(copy.survey_file).config.model_dump(mode="json")
+    logs = survey["runs"][0]["logs"]
+    logs += [
+        {**log, "path": path}
+        for log in logs
+        if log["sensor"] == "lidar"
+        for path in (log["path"], "raw/run-1/again.pcap")
+    ]
+    copy.run(runs=survey["runs"])
+    assert_same_files(finished.store(), copy.store())
+
+
+def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    runs = Survey.load(copy.survey_file).config.model_dump(mode="json")["runs"]
+    copy.run(runs=runs[:1], passes=[])
+    before = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
+    copy.run(runs=runs, passes=[])
+    after = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
+    assert any(after[u] == key for u, key in before.items())
+    swapped = copy.run("store-b", runs=runs[::-1], passes=[])
+    copy.run(runs=runs[::-1], passes=[])
+    assert_same_files(copy.store(), copy.store("store-b"))
+    assert swapped.failures == []
+
+
+def test_a_tile_that_a_filter_empties_loses_its_files(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    record = max((r for r in Manifest(copy.store()).of("tile").values() if r.path), key=lambda r: r.figures()["points"])
+    column, row = (int(v) for v in record.unit.split("_"))
+    line = (
+        f'{{"type":"LineString","coordinates":[[{column * 10 + 4},{row * 10 + 5}],[{column * 10 + 6},{row * 10 + 5}]]}}'
+    )
+    crs = '"crs":{"type":"name","properties":{"name":"urn:ogc:def:crs:EPSG::32632"}}'
+    feature = (
+        f'{{"type":"FeatureCollection",{crs},"features":[{{"type":"Feature","properties":{{}},"geometry":{line}}}]}}'
+    )
+    (copy.survey_file.parent / "line.geojson").write_text(feature)
+    filters = {"filters__centre_line": "line.geojson", "filters__centre_line_buffer_m": 3.0}
+    copy.run(**filters)
+    copy.run("store-b", **filters)
+    assert len(copy.store().files("tiles/las")) == 1
+    assert_same_files(copy.store(), copy.store("store-b"))
+
+
+def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    store, survey = copy.store(), Survey.load(copy.survey_file)
+    path = Path(store.path(store.files("tiles/las")[0]))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
+    assert [f for f in verify_store(store) if path.name in f and "the next run makes it again" in f]
+    store.remove("products/mosaic")
+    assert not survey_status(survey, store).is_complete
+    copy.run()
+    assert survey_status(survey, store).is_complete
+    assert verify_store(store) == []
+    assert_same_files(finished.store(), store)
+
+
+def test_sql_shows_the_logs_of_the_survey_only(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_to(tmp_path / "survey")
+    copy.run()
+    sbet = copy.survey_file.parent / "raw/run-1/trajectory.sbet"
+    sbet.write_bytes(sbet.read_bytes()[:-136])
+    copy.run()
+    command = [sys.executable, "-m", "roadscan", "sql", "--csv", "--survey", str(copy.survey_file)]
+    asked = "SELECT count(*) = count(DISTINCT epoch_gps_ns) AS once FROM trajectory"
+    found = subprocess.run([*command, asked], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ['"once"', "true"]

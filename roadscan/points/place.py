@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
 from typing import Any, Final
 
@@ -248,11 +248,6 @@ def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[n
     for one in passes:
         out[(epochs_gps_ns >= one.start_gps_ns) & (epochs_gps_ns < one.end_gps_ns)] = one.pass_id
     return out
-
-
-def fate_counts(fates: Int64) -> Mapping[str, int]:
-    """Counts by name of the kernels' fates."""
-    return {name: int(count) for name, count in zip(FATE_NAMES, fates, strict=False)}
 
 
 def _numpy(batch: pa.RecordBatch, column: str) -> npt.NDArray[Any]:

@@ -19,20 +19,6 @@ class Bounds:
     easting_max_m: float
     northing_max_m: float
 
-    def grown(self, margin_m: float) -> Bounds:
-        """The box with `margin_m` more on every side."""
-        return Bounds(
-            self.easting_min_m - margin_m,
-            self.northing_min_m - margin_m,
-            self.easting_max_m + margin_m,
-            self.northing_max_m + margin_m,
-        )
-
-    @property
-    def area_m2(self) -> float:
-        """Area (m²)."""
-        return (self.easting_max_m - self.easting_min_m) * (self.northing_max_m - self.northing_min_m)
-
 
 @dataclass(frozen=True)
 class TileGrid:

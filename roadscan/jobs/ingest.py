@@ -215,8 +215,8 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
         raise RoadscanError(
             "the log names no sensor", expected=f"sensor = one of {', '.join(survey.rig.sensors)}", file=path
         )
-    content, size = known.digest(path, format_)
     options = format_.options.parse(config.options, file=path)
+    content, size = known.digest(path, format_, format_.companions(path, options))
     source = LogSource(
         path=path,
         options=options,
@@ -264,13 +264,16 @@ class _Sources:
             stated = str(self._before[str(path)]["format"])
         return format_named(stated) if stated else format_of(path)
 
-    def digest(self, path: Path, format_: LogFormat) -> tuple[str, int]:
-        """Fingerprint over names and contents of a log's files, and their bytes in all."""
+    def digest(self, path: Path, format_: LogFormat, companions: list[Path]) -> tuple[str, int]:
+        """Fingerprint over names and contents of a log's files and companions, and their bytes in all."""
         before = self._before.get(str(path), {"files": {}})["files"]
         if path.exists():
-            files = {
-                _name(file, path): _fingerprint(file, before.get(_name(file, path))) for file in format_.files(path)
-            }
+            named = {_name(file, path): file for file in format_.files(path)}
+            named |= {f"beside:{file.name}": file for file in companions if file not in named.values()}
+            missing = next((file for file in named.values() if not file.exists()), None)
+            if missing is not None:
+                raise FormatError("a file that the log's options name does not exist", file=missing)
+            files = {name: _fingerprint(file, before.get(name)) for name, file in named.items()}
         elif before:
             files = before
         else:

@@ -133,6 +133,11 @@ class LogHeader:
 Item: TypeAlias = Rows | Reject
 
 
+def beside(log: Path, named: Path) -> Path:
+    """Absolute path of a file that a log's settings name: relative to the log's folder."""
+    return (log if log.is_dir() else log.parent) / named
+
+
 class LogFormat(ABC):
     """One raw format."""
 
@@ -158,6 +163,13 @@ class LogFormat(ABC):
         if path.is_dir():
             return sorted(p for p in path.rglob("*") if p.is_file())
         return [path]
+
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """Files beside the log that its settings name; their content is part of the log's fingerprint too.
+
+        A relative path counts from the log's folder (:func:`beside`).
+        """
+        return []
 
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:

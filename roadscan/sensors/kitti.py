@@ -36,7 +36,7 @@ from pydantic import Field
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.model.strict import Strict
-from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.sensors.records import Sieve, options_of
 
 RECORD_BYTES: Final = 16
@@ -95,6 +95,11 @@ class Kitti(LogFormat):
         texts = [p for pattern in ("timestamps*.txt", "*.csv") for p in _points_folder(path).glob(pattern)]
         texts += [p for p in path.glob("*.csv") if p not in texts]
         return sorted([*_sweeps(path), *texts])
+
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """The CSV of stamps, wherever it is."""
+        stamps = options.stamps if isinstance(options, KittiOptions) else None
+        return [] if stamps is None else [beside(path, stamps)]
 
     def header(self, source: LogSource) -> LogHeader:
         """Number of sweeps and the period of a turn."""
@@ -197,7 +202,7 @@ def _stamps(source: LogSource, options: KittiOptions) -> dict[int, int]:
     """Epoch (GPS ns) by number of the sweep."""
     if options.stamps is not None:
         clock = source.need_clock('{ system = "unix_utc", unit = "s" }')
-        file = source.path / options.stamps
+        file = beside(source.path, options.stamps)
         numbers, stamps_ns = _stamps_of_csv(file, options, UNIT_NS[clock.unit])
     else:
         clock = source.clock or Clock(TimeSystem.UNIX_UTC)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Self, Union, get_args, get_origin
+from typing import Any, Final, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -29,15 +29,37 @@ class Strict(BaseModel):
             raise ConfigError("; ".join(faults), file=file) from error
 
 
+OPEN_QUESTION: Final = "#?"
+"""Begins a line that waits for its author: `roadscan init` writes one for each thing it must not guess."""
+
+
 def load_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file, or raise :class:`ConfigError` with the line of the fault."""
+    """Read a TOML file, or raise :class:`ConfigError` with the line of the fault.
+
+    A line that begins with :data:`OPEN_QUESTION` is a fault: the file is not completed.
+    """
     try:
-        with Path(path).open("rb") as stream:
-            return tomllib.load(stream)
+        text = Path(path).read_bytes().decode("utf-8")
+        values = tomllib.loads(text)
     except FileNotFoundError as error:
         raise ConfigError("the file does not exist", file=path) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"not valid TOML: {error}", file=path) from error
+    _refuse_open_questions(text, path)
+    return values
+
+
+def _refuse_open_questions(text: str, path: str | Path) -> None:
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
+    questions = [(n, line) for n, line in lines if line.startswith(OPEN_QUESTION)]
+    if questions:
+        number, line = questions[0]
+        raise ConfigError(
+            f"line {number} is not completed ({len(questions)} open in all): "
+            f"{line.removeprefix(OPEN_QUESTION).strip()}",
+            expected=f"the line completed, and its '{OPEN_QUESTION}' taken away",
+            file=path,
+        )
 
 
 def _describe(model: type[BaseModel], fault: Any) -> str:

@@ -133,6 +133,18 @@ class LogHeader:
 Item: TypeAlias = Rows | Reject
 
 
+@dataclass(frozen=True)
+class Provisional:
+    """What may be assumed to look into a log of which nothing is stated: for looking only, never for ingest."""
+
+    clock: Clock | None = None
+    """Clock that shows the stamps as they are: `free` for a count of seconds, week 0 for seconds of the week."""
+    crs: str | None = None
+    """CRS that fits the kind of coordinates (degrees, metres, Cartesian)."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Settings of the format that have no default."""
+
+
 def beside(log: Path, named: Path) -> Path:
     """Absolute path of a file that a log's settings name: relative to the log's folder."""
     return (log if log.is_dir() else log.parent) / named
@@ -153,6 +165,9 @@ class LogFormat(ABC):
     """What the format says about its time system and what the survey file has to state."""
     options: ClassVar[type[Strict]] = NoOptions
     """Model of the format's settings; the docstrings of its fields are the manual."""
+    provisional: ClassVar[tuple[Provisional, ...]] = ()
+    """Readings that `roadscan inspect` tries first where statements are missing. Needed only where the usual
+    clocks, frames and settings, which it then tries one after another, do not open the log."""
 
     @abstractmethod
     def sniff(self, path: Path) -> bool:

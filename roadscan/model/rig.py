@@ -63,6 +63,8 @@ class Sensor(Strict):
     """Readings nearer than this are left out (own vehicle)."""
     range_max_m: float = Field(default=float("inf"), gt=0.0)
     """Readings farther than this are left out."""
+    metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -22,7 +22,7 @@ import pyarrow as pa
 from roadscan.model.crs import Geoid, MapFrame
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
 from roadscan.model.gpstime import Clock
-from roadscan.model.rig import Sensor
+from roadscan.model.rig import Sensor, SensorKind
 from roadscan.model.strict import Strict
 
 ENTRY_POINT_GROUP: Final = "roadscan.formats"
@@ -77,6 +77,25 @@ class LogSource:
                 file=self.path,
             )
         return self.crs
+
+    def need_sensor(self, *kinds: SensorKind) -> Sensor:
+        """The rig's sensor that wrote the log, or an error where none is named or it is of another kind."""
+        wanted = " or ".join(kinds)
+        if self.sensor is None:
+            raise ConfigError(
+                "the log names no sensor",
+                expected=f"a sensor of the rig, of kind {wanted}",
+                change='add sensor = "…" to this log',
+                file=self.path,
+            )
+        if self.sensor.kind not in kinds:
+            raise ConfigError(
+                f"the log's sensor is of kind {self.sensor.kind}",
+                expected=f"a sensor of kind {wanted}",
+                change="name another sensor, or correct its kind in the rig file",
+                file=self.path,
+            )
+        return self.sensor
 
 
 @dataclass(frozen=True)

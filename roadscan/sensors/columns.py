@@ -16,15 +16,46 @@ from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nea
 from roadscan.model.gpstime import UNIT_NS, Clock
 from roadscan.model.strict import Strict
 
-Dimension: TypeAlias = Literal["angle", "length", "time", "text"]
+Dimension: TypeAlias = Literal[
+    "angle", "length", "time", "rate", "acceleration", "speed", "temperature", "count", "text"
+]
+
+STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+"""Size of the unit g (CGPM 1901)."""
 
 UNITS: Final[dict[Dimension, dict[str, float]]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10_800, "arcsec": math.pi / 648_000},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "ft_us": 1200 / 3937},
     "time": {unit: scale / 1e9 for unit, scale in UNIT_NS.items()} | {"utc": 1.0},
+    "rate": {
+        "rad_per_s": 1.0,
+        "rad_s": 1.0,
+        "deg_per_s": math.pi / 180,
+        "deg_s": math.pi / 180,
+        "dps": math.pi / 180,
+        "deg_per_h": math.pi / 648_000,
+        "deg_h": math.pi / 648_000,
+    },
+    "acceleration": {
+        "m_per_s2": 1.0,
+        "m_s2": 1.0,
+        "g": STANDARD_GRAVITY_M_PER_S2,
+        "mg": STANDARD_GRAVITY_M_PER_S2 / 1e3,
+    },
+    "speed": {
+        "m_per_s": 1.0,
+        "m_s": 1.0,
+        "km_per_h": 1 / 3.6,
+        "km_h": 1 / 3.6,
+        "kmh": 1 / 3.6,
+        "mph": 1609.344 / 3600,
+    },
+    "temperature": {"deg_c": 1.0},
+    "count": {"": 1.0},
     "text": {"": 1.0},
 }
-"""Units by dimension and their size in radians, metres or seconds; `utc` is ISO 8601 text."""
+"""Units by dimension and their size in radians, metres, seconds or what they make of these; `utc` is ISO 8601
+text."""
 
 
 class ColumnOption(Strict):
@@ -33,8 +64,8 @@ class ColumnOption(Strict):
     name: str
     """Name of the column in the file."""
     unit: str | None = None
-    """Its unit: deg, rad, arcmin, arcsec; m, mm, cm, km, ft, ft_us (US survey foot). Needed unless
-    the name ends in it."""
+    """Its unit: deg, rad, arcmin, arcsec; m, mm, cm, km, ft, ft_us (US survey foot); rad_per_s, deg_per_s,
+    deg_per_h; m_per_s2, g, mg; m_per_s, km_per_h, mph; deg_c. Needed unless the name ends in it."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +85,7 @@ class Found:
 
     column: str
     scale: float
-    """Radians, metres or seconds in one unit of the column."""
+    """Size of the column's unit, see :data:`UNITS`."""
     unit: str
     """Unit as named, "" where the name of a time column says none."""
 
@@ -64,7 +95,7 @@ def find_columns(
     names: tuple[str, ...],
     stated: Mapping[str, ColumnOption],
     file: Path,
-    units_of_crs: Mapping[str, float] | None = None,
+    plain_units: Mapping[str, float] | None = None,
 ) -> dict[str, Found]:
     """Find the column of each quantity.
 
@@ -72,8 +103,8 @@ def find_columns(
     ----------
     names : names of the file's columns.
     stated : columns as the log's options state them, by quantity.
-    units_of_crs : size in radians or metres of the unit in which columns that bear just the
-        quantity's name are taken, for quantities whose unit the stated CRS fixes.
+    plain_units : size of the unit (see :data:`UNITS`) in which columns that bear just the quantity's
+        name are taken, for quantities whose unit the stated CRS, or an option, fixes.
 
     Raises
     ------
@@ -88,7 +119,7 @@ def find_columns(
     for quantity in known.values():
         option = stated.get(quantity.name)
         one = (
-            _by_name(quantity, names, file, units_of_crs or {})
+            _by_name(quantity, names, file, plain_units or {})
             if option is None
             else _by_option(quantity, option, names, file)
         )
@@ -135,7 +166,7 @@ def _plain(quantity: Quantity, lower: list[str]) -> list[str]:
     return [stem for stem in (quantity.name, *quantity.also) if stem in lower]
 
 
-def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, units_of_crs: Mapping[str, float]) -> Found | None:
+def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, plain_units: Mapping[str, float]) -> Found | None:
     spellings = _spellings(quantity)
     fitting = [n for n in names if n.lower() in spellings]
     if len(fitting) > 1:
@@ -148,8 +179,8 @@ def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, units_of_cr
         unit = spellings[fitting[0].lower()]
         return Found(fitting[0], UNITS[quantity.dimension][unit], unit)
     plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
-    if plain and quantity.name in units_of_crs:
-        return Found(plain[0], units_of_crs[quantity.name], "of the CRS")
+    if plain and quantity.name in plain_units:
+        return Found(plain[0], plain_units[quantity.name], "as stated")
     return None
 
 

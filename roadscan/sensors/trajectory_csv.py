@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from roadscan.model.crs import LOCAL_WORLD, crs_from_text
-from roadscan.model.errors import TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.sensors.columns import ColumnOption, Found, Quantity, find_columns, fits, need_stamp_unit
+from roadscan.sensors.columns import ColumnOption, Found, Quantity, find_columns, fits
 from roadscan.sensors.poses import (
     North,
     Placement,
@@ -27,22 +23,19 @@ from roadscan.sensors.poses import (
     ned_from_rph,
 )
 from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.stamps import TIME, StampColumn
 from roadscan.sensors.text_table import (
     Kind,
     TextBlock,
     TextLayout,
     TextOptions,
-    first_fields,
     sniff_layout,
-    stamp_kind,
     text_blocks,
     text_layout,
 )
 
-Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 
-TIME: Final = Quantity("time", "time", ("timestamp", "stamp", "gps_time", "utc_time", "unix_time"))
 GEODETIC: Final = (
     Quantity("longitude", "angle", ("lon", "lng")),
     Quantity("latitude", "angle", ("lat",)),
@@ -64,6 +57,7 @@ SIGMAS: Final = (
     Quantity("sigma_east", "length", ("sigma_easting",), optional=True),
     Quantity("sigma_down", "length", ("sigma_height", "sigma_up"), optional=True),
 )
+ANGLE_SIGMAS: Final = tuple(Quantity(f"sigma_{q.name}", "angle", optional=True) for q in ATTITUDE)
 
 
 class TrajectoryCsvOptions(TextOptions):
@@ -71,7 +65,8 @@ class TrajectoryCsvOptions(TextOptions):
 
     columns: dict[str, ColumnOption] = {}
     """Which column holds which quantity, where its name does not say so: time; longitude, latitude,
-    height, or easting, northing, height; roll, pitch, heading; sigma_north, sigma_east, sigma_down.
+    height, or easting, northing, height; roll, pitch, heading; sigma_north, sigma_east, sigma_down;
+    sigma_roll, sigma_pitch, sigma_heading.
     For example { latitude = { name = "Lat", unit = "deg" } }."""
     heading: North | None = None
     """North that the heading is counted from, clockwise: "true" or "grid". Needed for a projected CRS;
@@ -86,10 +81,8 @@ class _Plan:
     columns: dict[str, Found]
     horizontal: tuple[str, str]
     kinds: dict[str, Kind]
-    clock: Clock
+    stamps: StampColumn
     placement: Placement
-    zoned: bool
-    """Calendar times carry a zone."""
 
 
 class TrajectoryCsv(LogFormat):
@@ -128,7 +121,7 @@ class TrajectoryCsv(LogFormat):
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a line that cannot be read is rejected."""
         plan = _plan(source)
-        reader = PoseReader(source, plan.clock, plan.placement)
+        reader = PoseReader(source, plan.stamps.clock, plan.placement)
         for block in text_blocks(source.path, plan.layout, plan.kinds):
             if isinstance(block, Reject):
                 yield block
@@ -142,19 +135,11 @@ def _plan(source: LogSource) -> _Plan:
     placement = level_placement(source, options.heading)
     position = _position_of(source.need_crs())
     layout = text_layout(source.path, options)
-    columns = find_columns((TIME, *position, *ATTITUDE, *SIGMAS), layout.names, options.columns, source.path)
-    stamp = columns["time"]
+    columns = find_columns((TIME, *position, *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS), layout.names, options.columns, source.path)
+    stamps = StampColumn.of(source, source.path, layout, columns["time"])
     kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
-    kinds[stamp.column] = stamp_kind(source.path, layout, stamp.column)
-    zoned = False
-    if kinds[stamp.column] == "text":
-        word = _first_word(source.path, layout, stamp.column)
-        zoned = _parse_calendar([word], zoned=True) is not None
-        clock = _clock_of_text(source, word, zoned=zoned)
-    else:
-        clock = source.need_clock('{ system = "gps", unit = "s" }')
-        need_stamp_unit(stamp, clock, source.path)
-    return _Plan(layout, columns, (position[0].name, position[1].name), kinds, clock, placement, zoned)
+    kinds[stamps.column] = stamps.kind
+    return _Plan(layout, columns, (position[0].name, position[1].name), kinds, stamps, placement)
 
 
 def _position_of(crs: str) -> tuple[Quantity, ...]:
@@ -173,72 +158,12 @@ def _raw(block: TextBlock, plan: _Plan, sieve: Sieve) -> RawPoses:
     check_rph(roll, pitch, heading, sieve)
     with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
         attitude = ned_from_rph(roll, pitch, heading)
-    stamp = plan.columns["time"].column
-    if plan.kinds[stamp] == "text":
-        stamps: npt.NDArray[np.generic] = _calendar_ns(block.text(stamp), sieve, zoned=plan.zoned)
-    else:
-        stamps = block.stamps(stamp)
     return RawPoses(
         records=block.records,
         offsets=block.offsets,
-        stamps=stamps,
+        stamps=plan.stamps.stamps(block, sieve),
         position=np.stack([quantity(name) for name in (*plan.horizontal, "height")]),
         attitude=attitude,
-        sigma_ned_m={f"{q.name}_m": quantity(q.name) for q in SIGMAS if q.name in plan.columns},
+        sigmas={f"{q.name}_m": quantity(q.name) for q in SIGMAS if q.name in plan.columns}
+        | {f"{q.name}_deg": np.degrees(quantity(q.name)) for q in ANGLE_SIGMAS if q.name in plan.columns},
     )
-
-
-# --- time as text -----------------------------------------------------------------------------------
-
-
-def _first_word(path: Path, layout: TextLayout, column: str) -> str:
-    index = layout.names.index(column)
-    words = (fields[index].strip() for fields in first_fields(path, layout, 20))
-    return next((word for word in words if word), "")
-
-
-def _clock_of_text(source: LogSource, word: str, *, zoned: bool) -> Clock:
-    """Clock of calendar times, counted in nanoseconds from 1970 on the scale they are written in."""
-    clock = source.clock
-    if zoned:
-        if clock is not None and clock.system is not TimeSystem.UNIX_UTC:
-            raise TimeSystemError(
-                f"time '{word}' has a zone, so it is UTC, the clock says {clock.system}",
-                expected='clock.system = "unix_utc", or no clock',
-                file=source.path,
-            )
-        return replace(clock or Clock(TimeSystem.UNIX_UTC), unit="ns")
-    if _parse_calendar([word], zoned=False) is None:
-        raise TimeSystemError(
-            f"time '{word[:40]}' is neither a number nor ISO 8601 text",
-            expected="such as 2026-05-04T09:30:00.125Z",
-            file=source.path,
-        )
-    scales = (TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TAI)
-    if clock is None or clock.system not in scales:
-        raise TimeSystemError(
-            f"time '{word}' has no zone",
-            expected="clock.system = unix_utc, unix_gps or unix_tai: the scale it is written in",
-            change='add clock = { system = "unix_utc" } if it is UTC',
-            file=source.path,
-        )
-    return replace(clock, unit="ns")
-
-
-def _calendar_ns(words: list[str], sieve: Sieve, *, zoned: bool) -> Int64:
-    """Nanoseconds (n,) from 1970 of ISO 8601 times; a word that is none costs its record."""
-    whole = _parse_calendar(words, zoned=zoned)
-    if whole is not None:
-        return whole
-    singles = [_parse_calendar([word], zoned=zoned) for word in words]
-    zone = "with" if zoned else "without"
-    sieve.drop(np.array([one is None for one in singles]), f"time is not ISO 8601 text {zone} a zone, as the first is")
-    return np.array([0 if one is None else one[0] for one in singles], dtype=np.int64)
-
-
-def _parse_calendar(words: list[str], *, zoned: bool) -> Int64 | None:
-    kind = pa.timestamp("ns", "UTC") if zoned else pa.timestamp("ns")
-    try:
-        return np.asarray(pc.cast(pa.array(words, pa.string()), kind).cast(pa.int64()), dtype=np.int64)
-    except pa.ArrowInvalid:
-        return None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -53,6 +53,8 @@ ANGLE_MAX_RAD: Final = 4 * math.pi
 """Attitude angles beyond two turns are damage."""
 SIGMA_MAX_M: Final = 1e6
 """A position less certain than this is damage."""
+SIGMA_MAX_DEG: Final = 360.0
+"""An angle less certain than a whole turn is damage."""
 GRID_MAX_M: Final = 2.1e7
 """Eastings and northings beyond half the Earth's girth are damage."""
 
@@ -353,19 +355,109 @@ class RawPoses:
     """(3, n)."""
     attitude: Float64
     """(4, n) unit quaternions."""
-    sigma_ned_m: dict[str, Float64]
-    """1 σ of the position by column name, (n,) with NaN where missing."""
+    sigmas: dict[str, Float64]
+    """1 σ of position (m) and attitude (degrees) by column name, (n,) with NaN where missing."""
+
+
+class BlockPlacer:
+    """Places the positions of one log, block by block; one that cannot be placed costs its record."""
+
+    def __init__(self, placement: Placement, file: Path) -> None:
+        self._placement = placement
+        self._file = file
+        self._placed_any = False
+
+    def place(
+        self, records: Int64, position: Float64, attitude: Float64, sieve: Sieve
+    ) -> tuple[Float64, Float64] | None:
+        """World positions (3, m) and attitudes (4, m) of the records that are sound afterwards, None where none is.
+
+        Raises
+        ------
+        CrsError
+            if no position of the log's first block can be placed.
+        """
+
+        def attempt(rows: Index) -> tuple[Float64, Float64]:
+            return self._placement.place(position[:, rows], attitude[:, rows])
+
+        if not sieve.good.any():
+            return None
+        try:
+            placed = attempt(sieve.kept)
+        except CrsError:
+            failed = drop_failing(sieve, attempt)
+            if failed is not None:
+                self._give_up(failed, records, sieve)
+                return None
+            placed = attempt(sieve.kept)
+        self._placed_any = True
+        return placed
+
+    def _give_up(self, error: RoadscanError, records: Int64, sieve: Sieve) -> None:
+        """No position of the block can be placed: a fault of the log, unless earlier blocks were sound."""
+        if not self._placed_any:
+            raise CrsError(
+                error.arrived,
+                expected=error.expected,
+                change=error.change,
+                file=self._file,
+                record=int(records[np.flatnonzero(sieve.good)[0]]),
+            )
+        sieve.drop(sieve.good.copy(), error.arrived)
+
+
+def block_rows(
+    table: str, columns: Mapping[str, pa.Array], records: Int64, offsets: Int64, record_bytes: int = 0
+) -> Rows:
+    """Rows of the sound records of a block.
+
+    Parameters
+    ----------
+    columns : by name, of n values each.
+    records, offsets : (n,) record numbers, growing, and byte offsets (−1 without any).
+    record_bytes : bytes from one record to the next, 0 where it varies.
+    """
+    unbroken = int(records[-1] - records[0]) == records.size - 1
+    return Rows(
+        table,
+        pa.record_batch(dict(columns)),
+        first_record=int(records[0]),
+        first_offset=int(offsets[0]),
+        record_bytes=record_bytes if unbroken else 0,
+    )
+
+
+def check_sigmas(sigmas: dict[str, Float64], sieve: Sieve) -> None:
+    """Drop records with a σ (by column name, (n,), NaN where missing) that is negative or beyond all reason."""
+    for name, sigma in sigmas.items():
+        limit = SIGMA_MAX_DEG if name.endswith("_deg") else SIGMA_MAX_M
+        sieve.drop(~(np.isnan(sigma) | ((sigma >= 0) & (sigma <= limit))), f"{name} is no σ: not within 0 to {limit:g}")
 
 
 class PoseReader:
-    """Turns the blocks of one log into rows of `trajectory` and rejects."""
+    """Turns the blocks of one log into rows of `trajectory` and rejects.
 
-    def __init__(self, source: LogSource, clock: Clock, placement: Placement, record_bytes: int = 0) -> None:
-        self._file = source.path
+    Parameters
+    ----------
+    record_bytes : bytes from one record to the next, 0 where it varies.
+    accuracy : gives, for the GPS epochs (n,) of poses, the σ of another log by column name, as in
+        :class:`RawPoses`.
+    """
+
+    def __init__(
+        self,
+        source: LogSource,
+        clock: Clock,
+        placement: Placement,
+        record_bytes: int = 0,
+        accuracy: Callable[[Int64], dict[str, Float64]] | None = None,
+    ) -> None:
         self._placement = placement
+        self._placer = BlockPlacer(placement, source.path)
         self._record_bytes = record_bytes
+        self._accuracy = accuracy
         self._epochs = EpochReader(clock, source.path)
-        self._placed_any = False
 
     def items(self, raw: RawPoses, sieve: Sieve) -> Iterator[Item]:
         """Rows of the sound poses of a block, then its rejects.
@@ -376,61 +468,24 @@ class PoseReader:
             if the stated clock or CRS fits no record of the log's first block.
         """
         self._placement.check(raw.position, sieve)
-        for name, sigma in raw.sigma_ned_m.items():
-            sieve.drop(~(np.isnan(sigma) | ((sigma >= 0) & (sigma <= SIGMA_MAX_M))), f"{name} is no σ of a position")
+        check_sigmas(raw.sigmas, sieve)
         epochs = self._epochs.epochs(raw.stamps, sieve, raw.records)
-        placed = self._placed(raw, sieve)
+        placed = self._placer.place(raw.records, raw.position, raw.attitude, sieve)
         if placed is not None:
             yield self._rows(raw, sieve.kept, epochs[sieve.kept], *placed)
         yield from sieve.rejects(raw.records, raw.offsets)
-
-    def _placed(self, raw: RawPoses, sieve: Sieve) -> tuple[Float64, Float64] | None:
-        """World poses of the records that are sound afterwards, None where none is."""
-
-        def attempt(rows: Index) -> tuple[Float64, Float64]:
-            return self._placement.place(raw.position[:, rows], raw.attitude[:, rows])
-
-        if not sieve.good.any():
-            return None
-        try:
-            placed = attempt(sieve.kept)
-        except CrsError:
-            failed = drop_failing(sieve, attempt)
-            if failed is not None:
-                self._give_up(failed, raw, sieve)
-                return None
-            placed = attempt(sieve.kept)
-        self._placed_any = True
-        return placed
-
-    def _give_up(self, error: RoadscanError, raw: RawPoses, sieve: Sieve) -> None:
-        """No position of the block can be placed: a fault of the log, unless earlier blocks were sound."""
-        if not self._placed_any:
-            raise CrsError(
-                error.arrived,
-                expected=error.expected,
-                change=error.change,
-                file=self._file,
-                record=int(raw.records[np.flatnonzero(sieve.good)[0]]),
-            )
-        sieve.drop(sieve.good.copy(), error.arrived)
 
     def _rows(self, raw: RawPoses, good: Index, epochs: Int64, xyz: Float64, quaternion: Float64) -> Rows:
         columns: dict[str, npt.NDArray[np.generic]] = {"epoch_gps_ns": epochs}
         columns |= dict(zip(("x_world_m", "y_world_m", "z_world_m"), xyz, strict=True))
         columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True))
         arrays = {name: pa.array(values) for name, values in columns.items()}
-        for name, sigma in raw.sigma_ned_m.items():
-            arrays[name] = pa.array(sigma[good].astype(np.float32), from_pandas=True)  # NaN becomes null
-        records, offsets = raw.records[good], raw.offsets[good]
-        unbroken = int(records[-1] - records[0]) == records.size - 1
-        return Rows(
-            "trajectory",
-            pa.record_batch(arrays),
-            first_record=int(records[0]),
-            first_offset=int(offsets[0]),
-            record_bytes=self._record_bytes if unbroken else 0,
-        )
+        sigmas = {name: sigma[good] for name, sigma in raw.sigmas.items()}
+        if self._accuracy is not None:
+            sigmas |= self._accuracy(epochs)
+        for name, sigma in sigmas.items():
+            arrays[name] = pa.array(sigma.astype(np.float32), from_pandas=True)  # NaN becomes null
+        return block_rows("trajectory", arrays, raw.records[good], raw.offsets[good], self._record_bytes)
 
 
 def unit_quaternions(quaternion: Float64, sieve: Sieve) -> Float64:

@@ -6,16 +6,25 @@ Nothing here knows a format. A :class:`Sieve` collects the faults of a block's r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.errors import RoadscanError, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, unroll_week
+from roadscan.model.gpstime import (
+    EARLIEST_GPS_NS,
+    LATEST_GPS_NS,
+    NS_PER_S,
+    UNIT_NS,
+    WEEK_S,
+    Clock,
+    TimeSystem,
+    unroll_week,
+)
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import LogSource, Reject
 
@@ -25,6 +34,9 @@ Bool = npt.NDArray[np.bool_]
 
 LEAP_NS: Final = 10 * NS_PER_S
 """A single stamp farther than this outside its two neighbours is damage, not a late record."""
+
+_DAY_NS: Final = 86_400 * NS_PER_S
+_MOST_REJECTS: Final = 200
 
 
 Options = TypeVar("Options", bound=Strict)
@@ -77,6 +89,21 @@ class Sieve:
                 yield Reject(reason, int(records[run[0]]), int(offsets[run[0]]), run.size)
 
 
+def few_rejects(rejects: Sequence[Reject]) -> list[Reject]:
+    """Rejects of a batch; where there are very many runs of records, one a reason."""
+    if len(rejects) <= _MOST_REJECTS:
+        return list(rejects)
+    merged: dict[str, list[Reject]] = {}
+    for reject in rejects:
+        merged.setdefault(reject.reason, []).append(reject)
+    return [
+        Reject(
+            f"{reason} (scattered from this record on)", same[0].record, same[0].offset, sum(r.records for r in same)
+        )
+        for reason, same in merged.items()
+    ]
+
+
 def isolate(attempt: Callable[[Int64], object], rows: Int64) -> list[tuple[int, RoadscanError]]:
     """Find the single rows on which `attempt` fails, by halving.
 
@@ -125,9 +152,14 @@ class EpochReader:
 
     A stamp that the clock refuses costs its record. If the clock refuses all stamps of the log's
     first block, it is the clock that is wrong: the error is raised, with file and record.
+
+    Parameters
+    ----------
+    near_s : for seconds of the week, a stamp of another log (in the week that the clock states) to which
+        the first stamp is nearer than half a week; without one, the log itself starts in that week.
     """
 
-    def __init__(self, clock: Clock, file: Path) -> None:
+    def __init__(self, clock: Clock, file: Path, near_s: float | None = None) -> None:
         self._clock = clock
         self._file = file
         self._weekly = clock.system is TimeSystem.GPS_WEEK
@@ -135,7 +167,7 @@ class EpochReader:
             clock.first_week()  # refuses a clock without a week before anything is read
             self._clock = replace(clock, unit="s")
         self._stamp_s = UNIT_NS[clock.unit] / NS_PER_S
-        self._last_seconds: float | None = None
+        self._last_seconds = near_s
         self._last_epoch: int | None = None
 
     def epochs(self, stamps: npt.NDArray[np.generic], sieve: Sieve, records: Int64) -> Int64:
@@ -222,3 +254,51 @@ class EpochReader:
             sieve.drop(leaping, f"time stamp leaps out of the log's order by over {LEAP_NS // NS_PER_S} s and back")
             rows = np.flatnonzero(sieve.good)
         self._last_epoch = int(epochs[rows[-1]])
+
+
+@dataclass(frozen=True)
+class UnorderedStamps:
+    """Stamps of points that stand in no order of time: brought to GPS time about one of them."""
+
+    clock: Clock
+    anchor: float
+    """A stamp of the log's start, in the clock's unit."""
+    anchor_gps_ns: int
+
+    @classmethod
+    def of(cls, clock: Clock, sample: Float64, file: Path) -> Self:
+        """Take the middle one of `sample` (n,), finite stamps of the log's start, as the anchor.
+
+        Raises
+        ------
+        TimeSystemError
+            if the clock does not fit it.
+        """
+        if not sample.size:
+            return cls(clock, 0.0, 0)
+        anchor = np.sort(sample)[[sample.size // 2]]
+        try:
+            epoch = int(clock.to_epoch_gps_ns(anchor)[0])
+        except TimeSystemError as error:
+            raise TimeSystemError(error.arrived, expected=error.expected, change=error.change, file=file) from error
+        return cls(clock, float(anchor[0]), epoch)
+
+    def epochs(self, stamps: Float64, sieve: Sieve, name: str = "gps_time") -> Int64:
+        """GPS time (ns, (n,)) of `stamps` (n,); records without a possible one are dropped, and 0."""
+        scale_ns = UNIT_NS[self.clock.unit]
+        with np.errstate(invalid="ignore", over="ignore"):
+            elapsed_ns = (stamps - self.anchor) * scale_ns
+            # A day's margin: leap seconds and drift are left to the clock's own exact rule.
+            earliest = EARLIEST_GPS_NS - self.anchor_gps_ns + _DAY_NS
+            latest = LATEST_GPS_NS - self.anchor_gps_ns - _DAY_NS
+            sieve.drop(~((elapsed_ns >= earliest) & (elapsed_ns <= latest)), f"{name} is no possible time")
+        used = stamps
+        if self.clock.system is TimeSystem.GPS_WEEK:
+            seconds = stamps * (scale_ns / NS_PER_S)
+            sieve.drop(~((seconds >= 0) & (seconds <= WEEK_S)), f"{name} is outside the GPS week")
+            # Records are not in order of time: those beyond a week's end are the ones half a week away.
+            weeks = np.rint((self.anchor - stamps) * scale_ns / NS_PER_S / WEEK_S)
+            used = stamps + weeks * (WEEK_S * NS_PER_S / scale_ns)
+        out = np.zeros(stamps.size, dtype=np.int64)
+        out[sieve.kept] = self.clock.to_epoch_gps_ns(used[sieve.kept])
+        return out

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import ConfigError, FormatError
-from roadscan.model.gpstime import WEEK_S
-from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock
+from roadscan.model.strict import Strict
+from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.sensors.poses import (
     HEIGHT_MAX_M,
     HEIGHT_MIN_M,
@@ -23,7 +24,8 @@ from roadscan.sensors.poses import (
     check_rph,
     ned_from_rph,
 )
-from roadscan.sensors.records import Sieve
+from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.smrmsg import CLOCK_EXAMPLE, CarriedAccuracy
 
 Float64 = npt.NDArray[np.float64]
 
@@ -46,6 +48,14 @@ _LIMITS: Final = np.array(
 )
 
 
+class SbetOptions(Strict):
+    """Settings of `sbet`."""
+
+    accuracy: Path | None = None
+    """SMRMSG file of the same mission, relative to the log's folder: its σ of position and attitude are
+    carried with the poses, linear in time; poses beyond its span have none."""
+
+
 class Sbet(LogFormat):
     """Little-endian records of 17 doubles without a header.
 
@@ -61,6 +71,7 @@ class Sbet(LogFormat):
         "seconds of the GPS week; the week is not in the file: state "
         'clock = { system = "gps_week_seconds", week = … } or date = …; other systems can be stated'
     )
+    options = SbetOptions
 
     def sniff(self, path: Path) -> bool:
         """True if the first records are plausible and their times grow."""
@@ -79,9 +90,14 @@ class Sbet(LogFormat):
         growing = np.all(np.diff(records[:, TIME]) > 0) and records[0, TIME] >= 0
         return bool(ordinary and somewhere and growing and records[0, HEIGHT] > HEIGHT_MIN_M)
 
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """The SMRMSG file, where one is named."""
+        named = options.accuracy if isinstance(options, SbetOptions) else None
+        return [] if named is None else [beside(path, named)]
+
     def header(self, source: LogSource) -> LogHeader:
-        """Check clock, CRS and heights, and that there is a record."""
-        _reader(source)
+        """Check clock, CRS, heights and the accuracy file's name, and that there is a record."""
+        _reader(source, _accuracy(source))
         if source.path.stat().st_size < RECORD_BYTES:
             raise FormatError(
                 f"the file has {source.path.stat().st_size} bytes",
@@ -92,7 +108,8 @@ class Sbet(LogFormat):
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a truncated last record is rejected."""
-        reader = _reader(source)
+        accuracy = _accuracy(source)
+        reader = _reader(source, accuracy)
         for first, fields in _chunks(source.path):
             if isinstance(fields, Reject):
                 yield fields
@@ -111,14 +128,36 @@ class Sbet(LogFormat):
                 stamps=time,
                 position=np.stack([longitude, latitude, height]),
                 attitude=attitude,
-                sigma_ned_m={},
+                sigmas={},
             )
             yield from reader.items(raw, sieve)
+            if accuracy is not None:
+                yield from accuracy.rejects()
+        if accuracy is not None:
+            yield from accuracy.finish()
 
 
-def _reader(source: LogSource) -> PoseReader:
-    clock = source.need_clock('{ system = "gps_week_seconds", week = 2405 }')
-    return PoseReader(source, clock, _placement(source), RECORD_BYTES)
+def _reader(source: LogSource, accuracy: CarriedAccuracy | None) -> PoseReader:
+    clock = source.need_clock(CLOCK_EXAMPLE)
+    return PoseReader(source, clock, _placement(source), RECORD_BYTES, None if accuracy is None else accuracy.at)
+
+
+def _accuracy(source: LogSource) -> CarriedAccuracy | None:
+    named = options_of(source, SbetOptions).accuracy
+    if named is None:
+        return None
+    clock = source.need_clock(CLOCK_EXAMPLE)
+    return CarriedAccuracy(beside(source.path, named), named.as_posix(), clock, _first_second(source.path, clock))
+
+
+def _first_second(path: Path, clock: Clock) -> float | None:
+    """First stamp (s), None where it cannot be seconds of a week."""
+    with path.open("rb") as stream:
+        head = stream.read(8)
+    if len(head) < 8:
+        return None
+    seconds = float(np.frombuffer(head, dtype="<f8")[0]) * UNIT_NS[clock.unit] / NS_PER_S
+    return seconds if 0 <= seconds < 2 * WEEK_S else None
 
 
 def _placement(source: LogSource) -> GeodeticPlacement:

@@ -226,7 +226,7 @@ def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> It
     a block of some 1 MB of text.
     """
     record = 0
-    for offset, data in _line_blocks(path, layout.data_offset):
+    for offset, data in line_blocks(path, layout.data_offset):
         if isinstance(data, Reject):
             yield Reject(data.reason, record, offset)
             record += 1
@@ -236,18 +236,41 @@ def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> It
             continue
         records = record + np.arange(starts.size, dtype=np.int64)
         record += starts.size
-        whole = int((ends - starts).sum()) == len(data)
-        table = _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
-        if table is not None:
-            yield TextBlock(table, records, offset + starts)
-        else:
-            yield from _parse_lines(data, starts, ends, layout, kinds, records, offset)
+        yield from parse_lines(data, starts, ends, layout, kinds, records, offset + starts)
 
 
-def _line_blocks(path: Path, start: int) -> Iterator[tuple[int, bytes | Reject]]:
-    """Pieces of whole lines from byte `start` of the text on, each with its offset."""
+def parse_lines(
+    data: bytes,
+    starts: Int64,
+    ends: Int64,
+    layout: TextLayout,
+    kinds: Mapping[str, Kind],
+    records: Int64,
+    offsets: Int64,
+) -> Iterator[TextBlock | Reject]:
+    """Read the columns `kinds` of lines in memory; a line at fault becomes a reject.
+
+    Parameters
+    ----------
+    starts, ends : (n,) bytes of `data` where each line starts, and ends behind its line feed.
+    layout : `data_offset` and `comment` are not looked at.
+    records, offsets : (n,) record number and byte offset of each line, as blocks and rejects state them.
+    """
+    whole = int((ends - starts).sum()) == len(data)
+    table = _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
+    if table is not None:
+        yield TextBlock(table, records, offsets)
+    else:
+        yield from _parse_singly(data, starts, ends, layout, kinds, records, offsets)
+
+
+def line_blocks(path: Path, start: int = 0) -> Iterator[tuple[int, bytes | Reject]]:
+    """Pieces of whole lines from byte `start` of the text on, each with its offset.
+
+    A reject stands for a line without end, or for all that follows the break of a compressed stream.
+    """
     carry, offset, skipping = b"", 0, False
-    for chunk in _pieces(path):
+    for chunk in byte_pieces(path):
         if isinstance(chunk, Reject):
             yield offset, chunk
             return
@@ -270,8 +293,8 @@ def _line_blocks(path: Path, start: int) -> Iterator[tuple[int, bytes | Reject]]
         yield offset, carry
 
 
-def _pieces(path: Path) -> Iterator[bytes | Reject]:
-    """Pieces of the text of up to some 1 MB; a last reject where a compressed stream breaks off."""
+def byte_pieces(path: Path) -> Iterator[bytes | Reject]:
+    """Pieces of a file (decompressed) of up to some 1 MB; a last reject where a compressed stream breaks off."""
     with open_text(path) as stream:
         packed = isinstance(stream, gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile)
         parts: list[bytes] = []
@@ -338,14 +361,14 @@ def _parse(data: bytes, layout: TextLayout, kinds: Mapping[str, Kind], lines: in
     return None if table.num_rows != lines or missing else columns
 
 
-def _parse_lines(
+def _parse_singly(
     data: bytes,
     starts: Int64,
     ends: Int64,
     layout: TextLayout,
     kinds: Mapping[str, Kind],
     records: Int64,
-    offset: int,
+    offsets: Int64,
 ) -> Iterator[TextBlock | Reject]:
     """A block with faults, line by line."""
     where = {name: layout.names.index(name) for name in kinds}
@@ -358,17 +381,17 @@ def _parse_lines(
                 raise ValueError(f"{len(fields)} fields, expected {len(layout.names)}")
             row = {name: _value(name, fields[where[name]], kind) for name, kind in kinds.items()}
         except UnicodeDecodeError:
-            yield Reject("the line is not UTF-8 text", int(records[i]), offset + a)
+            yield Reject("the line is not UTF-8 text", int(records[i]), int(offsets[i]))
             continue
         except ValueError as error:
-            yield Reject(str(error), int(records[i]), offset + a)
+            yield Reject(str(error), int(records[i]), int(offsets[i]))
             continue
         kept.append(i)
         for name, value in row.items():
             values[name].append(value)
     if kept:
         columns = {name: pa.array(values[name], type=_ARROW_TYPES[kind]) for name, kind in kinds.items()}
-        yield TextBlock(columns, records[kept], offset + starts[kept])
+        yield TextBlock(columns, records[kept], offsets[kept])
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

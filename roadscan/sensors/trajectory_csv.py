@@ -135,7 +135,9 @@ def _plan(source: LogSource) -> _Plan:
     placement = level_placement(source, options.heading)
     position = _position_of(source.need_crs())
     layout = text_layout(source.path, options)
-    columns = find_columns((TIME, *position, *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS), layout.names, options.columns, source.path)
+    columns = find_columns(
+        (TIME, *position, *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS), layout.names, options.columns, source.path
+    )
     stamps = StampColumn.of(source, source.path, layout, columns["time"])
     kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
     kinds[stamps.column] = stamps.kind

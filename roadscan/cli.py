@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -183,6 +184,47 @@ def list_formats(
         typer.echo(f"  options.{field} ({default}): {info.description or ''}")
 
 
+@app.command("inspect")
+def inspect_files(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Files or folder logs.", show_default=False)],
+    clock: Annotated[
+        str | None, typer.Option(help="Time system, such as gps_week_seconds,week=2405 or unix_utc,unit=us.")
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help='CRS of positions, such as EPSG:4979 or "local".')] = None,
+    option: Annotated[
+        list[str] | None, typer.Option("--option", help="Setting of the format, key=value; may be repeated.")
+    ] = None,
+    format_name: Annotated[str | None, typer.Option("--format", help="Read as this format.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Read only the beginning.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: a list, one entry a file.")] = False,
+) -> None:
+    """Say of any file what it is, what it holds, its time span and extent, and what is wrong with it.
+
+    Ends with 0 if all files can be read (faults of single records do not count), with 2 if one cannot.
+    """
+    from roadscan.jobs.inspect import inspect
+    from roadscan.jobs.provisional import Stated, parse_clock, parse_option
+
+    stated = Stated(
+        clock=None if clock is None else parse_clock(clock),
+        crs=crs,
+        options=dict(parse_option(one) for one in option or ()),
+    )
+    found = []
+    for file in files:
+        with _looking(file) as progress:
+            found.append(inspect(file, stated, format_name, quick=quick, progress=progress))
+        if not as_json:
+            from roadscan.jobs.inspect_text import print_inspection
+
+            print_inspection(found[-1])
+    if as_json:
+        import json
+
+        typer.echo(json.dumps([one.as_json() for one in found], indent=2, ensure_ascii=False))
+    raise typer.Exit(0 if all(one.readable for one in found) else 2)
+
+
 @app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of a shipped scene.")],
@@ -255,6 +297,23 @@ def _reporter() -> Any:
     from roadscan.progress import LineReporter, TerminalReporter
 
     return TerminalReporter() if sys.stderr.isatty() else LineReporter()
+
+
+@contextmanager
+def _looking(file: Path) -> Iterator[Callable[[int, float | None], None]]:
+    """Show on a terminal how far a file is read; nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda rows, share: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(str(file)) as status:
+
+        def show(rows: int, share: float | None) -> None:
+            done = "" if share is None else f", {share:.0%}"
+            status.update(f"{file}: {rows:,} rows{done}")
+
+        yield show
 
 
 def _selection(tiles: list[str] | None, bbox: str | None, span: str | None) -> Selection:

@@ -15,7 +15,13 @@ from roadscan.model.errors import ConfigError, nearest
 class Strict(BaseModel):
     """Base of every configuration model: frozen, no unknown keys, documented fields."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, validate_default=True)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        use_attribute_docstrings=True,
+        validate_default=True,
+        ser_json_inf_nan="constants",
+    )
 
     @classmethod
     def parse(cls, values: dict[str, Any], *, file: str | Path | None = None) -> Self:

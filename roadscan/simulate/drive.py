@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.kernels import NODE_STEP_M
+from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.surface import Surface

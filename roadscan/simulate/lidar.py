@@ -17,9 +17,10 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.simulate import kernels
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.earth import LocalMap
+from roadscan.simulate.kernels import rays as kernels
+from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.noise import stream
 from roadscan.simulate.pcap import PcapWriter
 from roadscan.simulate.scene import Scene
@@ -129,7 +130,7 @@ def _measure_block(
     beams = hdl32e_beams()
     elevation = np.radians(beams.elevation_deg)
     found = np.zeros((*azimuth_deg.shape, 5))
-    node = (drive.station_m(ends) - surface.arrays.nodes[0, 12]) / kernels.NODE_STEP_M
+    node = (drive.station_m(ends) - surface.arrays.nodes[0, 12]) / NODE_STEP_M
     kernels.fire_lidar(
         surface.arrays,
         local.bases,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Iterator
@@ -13,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.special import ndtri
 
-from roadscan.simulate import kernels
 from roadscan.simulate.drive import Drive
+from roadscan.simulate.kernels import profiles as kernels
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Profilers, Scene
 from roadscan.simulate.surface import Surface
@@ -24,7 +26,9 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 BLOCK_PROFILES: Final = 512
-"""Profiles measured at once and a Parquet row group: the noise is drawn by the block, so this changes bytes."""
+"""Profiles measured at once and a Parquet row group."""
+WRONG_WITHIN_M: Final = 0.03
+"""Wrong readings lie this near to the road (m)."""
 _BENT_M: Final = 1e-7
 """Planes that miss their points in road coordinates by more are followed in the map, which takes longer."""
 _REACH_M: Final = 0.3
@@ -132,13 +136,13 @@ def measure(scene: Scene, surface: Surface, drive: Drive, head: Head, *, with_hi
     """Profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
     spacing = head.settings.spacing_m
     count = math.floor(drive.length_m / spacing + 1e-9) + 1
-    for block, first in enumerate(range(0, count, BLOCK_PROFILES)):
+    for first in range(0, count, BLOCK_PROFILES):
         driven = np.asarray(spacing * np.arange(first, min(first + BLOCK_PROFILES, count), dtype=np.float64))
-        yield _measure_block(scene, surface, drive, head, driven, block, with_hits)
+        yield _measure_block(scene, surface, drive, head, driven, first, with_hits)
 
 
 def _measure_block(
-    scene: Scene, surface: Surface, drive: Drive, head: Head, driven_m: Float64, block: int, with_hits: bool
+    scene: Scene, surface: Surface, drive: Drive, head: Head, driven_m: Float64, first: int, with_hits: bool
 ) -> Profiles:
     settings = head.settings
     epochs = drive.epoch_gps_ns(driven_m)
@@ -147,27 +151,25 @@ def _measure_block(
     middle = scene.vehicle.imu_height_m - head.mount.lever_arm_body_m[2]
     planes = _planes(surface, drive, origins, rotations, float(y[-1]), middle)
     shape = (epochs.size, y.size)
-    noise, bits = _errors(scene, drive, head, block, shape)
     ranges, intensity = np.empty(shape, np.uint16), np.empty(shape, np.uint8)
     true_range = np.empty(shape if with_hits else (0, 0))
-    noises = (scene.noise.dropout, scene.noise.intensity)
-    scale = np.array([middle, settings.range_offset_m, settings.range_step_m, *noises])
-    beam = np.empty((3, 3))
+    noise = scene.noise
+    errors = [noise.dropout, noise.profiler_range_m, noise.intensity, noise.impulse]
     kernels.scan_profiles(
         surface.arrays,
         planes.in_road,
         planes.in_map,
         planes.is_bent,
         y,
-        scale,
-        noise,
-        bits,
-        beam,
+        np.array([middle, settings.range_offset_m, settings.range_step_m, *errors, WRONG_WITHIN_M]),
+        _normal_numbers() if any(errors) else np.zeros(0, np.float32),
+        np.uint64(_random_from(scene, drive, head) + first * y.size),
+        np.empty((3, 3)),
         ranges,
         intensity,
         true_range,
     )
-    ticks = np.floor(drive.driven_m(epochs) * scene.vehicle.ticks_per_m + 0.5).astype(np.int64)
+    ticks = np.floor(drive.driven_m(epochs) * scene.encoder.ticks_per_m + 0.5).astype(np.int64)
     hits = _hits(drive, origins, rotations, y, true_range) if with_hits else np.empty((0, 0, 0))
     return Profiles(epochs, ticks, ranges, intensity, hits)
 
@@ -199,7 +201,7 @@ def _planes(
     near = surface.nearest_node(
         easting[:, middle] + surface.origin_enh_m[0], northing[:, middle] + surface.origin_enh_m[1]
     )
-    kernels.survey_planes(surface.arrays.nodes, easting, northing, near, in_road)
+    kernels.survey_planes(surface.arrays, easting, northing, near, in_road)
 
     def fitted(values: Float64, powers: tuple[tuple[int, int], ...]) -> tuple[Float64, Float64]:
         terms = np.stack([unit_y**m * unit_r**n for m, n in powers], axis=-1)
@@ -225,17 +227,16 @@ def _hits(drive: Drive, origins: Float64, rotations: Float64, y_sensor_m: Float6
     return np.concatenate([enh, range_m[:, :, None]], axis=-1)
 
 
-def _errors(
-    scene: Scene, drive: Drive, head: Head, block: int, shape: tuple[int, int]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
-    """Range noise (m), and random bits for losses and intensity noise, of a block; empty where there is none."""
-    rng = stream(scene.seed, drive.number, head.name, block)
-    noise, bits = np.empty((0, 0), np.float32), np.empty((0, 0), np.uint32)
-    if scene.noise.profiler_range_m > 0.0:
-        noise = rng.standard_normal(shape, dtype=np.float32) * np.float32(scene.noise.profiler_range_m)
-    if scene.noise.dropout > 0.0 or scene.noise.intensity > 0.0:
-        bits = rng.integers(0, 2**32, shape, dtype=np.uint32)
-    return noise, bits
+@functools.cache
+def _normal_numbers() -> npt.NDArray[np.float32]:
+    """Standard normal numbers (65536,) of equal probability."""
+    numbers: npt.NDArray[np.float32] = ndtri((np.arange(65_536) + 0.5) / 65_536).astype(np.float32)
+    return numbers
+
+
+def _random_from(scene: Scene, drive: Drive, head: Head) -> int:
+    """Where the random numbers of a head's first reading in a pass begin."""
+    return int(stream(scene.seed, drive.number, head.name).integers(0, 2**62))
 
 
 def _scans_schema(head: Head) -> pa.Schema:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from roadscan.simulate import kernels
-from roadscan.simulate.kernels import NODE_STEP_M, RoadArrays
-from roadscan.simulate.scene import Element, Road, Scene
+from roadscan.simulate import features, roughness
+from roadscan.simulate.kernels import road as kernels
+from roadscan.simulate.kernels.road import NODE_STEP_M, RoadArrays
+from roadscan.simulate.noise import stream
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.scene.road import CrossSlope, Element, Kerb, Road
+from roadscan.simulate.texture import CELL_M, texture_field
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -23,14 +27,15 @@ RIDE_WAVELENGTH_M = 10.0
 class Surface:
     """Height and intensity of the road, known everywhere on it.
 
-    The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grade and
-    waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
-    1 µm for waves of 2 m). On it lie crown, verge, ruts, and potholes or cracks, all functions of station and offset.
+    The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grades, humps
+    and waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
+    1 µm for waves of 2 m). On it lie cross-section, ruts, unevenness, patches, and potholes, cracks or joints, all
+    functions of station and offset; and the texture, which only the profilers see.
 
     Parameters
     ----------
     scene : the scene.
-    ride : True for the smooth surface that guides the vehicle: long waves, crown and verge only.
+    ride : True for the smooth surface that guides the vehicle: long waves, humps and cross-section only.
     """
 
     def __init__(self, scene: Scene, *, ride: bool = False) -> None:
@@ -40,26 +45,48 @@ class Surface:
         before = math.ceil(road.lead_m / NODE_STEP_M)
         after = math.ceil((scene.length_m + road.lead_m) / NODE_STEP_M)
         station: Float64 = NODE_STEP_M * np.arange(-before, after + 1, dtype=np.float64)
+        worn = features.of_road(road, scene.seed, float(station[0]), float(station[-1]), scene.length_m, smooth=ride)
+        defects, defect_ranges = features.by_node(worn.defects, worn.defect_reach_m, station)
+        patches, patch_ranges = features.by_node(worn.patches, worn.patch_reach_m, station)
+        items, item_ranges = features.by_node(worn.items, worn.item_reach_m, station)
         line = _reference_line(road, station, math.radians(scene.map.azimuth_deg))
-        defects, ranges = _by_node(np.zeros((0, 7)) if ride else _defects(road, scene.length_m), station)
+        height = _profile(road, station, ride)
+        columns = [line, height, station[:, None], defect_ranges, patch_ranges, item_ranges, _sides(road, station)]
+        tracks, first_m = _tracks(scene, station, ride)
+        textured = road.texture is not None and not ride
         self.arrays = RoadArrays(
-            nodes=np.concatenate([line, _profile(road, station, ride), station[:, None], ranges], axis=1),
-            section=_section(road, ride),
+            nodes=np.ascontiguousarray(np.concatenate(columns, axis=1)),
+            section=_section(road, tracks, first_m, textured, scene.seed, ride),
             defects=defects,
-            paint=_paint(road),
+            patches=patches,
+            lines=features.lines(road),
+            items=items,
+            tracks=tracks,
+            texture=_texture(road, scene.seed) if textured else np.zeros((0, 0), np.float32),
         )
         self._nodes: cKDTree | None = None
 
-    def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """Ellipsoidal height at map points (any shape, m); NaN where there is no road or verge."""
+    def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike, *, texture: bool = True) -> Float64:
+        """Ellipsoidal height at map points (any shape, m); NaN where there is no road or verge.
+
+        texture : False leaves the macrotexture out, as wide beams do.
+        """
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
-        height = self._survey(easting_m, northing_m)[:, 0] + self.origin_enh_m[2]
+        found = self._survey(easting_m, northing_m)
+        height = found[:, 0] + self.origin_enh_m[2]
+        if texture:
+            height = height + found[:, 5]
         return np.asarray(height.reshape(shape))
 
     def intensity(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
         """Intensity at map points (any shape), digital numbers of a profiler."""
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
         return self._survey(easting_m, northing_m)[:, 4].reshape(shape)
+
+    def defect_depth_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
+        """Depth of the pothole, crack or joint at map points (any shape, m); 0 where there is none."""
+        shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
+        return self._survey(easting_m, northing_m)[:, 3].reshape(shape)
 
     def station_offset_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
         """Station and offset (right positive) of map points (any shape, m)."""
@@ -76,7 +103,7 @@ class Surface:
         return e + self.origin_enh_m[0], n + self.origin_enh_m[1], heading
 
     def points_at(self, station_m: Float64, offset_m: Float64) -> Float64:
-        """Map coordinates (n, 3) on the surface without defects at stations and offsets (n,)."""
+        """Map points (n, 3) on the surface without defects and texture, at stations and offsets (n,)."""
         e, n, _ = self.place(station_m, offset_m)
         height = np.empty(station_m.size)
         kernels.heights_along(self.arrays, station_m, offset_m, height)
@@ -93,34 +120,67 @@ class Surface:
     def _survey(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
         e, n = np.broadcast_arrays(np.asarray(easting_m, np.float64), np.asarray(northing_m, np.float64))
         e, n = e.ravel(), n.ravel()
-        out = np.empty((e.size, 5))
+        out = np.empty((e.size, 6))
         kernels.survey_points(
             self.arrays, e - self.origin_enh_m[0], n - self.origin_enh_m[1], self.nearest_node(e, n), out
         )
         return out
 
 
-def _table(rows: list[list[float]], columns: int) -> Float64:
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
-
-
-def _section(road: Road, ride: bool) -> Float64:
-    """Cross section as :class:`RoadArrays` holds it; no ruts in the smooth surface."""
-    rounding = min(0.25, road.verge_width_m / 2)
-    fall = road.verge_slope - road.cross_slope
-    shape = [road.cross_slope, road.crown_rounding_m, road.half_width_m, fall, rounding, road.edge_m]
-    ruts = [] if ride else [[r.offset_m, 2.0 / r.width_m, r.depth_m] for r in road.ruts]
-    return np.append(shape, _table(ruts, 3))
-
-
-def _paint(road: Road) -> Float64:
-    """Intensities and markings as :class:`RoadArrays` holds them."""
+def _section(road: Road, tracks: Float64, first_m: float, textured: bool, seed: int, ride: bool) -> Float64:
+    """Constants and ruts as :class:`RoadArrays` holds them; no ruts in the smooth surface."""
     shades = road.brightness
-    rows = [[shades.asphalt, shades.marking, shades.defect, shades.verge]]
-    for line in road.markings:
-        broken = line.dash_m > 0.0 and line.gap_m > 0.0
-        rows.append([line.offset_m, line.width_m / 2, line.dash_m, line.dash_m + line.gap_m if broken else 0.0])
-    return _table(rows, 4)
+    shoulder = road.shoulder_width_m / 2 if road.shoulder_width_m > 0.0 else 0.25
+    offsets = roughness.track_offsets_m(road)
+    contrast = 0.0
+    if textured and road.texture is not None:
+        contrast = road.texture.contrast / float(_texture(road, seed).std())
+    constants = np.zeros(kernels.RUTS)
+    constants[kernels.CROWN] = road.crown_rounding_m
+    constants[kernels.LANES_EDGE] = road.half_width_m
+    constants[kernels.SHOULDER_SLOPE] = road.shoulder_slope
+    constants[kernels.PAVED_EDGE] = road.paved_m
+    constants[kernels.VERGE_SLOPE] = road.verge_slope
+    constants[kernels.ROUNDING] = min(0.25, road.verge_width_m / 2, shoulder)
+    constants[kernels.SURFACE_EDGE] = road.edge_m
+    constants[kernels.KERB_FACE] = road.kerbs[0].face_m if road.kerbs else 0.02
+    constants[kernels.TRACK_FIRST] = offsets[0]
+    constants[kernels.TRACK_PER_M] = 1.0 / float(offsets[1] - offsets[0])
+    constants[kernels.TRACK_STATION] = first_m
+    constants[kernels.TRACK_STATION_PER_M] = 1.0 / roughness.STEP_M
+    constants[kernels.TEXTURE_PER_M] = 1.0 / CELL_M
+    constants[kernels.CONTRAST] = contrast
+    constants[kernels.ASPHALT : kernels.KERB + 1] = [
+        shades.asphalt, shades.marking, shades.defect, shades.shoulder, shades.verge, shades.kerb,
+    ]  # fmt: skip
+    phases = stream(seed, 0, "ruts").uniform(0, 2 * math.pi, len(road.ruts))
+    ruts = [
+        [r.offset_m, 2.0 / r.width_m, r.depth_m, r.variation, 2 * math.pi / r.variation_m, phase]
+        for r, phase in zip(road.ruts, phases, strict=True)
+    ]
+    return np.append(constants, [] if ride else np.array(ruts, dtype=np.float64).ravel())
+
+
+def _texture(road: Road, seed: int) -> npt.NDArray[np.float32]:
+    settings = road.texture
+    return np.zeros((0, 0), np.float32) if settings is None else texture_field(settings.mpd_mm, settings.grain_mm, seed)
+
+
+def _tracks(scene: Scene, station: Float64, ride: bool) -> tuple[Float64, float]:
+    """Unevenness (t, s), and the station of its first sample; only its long waves in the smooth surface."""
+    step = roughness.STEP_M
+    first = float(station[0]) - 3 * step
+    fine: Float64 = first + step * np.arange(math.ceil((float(station[-1]) - first) / step) + 4, dtype=np.float64)
+    waves = np.zeros(fine.size)
+    for wave in scene.road.waves:
+        waves += wave.amplitude_m * np.sin(2 * math.pi / wave.wavelength_m * fine + math.radians(wave.phase_deg))
+    found = roughness.tracks(scene.road, fine, waves, stream(scene.seed, 0, "roughness"))
+    if ride and found.size:
+        # Half of the amplitude of waves of RIDE_WAVELENGTH_M is left.
+        sigma_m = RIDE_WAVELENGTH_M * math.sqrt(math.log(2.0) / 2.0) / math.pi
+        found = gaussian_filter1d(found, sigma_m / step, axis=1, mode="nearest")
+        found = np.repeat(found.mean(axis=0, keepdims=True), found.shape[0], axis=0)
+    return np.ascontiguousarray(found), first
 
 
 def _reference_line(road: Road, station: Float64, azimuth_rad: float) -> Float64:
@@ -158,9 +218,45 @@ def _curvature(alignment: list[Element], station: Float64) -> Float64:
     return curvature
 
 
+def _sides(road: Road, station: Float64) -> Float64:
+    """(n, 8) falls and kerb heights at the nodes, each with its change per metre up to the next node."""
+    slopes = road.cross_slopes or [CrossSlope(station_m=0.0, left=road.cross_slope, right=road.cross_slope)]
+    at = [s.station_m for s in slopes]
+    kerbs = {kerb.side: kerb for kerb in road.kerbs}
+    values = [
+        np.interp(station, at, [s.left for s in slopes]),
+        np.interp(station, at, [s.right for s in slopes]),
+        _kerb_height(kerbs.get("left"), station),
+        _kerb_height(kerbs.get("right"), station),
+    ]
+    return np.stack([a for v in values for a in (v, np.append(np.diff(v), 0.0) / NODE_STEP_M)], axis=-1)
+
+
+def _kerb_height(kerb: Kerb | None, station: Float64) -> Float64:
+    if kerb is None:
+        return np.zeros(station.size)
+    height = np.full(station.size, kerb.height_m)
+    for ramp in kerb.ramps:
+        beyond = (np.abs(station - ramp.station_m) - ramp.length_m / 2) / ramp.transition_m
+        height = np.minimum(height, ramp.height_m + (kerb.height_m - ramp.height_m) * np.clip(beyond, 0.0, 1.0))
+    return height
+
+
 def _profile(road: Road, station: Float64, ride: bool) -> Float64:
     """(n, 6) quintic coefficients of the reference line's height from each node to the next."""
     value, slope, bend = road.grade * station, np.full_like(station, road.grade), np.zeros_like(station)
+    grade = road.grade
+    for change in road.grades:
+        x = np.clip(station - change.station_m + change.curve_m / 2, 0.0, change.curve_m)
+        beyond = np.maximum(station - change.station_m - change.curve_m / 2, 0.0)
+        step = change.grade - grade
+        value = value + step * (x * x / (2 * change.curve_m) + beyond)
+        slope = slope + step * x / change.curve_m
+        bend = bend + step / change.curve_m * ((x > 0) & (beyond == 0.0))
+        grade = change.grade
+    for hump in road.humps:
+        lift, tilt, arch = _hump(station - hump.station_m, hump.top_m / 2, hump.ramp_m)
+        value, slope, bend = value + hump.height_m * lift, slope + hump.height_m * tilt, bend + hump.height_m * arch
     for wave in road.waves:
         if ride and wave.wavelength_m < RIDE_WAVELENGTH_M:
             continue
@@ -181,36 +277,9 @@ def _profile(road: Road, station: Float64, ride: bool) -> Float64:
     return out
 
 
-def _defects(road: Road, length_m: float) -> Float64:
-    """(m, 7) potholes and pieces of cracks, see :class:`RoadArrays`."""
-    rows = [[0.0, p.depth_m, 1.0 / p.radius_m, p.station_m, p.offset_m, 0.0, 0.0] for p in road.potholes]
-    for crack in road.cracks:
-        rows += [
-            [1.0, crack.depth_m, 2.0 / crack.width_m, s0, o0, s1, o1]
-            for (s0, o0), (s1, o1) in itertools.pairwise(crack.points_m)
-            if (s0, o0) != (s1, o1)
-        ]
-    once = _table(rows, 7)
-    if road.repeat_m <= 0.0 or not rows:
-        return once
-    shifts = road.repeat_m * np.arange(math.ceil(length_m / road.repeat_m))
-    again = np.repeat(once[None], shifts.size, axis=0)
-    again[:, :, 3] += shifts[:, None]
-    again[:, :, 5] += np.where(once[:, 0] == 1.0, shifts[:, None], 0.0)
-    return again.reshape(-1, 7)
-
-
-def _by_node(defects: Float64, station: Float64) -> tuple[Float64, Float64]:
-    """Defects in the order of the half metres they reach into, and for each node its first and end row (n, 2)."""
-    reach = 1.0 / defects[:, 2]
-    other_end = np.where(defects[:, 0] == 1.0, defects[:, 5], defects[:, 3])
-    low = np.minimum(defects[:, 3], other_end) - reach
-    high = np.maximum(defects[:, 3], other_end) + reach
-    first = np.clip(np.floor((low - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
-    last = np.clip(np.floor((high - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
-    count = last - first + 1
-    items = np.repeat(np.arange(len(defects)), count)
-    nodes = np.repeat(first, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    order = np.lexsort((items, nodes))
-    edges = np.searchsorted(nodes[order], np.arange(station.size + 1))
-    return defects[items[order]], np.stack([edges[:-1], edges[1:]], axis=-1).astype(np.float64)
+def _hump(away_m: Float64, half_top_m: float, ramp_m: float) -> tuple[Float64, Float64, Float64]:
+    """Shape of a hump of height 1, its slope and curvature: each ramp is 10 x³ − 15 x⁴ + 6 x⁵."""
+    x = np.clip((half_top_m + ramp_m - np.abs(away_m)) / ramp_m, 0.0, 1.0)
+    rise = -np.sign(away_m) / ramp_m
+    shape = x**3 * (10 - 15 * x + 6 * x * x)
+    return shape, rise * 30 * x**2 * (1 - x) ** 2, rise**2 * 60 * x * (1 - x) * (1 - 2 * x)

@@ -40,7 +40,7 @@ def wander_rad(number: int) -> float:
 
 def write_trajectory(scene: Scene, drive: Drive, file: Path, truth_file: Path) -> Iterator[int]:
     """Write the poses of one pass, a chunk a step; yields the poses of each."""
-    step = NS_PER_S // scene.vehicle.poses_per_s
+    step = NS_PER_S // scene.trajectory.poses_per_s
     first = (drive.start_gps_ns - round(RUN_UP_S * 1e9)) // step * step
     last = drive.start_gps_ns + round((drive.duration_s + RUN_UP_S) * 1e9)
     errors = _Errors(scene, drive.number)
@@ -62,7 +62,7 @@ class _Errors:
             stream(scene.seed, number, "trajectory"),
             np.array([noise.position_m] * 3 + [tilt, tilt, 2 * tilt]),
             noise.time_constant_s,
-            1.0 / scene.vehicle.poses_per_s,
+            1.0 / scene.trajectory.poses_per_s,
         )
 
     def take(self, count: int) -> tuple[Float64, Float64]:

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import quad
 
 from roadscan.model.errors import ConfigError
-from roadscan.simulate.scene import Crack, Element, Marking, Pothole, Rut, Scene, Wave, shipped_scenes
+from roadscan.simulate.scene import Scene, shipped_scenes
+from roadscan.simulate.scene.road import Crack, Element, Marking, Pothole, Rut, Wave
 from roadscan.simulate.surface import Surface
 
 FLAT = Scene().changed(road={"cross_slope": 0.0, "grade": 0.0, "verge_slope": 0.0})

@@ -1,0 +1,84 @@
+"""A sensor's clock: from the true epoch to the stamp it writes, and what the survey file states of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import (
+    GPS_EPOCH_UNIX_S,
+    NS_PER_S,
+    WEEK_S,
+    TimeSystem,
+    gps_ns_from_utc,
+    leap_seconds_at_gps,
+    utc_from_gps_ns,
+)
+from roadscan.simulate.scene import ClockError, Scene
+
+Int64 = npt.NDArray[np.int64]
+
+UNIT_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+@dataclass(frozen=True)
+class SensorClock:
+    """Stamps of one sensor's log."""
+
+    error: ClockError
+    system: TimeSystem
+    """Time system of the stamps."""
+    start_gps_ns: int
+    """Epoch from which the drift counts: the first profile of the first pass."""
+
+    @classmethod
+    def of(cls, scene: Scene, error: ClockError, usual: TimeSystem) -> SensorClock:
+        """Clock of a sensor whose log usually is stamped in `usual`."""
+        return cls(error, error.system or usual, gps_ns_from_utc(scene.start))
+
+    def shown_gps_ns(self, epoch_gps_ns: Int64) -> Int64:
+        """GPS time (ns, (n,)) that the clock shows at true epochs (n,)."""
+        if self.error.is_right:
+            return epoch_gps_ns
+        elapsed_s = (epoch_gps_ns - self.start_gps_ns).astype(np.float64) / NS_PER_S
+        wrong = self.error.offset_s + self.error.drift_ppm * 1e-6 * elapsed_s
+        shown: Int64 = epoch_gps_ns + np.rint(wrong * NS_PER_S).astype(np.int64)
+        return shown
+
+    def stamps_ns(self, epoch_gps_ns: Int64) -> Int64:
+        """Stamps (ns of the system's own count, (n,)) at true epochs (n,)."""
+        shown = self.shown_gps_ns(epoch_gps_ns)
+        match self.system:
+            case TimeSystem.GPS | TimeSystem.FREE:
+                return shown
+            case TimeSystem.GPS_WEEK:
+                return shown % (WEEK_S * NS_PER_S)
+            case TimeSystem.UNIX_GPS:
+                return shown + GPS_EPOCH_UNIX_S * NS_PER_S
+            case TimeSystem.UNIX_UTC:
+                return shown + (GPS_EPOCH_UNIX_S - leap_seconds_at_gps(shown // NS_PER_S)) * NS_PER_S
+        raise ConfigError(
+            f"the simulator does not write stamps of the system '{self.system}'",
+            expected="gps, gps_week_seconds, unix_gps, unix_utc or free",
+        )
+
+    def toml(self, unit: str, run_start_gps_ns: int) -> str:
+        """The survey file's ``clock = …`` for a log that starts at `run_start_gps_ns` and is stamped in `unit`."""
+        parts = [f'system = "{self.system}"', f'unit = "{unit}"']
+        if self.system in {TimeSystem.GPS_WEEK, TimeSystem.UTC_HOUR}:
+            parts.append(f"date = {utc_from_gps_ns(run_start_gps_ns):%Y-%m-%d}")
+        free = self.system is TimeSystem.FREE
+        if self.error.known or free:
+            # stamp = true + offset + drift · (true − start), turned round.
+            rate = self.error.drift_ppm * 1e-6
+            reference = int(self.stamps_ns(np.array([self.start_gps_ns]))[0]) / NS_PER_S
+            parts += [
+                f"offset_s = {-self.error.offset_s or (1e-9 if free else 0.0)!r}",
+                f"drift_ppm = {-rate / (1.0 + rate) * 1e6!r}",
+                f"reference_s = {reference!r}",
+            ]
+        return "{ " + ", ".join(parts) + " }"

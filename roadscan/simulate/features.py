@@ -1,0 +1,206 @@
+"""What is local on the road, as rows of numbers by half metre: defects, patches, paint and spills."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import Voronoi
+
+from roadscan.simulate.kernels.road import NODE_STEP_M
+from roadscan.simulate.noise import stream
+from roadscan.simulate.scene.road import Alligator, Joints, Patch, Road
+
+Float64 = npt.NDArray[np.float64]
+
+RECTANGLE, ELLIPSE, RING, BAND = 0.0, 1.0, 2.0, 3.0
+"""Kinds of painted or spilt items."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Rows as :class:`roadscan.simulate.kernels.road.RoadArrays` has them, and the stations they reach over (m, 2)."""
+
+    defects: Float64
+    defect_reach_m: Float64
+    patches: Float64
+    patch_reach_m: Float64
+    items: Float64
+    item_reach_m: Float64
+
+
+def of_road(road: Road, seed: int, first_m: float, last_m: float, length_m: float, *, smooth: bool) -> Features:
+    """All features between two stations; none where the surface shall be `smooth`."""
+    if smooth:
+        nothing = [np.zeros((0, n)) for n in (7, 2, 8, 2, 8, 2)]
+        return Features(*nothing)
+    again = _shifts(road.repeat_m, length_m)
+    once = _table(_potholes(road) + _cracks(road) + _alligators(road, seed), 7)
+    defects = np.concatenate([_repeated(once, again, (3,), (5,)), _table(_joints(road, first_m, last_m), 7)])
+    patches = _repeated(_table([_patch(p) for p in road.patches], 8), again, (1,), ())
+    spilt = _repeated(_table(_spilt(road), 8), again, (2,), (6,))
+    items = np.concatenate([spilt, _table(_painted(road), 8)])
+    return Features(defects, _defect_reach(defects), patches, _patch_reach(patches), items, _item_reach(items))
+
+
+def by_node(rows: Float64, reach_m: Float64, station: Float64) -> tuple[Float64, Float64]:
+    """Rows in the order of the half metres they reach into, and for each node its first and end row (n, 2)."""
+    first = np.clip(np.floor((reach_m[:, 0] - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
+    last = np.clip(np.floor((reach_m[:, 1] - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
+    count = last - first + 1
+    items = np.repeat(np.arange(len(rows)), count)
+    nodes = np.repeat(first, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    order = np.lexsort((items, nodes))
+    edges = np.searchsorted(nodes[order], np.arange(station.size + 1))
+    return np.ascontiguousarray(rows[items[order]]), np.stack([edges[:-1], edges[1:]], axis=-1).astype(np.float64)
+
+
+def lines(road: Road) -> Float64:
+    """(m, 6) markings along the road."""
+    rows = []
+    for line in road.markings:
+        broken = line.dash_m > 0.0 and line.gap_m > 0.0
+        period = line.dash_m + line.gap_m if broken else 0.0
+        rows.append([line.offset_m, line.width_m / 2, line.dash_m, period, line.start_m, line.end_m])
+    return _table(rows, 6)
+
+
+def _table(rows: list[list[float]], columns: int) -> Float64:
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def _shifts(repeat_m: float, length_m: float) -> Float64:
+    """Stations by which features are repeated."""
+    return repeat_m * np.arange(math.ceil(length_m / repeat_m), dtype=np.float64) if repeat_m > 0.0 else np.zeros(1)
+
+
+def _repeated(rows: Float64, shifts_m: Float64, columns: tuple[int, ...], far_ends: tuple[int, ...]) -> Float64:
+    """Rows again at each shift: `columns` hold stations, `far_ends` those of other ends (bands and cracks only)."""
+    if not rows.size or shifts_m.size == 1:
+        return rows
+    again = np.repeat(rows[None], shifts_m.size, axis=0)
+    for column in columns:
+        again[:, :, column] += shifts_m[:, None]
+    has_far_end = (rows[:, 0] == 1.0) if rows.shape[1] == 7 else (rows[:, 0] == BAND)
+    for column in far_ends:
+        again[:, :, column] += np.where(has_far_end, shifts_m[:, None], 0.0)
+    return again.reshape(-1, rows.shape[1])
+
+
+# --- wear --------------------------------------------------------------------------------------------
+
+
+def _potholes(road: Road) -> list[list[float]]:
+    return [[0.0, p.depth_m, 1.0 / p.radius_m, p.station_m, p.offset_m, 0.0, 0.0] for p in road.potholes]
+
+
+def _cracks(road: Road) -> list[list[float]]:
+    return [
+        [1.0, crack.depth_m, 2.0 / crack.width_m, s0, o0, s1, o1]
+        for crack in road.cracks
+        for (s0, o0), (s1, o1) in itertools.pairwise(crack.points_m)
+        if (s0, o0) != (s1, o1)
+    ]
+
+
+def _joints(road: Road, first_m: float, last_m: float) -> list[list[float]]:
+    edge = road.paved_m
+    return [
+        [1.0, joints.depth_m, 2.0 / joints.width_m, station, -edge, station, edge]
+        for joints in road.joints
+        for station in _joint_stations(joints, first_m, last_m)
+    ]
+
+
+def _joint_stations(joints: Joints, first_m: float, last_m: float) -> list[float]:
+    first, last = max(first_m, joints.start_m), min(last_m, joints.end_m)
+    numbers = range(
+        math.ceil((first - joints.first_m) / joints.spacing_m),
+        math.floor((last - joints.first_m) / joints.spacing_m) + 1,
+    )
+    return [joints.first_m + n * joints.spacing_m for n in numbers]
+
+
+def _alligators(road: Road, seed: int) -> list[list[float]]:
+    rows: list[list[float]] = []
+    for number, field in enumerate(road.alligators):
+        for (s0, o0), (s1, o1) in _cell_borders(field, stream(seed, number, "alligator")):
+            rows.append([1.0, field.crack_depth_m, 2.0 / field.crack_width_m, s0, o0, s1, o1])
+    return rows
+
+
+def _cell_borders(field: Alligator, rng: np.random.Generator) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Borders of random cells (Voronoi) that lie inside the field's ellipse."""
+    half = np.array([field.length_m, field.width_m]) / 2
+    count = max(8, round(4 * 2.25 * half[0] * half[1] / field.cell_m**2))
+    cells = Voronoi(rng.uniform(-1.5, 1.5, (count, 2)) * half)
+    corners = cells.vertices
+    inside = np.sum((corners / half) ** 2, axis=1) < 1.0
+    middle = np.array([field.station_m, field.offset_m])
+    borders = []
+    for a, b in cells.ridge_vertices:
+        if a >= 0 and b >= 0 and inside[a] and inside[b] and np.hypot(*(corners[a] - corners[b])) > 1e-3:
+            (s0, o0), (s1, o1) = (corners[[a, b]] + middle).tolist()
+            borders.append(((s0, o0), (s1, o1)))
+    return borders
+
+
+def _patch(p: Patch) -> list[float]:
+    circle = p.shape == "circle"
+    half_width = (p.length_m if circle else p.width_m) / 2
+    return [float(circle), p.station_m, p.offset_m, p.length_m / 2, half_width, p.height_m, 1.0 / p.edge_m, p.shade]
+
+
+def _defect_reach(rows: Float64) -> Float64:
+    reach = 1.0 / rows[:, 2]
+    other_end = np.where(rows[:, 0] == 1.0, rows[:, 5], rows[:, 3])
+    return np.stack([np.minimum(rows[:, 3], other_end) - reach, np.maximum(rows[:, 3], other_end) + reach], axis=-1)
+
+
+def _patch_reach(rows: Float64) -> Float64:
+    return np.stack([rows[:, 1] - rows[:, 3], rows[:, 1] + rows[:, 3]], axis=-1)
+
+
+# --- paint and spills --------------------------------------------------------------------------------
+
+
+def _spilt(road: Road) -> list[list[float]]:
+    """Stains and tyre marks."""
+    rows = [[ELLIPSE, s.shade, s.station_m, s.offset_m, s.length_m / 2, s.width_m / 2, 0.0, 0.0] for s in road.stains]
+    rows += [
+        [BAND, mark.shade, s0, o0, mark.width_m / 2, 0.0, s1, o1]
+        for mark in road.tyre_marks
+        for (s0, o0), (s1, o1) in itertools.pairwise(mark.points_m)
+        if (s0, o0) != (s1, o1)
+    ]
+    return rows
+
+
+def _painted(road: Road) -> list[list[float]]:
+    """Stop bars, zebra crossings and targets."""
+    paint = road.brightness.marking
+    rows: list[list[float]] = []
+    for bar in road.stop_bars:
+        middle, half = (bar.from_m + bar.to_m) / 2, abs(bar.to_m - bar.from_m) / 2
+        rows.append([RECTANGLE, paint, bar.station_m, middle, bar.width_m / 2, half, 0.0, 0.0])
+    for walk in road.crosswalks:
+        left, right = min(walk.from_m, walk.to_m), max(walk.from_m, walk.to_m)
+        rows += [
+            [RECTANGLE, paint, walk.station_m, float(offset), walk.length_m / 2, walk.stripe_m / 2, 0.0, 0.0]
+            for offset in np.arange(left + walk.stripe_m / 2, right, walk.stripe_m + walk.gap_m)
+        ]
+    for target in road.targets:
+        place = [target.station_m, target.offset_m]
+        rows.append([RING, paint, *place, target.centre_m / 2, target.diameter_m / 2, 0.0, 0.0])
+        if target.centre_m > 0.0:
+            rows.append([RING, 15.0, *place, 0.0, target.centre_m / 2, 0.0, 0.0])
+    return rows
+
+
+def _item_reach(rows: Float64) -> Float64:
+    half = np.where(rows[:, 0] == RING, rows[:, 5], rows[:, 4])
+    other_end = np.where(rows[:, 0] == BAND, rows[:, 6], rows[:, 2])
+    return np.stack([np.minimum(rows[:, 2], other_end) - half, np.maximum(rows[:, 2], other_end) + half], axis=-1)

@@ -1,0 +1,1 @@
+"""The simulator's loops, compiled with Numba: arrays in, arrays out."""

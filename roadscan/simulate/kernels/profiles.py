@@ -1,0 +1,250 @@
+"""Profiles of a triangulation head: where the parallel beams of its planes meet the road."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
+from roadscan.simulate.kernels.options import compiled
+from roadscan.simulate.kernels.road import (
+    DEFECTS,
+    DEFECTS_END,
+    STATION,
+    RoadArrays,
+    brightness,
+    defect_depth,
+    node_at,
+    on_surface,
+    project,
+    texture_height,
+    worn_height,
+)
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+UInt16 = npt.NDArray[np.uint16]
+UInt8 = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.bool_]
+
+WALK_M = 0.5
+"""How far above the last guess a beam's walk begins (m)."""
+
+
+@compiled
+def survey_planes(road: RoadArrays, easting: Float64, northing: Float64, near: Int64, out: Float64) -> None:
+    """Station and offset of points on the planes of profiles.
+
+    easting, northing : (p, m); near : (p,) nodes to start from; out : (p, m, 2).
+    """
+    for p in range(easting.shape[0]):
+        k = near[p]
+        for i in range(easting.shape[1]):
+            k, u, offset = project(road, easting[p, i], northing[p, i], k)
+            out[p, i, 0] = road.nodes[k, STATION] + u
+            out[p, i, 1] = offset
+
+
+@compiled
+def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
+    """Beam of the reading at transverse position `y` of profile `p`, in road coordinates.
+
+    planes : (p, 3, 9) for station, offset and height the coefficients of 1, y, y², y³, y⁴, r, y·r, y²·r, r², where r
+    counts from the plane's middle range; beam : (3, 3), out.
+    """
+    for axis in range(3):
+        beam[axis, 0] = planes[p, axis, 0] + y * (
+            planes[p, axis, 1] + y * (planes[p, axis, 2] + y * (planes[p, axis, 3] + y * planes[p, axis, 4]))
+        )
+        beam[axis, 1] = planes[p, axis, 5] + y * (planes[p, axis, 6] + y * planes[p, axis, 7])
+        beam[axis, 2] = planes[p, axis, 8]
+
+
+@compiled
+def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
+    """The same in the map.
+
+    planes : (p, 3, 6) for easting, northing and height the coefficients of 1, y, y², r, y·r, r².
+    """
+    for axis in range(3):
+        beam[axis, 0] = planes[p, axis, 0] + y * (planes[p, axis, 1] + y * planes[p, axis, 2])
+        beam[axis, 1] = planes[p, axis, 3] + y * planes[p, axis, 4]
+        beam[axis, 2] = planes[p, axis, 5]
+
+
+@compiled
+def mixed(counter: np.uint64) -> np.uint64:
+    """64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
+    z = counter * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled
+def scan_profiles(
+    road: RoadArrays,
+    road_planes: Float64,
+    map_planes: Float64,
+    is_bent: Flags,
+    y_sensor_m: Float64,
+    scale: Float64,
+    normal: Float32,
+    random_from: np.uint64,
+    beam: Float64,
+    ranges: UInt16,
+    intensity: UInt8,
+    true_range_m: Float64,
+) -> None:
+    """Measure profiles of a triangulation head.
+
+    Parameters
+    ----------
+    road_planes, map_planes : (p, 3, 9), see :func:`road_beam`, and (p, 3, 6), see :func:`map_beam`.
+    is_bent : (p,) whether the road bends so much here that `road_planes` are only a first approximation.
+    y_sensor_m : (n,) transverse positions of the readings.
+    scale : (8,) middle range of the planes (m), range of raw 0 (m), range step (m), share of lost readings, range
+        noise (m), intensity noise, share of wrong readings and how far they lie off (m).
+    normal : (65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind.
+    random_from : where the random numbers of the first reading begin; reading i of profile p has its own.
+    beam : (3, 3) scratch.
+    ranges, intensity : (p, n), out.
+    true_range_m : (p, n), out; NaN where the beam misses. (0, 0): not wanted.
+    """
+    for p in range(road_planes.shape[0]):
+        before = 0.0
+        r = before
+        fall = 1.0
+        for i in range(y_sensor_m.size):
+            y = y_sensor_m[i]
+            start = 2.0 * r - before if i > 1 else r  # the road goes on as it did
+            before = r
+            road_beam(road_planes, p, y, beam)
+            r, k, u, offset, fall = plain_range(road, beam, start, fall, i > 1)
+            if is_bent[p]:
+                map_beam(map_planes, p, y, beam)
+                r, k, u, offset = polished_range(road, beam, r, fall, k)
+                road_beam(road_planes, p, y, beam)
+            found = scale[0] + r
+            depth = 0.0
+            if road.nodes[k, DEFECTS] < road.nodes[k, DEFECTS_END]:
+                depth, _ = defect_depth(road, k, u, offset)
+                if depth > 0.0:
+                    map_beam(map_planes, p, y, beam)
+                    turn_to_road(road, beam, r, 0.02, k)
+                    further, depth = into_defect(road, beam, 0.0, fall)
+                    found += further
+                    road_beam(road_planes, p, y, beam)
+            if road.texture.size:
+                found -= over_texture(road, beam, found - scale[0], road.nodes[k, STATION] + u, offset, r) / fall
+            seen = on_surface(road, k, u, offset)
+            if true_range_m.size:
+                true_range_m[p, i] = found if seen else np.nan
+            value = brightness(road, k, u, offset, depth)
+            if normal.size:
+                bits = mixed(random_from + np.uint64(p * y_sensor_m.size + i))
+                found += scale[4] * normal[bits & np.uint64(0xFFFF)]
+                value += scale[5] * normal[(bits >> np.uint64(16)) & np.uint64(0xFFFF)]
+                seen = seen and float((bits >> np.uint64(32)) & np.uint64(0xFFFF)) >= scale[3] * 65536.0
+                if float(bits >> np.uint64(48)) < scale[6] * 65536.0:
+                    found += scale[7] * (2.0 * float(mixed(bits) >> np.uint64(11)) / 9007199254740992.0 - 1.0)
+            raw = math.floor((found - scale[1]) / scale[2] + 0.5)
+            seen = seen and 1.0 <= raw <= 65535.0
+            ranges[p, i] = int(raw) if seen else 0
+            intensity[p, i] = int(min(max(value, 0.0), 255.0)) if seen else 0
+
+
+@compiled
+def over_texture(road: RoadArrays, beam: Float64, r: float, station: float, offset: float, plain: float) -> float:
+    """Height of the texture where a beam meets it (m).
+
+    The beam meets the surface without texture at range `r`; its place was found for the range `plain` above a defect.
+    Beams lean a few degrees at most, so the place moves by hundredths of a millimetre and one correction is enough.
+    """
+    station += along_beam(beam, 0, r) - along_beam(beam, 0, plain)
+    offset += along_beam(beam, 1, r) - along_beam(beam, 1, plain)
+    first = texture_height(road, station, offset)
+    lean_s = beam[0, 1] + 2.0 * r * beam[0, 2]
+    lean_o = beam[1, 1] + 2.0 * r * beam[1, 2]
+    second = texture_height(road, station - first * lean_s, offset - first * lean_o)
+    return texture_height(road, station - second * lean_s, offset - second * lean_o)
+
+
+@compiled
+def plain_range(
+    road: RoadArrays, beam: Float64, start: float, fall: float, is_fall_known: bool
+) -> tuple[float, int, float, float, float]:
+    """Range, node, u, offset where a beam in road coordinates meets the surface without defects, and its fall there.
+
+    The slope of a neighbouring reading is right to better than a tenth, so a last step of 1 µm leaves less than 0.1 µm.
+    Where the secant does not settle (the face of a kerb), the beam is walked down.
+    """
+    r = start
+    enough = 1e-6 if is_fall_known else ROOT_TOLERANCE_M
+    last_gap, moved = 0.0, 0.0
+    k, u, offset = 0, 0.0, 0.0
+    settled = False
+    for _ in range(12):
+        gap, k, u, offset = road_clearance(road, beam, r)
+        if abs(moved) > 1e-5:
+            fall = min(max((last_gap - gap) / moved, 0.3), 2.0)
+        moved = gap / fall
+        r += moved
+        if abs(moved) < enough:
+            settled = True
+            break
+        last_gap = gap
+    if not settled:
+        r, k, u, offset = walked_range(road, beam, r)
+        fall = 1.0
+    return r, k, u, offset, fall
+
+
+@compiled
+def road_clearance(road: RoadArrays, beam: Float64, r: float) -> tuple[float, int, float, float]:
+    """Height of the point of a beam in road coordinates above the surface without defects, its node, u and offset."""
+    station, offset = along_beam(beam, 0, r), along_beam(beam, 1, r)
+    k = node_at(road, station)
+    u = station - road.nodes[k, STATION]
+    return along_beam(beam, 2, r) - worn_height(road, k, u, offset), k, u, offset
+
+
+@compiled
+def walked_range(road: RoadArrays, beam: Float64, near: float) -> tuple[float, int, float, float]:
+    """Range, node, u, offset of the first meeting of a beam in road coordinates with the surface, within 0.5 m."""
+    stride = 0.002
+    low = near - WALK_M
+    while road_clearance(road, beam, low)[0] <= 0.0 and low > near - 4.0 * WALK_M:
+        low -= WALK_M
+    high = low
+    for _ in range(int(6.0 * WALK_M / stride)):
+        high = low + stride
+        if road_clearance(road, beam, high)[0] <= 0.0:
+            break
+        low = high
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if road_clearance(road, beam, middle)[0] > 0.0:
+            low = middle
+        else:
+            high = middle
+    _, k, u, offset = road_clearance(road, beam, high)
+    return high, k, u, offset
+
+
+@compiled
+def polished_range(
+    road: RoadArrays, beam: Float64, start: float, fall: float, near: int
+) -> tuple[float, int, float, float]:
+    """Range, node, u, offset where a beam in the map meets the surface without defects, near `start`."""
+    r = start
+    k, u, offset = near, 0.0, 0.0
+    for _ in range(10):
+        gap, k, u, offset = clearance(road, beam, r, k)
+        r += gap / fall
+        if abs(gap) < ROOT_TOLERANCE_M:
+            break
+    return r, k, u, offset

@@ -1,0 +1,438 @@
+"""The road as a function: alignment, height, depth of defects, texture and intensity.
+
+Coordinates are easting, northing and height in metres from the scene's origin. *Nodes* lie each half metre along the
+reference line; ``u`` is the station past a node.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.simulate.kernels.options import compiled
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Int64 = npt.NDArray[np.int64]
+
+NODE_STEP_M = 0.5
+"""Distance from node to node of the reference line."""
+NODE_TOLERANCE_M = 1e-9
+
+# Columns of the nodes.
+STATION = 12
+DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18
+FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25
+NODE_COLUMNS = 27
+
+# Places in the section.
+CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7
+TRACK_FIRST, TRACK_PER_M, TRACK_STATION, TRACK_STATION_PER_M, TEXTURE_PER_M, CONTRAST = 8, 9, 10, 11, 12, 13
+ASPHALT, PAINT, DEFECT, SHOULDER, VERGE, KERB = 14, 15, 16, 17, 18, 19
+RUTS = 20
+RUT_COLUMNS = 6
+KERB_TOP_M = 0.15
+"""Width of a kerb's top, told by its intensity."""
+
+
+class RoadArrays(NamedTuple):
+    """The road as the kernels see it."""
+
+    nodes: Float64
+    """(n, 27), the last node only ends the line: easting, northing (m, from the origin), sine and cosine of the grid
+    heading, curvature (1/m, right positive), its change per metre up to the next node; from column 6 on the
+    reference line's height as coefficients of u⁰ … u⁵; station; first row and end row in `defects`, `patches` and
+    `items`; fall to the left (m/m) and its change per metre, fall to the right, height of the left kerb (m; 0: none)
+    and of the right kerb, likewise."""
+    section: Float64
+    """(20 + 6m,) constants, see the names above; then offset, 1 / half width, depth, variation, its wave number
+    (rad/m) and phase of each rut."""
+    defects: Float64
+    """(m, 7) by node, repeated where one reaches over several. Pothole: 0, depth, 1 / radius, station, offset, 0, 0;
+    piece of a crack: 1, depth, 1 / half width, station and offset of both ends."""
+    patches: Float64
+    """(m, 8) by node. Rectangle (0) or circle (1), station, offset, half length, half width, height, 1 / edge,
+    intensity."""
+    lines: Float64
+    """(m, 6) offset, half width, dash and period (0: solid), first and last station of each marking."""
+    items: Float64
+    """(m, 8) by node, what is painted or spilt: kind, intensity, station, offset, and
+    0 rectangle: half length, half width; 1 ellipse with a soft edge: the same; 2 ring: inner and outer radius;
+    3 band: half width, 0, station and offset of its other end."""
+    tracks: Float64
+    """(t, s) unevenness (m) at even offsets and stations; (0, 0): none."""
+    texture: Float32
+    """(c, c) macrotexture (m) over station and offset, periodic; (0, 0): none."""
+
+
+# --- alignment ---------------------------------------------------------------------------------------
+
+
+@compiled
+def clothoid(curvature: float, rate: float, u: float) -> tuple[float, float, float, float]:
+    """Point and direction on a short clothoid: along and right (m), sine and cosine of the turned angle.
+
+    Power series of the Fresnel integrals; for radii over 20 m and u up to 0.5 m good to 1e-12 m.
+    """
+    turned = curvature * u + 0.5 * rate * u * u
+    square = turned * turned
+    sine = turned * (1.0 - square / 6.0 * (1.0 - square / 20.0))
+    cosine = 1.0 - square / 2.0 * (1.0 - square / 12.0 * (1.0 - square / 30.0))
+    u3 = u * u * u
+    k2 = curvature * curvature
+    along = u - u3 * (k2 / 6.0 + u * (curvature * rate / 8.0 + u * (rate * rate / 40.0 - k2 * k2 / 120.0)))
+    right = u * u * curvature / 2.0 + u3 * (rate / 6.0 - u * k2 * (curvature / 24.0 + u * rate / 20.0))
+    return along, right, sine, cosine
+
+
+@compiled
+def project(road: RoadArrays, easting: float, northing: float, near: int) -> tuple[int, float, float]:
+    """Node, station past it and offset of the foot of a map point on the reference line.
+
+    `near` is a node to start from. Beyond both ends the line goes on with its last curvature.
+    """
+    nodes = road.nodes
+    last = nodes.shape[0] - 2
+    k = min(max(near, 0), last)
+    u = 0.0
+    offset = 0.0
+    for _ in range(64):
+        de = easting - nodes[k, 0]
+        dn = northing - nodes[k, 1]
+        ahead = de * nodes[k, 2] + dn * nodes[k, 3]
+        right = de * nodes[k, 3] - dn * nodes[k, 2]
+        curvature = nodes[k, 4]
+        rate = nodes[k, 5]
+        u = ahead / max(1.0 - curvature * right, 0.2)
+        offset = right
+        if -2.0 * NODE_STEP_M < u < 3.0 * NODE_STEP_M or (u < 0.0 and k == 0) or (u > 0.0 and k == last):
+            for _ in range(6):
+                along, aside, sine, cosine = clothoid(curvature, rate, u)
+                gap = (ahead - along) * cosine + (right - aside) * sine
+                offset = (right - aside) * cosine - (ahead - along) * sine
+                move = gap / (1.0 - (curvature + rate * u) * offset)
+                u += move
+                if abs(move) < 1e-4:  # converges quadratically: what is left is below 1e-9
+                    break
+            if -NODE_TOLERANCE_M <= u <= NODE_STEP_M + NODE_TOLERANCE_M:
+                break
+        moved = min(max(k + math.floor(u / NODE_STEP_M), 0), last)
+        if moved == k:
+            break
+        k = moved
+    return k, u, offset
+
+
+@compiled
+def node_at(road: RoadArrays, station: float) -> int:
+    """Node at or before a station."""
+    before = int((station - road.nodes[0, STATION]) / NODE_STEP_M)
+    last: int = road.nodes.shape[0] - 2
+    return min(max(before, 0), last)
+
+
+@compiled
+def place(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> None:
+    """Map points of stations and offsets.
+
+    station, offset : (n,); out : (n, 3) easting, northing (m, from the origin), grid heading (rad).
+    """
+    nodes = road.nodes
+    for i in range(station.size):
+        k = node_at(road, station[i])
+        u = station[i] - nodes[k, STATION]
+        along, right, sine, cosine = clothoid(nodes[k, 4], nodes[k, 5], u)
+        s, c = nodes[k, 2], nodes[k, 3]
+        sin_here = s * cosine + c * sine
+        cos_here = c * cosine - s * sine
+        out[i, 0] = nodes[k, 0] + along * s + right * c + offset[i] * cos_here
+        out[i, 1] = nodes[k, 1] + along * c - right * s - offset[i] * sin_here
+        out[i, 2] = math.atan2(sin_here, cos_here)
+
+
+# --- height ------------------------------------------------------------------------------------------
+
+
+@compiled
+def softened(x: float, half: float) -> float:
+    """max(x, 0), with the bend rounded by a parabola within `half` of it."""
+    if x >= half:
+        return x
+    if x <= -half:
+        return 0.0
+    return (x + half) * (x + half) / (4.0 * half)
+
+
+@compiled
+def smooth_step(x: float) -> float:
+    """0 below 0, 1 above 1, a cubic between."""
+    y = min(max(x, 0.0), 1.0)
+    return y * y * (3.0 - 2.0 * y)
+
+
+@compiled
+def section_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
+    """Height of the cross-section above the reference line: crossfall, shoulder, verge, kerb and ruts (m)."""
+    nodes, section = road.nodes, road.section
+    fall_left = nodes[k, FALL_LEFT] + u * nodes[k, FALL_LEFT + 1]
+    fall_right = nodes[k, FALL_RIGHT] + u * nodes[k, FALL_RIGHT + 1]
+    crown = section[CROWN]
+    height = -fall_right * softened(offset, crown) - fall_left * softened(-offset, crown)
+    away = abs(offset)
+    is_right = offset > 0.0
+    fall = fall_right if is_right else fall_left
+    bend = section[ROUNDING]
+    if away > section[LANES_EDGE] - bend:
+        if section[PAVED_EDGE] > section[LANES_EDGE]:
+            height -= (section[SHOULDER_SLOPE] - fall) * softened(away - section[LANES_EDGE], bend)
+            fall = section[SHOULDER_SLOPE]
+        if away > section[PAVED_EDGE] - bend:
+            height -= (section[VERGE_SLOPE] - fall) * softened(away - section[PAVED_EDGE], bend)
+            if away > section[PAVED_EDGE]:
+                column = KERB_RIGHT if is_right else KERB_LEFT
+                kerb = nodes[k, column] + u * nodes[k, column + 1]
+                height += kerb * smooth_step((away - section[PAVED_EDGE]) / section[KERB_FACE])
+    for i in range(RUTS, section.size, RUT_COLUMNS):
+        x = (offset - section[i]) * section[i + 1]
+        wall = 1.0 - x * x
+        if wall > 0.0:
+            depth = section[i + 2]
+            if section[i + 3] > 0.0:
+                depth *= 1.0 + section[i + 3] * math.sin(section[i + 4] * (nodes[k, STATION] + u) + section[i + 5])
+            height -= depth * wall * wall * wall
+    result: float = height
+    return result
+
+
+@compiled
+def cubic_weights(x: float) -> tuple[float, float, float, float]:
+    """Weights of the four values around a place `x` (0–1) between the middle two: Catmull and Rom (1974)."""
+    x2 = x * x
+    x3 = x2 * x
+    return (
+        -0.5 * x3 + x2 - 0.5 * x,
+        1.5 * x3 - 2.5 * x2 + 1.0,
+        -1.5 * x3 + 2.0 * x2 + 0.5 * x,
+        0.5 * x3 - 0.5 * x2,
+    )
+
+
+@compiled
+def along_track(tracks: Float64, i: int, j: int, weights: tuple[float, float, float, float]) -> float:
+    """Height of track `i` between its samples `j` and `j` + 1 (m)."""
+    value: float = (
+        weights[0] * tracks[i, j - 1]
+        + weights[1] * tracks[i, j]
+        + weights[2] * tracks[i, j + 1]
+        + weights[3] * tracks[i, j + 2]
+    )
+    return value
+
+
+@compiled
+def unevenness(road: RoadArrays, station: float, offset: float) -> float:
+    """Random unevenness (m): bicubic between the tracks, which go on unchanged beyond the outermost."""
+    tracks, section = road.tracks, road.section
+    along = (station - section[TRACK_STATION]) * section[TRACK_STATION_PER_M]
+    across = (offset - section[TRACK_FIRST]) * section[TRACK_PER_M]
+    j = min(max(int(along), 1), tracks.shape[1] - 3)
+    last = tracks.shape[0] - 1
+    across = min(max(across, 0.0), float(last))
+    i = min(int(across), last - 1)
+    weights = cubic_weights(along - j)
+    v0, v1, v2, v3 = cubic_weights(across - i)
+    before, after = max(i - 1, 0), min(i + 2, last)
+    value: float = v0 * along_track(tracks, before, j, weights) + v1 * along_track(tracks, i, j, weights)
+    value += v2 * along_track(tracks, i + 1, j, weights) + v3 * along_track(tracks, after, j, weights)
+    return value
+
+
+@compiled
+def edge_distance(patches: Float64, i: int, station: float, offset: float) -> float:
+    """Distance inwards from the outline of patch `i` (m); negative outside."""
+    ds = station - patches[i, 1]
+    do = offset - patches[i, 2]
+    if patches[i, 0] == 1.0:
+        inward: float = patches[i, 3] - math.sqrt(ds * ds + do * do)
+        return inward
+    return min(patches[i, 3] - abs(ds), patches[i, 4] - abs(do))
+
+
+@compiled
+def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
+    """Height without potholes, cracks, joints and texture. Everywhere smooth and defined (m)."""
+    nodes = road.nodes
+    height: float = nodes[k, 6] + u * (
+        nodes[k, 7] + u * (nodes[k, 8] + u * (nodes[k, 9] + u * (nodes[k, 10] + u * nodes[k, 11])))
+    )
+    height += section_height(road, k, u, offset)
+    station = nodes[k, STATION] + u
+    if road.tracks.size:
+        height += unevenness(road, station, offset)
+    patches = road.patches
+    for i in range(int(nodes[k, PATCHES]), int(nodes[k, PATCHES_END])):
+        inward = edge_distance(patches, i, station, offset)
+        if inward > 0.0:
+            height += patches[i, 5] * smooth_step(inward * patches[i, 6])
+    return height
+
+
+@compiled
+def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[float, float]:
+    """Depth of the deepest pothole, crack or joint here, and the smallest radius or half width near this node (m)."""
+    nodes, defects = road.nodes, road.defects
+    deepest = 0.0
+    finest = 1e9
+    station = nodes[k, STATION] + u
+    for i in range(int(nodes[k, DEFECTS]), int(nodes[k, DEFECTS_END])):
+        is_crack = defects[i, 0] == 1.0
+        sharpness = defects[i, 2]
+        ds = station - defects[i, 3]
+        do = offset - defects[i, 4]
+        if is_crack:
+            length_s = defects[i, 5] - defects[i, 3]
+            length_o = defects[i, 6] - defects[i, 4]
+            share = (ds * length_s + do * length_o) / (length_s * length_s + length_o * length_o)
+            share = min(max(share, 0.0), 1.0)
+            ds -= share * length_s
+            do -= share * length_o
+        x = (ds * ds + do * do) * sharpness * sharpness
+        finest = min(finest, 1.0 / sharpness)
+        if x < 1.0:
+            wall = 1.0 - (x if is_crack else x * x)
+            deepest = max(deepest, defects[i, 1] * wall * wall)
+    return deepest, finest
+
+
+@compiled
+def texture_height(road: RoadArrays, station: float, offset: float) -> float:
+    """Macrotexture (m) of the paved surface, bilinear; 0 beside it."""
+    texture, section = road.texture, road.section
+    if texture.size == 0 or abs(offset) > section[PAVED_EDGE]:
+        return 0.0
+    size = texture.shape[0]
+    along = station * section[TEXTURE_PER_M]
+    across = offset * section[TEXTURE_PER_M]
+    i, j = math.floor(along), math.floor(across)
+    x, y = along - i, across - j
+    i0, j0 = i & (size - 1), j & (size - 1)
+    i1, j1 = (i0 + 1) & (size - 1), (j0 + 1) & (size - 1)
+    low = texture[i0, j0] + y * (texture[i0, j1] - texture[i0, j0])
+    high = texture[i1, j0] + y * (texture[i1, j1] - texture[i1, j0])
+    value: float = low + x * (high - low)
+    return value
+
+
+@compiled
+def on_surface(road: RoadArrays, k: int, u: float, offset: float) -> bool:
+    """Whether the surface is defined here."""
+    last = road.nodes.shape[0] - 2
+    inside: bool = abs(offset) <= road.section[SURFACE_EDGE]
+    return inside and (k > 0 or u >= -NODE_TOLERANCE_M) and (k < last or u <= NODE_STEP_M + NODE_TOLERANCE_M)
+
+
+# --- intensity ---------------------------------------------------------------------------------------
+
+
+@compiled
+def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
+    """Intensity of what the surface is made of, paint and spills left out."""
+    nodes, section, patches = road.nodes, road.section, road.patches
+    away = abs(offset)
+    value = section[ASPHALT]
+    if away > section[PAVED_EDGE]:
+        value = section[VERGE]
+        column = KERB_RIGHT if offset > 0.0 else KERB_LEFT
+        if nodes[k, column] > 0.0 and away < section[PAVED_EDGE] + KERB_TOP_M:
+            value = section[KERB]
+    elif away > section[LANES_EDGE]:
+        value = section[SHOULDER]
+    station = nodes[k, STATION] + u
+    for i in range(int(nodes[k, PATCHES]), int(nodes[k, PATCHES_END])):
+        if edge_distance(patches, i, station, offset) > 0.0:
+            value = patches[i, 7]
+    result: float = value
+    return result
+
+
+@compiled
+def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float) -> float:
+    """Intensity of the surface (digital numbers), where a defect is `depth` deep."""
+    nodes, section, lines, items = road.nodes, road.section, road.lines, road.items
+    if depth > 0.0:
+        inside: float = section[DEFECT]
+        return inside
+    value = material(road, k, u, offset)
+    station = nodes[k, STATION] + u
+    if abs(offset) <= section[PAVED_EDGE]:
+        for i in range(lines.shape[0]):
+            if abs(offset - lines[i, 0]) <= lines[i, 1] and lines[i, 4] <= station <= lines[i, 5]:
+                period = lines[i, 3]
+                if period == 0.0 or station % period < lines[i, 2]:
+                    value = section[PAINT]
+    for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
+        value = painted(items, i, station, offset, value)
+    if section[CONTRAST] > 0.0 and road.texture.size:
+        value += section[CONTRAST] * texture_height(road, station, offset)
+    return value
+
+
+@compiled
+def painted(items: Float64, i: int, station: float, offset: float, under: float) -> float:
+    """Intensity where item `i` lies over a surface of intensity `under`."""
+    kind = items[i, 0]
+    ds = station - items[i, 2]
+    do = offset - items[i, 3]
+    cover = 0.0
+    if kind == 0.0:
+        cover = 1.0 if abs(ds) <= items[i, 4] and abs(do) <= items[i, 5] else 0.0
+    elif kind == 1.0:
+        x = (ds / items[i, 4]) ** 2 + (do / items[i, 5]) ** 2
+        cover = (1.0 - x * x) if x < 1.0 else 0.0
+    elif kind == 2.0:
+        away = math.sqrt(ds * ds + do * do)
+        cover = 1.0 if items[i, 4] <= away <= items[i, 5] else 0.0
+    else:
+        length_s = items[i, 6] - items[i, 2]
+        length_o = items[i, 7] - items[i, 3]
+        share = (ds * length_s + do * length_o) / (length_s * length_s + length_o * length_o)
+        share = min(max(share, 0.0), 1.0)
+        ds -= share * length_s
+        do -= share * length_o
+        cover = 1.0 if ds * ds + do * do <= items[i, 4] * items[i, 4] else 0.0
+    value: float = under + cover * (items[i, 1] - under)
+    return value
+
+
+# --- at map points -----------------------------------------------------------------------------------
+
+
+@compiled
+def survey_points(road: RoadArrays, easting: Float64, northing: Float64, near: Int64, out: Float64) -> None:
+    """What lies at map points, exactly.
+
+    easting, northing : (n,) m from the origin; near : (n,) nodes to start from;
+    out : (n, 6) height without texture (NaN off the surface), station, offset, depth of defects, intensity, texture.
+    """
+    for i in range(easting.size):
+        k, u, offset = project(road, easting[i], northing[i], near[i])
+        station = road.nodes[k, STATION] + u
+        depth, _ = defect_depth(road, k, u, offset)
+        known = on_surface(road, k, u, offset)
+        out[i, 0] = worn_height(road, k, u, offset) - depth if known else np.nan
+        out[i, 1] = station
+        out[i, 2] = offset
+        out[i, 3] = depth
+        out[i, 4] = brightness(road, k, u, offset, depth)
+        out[i, 5] = texture_height(road, station, offset)
+
+
+@compiled
+def heights_along(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> None:
+    """Height without potholes, cracks, joints and texture at stations and offsets. All arrays (n,), m."""
+    for i in range(station.size):
+        k = node_at(road, station[i])
+        out[i] = worn_height(road, k, station[i] - road.nodes[k, STATION], offset[i])

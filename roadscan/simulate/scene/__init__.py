@@ -1,0 +1,203 @@
+"""The scene: road, roadside, vehicle, sensors and errors of a simulated survey (``SCENE.toml``).
+
+Lengths are metres of the map; *station* runs along the reference line, *offset* is positive to its right.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from importlib import resources
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.strict import Strict, load_toml
+from roadscan.simulate.scene.rig import (
+    IMU_GRADES,
+    Camera,
+    ClockError,
+    Control,
+    Encoder,
+    Gnss,
+    Imu,
+    ImuErrors,
+    ImuGrade,
+    Lidar,
+    Mount,
+    MountError,
+    Noise,
+    Profilers,
+    Sick,
+    Trajectory,
+)
+from roadscan.simulate.scene.road import Element, Road
+from roadscan.simulate.scene.roadside import Roadside
+from roadscan.simulate.scene.vehicle import PassScene, Route, Vehicle
+
+__all__ = [
+    "IMU_GRADES",
+    "Camera",
+    "ClockError",
+    "Control",
+    "Element",
+    "Encoder",
+    "Gnss",
+    "Imu",
+    "ImuErrors",
+    "ImuGrade",
+    "Lidar",
+    "MapScene",
+    "Mount",
+    "MountError",
+    "Noise",
+    "PassScene",
+    "Profilers",
+    "Road",
+    "Roadside",
+    "Route",
+    "Scene",
+    "Sick",
+    "Trajectory",
+    "Vehicle",
+    "shipped_scenes",
+]
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+
+
+class MapScene(Strict):
+    """Where on the Earth the road lies."""
+
+    crs: str = "EPSG:32632"
+    """Projected CRS of the map; heights are ellipsoidal. The logs' datum is the CRS's own. "local": a local frame
+    of metres, x to the right of y, z up, that is not tied to the Earth; logs that need the Earth cannot be written."""
+    easting_m: float = 691_000.0
+    """Easting of station 0 on the reference line (m)."""
+    northing_m: float = 5_335_000.0
+    """Northing of station 0 on the reference line (m)."""
+    height_m: float = 560.0
+    """Ellipsoidal height of station 0 on the reference line, waves left out (m)."""
+    azimuth_deg: float = 57.0
+    """Direction of the reference line at station 0, clockwise from grid north (degrees)."""
+
+
+class Scene(Strict):
+    """A simulated survey, whole. Every field has a default; ``Scene()`` is a straight road without defects."""
+
+    id: str = Field(default="simulated", pattern=_NAME)
+    """Name of the survey."""
+    title: str = "Simulated survey"
+    """One line about it."""
+    seed: int = Field(default=1, ge=0)
+    """Same seed, same bytes."""
+    start: dt.datetime = dt.datetime(2026, 5, 4, 9, 30, tzinfo=dt.UTC)
+    """First profile of the first pass, with zone (2026-05-04T09:30:00Z)."""
+    pause_s: float = Field(default=600.0, ge=10.0)
+    """From the start of one pass to the start of the next (s)."""
+    length_m: float = Field(default=100.0, ge=1.0, le=100_000.0)
+    """Length of road that each pass drives, from station 0 (m)."""
+    map: MapScene = MapScene()
+    """Where the road lies."""
+    road: Road = Road()
+    """Its surface."""
+    roadside: Roadside = Roadside()
+    """What stands and moves beside and on it."""
+    passes: list[PassScene] = Field(default=[PassScene(lane=2)], min_length=1)
+    """Traverses, in the order driven."""
+    vehicle: Vehicle = Vehicle()
+    """How the vehicle moves."""
+    trajectory: Trajectory = Trajectory()
+    """Post-processed trajectory."""
+    profilers: Profilers = Profilers()
+    """Triangulation pair."""
+    lidar: Lidar = Lidar()
+    """Spinning lidar."""
+    sick: Sick = Sick()
+    """Line scanner with a turning mirror."""
+    imu: Imu = Imu()
+    """Inertial measurement unit."""
+    gnss: Gnss = Gnss()
+    """GNSS receiver."""
+    encoder: Encoder = Encoder()
+    """Wheel encoder."""
+    camera: Camera = Camera()
+    """Camera."""
+    noise: Noise = Noise()
+    """Errors; all 0 where left out."""
+    control: Control = Control()
+    """Control points."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for one in self.passes:
+            if one.route is None and one.lane > self.road.lanes:
+                raise ValueError(f"a pass drives lane {one.lane} of a road with {self.road.lanes}")
+            fastest = max([one.speed_m_per_s or self.vehicle.speed_m_per_s, *(c.speed_m_per_s for c in one.speeds)])
+            rate = fastest * (1.0 + self.vehicle.speed_variation) / self.profilers.spacing_m
+            if self.profilers.on and rate > self.profilers.profiles_per_s_max:
+                raise ValueError(
+                    f"{fastest:g} m/s at a spacing of {self.profilers.spacing_m:g} m needs {rate:,.0f} profiles/s, "
+                    f"and the heads give {self.profilers.profiles_per_s_max:,.0f}"
+                )
+            lead = 1.3 * (one.speed_m_per_s or self.vehicle.speed_m_per_s) + 8.0
+            if one.route is None and self.road.lead_m < lead:
+                raise ValueError(
+                    f"road.lead_m {self.road.lead_m:g} leaves no run-up at this speed; give {lead:.0f} or more"
+                )
+        if self.start.tzinfo is None:
+            raise ValueError("start has no time zone; write it as 2026-05-04T09:30:00Z")
+        return self
+
+    @classmethod
+    def load(cls, source: str | Path) -> Self:
+        """Read a scene: a TOML file, or the name of one that ships with roadscan (:func:`shipped_scenes`)."""
+        shipped = shipped_scenes()
+        if isinstance(source, str) and source in shipped:
+            with resources.as_file(shipped[source]) as file:
+                return cls.parse(load_toml(file), file=f"scene {source}")
+        if not Path(source).is_file():
+            raise ConfigError(
+                f"there is no scene '{source}'{nearest(str(source), shipped)}",
+                expected="a TOML file, or one of: " + ", ".join(shipped),
+            )
+        return cls.parse(load_toml(source), file=source)
+
+    def changed(self, **values: Any) -> Self:
+        """The scene with some values replaced; dictionaries are merged, key by key.
+
+        ``scene.changed(length_m=20.0, lidar={"on": False})`` keeps all other settings of the lidar.
+        """
+        return self.parse(_merged(self.model_dump(), values))
+
+    def noiseless(self) -> Self:
+        """The scene without any error but the rounding of the logs: no noise, true mountings stated, right clocks."""
+        values: dict[str, Any] = self.model_dump() | {"noise": Noise()}
+        right = {"offset_s": 0.0, "drift_ppm": 0.0}
+        for name in ("profilers", "lidar", "sick", "imu", "encoder", "camera"):
+            values[name]["clock"] |= right
+        for mount in (values["profilers"]["left"], values["profilers"]["right"]):
+            mount["error"] = {}
+        for name in ("lidar", "sick", "camera"):
+            values[name]["mount"]["error"] = {}
+        values["imu"] |= {"grade": "perfect", "errors": None}
+        values["gnss"] |= {"sigma_horizontal_m": 0.0, "sigma_vertical_m": 0.0, "float_sigma_m": 0.0}
+        values["gnss"] |= {"jumps_per_minute": 0.0, "lever_arm_error_m": (0.0, 0.0, 0.0)}
+        values["encoder"]["scale_error"] = 0.0
+        values["camera"]["noise"] = 0.0
+        return self.parse(values)
+
+
+def shipped_scenes() -> dict[str, Any]:
+    """Scenes that come with roadscan: name → resource."""
+    folder = resources.files("roadscan.simulate") / "scenes"
+    return {f.name.removesuffix(".toml"): f for f in sorted(folder.iterdir(), key=lambda f: f.name)}
+
+
+def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    out = dict(old)
+    for key, value in new.items():
+        both = isinstance(value, dict) and isinstance(old.get(key), dict)
+        out[key] = _merged(old[key], value) if both else value
+    return out

@@ -1,0 +1,352 @@
+"""The sensors of a scene's rig: how they are mounted, what they measure, how far they err, and their clocks."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.model.gpstime import TimeSystem
+from roadscan.model.strict import Strict
+
+
+class ClockError(Strict):
+    """A sensor's clock: stamp = true epoch + offset_s + drift_ppm · 10⁻⁶ · (time since the first pass's start)."""
+
+    offset_s: float = 0.0
+    """How far the clock is ahead at the first profile of the first pass (s)."""
+    drift_ppm: float = 0.0
+    """How much too fast it runs (parts per million)."""
+    known: bool = False
+    """Whether the survey file states the correction, as if it had been measured."""
+    system: TimeSystem | None = None
+    """Time system of the log's stamps, where its format leaves the choice: the format's usual one otherwise."""
+
+    @property
+    def is_right(self) -> bool:
+        """True for a clock without error."""
+        return self.offset_s == 0.0 and self.drift_ppm == 0.0
+
+
+class MountError(Strict):
+    """How far the nominal mounting of the rig file lies from the true one: nominal = true + error."""
+
+    lever_arm_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Error of the lever arm: forward, right, down (m)."""
+    roll_deg: float = 0.0
+    """Error of the boresight's roll (degrees)."""
+    pitch_deg: float = 0.0
+    """Error of its pitch (degrees)."""
+    heading_deg: float = 0.0
+    """Error of its heading (degrees)."""
+
+
+class Mount(Strict):
+    """True lever arm and boresight of a sensor; the rig file states the nominal ones."""
+
+    lever_arm_body_m: tuple[float, float, float]
+    """IMU reference point to sensor origin: forward, right, down (m)."""
+    roll_deg: float = 0.0
+    """Boresight about body x (degrees); the order is Z-Y-X."""
+    pitch_deg: float = 0.0
+    """Boresight about body y (degrees)."""
+    heading_deg: float = 0.0
+    """Boresight about body z (degrees)."""
+    error: MountError = MountError()
+    """What the rig file has wrong."""
+
+    def nominal(self) -> Mount:
+        """The mounting as the rig file states it."""
+        e = self.error
+        forward, right, down = (a + b for a, b in zip(self.lever_arm_body_m, e.lever_arm_body_m, strict=True))
+        return Mount(
+            lever_arm_body_m=(forward, right, down),
+            roll_deg=self.roll_deg + e.roll_deg,
+            pitch_deg=self.pitch_deg + e.pitch_deg,
+            heading_deg=self.heading_deg + e.heading_deg,
+        )
+
+
+ImuGrade = Literal["perfect", "navigation", "tactical", "industrial", "mems"]
+"""How good an inertial measurement unit is."""
+
+
+class Profilers(Strict):
+    """The laser-triangulation pair at the vehicle's rear, looking down."""
+
+    on: bool = True
+    """Whether the rig carries them."""
+    spacing_m: float = Field(default=0.02, gt=0.0005)
+    """Distance driven from profile to profile (m)."""
+    profiles_per_s_max: float = Field(default=28_000.0, gt=0.0)
+    """Fastest rate of the heads (1/s); a scene that drives faster than that at its spacing is refused."""
+    readings: int = Field(default=1000, ge=2, le=20_000)
+    """Readings a profile and head: 2,000 make the pair's 4,000."""
+    width_m: float = Field(default=2.04, gt=0.1, le=5.0)
+    """From the first to the last reading of a head (m)."""
+    range_offset_m: float = Field(default=0.8, ge=0.0)
+    """Range that a raw value of 0 would stand for (m)."""
+    range_step_m: float = Field(default=0.00005, ge=0.000001, le=0.01)
+    """Range of one raw unit (m); rounding errors are half of it."""
+    left: Mount = Mount(lever_arm_body_m=(-2.35, -0.98, -1.08), roll_deg=0.4, pitch_deg=-0.3, heading_deg=0.6)
+    """Mounting of the left head (axes frd)."""
+    right: Mount = Mount(lever_arm_body_m=(-2.28, 0.99, -1.11), roll_deg=-0.35, pitch_deg=0.25, heading_deg=-0.5)
+    """Mounting of the right head (axes frd)."""
+    clock: ClockError = ClockError()
+    """Clock of both heads; GPS time by default."""
+    head_imus: ImuGrade | None = None
+    """Grade of the IMU inside each head (axes frd of the head); none where left out."""
+
+
+class Lidar(Strict):
+    """The spinning lidar, a Velodyne HDL-32E."""
+
+    on: bool = True
+    """Whether the rig carries it."""
+    turns_per_s: float = Field(default=10.0, ge=5.0, le=20.0)
+    """Turns of the head a second."""
+    range_max_m: float = Field(default=20.0, gt=2.0, le=100.0)
+    """Returns farther than this are not measured (m)."""
+    on_azimuth_grid: bool = False
+    """Fire on the hundredths of a degree that the packets state, at a whole number of them a cycle. The
+    directions of a decoder are then exact; otherwise they are rounded by up to 0.01 degrees."""
+    divergence_deg: float = Field(default=0.0, ge=0.0, le=0.5)
+    """Width of a beam (degrees): where two of its edges meet things at different ranges, the range is a mixture."""
+    mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)
+    """Mounting of the head (axes flu); it leans back, so that the road behind is seen."""
+    clock: ClockError = ClockError()
+    """Its clock; the packets count microseconds past the hour of UTC."""
+
+
+class Sick(Strict):
+    """A line scanner with a turning mirror, a SICK LMS 200 that looks down behind the vehicle: 180°, 361 readings."""
+
+    on: bool = False
+    """Whether the rig carries it."""
+    scans_per_s: float = Field(default=75.0, gt=1.0, le=75.0)
+    """Scans a second."""
+    resolution_deg: float = 0.5
+    """From reading to reading: 0.5 or 1 (degrees)."""
+    range_max_m: float = Field(default=30.0, gt=1.0, le=80.0)
+    """Readings farther than this are none (m)."""
+    divergence_deg: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Width of a beam (degrees), as for the lidar."""
+    mount: Mount = Mount(lever_arm_body_m=(-2.9, 0.0, -1.45), roll_deg=0.5, pitch_deg=12.0, heading_deg=-0.8)
+    """Mounting (axes frd: the middle reading looks along z, down; readings run from left to right)."""
+    clock: ClockError = ClockError()
+    """Clock of the computer that stamps the telegrams: Unix UTC."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.resolution_deg not in {0.5, 1.0}:
+            raise ValueError(f"resolution_deg {self.resolution_deg:g}, expected 0.5 or 1")
+        return self
+
+
+class ImuErrors(Strict):
+    """Errors of an inertial measurement unit, 1 σ; biases change as Gauss–Markov processes."""
+
+    gyro_noise_deg_per_sqrt_h: float = Field(ge=0.0)
+    """Angle random walk."""
+    gyro_bias_deg_per_h: float = Field(ge=0.0)
+    """Bias of each gyroscope."""
+    gyro_scale_ppm: float = Field(ge=0.0)
+    """Scale error of each gyroscope."""
+    accel_noise_ug_per_sqrt_hz: float = Field(ge=0.0)
+    """Velocity random walk, as noise density of the accelerometers (µg/√Hz)."""
+    accel_bias_mg: float = Field(ge=0.0)
+    """Bias of each accelerometer (mg)."""
+    accel_scale_ppm: float = Field(ge=0.0)
+    """Scale error of each accelerometer."""
+    bias_time_constant_s: float = Field(default=600.0, gt=0.0)
+    """Time constant of the biases (s)."""
+
+
+IMU_GRADES: dict[ImuGrade, ImuErrors] = {
+    "perfect": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.0,
+        gyro_bias_deg_per_h=0.0,
+        gyro_scale_ppm=0.0,
+        accel_noise_ug_per_sqrt_hz=0.0,
+        accel_bias_mg=0.0,
+        accel_scale_ppm=0.0,
+    ),
+    "navigation": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.002,
+        gyro_bias_deg_per_h=0.005,
+        gyro_scale_ppm=5.0,
+        accel_noise_ug_per_sqrt_hz=10.0,
+        accel_bias_mg=0.03,
+        accel_scale_ppm=50.0,
+        bias_time_constant_s=3600.0,
+    ),
+    "tactical": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.07,
+        gyro_bias_deg_per_h=1.0,
+        gyro_scale_ppm=150.0,
+        accel_noise_ug_per_sqrt_hz=50.0,
+        accel_bias_mg=1.0,
+        accel_scale_ppm=300.0,
+    ),
+    "industrial": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.2,
+        gyro_bias_deg_per_h=10.0,
+        gyro_scale_ppm=500.0,
+        accel_noise_ug_per_sqrt_hz=60.0,
+        accel_bias_mg=3.0,
+        accel_scale_ppm=1000.0,
+    ),
+    "mems": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.4,
+        gyro_bias_deg_per_h=100.0,
+        gyro_scale_ppm=3000.0,
+        accel_noise_ug_per_sqrt_hz=150.0,
+        accel_bias_mg=10.0,
+        accel_scale_ppm=3000.0,
+    ),
+}
+"""Errors by grade, the orders of magnitude of Groves (2013), table 4.1 and 4.2."""
+
+
+class Imu(Strict):
+    """The inertial measurement unit at the IMU reference point."""
+
+    on: bool = False
+    """Whether its raw data are logged."""
+    grade: ImuGrade = "tactical"
+    """Grade."""
+    errors: ImuErrors | None = None
+    """Errors, in place of the grade's."""
+    rate_hz: float = Field(default=200.0, ge=10.0, le=2000.0)
+    """Records a second."""
+    clock: ClockError = ClockError()
+    """Its clock; GPS time by default."""
+
+
+class GnssGap(Strict):
+    """A time without a GNSS solution (a tunnel, a bridge)."""
+
+    start_s: float = 0.0
+    """Begin, from the first profile of the pass (s)."""
+    duration_s: float = Field(gt=0.0)
+    """Length (s)."""
+    passes: list[int] = []
+    """Passes with this gap, counted from 1; all of them where empty."""
+
+
+class Gnss(Strict):
+    """A GNSS receiver with real-time kinematic corrections: its own solution, without the IMU."""
+
+    on: bool = False
+    """Whether its solutions are logged (RTKLIB .pos and NMEA)."""
+    rate_hz: float = Field(default=5.0, ge=0.1, le=100.0)
+    """Solutions a second."""
+    lever_arm_body_m: tuple[float, float, float] = (-0.4, 0.1, -1.9)
+    """IMU reference point to antenna: forward, right, down (m)."""
+    lever_arm_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How far the rig file's lever arm lies from the true one (m)."""
+    sigma_horizontal_m: float = Field(default=0.010, ge=0.0)
+    """Error of fixed solutions, north and east each (m)."""
+    sigma_vertical_m: float = Field(default=0.018, ge=0.0)
+    """Error of fixed solutions, up (m)."""
+    time_constant_s: float = Field(default=20.0, gt=0.0)
+    """Time constant of the correlated half of these errors (s)."""
+    gaps: list[GnssGap] = []
+    """Times without a solution; float solutions for some seconds after each."""
+    float_after_gap_s: float = Field(default=6.0, ge=0.0)
+    """How long solutions stay float after a gap (s)."""
+    float_sigma_m: float = Field(default=0.35, ge=0.0)
+    """Error of float solutions (m)."""
+    jumps_per_minute: float = Field(default=0.0, ge=0.0)
+    """Multipath jumps: the solution is off by `jump_m` for one to five seconds and says nothing of it."""
+    jump_m: float = Field(default=0.5, ge=0.0)
+    """Size of a multipath jump (m, 1 σ)."""
+
+
+class Encoder(Strict):
+    """A wheel encoder: counts the path that a rear wheel drives."""
+
+    on: bool = False
+    """Whether a log of its own is written; profiles carry its count in any case."""
+    rate_hz: float = Field(default=50.0, ge=1.0, le=1000.0)
+    """Records a second."""
+    ticks_per_m: float = Field(default=1000.0, gt=0)
+    """Nominal ticks a metre driven."""
+    scale_error: float = Field(default=0.0, ge=-0.1, le=0.1)
+    """The wheel really gives ticks_per_m · (1 + scale_error)."""
+    side_m: float = Field(default=0.0, ge=-2.0, le=2.0)
+    """The wheel's offset from the middle of the vehicle, right positive (m): in turns it drives another path."""
+    clock: ClockError = ClockError()
+    """Its clock; GPS time by default."""
+
+
+class Camera(Strict):
+    """A camera with a rolling, undistorted or distorted pinhole model (Brown–Conrady, as OpenCV's)."""
+
+    on: bool = False
+    """Whether the rig carries it."""
+    every_m: float = Field(default=5.0, gt=0.1)
+    """Distance driven from picture to picture (m)."""
+    width_px: int = Field(default=960, ge=64, le=8192)
+    """Width of a picture."""
+    height_px: int = Field(default=600, ge=64, le=8192)
+    """Height of a picture."""
+    focal_px: float = Field(default=820.0, gt=10.0)
+    """Focal length (pixels)."""
+    principal_px: tuple[float, float] | None = None
+    """Principal point, from the centre of the upper left pixel; the picture's middle where left out."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3."""
+    range_max_m: float = Field(default=80.0, gt=5.0, le=500.0)
+    """What lies farther away is sky (m)."""
+    noise: float = Field(default=2.0, ge=0.0, le=50.0)
+    """Noise of the grey values."""
+    jpeg_quality: int = Field(default=90, ge=10, le=100)
+    """Quality of the pictures' compression."""
+    mount: Mount = Mount(lever_arm_body_m=(0.9, -0.25, -1.15), roll_deg=0.3, pitch_deg=-12.0, heading_deg=1.5)
+    """Mounting (axes frd of the sensor frame: x forward along the optical axis, y right, z down)."""
+    clock: ClockError = ClockError()
+    """Clock of its stamps; Unix UTC by default."""
+
+
+class Noise(Strict):
+    """Errors of the sensors and of the stated trajectory, 1 σ."""
+
+    profiler_range_m: float = Field(default=0.0, ge=0.0)
+    """Range noise of the profilers (m)."""
+    lidar_range_m: float = Field(default=0.0, ge=0.0)
+    """Range noise of the lidar (m)."""
+    sick_range_m: float = Field(default=0.0, ge=0.0)
+    """Range noise of the line scanner (m)."""
+    intensity: float = Field(default=0.0, ge=0.0, le=60.0)
+    """Intensity noise (digital numbers)."""
+    dropout: float = Field(default=0.0, ge=0.0, le=0.5)
+    """Share of readings and returns that are lost."""
+    impulse: float = Field(default=0.0, ge=0.0, le=0.1)
+    """Share of profiler readings that are wrong: anywhere within 30 mm of the road."""
+    position_m: float = Field(default=0.0, ge=0.0)
+    """Position error of the stated trajectory, a Gauss–Markov process on each of north, east, down (m)."""
+    attitude_deg: float = Field(default=0.0, ge=0.0)
+    """Error of the stated roll and pitch, likewise; that of heading is twice this (degrees)."""
+    time_constant_s: float = Field(default=30.0, gt=0.0)
+    """Time constant of the trajectory's errors (s)."""
+    control_m: float = Field(default=0.0, ge=0.0)
+    """Error of the control points, on each coordinate (m)."""
+
+
+class Trajectory(Strict):
+    """The post-processed trajectory: an SBET, with its accuracy file beside it."""
+
+    poses_per_s: int = Field(default=200, ge=20, le=1000)
+    """Poses a second."""
+    accuracy: bool = True
+    """Write the companion SMRMSG (σ of position, velocity, attitude, once a second) and name it in the survey file."""
+
+
+class Control(Strict):
+    """Control and check points, surveyed along both edges of the lanes, where the road has no painted targets."""
+
+    spacing_m: float = Field(default=40.0, gt=0.0)
+    """Distance from pair to pair (m)."""
+    inset_m: float = Field(default=0.45, ge=0.0)
+    """Distance from the lanes' edge inwards (m)."""

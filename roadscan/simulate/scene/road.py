@@ -1,0 +1,452 @@
+"""The road of a scene: alignment, shape, wear, and what is painted on it.
+
+*Station* runs along the reference line (m), *offset* is positive to its right (m). Heights are metres, angles degrees.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.model.strict import Strict
+
+Shade = Annotated[float, Field(ge=0, le=255)]
+"""Intensity of a surface, in digital numbers of a profiler."""
+
+
+class Element(Strict):
+    """A piece of the alignment."""
+
+    kind: Literal["straight", "spiral", "arc"]
+    """straight; arc of `radius_m`; spiral: a clothoid from the curvature of the piece before to that of
+    the piece after it."""
+    length_m: float = Field(gt=0)
+    """Length along the reference line (m)."""
+    radius_m: float | None = None
+    """Radius of an arc, positive when it turns right (m)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.kind == "arc") != (self.radius_m is not None):
+            raise ValueError("an arc needs radius_m, and nothing else has one")
+        if self.radius_m is not None and abs(self.radius_m) < 20.0:
+            raise ValueError(f"radius_m {self.radius_m:g} is tighter than 20 m")
+        return self
+
+
+class GradeChange(Strict):
+    """A change of the reference line's grade, rounded by a parabola."""
+
+    station_m: float
+    """Middle of the parabola, where the two straight grades would meet (m)."""
+    grade: float = Field(ge=-0.15, le=0.15)
+    """Rise from here on (m/m)."""
+    curve_m: float = Field(default=40.0, gt=0.0)
+    """Length of the parabola (m)."""
+
+
+class CrossSlope(Strict):
+    """Fall of the lanes to both sides at a station; between two of them it changes linearly (superelevation)."""
+
+    station_m: float
+    """Station (m)."""
+    left: float = Field(ge=-0.12, le=0.12)
+    """Fall from the reference line to the left (m/m); negative: it rises."""
+    right: float = Field(ge=-0.12, le=0.12)
+    """Fall from the reference line to the right (m/m)."""
+
+
+class Wave(Strict):
+    """One sine of the longitudinal profile."""
+
+    wavelength_m: float = Field(ge=2.0)
+    """Length of the wave along the reference line (m)."""
+    amplitude_m: float = Field(ge=0.0)
+    """Half the height between trough and crest (m)."""
+    phase_deg: float = 0.0
+    """Phase at station 0 (degrees)."""
+
+
+class Roughness(Strict):
+    """Random unevenness of the longitudinal profiles: ISO 8608, G(n) = G(n0) · (n / n0)^−w, n0 = 0.1 cycles/m.
+
+    Wavelengths run from 0.7 to 80 m. Profiles at other offsets differ, the more the shorter the wave.
+    """
+
+    iso_class: Literal["A", "B", "C", "D", "E"] | None = None
+    """Class of ISO 8608: the degree of roughness G(n0) is the class's geometric mean."""
+    iri_m_per_km: float | None = Field(default=None, gt=0.0, le=20.0)
+    """International Roughness Index of the whole road's mean wheel path, in place of a class (m/km)."""
+    waviness: float = Field(default=2.0, ge=1.5, le=3.0)
+    """Exponent w."""
+    coherence_m: float = Field(default=3.0, gt=0.2)
+    """Distance across the road over which waves of 5 m lose their likeness (coherence 1/e; m)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.iso_class is None) == (self.iri_m_per_km is None):
+            raise ValueError("give iso_class or iri_m_per_km, one of both")
+        return self
+
+
+class Texture(Strict):
+    """Macrotexture of the paved surface: stones and gaps, seen by the profilers; wider beams see its mean."""
+
+    mpd_mm: float = Field(gt=0.0, le=4.0)
+    """Mean profile depth, ISO 13473-1:2019 (mm)."""
+    grain_mm: float = Field(default=8.0, ge=3.0, le=30.0)
+    """Wavelength at which the texture is strongest (mm)."""
+    contrast: float = Field(default=6.0, ge=0.0, le=60.0)
+    """Standard deviation of the intensity from stone to stone (digital numbers)."""
+
+
+class Rut(Strict):
+    """A wheel path worn down over the whole length of the road."""
+
+    offset_m: float
+    """Offset of its deepest line (m)."""
+    width_m: float = Field(default=0.7, gt=0.05)
+    """Width from edge to edge (m)."""
+    depth_m: float = Field(default=0.012, ge=0.0, le=0.2)
+    """Mean depth below the unworn surface (m)."""
+    variation: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share by which the depth swings along the road."""
+    variation_m: float = Field(default=40.0, ge=5.0)
+    """Length of that swing (m)."""
+
+
+class Pothole(Strict):
+    """A round hole: depth · (1 − (ρ / radius)⁴)² below the worn surface."""
+
+    station_m: float
+    """Station of its centre (m)."""
+    offset_m: float
+    """Offset of its centre (m)."""
+    radius_m: float = Field(gt=0.02, le=3.0)
+    """Radius of its rim (m)."""
+    depth_m: float = Field(gt=0.0, le=0.3)
+    """Depth of its centre (m)."""
+
+
+class Crack(Strict):
+    """An open crack along a broken line: depth · (1 − (distance / half width)²)² below the worn surface."""
+
+    points_m: list[tuple[float, float]] = Field(min_length=2)
+    """Corners of the line, each a station and an offset (m)."""
+    width_m: float = Field(default=0.006, ge=0.001, le=0.1)
+    """Width at the surface (m)."""
+    depth_m: float = Field(default=0.01, gt=0.0, le=0.1)
+    """Depth in the middle (m)."""
+
+
+class Alligator(Strict):
+    """A field of alligator cracks: the borders of random cells."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    length_m: float = Field(default=2.0, gt=0.2, le=50.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(default=0.8, gt=0.2, le=20.0)
+    """Extent across the road (m)."""
+    cell_m: float = Field(default=0.22, ge=0.08)
+    """Mean size of a cell (m)."""
+    crack_width_m: float = Field(default=0.005, ge=0.001, le=0.05)
+    """Width of its cracks (m)."""
+    crack_depth_m: float = Field(default=0.008, gt=0.0, le=0.1)
+    """Depth of its cracks (m)."""
+
+
+class Joints(Strict):
+    """Transverse joints at even distances, over the whole paved width."""
+
+    spacing_m: float = Field(gt=0.5)
+    """From joint to joint (m)."""
+    first_m: float = 0.0
+    """Station of one of them (m)."""
+    width_m: float = Field(default=0.010, ge=0.001, le=0.1)
+    """Width at the surface (m)."""
+    depth_m: float = Field(default=0.012, gt=0.0, le=0.1)
+    """Depth below the surface (m)."""
+    start_m: float = float("-inf")
+    """First station (m)."""
+    end_m: float = float("inf")
+    """Last station (m)."""
+
+
+class Hump(Strict):
+    """A speed hump or a raised table over the whole width: ramp up, flat top, ramp down."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    height_m: float = Field(default=0.08, gt=0.0, le=0.3)
+    """Height of its top (m)."""
+    top_m: float = Field(default=0.0, ge=0.0)
+    """Length of the flat top (m)."""
+    ramp_m: float = Field(default=1.5, ge=0.8)
+    """Length of each ramp (m), a raised cosine."""
+
+
+class Patch(Strict):
+    """A repaired place or utility cut: a rectangle or circle of other material, sunk or raised."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    shape: Literal["rectangle", "circle"] = "rectangle"
+    """Outline; a circle's diameter is `length_m` (a manhole, say)."""
+    length_m: float = Field(default=2.0, gt=0.1)
+    """Extent along the road (m)."""
+    width_m: float = Field(default=1.0, gt=0.1)
+    """Extent across the road (m)."""
+    height_m: float = Field(default=-0.004, ge=-0.05, le=0.02)
+    """Height of its surface above the road around it (m); negative: sunk."""
+    edge_m: float = Field(default=0.03, ge=0.01, le=0.5)
+    """Width of the slope along its edge, inside the outline (m)."""
+    shade: Shade = 52.0
+    """Intensity."""
+
+
+class Stain(Strict):
+    """An oil stain: an ellipse with a soft edge, in intensity only."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    length_m: float = Field(default=0.6, gt=0.02)
+    """Extent along the road (m)."""
+    width_m: float = Field(default=0.4, gt=0.02)
+    """Extent across the road (m)."""
+    shade: Shade = 22.0
+    """Intensity in the middle."""
+
+
+class TyreMark(Strict):
+    """A skid mark: a dark band along a broken line, in intensity only."""
+
+    points_m: list[tuple[float, float]] = Field(min_length=2)
+    """Corners of its middle line, each a station and an offset (m)."""
+    width_m: float = Field(default=0.2, gt=0.02, le=1.0)
+    """Width (m)."""
+    shade: Shade = 34.0
+    """Intensity."""
+
+
+class Marking(Strict):
+    """A painted line along the road: intensity only."""
+
+    offset_m: float
+    """Offset of its middle (m)."""
+    width_m: float = Field(default=0.12, gt=0.0)
+    """Width (m)."""
+    dash_m: float = Field(default=0.0, ge=0.0)
+    """Length of a dash (m); 0: a solid line."""
+    gap_m: float = Field(default=0.0, ge=0.0)
+    """Length of the gap between dashes (m)."""
+    start_m: float = float("-inf")
+    """First station (m)."""
+    end_m: float = float("inf")
+    """Last station (m)."""
+
+
+class StopBar(Strict):
+    """A painted bar across a lane."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    from_m: float
+    """Offset of its left end (m)."""
+    to_m: float
+    """Offset of its right end (m)."""
+    width_m: float = Field(default=0.5, gt=0.05)
+    """Extent along the road (m)."""
+
+
+class Crosswalk(Strict):
+    """A zebra crossing: stripes along the road, side by side."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    from_m: float
+    """Offset of its left end (m)."""
+    to_m: float
+    """Offset of its right end (m)."""
+    length_m: float = Field(default=4.0, gt=0.5)
+    """Extent along the road (m)."""
+    stripe_m: float = Field(default=0.5, gt=0.05)
+    """Width of a stripe (m)."""
+    gap_m: float = Field(default=0.5, gt=0.05)
+    """Gap between stripes (m)."""
+
+
+class Target(Strict):
+    """A painted circular control target: a white disc with a black centre; its middle is surveyed."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    diameter_m: float = Field(default=0.30, gt=0.05, le=2.0)
+    """Diameter of the disc (m)."""
+    centre_m: float = Field(default=0.06, ge=0.0)
+    """Diameter of the black centre (m)."""
+    role: Literal["gcp", "check"] = "gcp"
+    """Whether the survey states it as a control point or as a check point."""
+
+
+class KerbRamp(Strict):
+    """A dropped kerb."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    length_m: float = Field(default=4.0, gt=0.2)
+    """Length of the low part (m)."""
+    transition_m: float = Field(default=1.0, ge=0.5)
+    """Length of the slope on each side of it (m)."""
+    height_m: float = Field(default=0.02, ge=0.0, le=0.3)
+    """Height of the low part (m)."""
+
+
+class Kerb(Strict):
+    """A kerb along the edge of the pavement; the verge beyond it is the pavement for pedestrians."""
+
+    side: Literal["left", "right"]
+    """Side of the road."""
+    height_m: float = Field(default=0.12, gt=0.0, le=0.4)
+    """Height of its top above the pavement (m)."""
+    face_m: float = Field(default=0.02, ge=0.01, le=0.2)
+    """Width of its face, seen from above (m); both sides of a road have the same."""
+    ramps: list[KerbRamp] = []
+    """Dropped kerbs."""
+
+
+class Brightness(Strict):
+    """Intensity of each material, in digital numbers of a profiler (0–255)."""
+
+    asphalt: Shade = 70.0
+    """Asphalt of the lanes."""
+    marking: Shade = 190.0
+    """Lane markings and other paint."""
+    defect: Shade = 38.0
+    """Inside potholes and cracks."""
+    shoulder: Shade = 78.0
+    """Shoulders."""
+    verge: Shade = 105.0
+    """Verge, or pavement for pedestrians, beside the road."""
+    kerb: Shade = 135.0
+    """Kerbs."""
+
+
+class Road(Strict):
+    """The road's surface: a function of station and offset, known everywhere up to the verge's edge."""
+
+    alignment: list[Element] = [Element(kind="straight", length_m=100.0)]
+    """Pieces of the reference line from station 0 on, repeated in both directions as far as the road goes."""
+    lead_m: float = Field(default=45.0, ge=20.0)
+    """Length of road before station 0 and after the last one (m)."""
+    lanes: int = Field(default=2, ge=1, le=12)
+    """Number of lanes; the reference line is the middle of them. Lane 1 is the leftmost."""
+    lane_width_m: float = Field(default=3.5, ge=2.5, le=60.0)
+    """Width of a lane (m)."""
+    shoulder_width_m: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Width of the paved shoulder on each side (m)."""
+    shoulder_slope: float = Field(default=0.04, ge=-0.12, le=0.12)
+    """Fall of the shoulders away from the road (m/m)."""
+    verge_width_m: float = Field(default=7.0, ge=0.5)
+    """Width of the verge beside lanes and shoulders; beyond it there is no surface (m)."""
+    verge_slope: float = Field(default=0.07, ge=-0.2, le=0.2)
+    """Fall of the verge away from the road (m/m)."""
+    kerbs: list[Kerb] = Field(default=[], max_length=2)
+    """Kerbs, at most one on each side, at the outer edge of lanes and shoulders."""
+    cross_slope: float = Field(default=0.025, ge=-0.12, le=0.12)
+    """Fall from the crown to both sides (m/m), where `cross_slopes` says nothing."""
+    cross_slopes: list[CrossSlope] = []
+    """Falls along the road, in the order of their stations; before the first and after the last they stay."""
+    crown_rounding_m: float = Field(default=0.2, gt=0.0)
+    """Within this distance of the crown the two sides pass into each other (m)."""
+    grade: float = Field(default=0.018, ge=-0.15, le=0.15)
+    """Rise along the reference line up to the first of `grades` (m/m)."""
+    grades: list[GradeChange] = []
+    """Changes of the grade, in the order of their stations."""
+    waves: list[Wave] = []
+    """Waves on top of the grade."""
+    humps: list[Hump] = []
+    """Speed humps."""
+    roughness: Roughness | None = None
+    """Random unevenness."""
+    texture: Texture | None = None
+    """Macrotexture of lanes and shoulders."""
+    ruts: list[Rut] = []
+    """Wheel paths."""
+    potholes: list[Pothole] = []
+    """Potholes; where any of potholes, cracks and joints overlap, the deepest counts."""
+    cracks: list[Crack] = []
+    """Cracks."""
+    alligators: list[Alligator] = []
+    """Fields of alligator cracks."""
+    joints: list[Joints] = []
+    """Transverse joints."""
+    patches: list[Patch] = []
+    """Patches and utility cuts."""
+    repeat_m: float = Field(default=0.0, ge=0.0)
+    """Potholes, cracks, alligator cracks, patches, stains and tyre marks come again each this many metres of
+    station; 0: they do not."""
+    markings: list[Marking] = []
+    """Lane markings."""
+    stop_bars: list[StopBar] = []
+    """Stop bars."""
+    crosswalks: list[Crosswalk] = []
+    """Zebra crossings."""
+    targets: list[Target] = []
+    """Painted control targets; they are the survey's control points where there are any."""
+    stains: list[Stain] = []
+    """Oil stains."""
+    tyre_marks: list[TyreMark] = []
+    """Tyre marks."""
+    brightness: Brightness = Brightness()
+    """Intensities."""
+
+    @property
+    def half_width_m(self) -> float:
+        """From the reference line to the lanes' edge (m)."""
+        return self.lanes * self.lane_width_m / 2
+
+    @property
+    def paved_m(self) -> float:
+        """From the reference line to the outer edge of the shoulder, where a kerb stands (m)."""
+        return self.half_width_m + self.shoulder_width_m
+
+    @property
+    def edge_m(self) -> float:
+        """From the reference line to the outer edge of the verge (m)."""
+        return self.paved_m + self.verge_width_m
+
+    def lane_offset_m(self, lane: int) -> float:
+        """Offset of the middle of lane `lane`, counted from 1 at the left (m)."""
+        return (lane - (self.lanes + 1) / 2) * self.lane_width_m
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.alignment:
+            raise ValueError("alignment is empty: give at least one straight, arc or spiral")
+        tightest = min((abs(e.radius_m) for e in self.alignment if e.radius_m is not None), default=float("inf"))
+        if tightest < 1.5 * self.edge_m:
+            raise ValueError(
+                f"an arc of {tightest:g} m is too tight for a road that reaches {self.edge_m:g} m from its reference "
+                "line (1.5 times that is the limit)"
+            )
+        if self.crown_rounding_m > self.half_width_m / 2:
+            raise ValueError("crown_rounding_m is more than half of the lanes' half width")
+        if len({kerb.side for kerb in self.kerbs}) < len(self.kerbs):
+            raise ValueError("two kerbs on one side")
+        if len({kerb.face_m for kerb in self.kerbs}) > 1:
+            raise ValueError("the kerbs of both sides need the same face_m")
+        for name, listed in (("cross_slopes", self.cross_slopes), ("grades", self.grades)):
+            stations = [one.station_m for one in listed]
+            if stations != sorted(set(stations)):
+                raise ValueError(f"{name} are not in the order of their stations")
+        return self

@@ -1,0 +1,216 @@
+"""What stands and moves beside and on the road of a scene. Everything here blocks beams.
+
+Things stand at a station and an offset of the road, upright, turned with it. Lengths are metres.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.model.strict import Strict
+from roadscan.simulate.scene.road import Shade
+
+
+class Standing(Strict):
+    """Something at one place of the road, or at many."""
+
+    station_m: float
+    """Station (m)."""
+    offset_m: float
+    """Offset (m)."""
+    every_m: float = Field(default=0.0, ge=0.0)
+    """It comes again each this many metres of station; 0: it stands alone."""
+    count: int = Field(default=1, ge=1, le=10_000)
+    """How many of them, where `every_m` is given."""
+
+
+class Sign(Standing):
+    """A traffic sign: a plate on a post."""
+
+    shape: Literal["round", "rectangle"] = "rectangle"
+    """Outline of the plate."""
+    width_m: float = Field(default=0.6, gt=0.1, le=10.0)
+    """Width of the plate, or its diameter (m)."""
+    height_m: float = Field(default=0.6, gt=0.1, le=6.0)
+    """Height of a rectangular plate (m)."""
+    clearance_m: float = Field(default=2.2, ge=0.0, le=8.0)
+    """From the ground to the plate's lower edge (m)."""
+    faces: Literal["forward", "backward"] = "backward"
+    """Whom it faces: backward is read by traffic towards growing stations."""
+    shade: Shade = 250.0
+    """Intensity of the plate (retroreflecting)."""
+
+
+class Pole(Standing):
+    """A post, a mast, a bollard."""
+
+    height_m: float = Field(default=4.0, gt=0.1, le=30.0)
+    """Height (m)."""
+    diameter_m: float = Field(default=0.1, gt=0.01, le=2.0)
+    """Diameter (m)."""
+    shade: Shade = 120.0
+    """Intensity."""
+
+
+class LampPost(Standing):
+    """A lamp post with an arm over the road."""
+
+    height_m: float = Field(default=8.0, gt=1.0, le=30.0)
+    """Height of the arm (m)."""
+    diameter_m: float = Field(default=0.16, gt=0.02, le=1.0)
+    """Diameter of the post (m)."""
+    arm_m: float = Field(default=1.5, ge=0.0, le=6.0)
+    """Length of the arm towards the reference line (m)."""
+    shade: Shade = 110.0
+    """Intensity."""
+
+
+class Tree(Standing):
+    """A tree: a trunk and a crown that lets some beams through."""
+
+    height_m: float = Field(default=8.0, gt=1.0, le=40.0)
+    """Height (m)."""
+    trunk_m: float = Field(default=0.35, gt=0.02, le=2.0)
+    """Diameter of the trunk (m)."""
+    crown_m: float = Field(default=4.5, gt=0.2, le=20.0)
+    """Diameter of the crown (m)."""
+    density: float = Field(default=0.8, gt=0.0, le=1.0)
+    """Share of beams that the crown stops on each of its sides."""
+    shade: Shade = 95.0
+    """Intensity of the leaves."""
+
+
+class ParkedCar(Standing):
+    """A parked car: body, cabin, wheels."""
+
+    length_m: float = Field(default=4.4, gt=1.0, le=20.0)
+    """Length (m)."""
+    width_m: float = Field(default=1.8, gt=0.5, le=3.0)
+    """Width (m)."""
+    height_m: float = Field(default=1.5, gt=0.5, le=5.0)
+    """Height (m)."""
+    heading_deg: float = 0.0
+    """Direction from that of the road, clockwise (degrees)."""
+    shade: Shade = 160.0
+    """Intensity of the body."""
+
+
+class MovingCar(Strict):
+    """A car that drives along the road at constant speed while a pass is recorded."""
+
+    passes: list[int] = []
+    """Passes during which it drives, counted from 1; all of them where empty."""
+    station_m: float
+    """Station at the first profile of each pass (m)."""
+    offset_m: float
+    """Offset (m)."""
+    speed_m_per_s: float
+    """Speed, negative towards falling stations (m/s)."""
+    length_m: float = Field(default=4.4, gt=1.0, le=20.0)
+    """Length (m)."""
+    width_m: float = Field(default=1.8, gt=0.5, le=3.0)
+    """Width (m)."""
+    height_m: float = Field(default=1.5, gt=0.5, le=5.0)
+    """Height (m)."""
+    shade: Shade = 170.0
+    """Intensity of the body."""
+
+
+class Barrier(Strict):
+    """Something long that follows the road."""
+
+    offset_m: float
+    """Offset of the side that faces the road (m)."""
+    start_m: float
+    """First station (m)."""
+    end_m: float
+    """Last station (m)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.end_m <= self.start_m:
+            raise ValueError(f"end_m {self.end_m:g} is not beyond start_m {self.start_m:g}")
+        return self
+
+
+class Guardrail(Barrier):
+    """A steel rail on posts."""
+
+    height_m: float = Field(default=0.75, gt=0.2, le=2.0)
+    """Height of the rail's upper edge (m)."""
+    rail_m: float = Field(default=0.31, gt=0.05, le=1.0)
+    """Height of the rail itself (m)."""
+    post_every_m: float = Field(default=2.0, gt=0.5)
+    """From post to post (m)."""
+    shade: Shade = 180.0
+    """Intensity."""
+
+
+class Fence(Barrier):
+    """A fence that lets some beams through."""
+
+    height_m: float = Field(default=1.4, gt=0.2, le=5.0)
+    """Height (m)."""
+    density: float = Field(default=0.4, gt=0.0, le=1.0)
+    """Share of beams that it stops."""
+    shade: Shade = 110.0
+    """Intensity."""
+
+
+class Facade(Barrier):
+    """The front of a row of buildings, with windows that mirror beams away."""
+
+    height_m: float = Field(default=9.0, gt=1.0, le=100.0)
+    """Height (m)."""
+    storey_m: float = Field(default=3.0, gt=2.0, le=6.0)
+    """Height of a storey (m)."""
+    window_m: float = Field(default=1.2, ge=0.0, le=4.0)
+    """Width and height of a window (m); 0: none."""
+    bay_m: float = Field(default=3.2, gt=0.5, le=12.0)
+    """From window to window (m)."""
+    depth_m: float = Field(default=8.0, gt=0.5, le=60.0)
+    """Depth of the buildings away from the road (m)."""
+    shade: Shade = 140.0
+    """Intensity."""
+
+
+class Box(Standing):
+    """A plain box: a calibration object, a cabinet, a step of known height."""
+
+    length_m: float = Field(gt=0.005, le=50.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(gt=0.005, le=50.0)
+    """Extent across the road (m)."""
+    height_m: float = Field(gt=0.001, le=30.0)
+    """Height above the ground at its middle (m)."""
+    heading_deg: float = 0.0
+    """Turned from the direction of the road, clockwise (degrees)."""
+    shade: Shade = 150.0
+    """Intensity."""
+
+
+class Roadside(Strict):
+    """Everything that stands and moves."""
+
+    signs: list[Sign] = []
+    """Traffic signs."""
+    poles: list[Pole] = []
+    """Poles."""
+    lamp_posts: list[LampPost] = []
+    """Lamp posts."""
+    trees: list[Tree] = []
+    """Trees."""
+    parked_cars: list[ParkedCar] = []
+    """Parked cars."""
+    moving_cars: list[MovingCar] = []
+    """Moving cars."""
+    guardrails: list[Guardrail] = []
+    """Guardrails."""
+    fences: list[Fence] = []
+    """Fences."""
+    facades: list[Facade] = []
+    """Fronts of buildings."""
+    boxes: list[Box] = []
+    """Boxes."""

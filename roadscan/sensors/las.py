@@ -26,28 +26,17 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.model.errors import TimeSystemError
-from roadscan.model.gpstime import (
-    EARLIEST_GPS_NS,
-    LATEST_GPS_NS,
-    NS_PER_S,
-    UNIT_NS,
-    WEEK_S,
-    Clock,
-    TimeSystem,
-    iso_from_gps_ns,
-)
+from roadscan.model.gpstime import NS_PER_S, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.las_crs import CloudUnits, LengthUnit
 from roadscan.sensors.las_file import Cloud, Head
-from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.records import Sieve, UnorderedStamps, few_rejects, options_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _TOLERANCE_NS: Final = NS_PER_S
-_DAY_NS: Final = 86_400 * NS_PER_S
-_MOST_REJECTS: Final = 200
 _ADJUSTED_BIT: Final = 0x01
 _STORED: Final = frozenset(
     {
@@ -109,7 +98,7 @@ class Las(LogFormat):
                 "geoid": source.geoid.grid if source.geoid else None,
                 "horizontal_unit_m": units.horizontal_unit_m,
                 "vertical_unit_m": units.vertical_unit_m,
-                "time_system": str(times.clock.system),
+                "time_system": str(times.stamps.clock.system),
                 "left_out": dropped,
             }
         )
@@ -142,26 +131,13 @@ def _points(
     columns = {"epoch_gps_ns": epochs} | _columns(points, cloud.names, units)
     for axis in "xyz":
         sieve.drop(~np.isfinite(columns[f"{axis}_m"]), "a coordinate is no number")
-    yield from _few(list(sieve.rejects(records, cloud.offsets(records))))
+    yield from few_rejects(list(sieve.rejects(records, cloud.offsets(records))))
     kept = sieve.kept
     if not sieve.good.any():
         return
     batch = pa.RecordBatch.from_pydict({k: pa.array(np.ascontiguousarray(v[kept])) for k, v in columns.items()})
     start = int(records[np.argmax(sieve.good)])
     yield Rows("cloud", batch, "", start, int(cloud.offsets(np.array([start]))[0]), cloud.head.record_bytes_in_file)
-
-
-def _few(rejects: list[Reject]) -> list[Reject]:
-    """Rejects of a batch; where there are very many runs of points, one a reason."""
-    if len(rejects) <= _MOST_REJECTS:
-        return rejects
-    merged: dict[str, list[Reject]] = {}
-    for reject in rejects:
-        merged.setdefault(reject.reason, []).append(reject)
-    return [
-        Reject(f"{reason} (scattered from this point on)", same[0].record, same[0].offset, sum(r.records for r in same))
-        for reason, same in merged.items()
-    ]
 
 
 def _columns(points: laspy.ScaleAwarePointRecord, names: frozenset[str], units: Float64) -> dict[str, npt.NDArray[Any]]:
@@ -197,11 +173,8 @@ def _columns(points: laspy.ScaleAwarePointRecord, names: frozenset[str], units: 
 class _Times:
     """Brings gps_time to epochs and holds them against the trajectory."""
 
-    clock: Clock
+    stamps: UnorderedStamps
     source: LogSource
-    anchor_s: float
-    """A stamp of the log's start."""
-    anchor_gps_ns: int
     _inside: int = 0
     _outside: int = 0
     _seen_gps_ns: tuple[int, int] | None = None
@@ -217,36 +190,11 @@ class _Times:
                 if sample.size:
                     break
         clock = _clock(source, cloud.head, sample)
-        if not sample.size:
-            return cls(clock, source, 0.0, 0)
-        anchor = np.sort(sample)[[sample.size // 2]]
-        try:
-            epoch = int(clock.to_epoch_gps_ns(anchor)[0])
-        except TimeSystemError as error:
-            raise TimeSystemError(
-                error.arrived, expected=error.expected, change=error.change, file=source.path
-            ) from error
-        return cls(clock, source, float(anchor[0]), epoch)
+        return cls(UnorderedStamps.of(clock, sample, source.path), source)
 
     def epochs(self, stamps: Float64, sieve: Sieve) -> Int64:
         """Epochs (n,) of stamps (n,); points without a usable one are dropped from the sieve."""
-        scale_ns = UNIT_NS[self.clock.unit]
-        with np.errstate(invalid="ignore", over="ignore"):
-            elapsed_ns = (stamps - self.anchor_s) * scale_ns
-            # A day's margin: leap seconds and drift are left to the clock's own exact rule.
-            earliest = EARLIEST_GPS_NS - self.anchor_gps_ns + _DAY_NS
-            latest = LATEST_GPS_NS - self.anchor_gps_ns - _DAY_NS
-            sieve.drop(~((elapsed_ns >= earliest) & (elapsed_ns <= latest)), "gps_time is no possible time")
-        used = stamps
-        if self.clock.system is TimeSystem.GPS_WEEK:
-            seconds = stamps * (scale_ns / NS_PER_S)
-            sieve.drop(~((seconds >= 0) & (seconds <= WEEK_S)), "gps_time is outside the GPS week")
-            # Points are not in order of time: those beyond a week's end are the ones half a week away.
-            used = stamps + np.rint((self.anchor_s - stamps) * scale_ns / NS_PER_S / WEEK_S) * (
-                WEEK_S * NS_PER_S / scale_ns
-            )
-        out = np.zeros(stamps.size, dtype=np.int64)
-        out[sieve.kept] = self.clock.to_epoch_gps_ns(used[sieve.kept])
+        out = self.stamps.epochs(stamps, sieve)
         self._drop_outside(out, sieve)
         return out
 
@@ -268,7 +216,7 @@ class _Times:
         if span is None or self._inside or not self._outside or self._seen_gps_ns is None:
             return
         raise TimeSystemError(
-            f"all {self._outside:,} points, read as '{self.clock.system}', lie outside the run's trajectory: "
+            f"all {self._outside:,} points, read as '{self.stamps.clock.system}', lie outside the run's trajectory: "
             f"{_span(self._seen_gps_ns)} against {_span(span)}",
             expected="points and trajectory of the same drive",
             change="check clock.system and week or date of this log, and that it belongs to this run",

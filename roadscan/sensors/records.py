@@ -77,6 +77,13 @@ class Sieve:
         self.drop(~finite, f"{name} is missing or not a number")
         self.drop(finite & ~((values >= low) & (values <= high)), f"{name} is outside {low:g} to {high:g} {unit}")
 
+    def take_over(self, part: Sieve, rows: Int64) -> None:
+        """Drop what `part`, the sieve of this block's records `rows` alone, has dropped."""
+        for faulty, reason in part._faults:
+            bad = np.zeros(self.good.size, dtype=bool)
+            bad[rows[faulty]] = True
+            self.drop(bad, reason)
+
     def rejects(self, records: Int64, offsets: Int64) -> Iterator[Reject]:
         """One :class:`Reject` a run of neighbouring records dropped for the same reason.
 

@@ -257,8 +257,6 @@ def _positions(own: dict[str, npt.NDArray[Any]], sieve: Sieve) -> Float64:
         xyz = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=-1)
     if state is not None:
         sieve.drop(np.asarray(state, dtype=bool), "the scanner marks the point as invalid")
-    sieve.drop(~np.isfinite(xyz).all(axis=1), "a coordinate is no number")
-    xyz[~sieve.good] = 0.0
     return xyz
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.simulate.kernels.options import compiled
+from roadscan.simulate.kernels.options import compiled, inlined
 from roadscan.simulate.kernels.road import STATION, RoadArrays, defect_depth, node_at, project, worn_height
 
 Float64 = npt.NDArray[np.float64]
@@ -19,14 +19,14 @@ ROOT_TOLERANCE_M = 1e-8
 # road bend. beam (3, 3) holds the coefficients of 1, r, r² of each.
 
 
-@compiled
+@inlined
 def along_beam(beam: Float64, axis: int, r: float) -> float:
     """Station, offset or height (axis 0, 1, 2) at range `r` of a beam (3, 3)."""
     value: float = beam[axis, 0] + r * (beam[axis, 1] + r * beam[axis, 2])
     return value
 
 
-@compiled
+@inlined
 def through(beam: Float64, axis: int, step: float, first: float, second: float, third: float) -> None:
     """Lay the parabola of one axis of a beam through its values at r = 0, step and 2 · step."""
     beam[axis, 0] = first

@@ -23,7 +23,16 @@ def compiled(function: _Function) -> _Function:
     Numba's memory manager is off: counting references to the arrays of these short functions took half of the time.
     So nothing can be allocated inside; scratch arrays are handed in.
     """
-    options = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+    return _made(function, forceinline=False)
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile a piece of a loop into its callers: handing on the road's arrays costs more than the arithmetic."""
+    return _made(function, forceinline=True)
+
+
+def _made(function: _Function, *, forceinline: bool) -> _Function:
+    options = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False, "forceinline": forceinline}
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _CACHE_FOLDER  # read when the function is decorated
     try:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
-from roadscan.simulate.kernels.options import compiled
+from roadscan.simulate.kernels.options import compiled, inlined
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,
@@ -48,7 +48,7 @@ def survey_planes(road: RoadArrays, easting: Float64, northing: Float64, near: I
             out[p, i, 1] = offset
 
 
-@compiled
+@inlined
 def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
     """Beam of the reading at transverse position `y` of profile `p`, in road coordinates.
 
@@ -63,7 +63,7 @@ def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
         beam[axis, 2] = planes[p, axis, 8]
 
 
-@compiled
+@inlined
 def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
     """The same in the map.
 
@@ -75,7 +75,7 @@ def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
         beam[axis, 2] = planes[p, axis, 5]
 
 
-@compiled
+@inlined
 def mixed(counter: np.uint64) -> np.uint64:
     """64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
     z = counter * np.uint64(0x9E3779B97F4A7C15)
@@ -138,12 +138,14 @@ def scan_profiles(
                     further, depth = into_defect(road, beam, 0.0, fall)
                     found += further
                     road_beam(road_planes, p, y, beam)
+            stone = 0.0
             if road.texture.size:
-                found -= over_texture(road, beam, found - scale[0], road.nodes[k, STATION] + u, offset, r) / fall
+                stone = over_texture(road, beam, found - scale[0], road.nodes[k, STATION] + u, offset, r)
+                found -= stone / fall
             seen = on_surface(road, k, u, offset)
             if true_range_m.size:
                 true_range_m[p, i] = found if seen else np.nan
-            value = brightness(road, k, u, offset, depth)
+            value = brightness(road, k, u, offset, depth, stone)
             if normal.size:
                 bits = mixed(random_from + np.uint64(p * y_sensor_m.size + i))
                 found += scale[4] * normal[bits & np.uint64(0xFFFF)]
@@ -157,23 +159,22 @@ def scan_profiles(
             intensity[p, i] = int(min(max(value, 0.0), 255.0)) if seen else 0
 
 
-@compiled
+@inlined
 def over_texture(road: RoadArrays, beam: Float64, r: float, station: float, offset: float, plain: float) -> float:
     """Height of the texture where a beam meets it (m).
 
     The beam meets the surface without texture at range `r`; its place was found for the range `plain` above a defect.
-    Beams lean a few degrees at most, so the place moves by hundredths of a millimetre and one correction is enough.
+    Beams lean a few degrees at most: after one correction the place is right to a hundredth of a millimetre.
     """
     station += along_beam(beam, 0, r) - along_beam(beam, 0, plain)
     offset += along_beam(beam, 1, r) - along_beam(beam, 1, plain)
     first = texture_height(road, station, offset)
     lean_s = beam[0, 1] + 2.0 * r * beam[0, 2]
     lean_o = beam[1, 1] + 2.0 * r * beam[1, 2]
-    second = texture_height(road, station - first * lean_s, offset - first * lean_o)
-    return texture_height(road, station - second * lean_s, offset - second * lean_o)
+    return texture_height(road, station - first * lean_s, offset - first * lean_o)
 
 
-@compiled
+@inlined
 def plain_range(
     road: RoadArrays, beam: Float64, start: float, fall: float, is_fall_known: bool
 ) -> tuple[float, int, float, float, float]:
@@ -203,7 +204,7 @@ def plain_range(
     return r, k, u, offset, fall
 
 
-@compiled
+@inlined
 def road_clearance(road: RoadArrays, beam: Float64, r: float) -> tuple[float, int, float, float]:
     """Height of the point of a beam in road coordinates above the surface without defects, its node, u and offset."""
     station, offset = along_beam(beam, 0, r), along_beam(beam, 1, r)

@@ -119,7 +119,7 @@ def fire_lidar(
                 out[p, c, j, 0] = found
                 for axis in range(3):
                     out[p, c, j, 1 + axis] = along_beam(beam, axis, found)
-                out[p, c, j, 4] = brightness(road, k, u, offset, depth)
+                out[p, c, j, 4] = brightness(road, k, u, offset, depth, 0.0)
 
 
 @compiled

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.simulate.kernels.options import compiled
+from roadscan.simulate.kernels.options import compiled, inlined
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -126,7 +126,7 @@ def project(road: RoadArrays, easting: float, northing: float, near: int) -> tup
     return k, u, offset
 
 
-@compiled
+@inlined
 def node_at(road: RoadArrays, station: float) -> int:
     """Node at or before a station."""
     before = int((station - road.nodes[0, STATION]) / NODE_STEP_M)
@@ -156,7 +156,7 @@ def place(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> 
 # --- height ------------------------------------------------------------------------------------------
 
 
-@compiled
+@inlined
 def softened(x: float, half: float) -> float:
     """max(x, 0), with the bend rounded by a parabola within `half` of it."""
     if x >= half:
@@ -166,14 +166,14 @@ def softened(x: float, half: float) -> float:
     return (x + half) * (x + half) / (4.0 * half)
 
 
-@compiled
+@inlined
 def smooth_step(x: float) -> float:
     """0 below 0, 1 above 1, a cubic between."""
     y = min(max(x, 0.0), 1.0)
     return y * y * (3.0 - 2.0 * y)
 
 
-@compiled
+@inlined
 def section_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Height of the cross-section above the reference line: crossfall, shoulder, verge, kerb and ruts (m)."""
     nodes, section = road.nodes, road.section
@@ -207,7 +207,7 @@ def section_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return result
 
 
-@compiled
+@inlined
 def cubic_weights(x: float) -> tuple[float, float, float, float]:
     """Weights of the four values around a place `x` (0–1) between the middle two: Catmull and Rom (1974)."""
     x2 = x * x
@@ -220,7 +220,7 @@ def cubic_weights(x: float) -> tuple[float, float, float, float]:
     )
 
 
-@compiled
+@inlined
 def along_track(tracks: Float64, i: int, j: int, weights: tuple[float, float, float, float]) -> float:
     """Height of track `i` between its samples `j` and `j` + 1 (m)."""
     value: float = (
@@ -232,7 +232,7 @@ def along_track(tracks: Float64, i: int, j: int, weights: tuple[float, float, fl
     return value
 
 
-@compiled
+@inlined
 def unevenness(road: RoadArrays, station: float, offset: float) -> float:
     """Random unevenness (m): bicubic between the tracks, which go on unchanged beyond the outermost."""
     tracks, section = road.tracks, road.section
@@ -250,7 +250,7 @@ def unevenness(road: RoadArrays, station: float, offset: float) -> float:
     return value
 
 
-@compiled
+@inlined
 def edge_distance(patches: Float64, i: int, station: float, offset: float) -> float:
     """Distance inwards from the outline of patch `i` (m); negative outside."""
     ds = station - patches[i, 1]
@@ -261,7 +261,7 @@ def edge_distance(patches: Float64, i: int, station: float, offset: float) -> fl
     return min(patches[i, 3] - abs(ds), patches[i, 4] - abs(do))
 
 
-@compiled
+@inlined
 def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Height without potholes, cracks, joints and texture. Everywhere smooth and defined (m)."""
     nodes = road.nodes
@@ -307,7 +307,7 @@ def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[flo
     return deepest, finest
 
 
-@compiled
+@inlined
 def texture_height(road: RoadArrays, station: float, offset: float) -> float:
     """Macrotexture (m) of the paved surface, bilinear; 0 beside it."""
     texture, section = road.texture, road.section
@@ -326,7 +326,7 @@ def texture_height(road: RoadArrays, station: float, offset: float) -> float:
     return value
 
 
-@compiled
+@inlined
 def on_surface(road: RoadArrays, k: int, u: float, offset: float) -> bool:
     """Whether the surface is defined here."""
     last = road.nodes.shape[0] - 2
@@ -337,7 +337,7 @@ def on_surface(road: RoadArrays, k: int, u: float, offset: float) -> bool:
 # --- intensity ---------------------------------------------------------------------------------------
 
 
-@compiled
+@inlined
 def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Intensity of what the surface is made of, paint and spills left out."""
     nodes, section, patches = road.nodes, road.section, road.patches
@@ -358,9 +358,9 @@ def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return result
 
 
-@compiled
-def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float) -> float:
-    """Intensity of the surface (digital numbers), where a defect is `depth` deep."""
+@inlined
+def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float, stone: float) -> float:
+    """Intensity of the surface (digital numbers), where a defect is `depth` deep and the texture `stone` high (m)."""
     nodes, section, lines, items = road.nodes, road.section, road.lines, road.items
     if depth > 0.0:
         inside: float = section[DEFECT]
@@ -375,12 +375,10 @@ def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float) 
                     value = section[PAINT]
     for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
         value = painted(items, i, station, offset, value)
-    if section[CONTRAST] > 0.0 and road.texture.size:
-        value += section[CONTRAST] * texture_height(road, station, offset)
-    return value
+    return value + section[CONTRAST] * stone
 
 
-@compiled
+@inlined
 def painted(items: Float64, i: int, station: float, offset: float, under: float) -> float:
     """Intensity where item `i` lies over a surface of intensity `under`."""
     kind = items[i, 0]
@@ -426,8 +424,8 @@ def survey_points(road: RoadArrays, easting: Float64, northing: Float64, near: I
         out[i, 1] = station
         out[i, 2] = offset
         out[i, 3] = depth
-        out[i, 4] = brightness(road, k, u, offset, depth)
         out[i, 5] = texture_height(road, station, offset)
+        out[i, 4] = brightness(road, k, u, offset, depth, out[i, 5])
 
 
 @compiled

@@ -225,6 +225,36 @@ def inspect_files(
     raise typer.Exit(0 if all(one.readable for one in found) else 2)
 
 
+@app.command("init")
+def first_survey(
+    folder: Annotated[Path, typer.Argument(help="Folder of raw logs, looked through recursively.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Survey file to write; RIG.toml is written beside it.")] = Path(
+        "SURVEY.toml"
+    ),
+) -> None:
+    """Look through a folder of logs and write a first survey file for you to complete."""
+    from roadscan.jobs.first_survey import find_logs
+    from roadscan.jobs.first_survey_text import refuse_to_overwrite, write_first_survey
+
+    refuse_to_overwrite(out)
+    with _looking(folder) as progress:
+        found = find_logs(folder, progress)
+    made = write_first_survey(found, out)
+    _table(
+        ("run", "sensor", "log", "format", "to state"),
+        [
+            (run.id, log.sensor or "", os.path.relpath(log.path, found.folder), log.format.name,
+             ", ".join(need.key for need in log.report.opened.needs if need.key != "sensor"))
+            for run in [*found.runs, *found.further]
+            for log in run.logs
+        ],
+    )  # fmt: skip
+    for path, words in found.unknown:
+        typer.echo(f"not understood: {os.path.relpath(path, found.folder)}: {words}")
+    written = " and ".join(str(file) for file in (made.survey_file, made.rig_file) if file is not None)
+    typer.echo(f"written: {written}, with {made.questions} lines to complete (they begin with #?)")
+
+
 @app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of a shipped scene.")],

@@ -104,14 +104,19 @@ class LogReport:
     """True if it was read to its end."""
 
     @property
+    def is_time_assumed(self) -> bool:
+        """True if its time depends on something that is not stated."""
+        return any(need.is_of_time for need in self.opened.needs)
+
+    @property
     def time(self) -> TimeSpan | None:
-        """Its time span; None where it holds no epochs."""
+        """Its time span; None where it holds no epochs, or none of its own."""
         span = self.figures.span_gps_ns
         if span is None:
             return None
         need = next((need for need in self.opened.needs if need.key == "clock"), None)
         if need is None:
-            return TimeSpan(*span)
+            return None if self.is_time_assumed else TimeSpan(*span)
         return TimeSpan(*span, self.opened.source.clock, "utc_hour" in need.line)
 
     @property

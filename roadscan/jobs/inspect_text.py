@@ -71,6 +71,8 @@ def _log(log: LogReport) -> Iterator[Line]:
         yield "holds", "only its beginning was read", "yellow"
     if log.time is not None:
         yield from (("time", line, "") for line in _time(log.time))
+    elif log.is_time_assumed:
+        yield "time", "not known, and the log holds no stamps of its own", ""
     for table in log.figures.tables.values():
         if table.extent is not None:
             yield from (("extent", line, "") for line in _extent(table.extent, table, log.opened.needs_key("crs")))

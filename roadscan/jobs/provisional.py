@@ -33,11 +33,22 @@ from roadscan.model.gpstime import (
     TimeSystem,
     leap_seconds_at_gps,
 )
+from roadscan.model.rig import Sensor, SensorKind
 from roadscan.model.survey import ClockConfig
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Rows
 
 Int64 = npt.NDArray[np.int64]
-Dimension = Literal["clock", "crs", "height", "options"]
+Dimension = Literal["clock", "crs", "height", "options", "sensor"]
+
+SENSOR_KINDS: Final[dict[str, SensorKind]] = {
+    "scans": "profiler",
+    "returns": "lidar",
+    "images": "camera",
+    "gnss": "gnss",
+    "imu": "imu",
+    "encoder": "encoder",
+}
+"""Kind of the sensor that fills a table; other tables come from no sensor of the rig."""
 
 LOOKING_MAP_CRS: Final = "EPSG:3395"
 """Map that control points in degrees are shown through; they are turned back into degrees."""
@@ -49,6 +60,7 @@ _CRS_CHOICES: Final = ("EPSG:4979", "local", "EPSG:4978")
 _SYSTEM_IN_TEXT: Final = re.compile(r"system = \"(\w+)\"|unix_utc")
 _UNIT_IN_TEXT: Final = re.compile(r"unit = \"(\w+)\"")
 _TABLE_IN_TEXT: Final = re.compile(r"clock = (\{[^{}]*\})")
+_NOT_STATED: Final = "the log's time system is not stated"
 _PLAIN_ADVICE: Final = re.compile(r"^add clock = \{[^{}]*\} to this log$")
 """Advice that says no more than the line itself."""
 _OPTION_IN_TEXT: Final = re.compile(r"options(?:\.| = \{ *)(\w+)")
@@ -63,6 +75,7 @@ class Stated:
     height: HeightKind = "ellipsoidal"
     geoid: str | None = None
     options: dict[str, Any] = field(default_factory=dict)
+    sensor: Sensor | None = None
 
     def source(self, path: Path, log_format: LogFormat) -> LogSource:
         """The log as these statements describe it."""
@@ -70,6 +83,7 @@ class Stated:
             path=path.resolve(),
             options=log_format.options.parse(self.options, file=path),
             clock=self.clock,
+            sensor=self.sensor,
             crs=self.crs,
             height=self.height,
             geoid=Geoid(self.geoid) if self.geoid else None,
@@ -82,11 +96,18 @@ class Need:
     """A line that the survey file has to state for this log."""
 
     key: str
-    """clock, crs, height, or options.NAME."""
+    """clock, crs, height, sensor, or options.NAME."""
     line: str
     """The line as TOML, with ???? for what is not known."""
     reason: str
     """What the reader said."""
+    is_of_time: bool = False
+    """The log's time depends on it."""
+
+    @property
+    def is_generic(self) -> bool:
+        """True where the reader says no more than that the time system is not stated."""
+        return self.reason.startswith(_NOT_STATED)
 
 
 @dataclass(frozen=True)
@@ -201,8 +222,16 @@ class _Search:
     def _changes(self, trial: Stated, error: RoadscanError) -> Iterator[tuple[Dimension, Stated]]:
         if trial is self._stated:
             yield from self._own_proposals()
-        parts = {"clock": self._clocks, "crs": self._frames, "height": self._heights, "options": self._options}
-        order = ("clock", "options") if isinstance(error, TimeSystemError) else ("options", "height", "crs", "clock")
+        parts = {
+            "clock": self._clocks,
+            "crs": self._frames,
+            "height": self._heights,
+            "options": self._options,
+            "sensor": self._sensors,
+        }
+        order: tuple[Dimension, ...] = ("sensor", "options", "height", "crs", "clock")
+        if isinstance(error, TimeSystemError):
+            order = ("clock", "options")
         for dimension in order:
             yield from ((dimension, changed) for changed in parts[dimension](trial, error))  # type: ignore[misc]
 
@@ -242,29 +271,42 @@ class _Search:
         if 'height = "orthometric"' in error.change and trial.height == self._stated.height == "ellipsoidal":
             yield dataclasses.replace(trial, height="orthometric")
 
+    def _sensors(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
+        kind = sensor_kind(self._format)
+        if self._stated.sensor is None and kind is not None and "sensor" in error.arrived:
+            yield from (dataclasses.replace(trial, sensor=Sensor(kind=kind, axes=axes)) for axes in BODY_FROM_AXES)
+
     def _options(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
         for name in _options_in(error):
             if name not in self._stated.options and name in self._format.options.model_fields:
-                for value in option_choices(self._format, name):
+                for value in [*option_choices(self._format, name), *_proposed(error, name)]:
                     yield dataclasses.replace(trial, options=trial.options | {name: value})
 
     def _needs(self, trial: Stated, asked: dict[Dimension, RoadscanError]) -> Iterator[Need]:
         fallback = self.first_error or FormatError("not stated")
         if trial.clock != self._stated.clock:
             error = asked.get("clock", fallback)
-            yield Need("clock", f"clock = {_clock_line(error, trial.clock)}", _reason(error))
+            yield Need("clock", f"clock = {_clock_line(error, trial.clock)}", _reason(error), is_of_time=True)
             for name in _options_in(error):
                 if name in self._format.options.model_fields and name not in trial.options:
-                    yield Need(f"options.{name}", f'options.{name} = "????"', _reason(error))
+                    yield Need(f"options.{name}", f'options.{name} = "????"', _reason(error), is_of_time=True)
         if trial.crs != self._stated.crs:
             yield Need("crs", 'crs = "????"', _reason(asked.get("crs", fallback)))
+        if trial.sensor != self._stated.sensor:
+            yield Need("sensor", 'sensor = "????"', _reason(asked.get("sensor", fallback)))
         if trial.height != self._stated.height:
             yield Need("height", f'height = "{trial.height}"', _reason(asked.get("height", fallback)))
         for name in trial.options:
             if name not in self._stated.options:
-                choices = " or ".join(map(repr, option_choices(self._format, name))).replace("'", '"')
-                reason = _reason(asked.get("options", fallback))
-                yield Need(f"options.{name}", f'options.{name} = "????"', f"{choices}: {reason}")
+                error = asked.get("options", fallback)
+                choices = " or ".join(_toml(value) for value in option_choices(self._format, name))
+                reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
+                yield Need(f"options.{name}", f'options.{name} = "????"', reason, isinstance(error, TimeSystemError))
+
+
+def sensor_kind(log_format: LogFormat) -> SensorKind | None:
+    """Kind of the sensor that writes logs of this format; None where it is no sensor of the rig."""
+    return next((SENSOR_KINDS[table] for table in log_format.yields if table in SENSOR_KINDS), None)
 
 
 def option_choices(log_format: LogFormat, name: str) -> list[Any]:
@@ -275,6 +317,24 @@ def option_choices(log_format: LogFormat, name: str) -> list[Any]:
     if "axes" in name:
         return ["flu", *(a for a in BODY_FROM_AXES if a != "flu")]
     return list(dict.fromkeys(_literals(field_info.annotation)))
+
+
+def _proposed(error: RoadscanError, name: str) -> list[Any]:
+    """Value that a refusal itself proposes for a setting, if it does."""
+    text = f"{error.change} {error.expected}"
+    for pattern, key in ((rf"(options\.{name} = [^;]+)", f"options.{name}"), (r"(options = \{[^{}]*\})", "options")):
+        match = re.search(pattern, text)
+        for end in range(len(match.group(1)) if match else 0, len(key) + 3, -1):
+            try:
+                value = tomllib.loads(match.group(1)[:end] if match else "")["options"].get(name)
+            except (tomllib.TOMLDecodeError, KeyError, AttributeError):
+                continue
+            return [] if value is None else [value]
+    return []
+
+
+def _toml(value: Any) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def _literals(annotation: Any) -> Iterator[Any]:
@@ -310,6 +370,8 @@ def _clock_line(error: RoadscanError, fitting: Clock | None) -> str:
     """The clock that the reader proposes, in the unit that fitted, with ???? for what is not known."""
     match = _TABLE_IN_TEXT.search(f"{error.change} {error.expected}")
     line = match.group(1) if match else '{ system = "????" }'
+    if fitting is not None and fitting.system is TimeSystem.FREE and error.arrived == _NOT_STATED:
+        line = re.sub(r'system = "\w+"', 'system = "????"', line)  # the reader's example, and no more
     unit = "s" if fitting is None else fitting.unit
     if _UNIT_IN_TEXT.search(line):
         line = _UNIT_IN_TEXT.sub(f'unit = "{unit}"', line)

@@ -23,7 +23,7 @@ from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, TextOptions
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-TICKS: Final = Quantity("ticks", "count", ("encoder_ticks", "wheel_ticks", "pulses", "counts"), optional=True)
+TICKS: Final = Quantity("ticks", "count", ("encoder_ticks", "wheel_ticks", "pulses"), optional=True)
 DISTANCE: Final = Quantity("distance", "length", ("odometer", "wheel_distance"), optional=True)
 SPEED: Final = Quantity("speed", "speed", ("wheel_speed",), optional=True)
 WHAT: Final = (TICKS, DISTANCE, SPEED)
@@ -249,7 +249,7 @@ class _Reader:
         sieve = Sieve(rows.size)
         raw = {q.name: _raw(block, wheel, q, rows) for q in WHAT if q.name in wheel.columns}
         for name, values in raw.items():
-            _check(name, values, sieve)
+            _check(name, values, self.plan.options.counter_bits, sieve)
         sieve.drop(np.all([np.isnan(v) for v in raw.values()], axis=0), "no value")
         for name, values in raw.items():
             leaps = np.zeros(rows.size, dtype=bool)
@@ -316,7 +316,7 @@ def _raw(block: TextBlock, wheel: _Wheel, quantity: Quantity, rows: Int64) -> Fl
         return block.number(found.column)[rows] * found.scale
 
 
-def _check(name: str, values: Float64, sieve: Sieve) -> None:
+def _check(name: str, values: Float64, counter_bits: int | None, sieve: Sieve) -> None:
     """Drop records with values (n,) that cannot be; a missing one (NaN) is left to the other quantities."""
     limit, unit = {
         "ticks": (TICKS_MAX, "ticks"),
@@ -328,6 +328,9 @@ def _check(name: str, values: Float64, sieve: Sieve) -> None:
     if name == "ticks":
         with np.errstate(invalid="ignore"):  # infinities are dropped already
             sieve.drop(~missing & (values != np.rint(values)), "ticks are no whole number")
+    if name == "ticks" and counter_bits is not None:
+        inside = (values >= -(2.0 ** (counter_bits - 1))) & (values < 2.0**counter_bits)
+        sieve.drop(~(missing | inside), f"ticks are more than a counter of {counter_bits} bits can show")
 
 
 def _plan(source: LogSource) -> _Plan:
@@ -364,12 +367,12 @@ def _columns(
         wheel_column = named_column(
             "the wheel", wheel_option.name if wheel_option else None, (WHEEL_COLUMN,), names, file
         )
-    if found:
-        return time_column, wheel_column, (_Wheel("", found),)
-    by_wheel = _by_wheel(names)
-    if not by_wheel or wheel_column is not None:
+    wheels = (_Wheel("", found),) if found else ()
+    if wheel_column is None and not any(q.name in stated for q in WHAT):
+        wheels += tuple(_Wheel(wheel, columns) for wheel, columns in _by_wheel(names).items())
+    if not wheels:
         raise _nothing(names, file)
-    return time_column, None, tuple(_Wheel(wheel, columns) for wheel, columns in by_wheel.items())
+    return time_column, wheel_column, wheels
 
 
 def _stated(wheel: str, columns: dict[str, ColumnOption], names: tuple[str, ...], file: Path) -> dict[str, Found]:

@@ -33,7 +33,7 @@ Int64 = npt.NDArray[np.int64]
 
 FILE: Final = Quantity("file", "text", ("filename", "file_name", "image", "image_file", "name"))
 _TEXTS: Final = (".csv", ".txt", ".tsv")
-_COMPANY: Final = (*_TEXTS, ".json", ".toml", ".yaml", ".yml", ".md", ".xml", ".log", ".gz")
+_COMPANY: Final = (*_TEXTS, ".json", ".toml", ".yaml", ".yml", ".md", ".xml", ".log", ".gz", ".db", ".ini")
 """Suffixes of what may lie beside the images of a folder without making it another format's."""
 _SNIFFED: Final = 2_000
 _CHUNK: Final = 4_096
@@ -379,6 +379,10 @@ class _VideoLog:
     def of(cls, source: LogSource, options: ImagesOptions) -> _VideoLog:
         """Look into the video and bring its frames to GPS time."""
         path = source.path
+        if not path.is_file() or not _is_video(path):
+            raise FormatError(
+                "the log is neither a folder nor a video", expected="a folder of images, MP4, AVI or MKV", file=path
+            )
         for name in ("stamps", "pattern"):
             if getattr(options, name) is not None:
                 raise ConfigError(f"options.{name} is for a folder of images, and the log is a file", file=path)

@@ -136,6 +136,20 @@ def test_wheels_in_columns(tmp_path: Path) -> None:
     assert wheel(log, "rl", "speed_m_per_s") == [None, None]
 
 
+def test_the_vehicle_beside_its_wheels(tmp_path: Path) -> None:
+    log = log_of(tmp_path / "a.csv", "speed_m_per_s,speed_fl_m_per_s", ["3,4"], {})
+    assert {row["wheel"]: row["speed_m_per_s"] for row in log.table.to_pylist()} == {"": 3, "fl": 4}
+    stated = {"columns": {"speed": {"name": "speed_fl_m_per_s"}}}
+    log = log_of(tmp_path / "a.csv", "speed_m_per_s,speed_fl_m_per_s", ["3,4"], stated)
+    assert {row["wheel"]: row["speed_m_per_s"] for row in log.table.to_pylist()} == {"": 4}
+
+
+def test_a_count_beyond_the_counter_is_damage(tmp_path: Path) -> None:
+    log = log_of(tmp_path / "a.csv", "ticks", [1, 70_000, 2], TOTAL | {"counter_bits": 16})
+    assert log.column("ticks").tolist() == [1, 2]
+    assert [(r.record, r.reason) for r in log.rejects] == [(1, "ticks are more than a counter of 16 bits can show")]
+
+
 def test_wheels_in_rows(tmp_path: Path) -> None:
     lines = [f"{1_400_000_000 + i // 2},{'LR'[i % 2]},{(65_500 + 20 * i * (i % 2 + 1)) % 65_536}" for i in range(8)]
     path = write(tmp_path / "a.csv", "time_s,wheel,ticks", *lines)

@@ -487,6 +487,12 @@ def test_mutated_videos(tmp_path: Path) -> None:
     assert outcomes
 
 
+def test_a_single_image_is_no_log(tmp_path: Path) -> None:
+    path = folder_of(tmp_path / "cam", 1) / "img_0.jpg"
+    with pytest.raises(FormatError, match="neither a folder nor a video"):
+        read_log("images", path, {"end": T0}, **STATED)
+
+
 def test_videos_are_told_by_their_first_bytes(tmp_path: Path) -> None:
     sniff = format_named("images").sniff
     heads = {

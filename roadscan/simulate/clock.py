@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +20,6 @@ from roadscan.model.gpstime import (
 from roadscan.simulate.scene import ClockError, Scene
 
 Int64 = npt.NDArray[np.int64]
-
-UNIT_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
@@ -66,19 +63,28 @@ class SensorClock:
             expected="gps, gps_week_seconds, unix_gps, unix_utc or free",
         )
 
-    def toml(self, unit: str, run_start_gps_ns: int) -> str:
+    def toml(self, unit: str | None, run_start_gps_ns: int) -> str:
         """The survey file's ``clock = …`` for a log that starts at `run_start_gps_ns` and is stamped in `unit`."""
-        parts = [f'system = "{self.system}"', f'unit = "{unit}"']
+        parts = [f'system = "{self.system}"']
+        if unit is not None:
+            parts.append(f'unit = "{unit}"')
         if self.system in {TimeSystem.GPS_WEEK, TimeSystem.UTC_HOUR}:
             parts.append(f"date = {utc_from_gps_ns(run_start_gps_ns):%Y-%m-%d}")
-        free = self.system is TimeSystem.FREE
-        if self.error.known or free:
-            # stamp = true + offset + drift · (true − start), turned round.
-            rate = self.error.drift_ppm * 1e-6
-            reference = int(self.stamps_ns(np.array([self.start_gps_ns]))[0]) / NS_PER_S
-            parts += [
-                f"offset_s = {-self.error.offset_s or (1e-9 if free else 0.0)!r}",
-                f"drift_ppm = {-rate / (1.0 + rate) * 1e6!r}",
-                f"reference_s = {reference!r}",
-            ]
+        if self.error.known or self.system is TimeSystem.FREE:
+            parts += self._correction(run_start_gps_ns)
         return "{ " + ", ".join(parts) + " }"
+
+    def _correction(self, run_start_gps_ns: int) -> list[str]:
+        """The stamp's formula turned round; a clock that starts anew each hour states the correction of this run."""
+        if self.system is TimeSystem.UTC_HOUR:
+            ahead_ns = int(self.shown_gps_ns(np.array([run_start_gps_ns]))[0]) - run_start_gps_ns
+            return [f"offset_s = {-ahead_ns / NS_PER_S!r}"]
+        rate = self.error.drift_ppm * 1e-6
+        reference_s = int(self.stamps_ns(np.array([self.start_gps_ns]))[0]) / NS_PER_S
+        # A free-running clock without a stated offset is refused: nothing to correct is stated as a nanosecond.
+        offset_s = -self.error.offset_s or 1e-9
+        return [
+            f"offset_s = {offset_s!r}",
+            f"drift_ppm = {-rate / (1.0 + rate) * 1e6!r}",
+            f"reference_s = {reference_s!r}",
+        ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,19 +17,37 @@ from roadscan.model.errors import ConfigError
 Float64 = npt.NDArray[np.float64]
 
 
+LOCAL: Final = "local"
+"""A frame of x to the right of y, z up, that is not tied to the Earth: flat, and at rest."""
+_ENU_FROM_NED: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_RATE_RAD_PER_S: Final = 7.292115e-5
+"""Rate of the Earth's rotation: WGS 84."""
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+
+
 @dataclass(frozen=True)
 class Earth:
-    """Map frame of the scene (easting, northing, ellipsoidal height in metres) and ECEF of the same datum."""
+    """Map frame of the scene (easting, northing, ellipsoidal height in metres) and ECEF of the same datum.
+
+    With the CRS "local" both are the same local frame.
+    """
 
     crs: str
 
     def __post_init__(self) -> None:
+        if self.is_local:
+            return
         try:
             known = pyproj.CRS.from_user_input(self.crs)
         except ProjCrsError as error:
             raise ConfigError(f"map.crs '{self.crs}' is not known to PROJ", expected="such as EPSG:32632") from error
         if not known.is_projected or known.is_compound:
             raise ConfigError(f"map.crs '{self.crs}' ({known.name})", expected="a projected CRS without heights")
+
+    @property
+    def is_local(self) -> bool:
+        """True for a frame that is not tied to the Earth."""
+        return self.crs == LOCAL
 
     @property
     def geographic_crs(self) -> str:
@@ -38,6 +57,8 @@ class Earth:
 
     def ecef_from_map(self, enh_m: Float64) -> Float64:
         """ECEF positions (n, 3) of map coordinates (n, 3)."""
+        if self.is_local:
+            return np.array(enh_m, dtype=np.float64)
         to_degrees, to_ecef, units = self._steps
         e, n, h = np.ascontiguousarray((enh_m / units).T)
         lon, lat, up = to_degrees.transform(e, n, h)
@@ -45,6 +66,8 @@ class Earth:
 
     def map_from_ecef(self, xyz_m: Float64) -> Float64:
         """Map coordinates (n, 3) of ECEF positions (n, 3)."""
+        if self.is_local:
+            return np.array(xyz_m, dtype=np.float64)
         to_degrees, to_ecef, units = self._steps
         x, y, z = np.ascontiguousarray(xyz_m.T)
         lon, lat, up = to_ecef.transform(x, y, z, direction="INVERSE")
@@ -56,6 +79,37 @@ class Earth:
         _, to_ecef, _ = self._steps
         x, y, z = np.ascontiguousarray(xyz_m.T)
         return np.stack(to_ecef.transform(x, y, z, direction="INVERSE"), axis=-1)
+
+    def ecef_from_level(self, xyz_m: Float64) -> Rotation:
+        """Rotations that turn north-east-down vectors at ECEF positions (n, 3) into ECEF."""
+        if self.is_local:
+            return Rotation.concatenate([_ENU_FROM_NED] * len(xyz_m))
+        lon, lat, _ = self.geographic_from_ecef(xyz_m).T
+        return ecef_from_ned(lon, lat)
+
+    def specific_force_at_rest(self, xyz_m: Float64) -> Float64:
+        """What accelerometers at rest on the Earth feel (n, 3), in ECEF axes (m/s²): normal gravity, upwards.
+
+        Somigliana's formula on the ellipsoid and its change with height to second order (Groves 2013, eq. 2.134–2.139),
+        with the constants of WGS 84.
+        """
+        level = self.ecef_from_level(xyz_m)
+        if self.is_local:
+            gravity = np.full(len(xyz_m), _STANDARD_GRAVITY_M_PER_S2)
+        else:
+            _, lat, height = self.geographic_from_ecef(xyz_m).T
+            sine2 = np.sin(np.radians(lat)) ** 2
+            at_zero = 9.7803253359 * (1 + 0.001931853 * sine2) / np.sqrt(1 - 0.00669437999014 * sine2)
+            flattening, axis, m = 1 / 298.257223563, 6378137.0, 0.00344978650684
+            share = height / axis
+            gravity = at_zero * (1 - 2 * share * (1 + flattening * (1 - 2 * sine2) + m) + 3 * share**2)
+        up: Float64 = level.apply(np.stack([np.zeros_like(gravity), np.zeros_like(gravity), -gravity], axis=-1))
+        return up
+
+    @property
+    def rotation_ecef_rad_per_s(self) -> Float64:
+        """Rate of the Earth's rotation (3,), ECEF."""
+        return np.array([0.0, 0.0, 0.0 if self.is_local else _RATE_RAD_PER_S])
 
     @functools.cached_property
     def _geographic(self) -> pyproj.CRS:
@@ -104,8 +158,7 @@ class LocalMap:
 
         anchor_ecef_m : (3,); origin_enh_m : (3,) map coordinates that the result counts from.
         """
-        lon, lat, _ = earth.geographic_from_ecef(anchor_ecef_m[None])[0]
-        ned = ecef_from_ned(np.array(lon), np.array(lat)).as_matrix()
+        ned = earth.ecef_from_level(anchor_ecef_m[None]).as_matrix()[0]
         ecef_from_enu = np.stack([ned[:, 1], ned[:, 0], -ned[:, 2]], axis=-1)
         grid = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1)
         unit = grid.reshape(-1, 3)

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from roadscan.model.gpstime import utc_from_gps_ns
-from roadscan.simulate.drive import Drive
+from roadscan.simulate.earth import Earth
+from roadscan.simulate.imu import AT_BODY, head_imus
 from roadscan.simulate.lidar import RANGE_MIN_M
+from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
 from roadscan.simulate.profiler import Head, heads
-from roadscan.simulate.scene import Mount, Scene
+from roadscan.simulate.scene import Mount, MountError, Scene
 from roadscan.simulate.surface import Surface
 
 SURVEY_FILE: Final = "SURVEY.toml"
@@ -29,59 +31,55 @@ def run_id(number: int) -> str:
     return f"run-{number + 1}"
 
 
-def write_survey(scene: Scene, drives: Sequence[Drive], file: Path) -> None:
+def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLog]], file: Path) -> None:
     """Write ``SURVEY.toml``: runs with their logs, passes, control points."""
-    crs = _text(drives[0].earth.geographic_crs)
-    lines = [
-        f"id = {_text(scene.id)}",
-        f"title = {_text(scene.title)}",
-        f"rig = {_text(RIG_FILE)}",
-        "",
-        "[map]",
-        f"crs = {_text(scene.map.crs)}",
-        'height = "ellipsoidal"',
-    ]
-    for drive in drives:
-        day = f"date = {utc_from_gps_ns(drive.start_gps_ns):%Y-%m-%d}"
-        folder = f"raw/{run_id(drive.number)}"
-        lines += ["", "[[runs]]", f"id = {_text(run_id(drive.number))}"]
-        lines += _log(f"{folder}/trajectory.sbet", "sbet", clock=f'{{ system = "gps_week_seconds", {day} }}', crs=crs)
-        for head in heads(scene.profilers):
-            lines += _log(f"{folder}/{head.name}.parquet", "scans", sensor=head.name)
-        if scene.lidar.on:
-            clock = f'{{ system = "utc_hour", {day} }}'
-            lines += _log(f"{folder}/lidar.pcap", "velodyne_pcap", sensor="lidar", clock=clock)
-    for drive in drives:
-        one = scene.passes[drive.number]
-        lines += ["", "[[passes]]", f"id = {drive.number + 1}", f"run = {_text(run_id(drive.number))}"]
-        lines += [f'lane = "{one.lane}"', f"direction = {_text(one.direction)}"]
+    lines = [f"id = {_text(scene.id)}", f"title = {_text(scene.title)}", f"rig = {_text(RIG_FILE)}", "", "[map]"]
+    lines += ['local = { name = "local" }' if earth.is_local else f"crs = {_text(scene.map.crs)}"]
+    lines.append('height = "ellipsoidal"')
+    for number, listed in enumerate(logs):
+        lines += ["", "[[runs]]", f"id = {_text(run_id(number))}"]
+        for log in sorted((log for log in listed if log.format), key=lambda log: log.content != "poses"):
+            lines += _log(f"raw/{run_id(number)}/{log.name}", log)
+    for number, one in enumerate(scene.passes):
+        lines += ["", "[[passes]]", f"id = {number + 1}", f"run = {_text(run_id(number))}"]
+        if one.route is None:
+            lines += [f'lane = "{one.lane}"', f"direction = {_text(one.direction)}"]
     lines += ["", "[[control]]", f"path = {_text(CONTROL_FILE)}", f"crs = {_text(scene.map.crs)}"]
     lines += ['height = "ellipsoidal"', ""]
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
 def write_rig(scene: Scene, file: Path) -> None:
-    """Write ``RIG.toml``: the sensors with their mountings."""
+    """Write ``RIG.toml``: the sensors with their nominal mountings."""
     lines = ['name = "simulated rig"']
     for head in heads(scene.profilers):
         lines += _sensor(head.name, "profiler", "laser-triangulation head", "frd", head.mount, _profiler_limits(head))
     if scene.lidar.on:
         limits = (RANGE_MIN_M, scene.lidar.range_max_m + 1.0)
         lines += _sensor("lidar", "lidar", "Velodyne HDL-32E", "flu", scene.lidar.mount, limits)
+    if scene.imu.on:
+        lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", AT_BODY)
+    for imu in head_imus(scene):
+        lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", imu.mount)
+    if scene.gnss.on:
+        error = MountError(lever_arm_body_m=scene.gnss.lever_arm_error_m)
+        mount = Mount(lever_arm_body_m=scene.gnss.lever_arm_body_m, error=error)
+        lines += _sensor("gnss", "gnss", "RTK receiver", "frd", mount)
+    if scene.encoder.on:
+        mount = Mount(lever_arm_body_m=(-1.4, scene.encoder.side_m, scene.vehicle.imu_height_m))
+        lines += _sensor("encoder", "encoder", "wheel encoder", "frd", mount)
+        lines.append(f"metres_per_tick = {1.0 / scene.encoder.ticks_per_m!r}")
     file.write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 def write_control(scene: Scene, surface: Surface, file: Path) -> None:
-    """Write control points along both edges of the lanes: every third one is a check point.
+    """Write control points: the painted targets, or points along both edges of the lanes, every third a check point.
 
     The stated σ is the true one, or a millimetre where the points have no error: no surveyor states zero.
     """
-    spacing = scene.control.spacing_m
-    stations = np.arange(min(spacing, scene.length_m) / 2, scene.length_m, spacing)
-    offset = scene.road.half_width_m - scene.control.inset_m
-    places = np.stack(np.meshgrid(stations, [-offset, offset], indexing="ij"), axis=-1).reshape(-1, 2)
+    places, roles = _control_places(scene)
     easting, northing, _ = surface.place(places[:, 0], places[:, 1])
-    true = np.stack([easting, northing, surface.height_m(easting, northing)], axis=-1)
+    true = np.stack([easting, northing, surface.height_m(easting, northing, texture=False)], axis=-1)
     sigma = scene.noise.control_m
     stated_sigma = max(sigma, 0.001)
     stated = true + sigma * stream(scene.seed, 0, "control").standard_normal(true.shape)
@@ -90,27 +88,42 @@ def write_control(scene: Scene, surface: Surface, file: Path) -> None:
         header = "name,code,role,easting_m,northing_m,height_m,sigma_horizontal_m,sigma_height_m"
         rows.writerow(header.split(","))
         for i, enh in enumerate(stated):
-            role, letter = ("check", "C") if i % 3 == 2 else ("gcp", "G")
+            role, letter = roles[i], "C" if roles[i] == "check" else "G"
             numbers = [f"{value:.4f}" for value in (*enh, stated_sigma, stated_sigma)]
             rows.writerow([f"{letter}{i + 1:03d}", "PAINT", role, *numbers])
 
 
-def _log(
-    path: str, kind: str, *, sensor: str | None = None, clock: str | None = None, crs: str | None = None
-) -> list[str]:
-    lines = ["", "[[runs.logs]]", f"path = {_text(path)}", f"format = {_text(kind)}"]
-    if sensor is not None:
-        lines.append(f"sensor = {_text(sensor)}")
-    if clock is not None:
-        lines.append(f"clock = {clock}")
-    if crs is not None:
-        lines.append(f"crs = {crs}")
+def _control_places(scene: Scene) -> tuple[npt.NDArray[np.float64], list[str]]:
+    """Stations and offsets (n, 2) of the control points, and their roles."""
+    targets = scene.road.targets
+    if targets:
+        return np.array([[t.station_m, t.offset_m] for t in targets]), [t.role for t in targets]
+    spacing = scene.control.spacing_m
+    stations = np.arange(min(spacing, scene.length_m) / 2, scene.length_m, spacing)
+    offset = scene.road.half_width_m - scene.control.inset_m
+    places = np.stack(np.meshgrid(stations, [-offset, offset], indexing="ij"), axis=-1).reshape(-1, 2)
+    return places, ["check" if i % 3 == 2 else "gcp" for i in range(len(places))]
+
+
+def _log(path: str, log: SimulatedLog) -> list[str]:
+    lines = ["", "[[runs.logs]]", f"path = {_text(path)}", f"format = {_text(log.format)}"]
+    if log.sensor is not None:
+        lines.append(f"sensor = {_text(log.sensor)}")
+    if log.clock is not None:
+        lines.append(f"clock = {log.clock}")
+    if log.crs is not None:
+        lines.append(f"crs = {_text(log.crs)}")
+    if log.options is not None:
+        lines.append(f"options = {log.options}")
     return lines
 
 
-def _sensor(name: str, kind: str, model: str, axes: str, mount: Mount, limits_m: tuple[float, float]) -> list[str]:
+def _sensor(
+    name: str, kind: str, model: str, axes: str, true: Mount, limits_m: tuple[float, float] | None = None
+) -> list[str]:
+    mount = true.nominal()
     forward, right, down = mount.lever_arm_body_m
-    return [
+    lines = [
         "",
         f"[sensors.{name}]",
         f"kind = {_text(kind)}",
@@ -119,9 +132,10 @@ def _sensor(name: str, kind: str, model: str, axes: str, mount: Mount, limits_m:
         f"lever_arm_body_m = [{float(forward)!r}, {float(right)!r}, {float(down)!r}]",
         f"boresight = {{ roll_deg = {mount.roll_deg!r}, pitch_deg = {mount.pitch_deg!r}, "
         f"heading_deg = {mount.heading_deg!r} }}",
-        f"range_min_m = {limits_m[0]!r}",
-        f"range_max_m = {limits_m[1]!r}",
     ]
+    if limits_m is not None:
+        lines += [f"range_min_m = {limits_m[0]!r}", f"range_max_m = {limits_m[1]!r}"]
+    return lines
 
 
 def _profiler_limits(head: Head) -> tuple[float, float]:

@@ -16,7 +16,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
+from roadscan.model.gpstime import TimeSystem
+from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
+from roadscan.simulate.encoder import WheelEncoder
 from roadscan.simulate.kernels import profiles as kernels
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Profilers, Scene
@@ -93,11 +96,18 @@ def heads(settings: Profilers) -> list[Head]:
 
 
 def write_profiles(
-    scene: Scene, surface: Surface, drive: Drive, head: Head, file: Path, hits_file: Path | None
+    scene: Scene,
+    surface: Surface,
+    drive: Drive,
+    head: Head,
+    clock: SensorClock,
+    file: Path,
+    hits_file: Path | None,
 ) -> Iterator[int]:
     """Write the profiles of one head, a row group a step; yields the readings of each."""
     readings = head.settings.readings
-    schema = _scans_schema(head)
+    stamp = "epoch_gps_ns" if clock.error.is_right and clock.system is TimeSystem.GPS else "time"
+    schema = _scans_schema(head, stamp)
     hits_schema = _hits_schema(readings)
     hits_writer = pq.ParquetWriter(hits_file, hits_schema, use_dictionary=False) if hits_file else None
     with pq.ParquetWriter(
@@ -106,16 +116,16 @@ def write_profiles(
         compression="NONE",
         use_dictionary=False,
         column_encoding={
-            "epoch_gps_ns": "DELTA_BINARY_PACKED",
+            stamp: "DELTA_BINARY_PACKED",
             "range.list.element": "DELTA_BINARY_PACKED",
             "intensity.list.element": "DELTA_BINARY_PACKED",
             "encoder_ticks": "DELTA_BINARY_PACKED",
         },
-        write_statistics=["epoch_gps_ns", "encoder_ticks"],
+        write_statistics=[stamp, "encoder_ticks"],
     ) as writer:
         for block in measure(scene, surface, drive, head, with_hits=hits_file is not None):
             columns = [
-                pa.array(block.epoch_gps_ns),
+                pa.array(clock.stamps_ns(block.epoch_gps_ns)),
                 _lists(block.ranges, schema.field("range").type),
                 _lists(block.intensity, schema.field("intensity").type),
                 pa.array(block.encoder_ticks),
@@ -136,13 +146,21 @@ def measure(scene: Scene, surface: Surface, drive: Drive, head: Head, *, with_hi
     """Profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
     spacing = head.settings.spacing_m
     count = math.floor(drive.length_m / spacing + 1e-9) + 1
+    encoder = WheelEncoder(scene, drive)
     for first in range(0, count, BLOCK_PROFILES):
         driven = np.asarray(spacing * np.arange(first, min(first + BLOCK_PROFILES, count), dtype=np.float64))
-        yield _measure_block(scene, surface, drive, head, driven, first, with_hits)
+        yield _measure_block(scene, surface, drive, head, encoder, driven, first, with_hits)
 
 
 def _measure_block(
-    scene: Scene, surface: Surface, drive: Drive, head: Head, driven_m: Float64, first: int, with_hits: bool
+    scene: Scene,
+    surface: Surface,
+    drive: Drive,
+    head: Head,
+    encoder: WheelEncoder,
+    driven_m: Float64,
+    first: int,
+    with_hits: bool,
 ) -> Profiles:
     settings = head.settings
     epochs = drive.epoch_gps_ns(driven_m)
@@ -169,7 +187,7 @@ def _measure_block(
         intensity,
         true_range,
     )
-    ticks = np.floor(drive.driven_m(epochs) * scene.encoder.ticks_per_m + 0.5).astype(np.int64)
+    ticks = encoder.ticks(epochs)
     hits = _hits(drive, origins, rotations, y, true_range) if with_hits else np.empty((0, 0, 0))
     return Profiles(epochs, ticks, ranges, intensity, hits)
 
@@ -239,11 +257,11 @@ def _random_from(scene: Scene, drive: Drive, head: Head) -> int:
     return int(stream(scene.seed, drive.number, head.name).integers(0, 2**62))
 
 
-def _scans_schema(head: Head) -> pa.Schema:
+def _scans_schema(head: Head, stamp: str) -> pa.Schema:
     size = head.settings.readings
     return pa.schema(
         [
-            pa.field("epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field(stamp, pa.int64(), nullable=False),
             pa.field("range", _list_of(pa.uint16(), size), nullable=False),
             pa.field("intensity", _list_of(pa.uint8(), size)),
             pa.field("encoder_ticks", pa.int64()),

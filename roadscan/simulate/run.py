@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from roadscan.model.errors import ConfigError
 from roadscan.simulate import files, truth
-from roadscan.simulate.drive import Drive
+from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.lidar import write_lidar
-from roadscan.simulate.profiler import heads, write_profiles
+from roadscan.simulate.logs import Pass, SimulatedLog
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.simulate.trajectory import write_trajectory
+
+_AT_ONCE: Final = 2
+"""Logs written at once, each by a thread of its own: the loops let go of the interpreter."""
 
 
 @dataclass(frozen=True)
@@ -63,61 +67,53 @@ def simulate(
     _prepare(scene, target)
     earth = Earth(scene.map.crs)
     surface, ride = Surface(scene), Surface(scene, ride=True)
-    drives = [Drive(scene, number, earth, ride) for number in range(len(scene.passes))]
-    tell = progress or (lambda _: None)
-    counts = [_write_run(scene, surface, drive, target, write_hits, tell) for drive in drives]
+    drives = drives_of(scene, earth, ride)
+    known = truth.Truth(scene, surface, target / truth.TRUTH_FOLDER)
+    logs = [_pass(known, drive, target, write_hits).logs() for drive in drives]
+    counts: Counter[str] = Counter()
+    for drive, listed in zip(drives, logs, strict=True):
+        counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
     files.write_rig(scene, target / files.RIG_FILE)
     files.write_control(scene, surface, target / files.CONTROL_FILE)
-    files.write_survey(scene, drives, target / files.SURVEY_FILE)
-    readings = sum(c.readings for c in counts)
+    files.write_survey(scene, earth, logs, target / files.SURVEY_FILE)
     return SimulatedSurvey(
         folder=target,
         survey_file=target / files.SURVEY_FILE,
         rig_file=target / files.RIG_FILE,
         control_file=target / files.CONTROL_FILE,
         truth_folder=target / truth.TRUTH_FOLDER,
-        profiles=readings // scene.profilers.readings,
-        readings=readings,
-        returns=sum(c.returns for c in counts),
-        poses=sum(c.poses for c in counts),
+        profiles=counts["readings"] // scene.profilers.readings,
+        readings=counts["readings"],
+        returns=counts["returns"],
+        poses=counts["poses"],
     )
 
 
-@dataclass(frozen=True)
-class _Counts:
-    readings: int
-    returns: int
-    poses: int
-
-
-def _write_run(
-    scene: Scene, surface: Surface, drive: Drive, folder: Path, write_hits: bool, tell: Callable[[str], None]
-) -> _Counts:
-    """Write the logs of one pass."""
+def _pass(known: truth.Truth, drive: Drive, folder: Path, write_hits: bool) -> Pass:
+    """One pass with its folders, which are made."""
     run = files.run_id(drive.number)
-    known = truth.Truth(scene, surface, folder / truth.TRUTH_FOLDER)
     raw = folder / "raw" / run
     for needed in (raw, known.trajectory_file(run).parent, *([known.hits_file(run, "").parent] if write_hits else [])):
         needed.mkdir(parents=True, exist_ok=True)
 
-    def written(name: str, steps: Iterator[int]) -> int:
-        tell(f"{run}/{name}")
-        return sum(steps)
-
     def hits(sensor: str) -> Path | None:
         return known.hits_file(run, sensor) if write_hits else None
 
-    name = "trajectory.sbet"
-    poses = written(name, write_trajectory(scene, drive, raw / name, known.trajectory_file(run)))
-    readings = 0
-    for head in heads(scene.profilers):
-        name = f"{head.name}.parquet"
-        readings += written(name, write_profiles(scene, surface, drive, head, raw / name, hits(head.name)))
-    returns = 0
-    if scene.lidar.on:
-        name = "lidar.pcap"
-        returns = written(name, write_lidar(scene, surface, drive, raw / name, hits("lidar")))
-    return _Counts(readings, returns, poses)
+    return Pass(known.scene, known.surface, drive, raw, known.trajectory_file(run), hits)
+
+
+def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:
+    """Write the logs of a pass, two at a time; how many records of each content."""
+
+    def write(log: SimulatedLog) -> tuple[str, int]:
+        tell(f"{run}/{log.name}")
+        return log.content, sum(log.write())
+
+    counts: Counter[str] = Counter()
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        for content, records in pool.map(write, logs):
+            counts[content] += records
+    return counts
 
 
 def _prepare(scene: Scene, folder: Path) -> None:

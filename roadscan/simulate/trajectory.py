@@ -1,4 +1,7 @@
-"""The vehicle's trajectory: as stated (SBET, with errors) and as it was (Parquet, in the truth)."""
+"""The vehicle's trajectory: as stated (SBET and SMRMSG, with errors) and as it was (Parquet, in the truth).
+
+A rig in a local frame has no latitude: there the stated trajectory is a table of poses, too.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,9 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.gpstime import NS_PER_S, WEEK_S
-from roadscan.simulate.drive import RUN_UP_S, Drive, Poses
-from roadscan.simulate.earth import ecef_from_ned
+from roadscan.simulate.drive import Drive, Poses
 from roadscan.simulate.noise import GaussMarkov, stream
-from roadscan.simulate.scene import Scene
+from roadscan.simulate.scene import Noise, Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -25,12 +27,26 @@ Int64 = npt.NDArray[np.int64]
 CHUNK_POSES: Final = 8_192
 _DIFFERENCE_NS: Final = 2_000_000
 """Velocities, accelerations and rates are differences over this to both sides."""
+_LEAST_SIGMA_M: Final = 0.001
+_LEAST_SIGMA_DEG: Final = 0.0005
+"""No post-processor states less."""
 _TRUTH_SCHEMA: Final = pa.schema(
     [
         pa.field("epoch_gps_ns", pa.int64()),
         *(pa.field(name, pa.float64()) for name in ("x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz")),
     ]
 )
+_LOCAL_SCHEMA: Final = pa.schema(
+    [
+        pa.field("timestamp_ns", pa.int64()),
+        *(pa.field(name, pa.float64()) for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")),
+    ]
+)
+
+
+def file_name(drive: Drive) -> str:
+    """Name of the stated trajectory's log."""
+    return "trajectory.parquet" if drive.earth.is_local else "trajectory.sbet"
 
 
 def wander_rad(number: int) -> float:
@@ -41,15 +57,39 @@ def wander_rad(number: int) -> float:
 def write_trajectory(scene: Scene, drive: Drive, file: Path, truth_file: Path) -> Iterator[int]:
     """Write the poses of one pass, a chunk a step; yields the poses of each."""
     step = NS_PER_S // scene.trajectory.poses_per_s
-    first = (drive.start_gps_ns - round(RUN_UP_S * 1e9)) // step * step
-    last = drive.start_gps_ns + round((drive.duration_s + RUN_UP_S) * 1e9)
+    first, last = drive.recorded_span_gps_ns
+    first = first // step * step
     errors = _Errors(scene, drive.number)
-    with file.open("wb") as log, pq.ParquetWriter(truth_file, _TRUTH_SCHEMA, use_dictionary=False) as truth:
+    with pq.ParquetWriter(truth_file, _TRUTH_SCHEMA, use_dictionary=False) as truth, _Log(drive, file) as log:
         for begin in range(first, last + step, step * CHUNK_POSES):
             epochs = np.arange(begin, min(begin + step * CHUNK_POSES, last + step), step)
             truth.write_batch(_true_rows(drive, epochs))
-            log.write(_sbet(drive, epochs, errors, wander_rad(drive.number)).astype("<f8").tobytes())
+            log.write(epochs, errors)
             yield epochs.size
+
+
+def write_accuracy(scene: Scene, drive: Drive, file: Path) -> Iterator[int]:
+    """Write the companion SMRMSG of a pass, a record a second; yields their count.
+
+    Records of 10 doubles: time, position σ (m), velocity σ (m/s), roll, pitch, heading σ (arc minutes).
+    """
+    first, last = drive.recorded_span_gps_ns
+    epochs = np.arange(first // NS_PER_S * NS_PER_S, last + NS_PER_S, NS_PER_S)
+    noise = scene.noise
+    position = max(noise.position_m, _LEAST_SIGMA_M)
+    tilt = max(noise.attitude_deg, _LEAST_SIGMA_DEG) * 60.0
+    velocity = _velocity_sigma(noise)
+    rows = np.empty((epochs.size, 10))
+    rows[:, 0] = epochs % (WEEK_S * NS_PER_S) / NS_PER_S
+    rows[:, 1:] = [position, position, position, velocity, velocity, velocity, tilt, tilt, 2 * tilt]
+    file.write_bytes(rows.astype("<f8").tobytes())
+    yield epochs.size
+
+
+def _velocity_sigma(noise: Noise) -> float:
+    """Change of the position's error in a second (m/s): what a Gauss–Markov process gives."""
+    sigma = max(noise.position_m, _LEAST_SIGMA_M)
+    return sigma * math.sqrt(2.0 * (1.0 - math.exp(-1.0 / noise.time_constant_s)))
 
 
 class _Errors:
@@ -71,11 +111,56 @@ class _Errors:
         return values[:, :3], values[:, 3:]
 
 
+class _Log:
+    """The stated trajectory's log, an SBET or (in a local frame) a table of poses."""
+
+    def __init__(self, drive: Drive, file: Path) -> None:
+        self._drive = drive
+        local = drive.earth.is_local
+        self._table = pq.ParquetWriter(file, _LOCAL_SCHEMA, use_dictionary=False) if local else None
+        self._stream = None if local else file.open("wb")
+
+    def __enter__(self) -> _Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in (self._table, self._stream):
+            if one is not None:
+                one.close()
+
+    def write(self, epochs: Int64, errors: _Errors) -> None:
+        """Append poses, with the next errors."""
+        if self._table is not None:
+            self._table.write_batch(_local_rows(self._drive, epochs, errors))
+        if self._stream is not None:
+            rows = _sbet(self._drive, epochs, errors, wander_rad(self._drive.number))
+            self._stream.write(rows.astype("<f8").tobytes())
+
+
 def _true_rows(drive: Drive, epochs: Int64) -> pa.RecordBatch:
     poses = drive.poses(epochs)
     quaternion = poses.ecef_from_body.as_quat(canonical=True, scalar_first=True)
-    columns = [epochs, *poses.position_ecef_m.T, *quaternion.T]
-    return pa.RecordBatch.from_arrays([pa.array(np.ascontiguousarray(c)) for c in columns], schema=_TRUTH_SCHEMA)
+    return _batch([epochs, *poses.position_ecef_m.T, *quaternion.T], _TRUTH_SCHEMA)
+
+
+def _local_rows(drive: Drive, epochs: Int64, errors: _Errors) -> pa.RecordBatch:
+    """Stated poses in the local frame, axes forward, right, down."""
+    here = drive.poses(epochs)
+    position, attitude = _stated(drive, here, errors)
+    quaternion = attitude.as_quat(canonical=True, scalar_first=True)
+    return _batch([epochs, *quaternion.T, *position.T], _LOCAL_SCHEMA)
+
+
+def _batch(columns: list[npt.NDArray[np.generic]], schema: pa.Schema) -> pa.RecordBatch:
+    return pa.RecordBatch.from_arrays([pa.array(np.ascontiguousarray(c)) for c in columns], schema=schema)
+
+
+def _stated(drive: Drive, here: Poses, errors: _Errors) -> tuple[Float64, Rotation]:
+    """ECEF positions (n, 3) and attitudes with errors; those of attitude are added to roll, pitch and heading."""
+    position_error, attitude_error = errors.take(len(here.position_ecef_m))
+    level = drive.earth.ecef_from_level(here.position_ecef_m)
+    angles = (level.inv() * here.ecef_from_body).as_euler("ZYX") + attitude_error[:, ::-1]
+    return here.position_ecef_m + level.apply(position_error), level * Rotation.from_euler("ZYX", angles)
 
 
 def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float64:
@@ -86,11 +171,10 @@ def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float6
     """
     before, here, after = (drive.poses(epochs + shift) for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS))
     dt = _DIFFERENCE_NS * 1e-9
-    lon, lat, _ = drive.earth.geographic_from_ecef(here.position_ecef_m).T
-    level = ecef_from_ned(lon, lat)
-    position_error, attitude_error = errors.take(epochs.size)
-    stated = drive.earth.geographic_from_ecef(here.position_ecef_m + level.apply(position_error))
-    heading, pitch, roll = (level.inv() * here.ecef_from_body).as_euler("ZYX").T + attitude_error.T[::-1]
+    level = drive.earth.ecef_from_level(here.position_ecef_m)
+    position, attitude = _stated(drive, here, errors)
+    stated = drive.earth.geographic_from_ecef(position)
+    heading, pitch, roll = (level.inv() * attitude).as_euler("ZYX").T
     velocity = level.inv().apply((after.position_ecef_m - before.position_ecef_m) / (2 * dt))
     along_wander = Rotation.from_euler("z", wander).apply(velocity)
     acceleration, rates = _body_motion(before, here, after, dt)

@@ -29,7 +29,7 @@ def test_same_seed_same_bytes(tmp_path: Path):
     simulate(scene, tmp_path / "a", write_hits=True)
     simulate(scene, tmp_path / "b", write_hits=True)
     first = hashes(tmp_path / "a")
-    assert len(first) == 4 + 2 * (4 + 1 + 3)
+    assert len(first) == 4 + 2 * (5 + 1 + 3)
     assert first == hashes(tmp_path / "b")
     # Again into the same folder: the same files.
     simulate(scene, tmp_path / "a", write_hits=True)
@@ -51,12 +51,9 @@ def test_chunks_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("trajectory.sbet", "profiler_left.parquet"):
         a, b = ((tmp_path / folder / "raw" / "run-1" / name).read_bytes() for folder in "ab")
         assert a == b
-    # Noise is drawn by the block of profiles; without it, blocks change no range either.
-    monkeypatch.setattr(profiler, "BLOCK_PROFILES", 512)
-    quiet = TINY.noiseless()
-    whole = _ranges(quiet)
+    whole = _ranges(TINY)
     monkeypatch.setattr(profiler, "BLOCK_PROFILES", 37)
-    assert _ranges(quiet) == whole
+    assert _ranges(TINY) == whole
 
 
 def _ranges(scene: Scene) -> bytes:
@@ -114,7 +111,9 @@ def test_refuses_what_is_not_its_own(tmp_path: Path):
 def test_progress_names_each_log(tmp_path: Path):
     seen: list[str] = []
     simulate(TINY, tmp_path / "survey", progress=seen.append)
-    assert seen == ["run-1/trajectory.sbet", "run-1/profiler_left.parquet", "run-1/profiler_right.parquet"]
+    logs = ("trajectory.sbet", "trajectory.smrmsg", "profiler_left.parquet", "profiler_right.parquet")
+    assert set(seen) == {f"run-1/{log}" for log in logs}
+    assert len(seen) == 4
 
 
 def test_truth_is_the_scene_itself(tmp_path: Path):

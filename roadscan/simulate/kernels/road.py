@@ -258,7 +258,8 @@ def edge_distance(patches: Float64, i: int, station: float, offset: float) -> fl
     if patches[i, 0] == 1.0:
         inward: float = patches[i, 3] - math.sqrt(ds * ds + do * do)
         return inward
-    return min(patches[i, 3] - abs(ds), patches[i, 4] - abs(do))
+    nearest: float = min(patches[i, 3] - abs(ds), patches[i, 4] - abs(do))
+    return nearest
 
 
 @inlined
@@ -375,7 +376,8 @@ def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float, 
                     value = section[PAINT]
     for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
         value = painted(items, i, station, offset, value)
-    return value + section[CONTRAST] * stone
+    shade: float = value + section[CONTRAST] * stone
+    return shade
 
 
 @inlined

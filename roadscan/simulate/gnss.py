@@ -1,0 +1,179 @@
+"""A GNSS receiver with real-time kinematic corrections: its solutions as RTKLIB ``.pos`` and NMEA 0183."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, utc_from_gps_ns
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.noise import GaussMarkov, stream
+from roadscan.simulate.scene import Mount, Scene
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+FIXED: Final = 1
+FLOAT: Final = 2
+"""Quality of a solution, as RTKLIB numbers it."""
+RECEIVER_UNDULATION_M: Final = 46.9
+"""Height of the geoid above the ellipsoid that the receiver's own coarse model gives everywhere here (NMEA GGA)."""
+_SATELLITES: Final = 14
+_DIFFERENCE_NS: Final = 10_000_000
+_VELOCITY_SIGMA_M_PER_S: Final = 0.03
+_KNOTS_PER_M_PER_S: Final = 3600.0 / 1852.0
+_SHORTEST_JUMP_S, _LONGEST_JUMP_S = 1.0, 5.0
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """n solutions of a pass; gaps are left out."""
+
+    epoch_gps_ns: Int64
+    geographic: Float64
+    """(n, 3) longitude, latitude (degrees), ellipsoidal height (m) of the antenna, with errors."""
+    velocity_ned_m_per_s: Float64
+    """(n, 3)"""
+    quality: Int64
+    """(n,) :data:`FIXED` or :data:`FLOAT`."""
+    sigma_ned_m: Float64
+    """(n, 3) as the receiver states them; of a multipath jump it knows nothing."""
+    jump_ned_m: Float64
+    """(n, 3) multipath error within the position, for the truth."""
+
+
+def solve(scene: Scene, drive: Drive) -> Solutions:
+    """Solutions of a whole pass at the antenna, in the datum of the scene's CRS."""
+    gnss = scene.gnss
+    step = round(NS_PER_S / gnss.rate_hz)
+    first, last = drive.recorded_span_gps_ns
+    epochs = np.arange(-(-(first + _DIFFERENCE_NS) // step) * step, last - _DIFFERENCE_NS + 1, step)
+    rng = stream(scene.seed, drive.number, "gnss")
+    quality = _quality(scene, drive, epochs)
+    sigma = np.array([gnss.sigma_horizontal_m, gnss.sigma_horizontal_m, gnss.sigma_vertical_m])
+    slow = GaussMarkov(rng, sigma * math.sqrt(0.5), gnss.time_constant_s, 1.0 / gnss.rate_hz).take(epochs.size)
+    error = slow + sigma * math.sqrt(0.5) * rng.standard_normal((epochs.size, 3))
+    adrift = GaussMarkov(rng, np.full(3, gnss.float_sigma_m), gnss.time_constant_s, 1.0 / gnss.rate_hz)
+    error += adrift.take(epochs.size) * (quality == FLOAT)[:, None]
+    jumps = _jumps(scene, epochs, rng)
+    mount = Mount(lever_arm_body_m=gnss.lever_arm_body_m)
+    before, here, after = (
+        drive.poses(epochs + shift).sensor(mount, np.eye(3))[0] for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS)
+    )
+    level = drive.earth.ecef_from_level(here)
+    velocity = level.inv().apply((after - before) / (2e-9 * _DIFFERENCE_NS))
+    velocity += _VELOCITY_SIGMA_M_PER_S * rng.standard_normal(velocity.shape) * (gnss.sigma_horizontal_m > 0.0)
+    stated_sigma = np.where((quality == FLOAT)[:, None], np.hypot(sigma, gnss.float_sigma_m), sigma)
+    seen = quality > 0
+    return Solutions(
+        epochs[seen],
+        drive.earth.geographic_from_ecef(here + level.apply(error + jumps))[seen],
+        velocity[seen],
+        quality[seen],
+        np.maximum(stated_sigma, 0.001)[seen],
+        jumps[seen],
+    )
+
+
+def write_pos(solutions: Solutions, file: Path) -> Iterator[int]:
+    """Write RTKLIB's text: GPST, degrees, ellipsoidal height; yields the number of solutions."""
+    names = "latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio"
+    header = [
+        "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)",
+        f"%  GPST {names} vn(m/s) ve(m/s) vu(m/s)",
+    ]
+    with file.open("w", encoding="ascii", newline="\n") as out:
+        out.writelines(f"{line}\n" for line in header)
+        for i in range(solutions.epoch_gps_ns.size):
+            lon, lat, height = solutions.geographic[i]
+            north, east, down = solutions.velocity_ned_m_per_s[i]
+            sigma_n, sigma_e, sigma_d = solutions.sigma_ned_m[i]
+            fixed = solutions.quality[i] == FIXED
+            out.write(
+                f"{_calendar(int(solutions.epoch_gps_ns[i]))} {lat:14.10f} {lon:15.10f} {height:11.5f} "
+                f"{solutions.quality[i]:3d} {_SATELLITES:3d} {sigma_n:8.4f} {sigma_e:8.4f} {sigma_d:8.4f} "
+                f"{0.0:8.4f} {0.0:8.4f} {0.0:8.4f} {0.8:6.2f} {30.0 if fixed else 1.6:6.1f} "
+                f"{north:10.5f} {east:10.5f} {-down:10.5f}\n"
+            )
+    yield solutions.epoch_gps_ns.size
+
+
+def write_nmea(solutions: Solutions, file: Path) -> Iterator[int]:
+    """Write GGA, RMC, VTG and GST sentences of each solution, in UTC; yields the number of solutions."""
+    with file.open("w", encoding="ascii", newline="") as out:
+        for i in range(solutions.epoch_gps_ns.size):
+            out.writelines(f"${body}*{_checksum(body):02X}\r\n" for body in _sentences(solutions, i))
+    yield solutions.epoch_gps_ns.size
+
+
+def _sentences(solutions: Solutions, i: int) -> list[str]:
+    epoch = int(solutions.epoch_gps_ns[i])
+    utc = utc_from_gps_ns(epoch + 5_000_000)  # hundredths of a second are written, rounded
+    time = f"{utc:%H%M%S}.{utc.microsecond // 10_000:02d}"
+    lon, lat, height = solutions.geographic[i]
+    place = (
+        f"{_degrees_minutes(lat, 2)},{'N' if lat >= 0 else 'S'},{_degrees_minutes(lon, 3)},{'E' if lon >= 0 else 'W'}"
+    )
+    north, east, _ = solutions.velocity_ned_m_per_s[i]
+    course = math.degrees(math.atan2(east, north)) % 360.0
+    speed = math.hypot(north, east)
+    knots = speed * _KNOTS_PER_M_PER_S
+    sigma_n, sigma_e, sigma_d = solutions.sigma_ned_m[i]
+    fix = 4 if solutions.quality[i] == FIXED else 5
+    above = height - RECEIVER_UNDULATION_M
+    return [
+        f"GNGGA,{time},{place},{fix},{_SATELLITES},0.8,{above:.4f},M,{RECEIVER_UNDULATION_M:.4f},M,0.8,0000",
+        f"GNRMC,{time},A,{place},{knots:.4f},{course:.3f},{utc:%d%m%y},,,R",
+        f"GNVTG,{course:.3f},T,,M,{knots:.4f},N,{speed * 3.6:.4f},K,R",
+        f"GNGST,{time},{sigma_n:.4f},{max(sigma_n, sigma_e):.4f},{min(sigma_n, sigma_e):.4f},0.0,"
+        f"{sigma_n:.4f},{sigma_e:.4f},{sigma_d:.4f}",
+    ]
+
+
+def _quality(scene: Scene, drive: Drive, epochs: Int64) -> Int64:
+    """Quality of the solution at each epoch (n,), 0 in a gap."""
+    quality = np.full(epochs.size, FIXED, dtype=np.int64)
+    seconds = (epochs - drive.start_gps_ns) / NS_PER_S
+    gaps = [g for g in scene.gnss.gaps if not g.passes or drive.number + 1 in g.passes]
+    for gap in gaps:
+        end = gap.start_s + gap.duration_s
+        quality[(seconds >= end) & (seconds < end + scene.gnss.float_after_gap_s)] = FLOAT
+    for gap in gaps:
+        quality[(seconds >= gap.start_s) & (seconds < gap.start_s + gap.duration_s)] = 0
+    return quality
+
+
+def _jumps(scene: Scene, epochs: Int64, rng: np.random.Generator) -> Float64:
+    """Multipath errors (n, 3), north-east-down (m)."""
+    out = np.zeros((epochs.size, 3))
+    seconds = (epochs - epochs[0]) / NS_PER_S
+    count = rng.poisson(scene.gnss.jumps_per_minute * float(seconds[-1]) / 60.0)
+    for start in np.sort(rng.uniform(0.0, float(seconds[-1]), count)):
+        end = start + rng.uniform(_SHORTEST_JUMP_S, _LONGEST_JUMP_S)
+        out[(seconds >= start) & (seconds < end)] = scene.gnss.jump_m * rng.standard_normal(3)
+    return out
+
+
+def _calendar(epoch_gps_ns: int) -> str:
+    """``2026/05/04 09:30:18.000``: GPS time as a calendar without leap seconds."""
+    milliseconds = (epoch_gps_ns + 500_000) // 1_000_000 + GPS_EPOCH_UNIX_S * 1000
+    moment = np.datetime64(milliseconds, "ms").item()
+    return f"{moment:%Y/%m/%d %H:%M:%S}.{milliseconds % 1000:03d}"
+
+
+def _degrees_minutes(degrees: float, digits: int) -> str:
+    """``4806.1234567``: whole degrees of `digits` figures and minutes."""
+    whole, rest = divmod(round(abs(degrees) * 60 * 10**8), 60 * 10**8)
+    return f"{whole:0{digits}d}{rest // 10**8:02d}.{rest % 10**8:08d}"
+
+
+def _checksum(body: str) -> int:
+    return functools.reduce(operator.xor, body.encode("ascii"), 0)

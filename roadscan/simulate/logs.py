@@ -1,0 +1,165 @@
+"""The logs of one pass: what the rig's sensors write, in which format, and what the survey file has to state of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
+from roadscan.simulate import encoder, gnss, imu, trajectory
+from roadscan.simulate.clock import SensorClock
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.lidar import write_lidar
+from roadscan.simulate.profiler import Head, heads, write_profiles
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+
+Content = Literal["poses", "readings", "returns", "other"]
+
+
+@dataclass(frozen=True)
+class SimulatedLog:
+    """One log of a pass."""
+
+    name: str
+    """File or folder, relative to the run's folder."""
+    write: Callable[[], Iterator[int]]
+    """Writes it, a piece a step; yields the records of each."""
+    content: Content = "other"
+    """What its records are, for the summary."""
+    format: str = ""
+    """Format that the survey file states; empty: the log is not listed there."""
+    sensor: str | None = None
+    """Sensor of the rig."""
+    clock: str | None = None
+    """TOML of its clock."""
+    crs: str | None = None
+    """CRS of its positions."""
+    options: str | None = None
+    """TOML of the format's settings."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One pass with the folders that its logs and hits go to."""
+
+    scene: Scene
+    surface: Surface
+    drive: Drive
+    raw: Path
+    """Folder of the logs."""
+    true_trajectory: Path
+    """File of the true poses."""
+    hits: Callable[[str], Path | None]
+    """File for a sensor's hits; None where they are not wanted."""
+
+    def clock(self, sensor: str, usual: TimeSystem) -> SensorClock:
+        """Clock of a sensor (a table of the scene) whose log usually is stamped in `usual`."""
+        return SensorClock.of(self.scene, getattr(self.scene, sensor).clock, usual)
+
+    def logs(self) -> list[SimulatedLog]:
+        """All logs of the pass, the longest work first.
+
+        Raises
+        ------
+        ConfigError
+            where a sensor needs the Earth, and the scene lies in a local frame.
+        """
+        makers = (self._profilers, self._lidar, self._trajectory, self._imus, self._gnss, self._encoder)
+        return [log for make in makers for log in make()]
+
+    def _trajectory(self) -> Iterator[SimulatedLog]:
+        scene, drive = self.scene, self.drive
+        name = trajectory.file_name(drive)
+
+        def write() -> Iterator[int]:
+            return trajectory.write_trajectory(scene, drive, self.raw / name, self.true_trajectory)
+
+        if drive.earth.is_local:
+            clock, options = '{ system = "gps", unit = "ns" }', '{ axes = "frd" }'
+            yield SimulatedLog(name, write, "poses", "pose_quaternions", None, clock, "local", options)
+            return
+        clock = f'{{ system = "gps_week_seconds", date = {utc_from_gps_ns(drive.start_gps_ns):%Y-%m-%d} }}'
+        companion = "trajectory.smrmsg"
+        accuracy = f'{{ accuracy = "{companion}" }}' if scene.trajectory.accuracy else None
+        yield SimulatedLog(name, write, "poses", "sbet", None, clock, drive.earth.geographic_crs, accuracy)
+        if scene.trajectory.accuracy:
+            yield SimulatedLog(companion, lambda: trajectory.write_accuracy(scene, drive, self.raw / companion))
+
+    def _profilers(self) -> Iterator[SimulatedLog]:
+        clock = self.clock("profilers", TimeSystem.GPS)
+        plain = clock.error.is_right and clock.system is TimeSystem.GPS
+        for head in heads(self.scene.profilers):
+            name = f"{head.name}.parquet"
+
+            def write(head: Head = head, name: str = name) -> Iterator[int]:
+                return write_profiles(
+                    self.scene, self.surface, self.drive, head, clock, self.raw / name, self.hits(head.name)
+                )
+
+            stated = None if plain else clock.toml("ns", self.drive.start_gps_ns)
+            yield SimulatedLog(name, write, "readings", "scans", head.name, stated)
+
+    def _lidar(self) -> Iterator[SimulatedLog]:
+        if not self.scene.lidar.on:
+            return
+        self._need_earth("lidar", "its packets carry GNSS sentences")
+        name = "lidar.pcap"
+
+        def write() -> Iterator[int]:
+            return write_lidar(self.scene, self.surface, self.drive, self.raw / name, self.hits("lidar"))
+
+        clock = self.clock("lidar", TimeSystem.UTC_HOUR).toml(None, self.drive.start_gps_ns)
+        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", clock)
+
+    def _imus(self) -> Iterator[SimulatedLog]:
+        scene = self.scene
+        on_rig = [(imu.imu_of(scene), self.clock("imu", TimeSystem.GPS))] if scene.imu.on else []
+        on_rig += [(one, self.clock("profilers", TimeSystem.GPS)) for one in imu.head_imus(scene)]
+        for one, clock in on_rig:
+            name = f"{one.name}.csv"
+
+            def write(one: imu.ImuOnRig = one, clock: SensorClock = clock, name: str = name) -> Iterator[int]:
+                return imu.write_imu(scene, self.drive, one, clock, self.raw / name)
+
+            stated = clock.toml("ns", self.drive.start_gps_ns)
+            yield SimulatedLog(name, write, "other", "imu_csv", one.name, stated)
+
+    def _gnss(self) -> Iterator[SimulatedLog]:
+        if not self.scene.gnss.on:
+            return
+        self._need_earth("gnss", "its solutions are latitude and longitude")
+        crs = self.drive.earth.geographic_crs
+
+        def pos() -> Iterator[int]:
+            return gnss.write_pos(gnss.solve(self.scene, self.drive), self.raw / "gnss.pos")
+
+        def nmea() -> Iterator[int]:
+            return gnss.write_nmea(gnss.solve(self.scene, self.drive), self.raw / "gnss.nmea")
+
+        yield SimulatedLog("gnss.pos", pos, "other", "rtklib_pos", "gnss", None, crs)
+        yield SimulatedLog("gnss.nmea", nmea)  # the same solutions again: listed, they would count twice
+
+    def _encoder(self) -> Iterator[SimulatedLog]:
+        if not self.scene.encoder.on:
+            return
+        clock = self.clock("encoder", TimeSystem.GPS)
+
+        def write() -> Iterator[int]:
+            return encoder.write_encoder(self.scene, self.drive, clock, self.raw / "encoder.csv")
+
+        stated = clock.toml("ns", self.drive.start_gps_ns)
+        yield SimulatedLog(
+            "encoder.csv", write, "other", "encoder_csv", "encoder", stated, None, '{ record = "total" }'
+        )
+
+    def _need_earth(self, sensor: str, why: str) -> None:
+        if self.drive.earth.is_local:
+            raise ConfigError(
+                f'map.crs is "local" and {sensor}.on is true, but {why}',
+                expected="a projected CRS",
+                change=f"name one, or switch the sensor off ({sensor}.on = false)",
+            )

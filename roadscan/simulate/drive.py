@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import gps_ns_from_utc
+from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import NS_PER_S, gps_ns_from_utc
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.kernels.road import NODE_STEP_M
+from roadscan.simulate.motion import MARGIN_S, RUN_UP_S, Motion
 from roadscan.simulate.noise import stream
-from roadscan.simulate.scene import Mount, Scene
+from roadscan.simulate.path import Stand, path_of
+from roadscan.simulate.scene import Mount, Scene, Vehicle
 from roadscan.simulate.surface import Surface
+
+__all__ = ["RUN_UP_S", "Drive", "Poses", "drives_of"]
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-RUN_UP_S = 0.6
-"""Driven before the first and after the last profile (s); the trajectory covers it."""
-_SPEED_WAVE_M = 120.0
-_WANDER_WAVES_M = (83.0, 31.0)
-_AXLE_M = 0.5
-"""Half the distance between the points of contact that tilt the body (m)."""
 _HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ = 1.3, 0.9, 1.6, 0.35
-_YAW_SHARE = 0.3
+_PITCH_SHARE: Final = 0.7
+_YAW_SHARE: Final = 0.3
+_CALM_M_PER_S: Final = 1.0
+"""Speed at which the road shakes the springs half as much as it does at high speed."""
 
 
 @dataclass(frozen=True)
@@ -40,125 +42,158 @@ class Poses:
     """n rotations"""
 
     def sensor(self, mount: Mount, body_from_axes: Float64) -> tuple[Float64, Float64]:
-        """ECEF origin (n, 3) and ecef_from_sensor (n, 3, 3) of a sensor.
+        """ECEF origin (n, 3) and ecef_from_sensor (n, 3, 3) of a sensor, with its true mounting.
 
         body_from_sensor = R(roll, pitch, heading) · body_from_axes, Z-Y-X.
         """
-        boresight = Rotation.from_euler("ZYX", [mount.heading_deg, mount.pitch_deg, mount.roll_deg], degrees=True)
-        rotation = (self.ecef_from_body * boresight).as_matrix() @ body_from_axes
+        angles = [mount.heading_deg, mount.pitch_deg, mount.roll_deg]
+        body_from_sensor = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ body_from_axes
+        rotation = self.ecef_from_body.as_matrix() @ body_from_sensor
         return self.position_ecef_m + self.ecef_from_body.apply(np.array(mount.lever_arm_body_m)), rotation
 
 
 class Drive:
     """One pass: path length driven as a function of time, and the pose there.
 
-    The mean path follows a lane with the driver's wander; the body stands on a smooth version of the road (long
-    waves, crown and grade) and moves on its springs. Time is seconds from the first profile; *driven* is the path's
-    length in the map from there (m).
+    The path follows a lane with the driver's wander, or a route; the body stands on a smooth version of the road (long
+    waves, crown and grade) and moves on its springs, which add to roll, pitch and heading of the road under it. Time
+    is seconds from the first profile; *driven* is the path's length in the map from there (m).
+
+    Raises
+    ------
+    ConfigError
+        where the path leaves the road, or stops and changes of speed do not fit the pass.
     """
 
     def __init__(self, scene: Scene, number: int, earth: Earth, ride: Surface) -> None:
         one = scene.passes[number]
+        phases = stream(scene.seed, number, "drive").uniform(0, 2 * math.pi, 8)
+        path = path_of(scene, number, ride, phases[1:3])
         self.number = number
         self.earth = earth
-        self.start_gps_ns = gps_ns_from_utc(scene.start) + round(number * scene.pause_s * 1e9)
+        self.start_gps_ns = gps_ns_from_utc(scene.start) + round(number * scene.pause_s * NS_PER_S)
         """Epoch of the first profile."""
-        self._vehicle = scene.vehicle
-        self._ride = ride
-        self._sign = 1.0 if one.direction == "forward" else -1.0
-        self._lane_m = scene.road.lane_offset_m(one.lane)
-        self._phases = stream(scene.seed, number, "drive").uniform(0, 2 * math.pi, 8)
-        self._station, self.length_m = self._path(scene)
-        self.duration_s = float(self._time_s(np.array(self.length_m)))
+        self.length_m = path.length_m
+        """Driven from the first to the last profile (m)."""
+        self._motion = Motion(one, scene.vehicle, number, path.length_m, float(phases[0]))
+        self._springs = _Springs(scene.vehicle, phases[3:7])
+        self._imu_height_m = scene.vehicle.imu_height_m
+        self._sign = -1.0 if one.route is not None and one.route.reverse else 1.0
+        first, last = self._motion.recorded_span_s
+        self._known_s = first - MARGIN_S, last + MARGIN_S
+        begin, end = self._motion.driven_m(np.array(self._known_s))
+        self._stand = Stand(path, earth, float(begin), float(end), self._sign)
+        self._ecef_from_level = Rotation.from_matrix(self._stand.ecef_from_level)
+
+    @property
+    def duration_s(self) -> float:
         """From the first to the last profile (s)."""
+        return self._motion.duration_s
+
+    @property
+    def recorded_span_gps_ns(self) -> tuple[int, int]:
+        """First and last epoch that trajectory, IMU, GNSS and encoder record: with run-up, run-out and standstill."""
+        first, last = self._motion.recorded_span_s
+        return self.start_gps_ns + round(first * NS_PER_S), self.start_gps_ns + round(last * NS_PER_S)
 
     def epoch_gps_ns(self, driven_m: Float64) -> Int64:
-        """Epochs at which a path length was driven (n,)."""
-        return self.start_gps_ns + np.rint(self._time_s(driven_m) * 1e9).astype(np.int64)
+        """Epochs at which a path length is first driven (n,)."""
+        return self.start_gps_ns + np.rint(self._motion.time_s(driven_m) * NS_PER_S).astype(np.int64)
 
     def driven_m(self, epoch_gps_ns: Int64) -> Float64:
-        """Path length driven at epochs (n,): the inverse of :meth:`epoch_gps_ns`, by Newton's method."""
-        time_s = self._seconds(epoch_gps_ns)
-        driven = time_s * self._vehicle.speed_m_per_s
-        for _ in range(5):
-            driven = driven - (self._time_s(driven) - time_s) / self._slowness(driven)
-        return driven
+        """Path length driven at epochs (n,): the inverse of :meth:`epoch_gps_ns` where the vehicle moves."""
+        return self._motion.driven_m(self._seconds(epoch_gps_ns))
 
     def station_m(self, epoch_gps_ns: Int64) -> Float64:
         """Station of the IMU reference point (n,)."""
-        found: Float64 = self._station(self.driven_m(epoch_gps_ns))
-        return found
+        return self._stand.station_m(self.driven_m(epoch_gps_ns))
 
     def poses(self, epoch_gps_ns: Int64) -> Poses:
-        """True poses at epochs (n,)."""
+        """True poses at epochs (n,), up to a quarter of a second outside the recorded span.
+
+        Raises ValueError further outside: what the vehicle does there is not known.
+        """
         time_s = self._seconds(epoch_gps_ns)
-        station = self.station_m(epoch_gps_ns)
-        contact, ahead, aside = (self._contact(station, *shift) for shift in ((0, 0), (_AXLE_M, 0), (0, _AXLE_M)))
-        behind, other = (self._contact(station, *shift) for shift in ((-_AXLE_M, 0), (0, -_AXLE_M)))
-        forward = _unit(ahead - behind) * self._sign
-        down = _unit(np.cross(forward, (aside - other) * self._sign))
-        road = np.stack([forward, np.cross(down, forward), down], axis=-1)
-        heave, sway = self._springs(time_s)
-        ecef_from_body = Rotation.from_matrix(road) * sway
-        height = self._vehicle.imu_height_m + heave
-        return Poses(contact - height[:, None] * ecef_from_body.apply([0.0, 0.0, 1.0]), ecef_from_body)
+        if time_s.size and (time_s.min() < self._known_s[0] or time_s.max() > self._known_s[1]):
+            raise ValueError(
+                f"poses of pass {self.number + 1} are known from {self._known_s[0]:.3f} s to {self._known_s[1]:.3f} s "
+                f"after its first profile, not from {time_s.min():.3f} s to {time_s.max():.3f} s"
+            )
+        driven, speed, acceleration = self._motion.state(time_s)
+        north, east, down, heading, pitch, roll, bend = self._stand.at(driven)
+        along, aside = self._sign * acceleration, self._sign * speed**2 * bend
+        heave, yaw, nod, sway = self._springs.at(time_s, speed, along, aside)
+        quaternion, body_down = _attitude(heading + yaw, pitch + nod, roll + sway)
+        in_level = np.stack([north, east, down]) - (self._imu_height_m + heave) * body_down
+        position = self._stand.origin_ecef_m + in_level.T @ self._stand.ecef_from_level.T
+        return Poses(position, Rotation.from_quat((_times(self._ecef_from_level) @ quaternion).T))
 
     def _seconds(self, epoch_gps_ns: Int64) -> Float64:
         """Seconds since the first profile (n,)."""
-        seconds: Float64 = (epoch_gps_ns - self.start_gps_ns).astype(np.float64) * 1e-9
+        seconds: Float64 = (epoch_gps_ns - self.start_gps_ns).astype(np.float64) / NS_PER_S
         return seconds
 
-    def _time_s(self, driven_m: Float64) -> Float64:
-        k = 2 * math.pi / _SPEED_WAVE_M
-        bow = self._vehicle.speed_variation * (np.sin(k * driven_m + self._phases[0]) - math.sin(self._phases[0])) / k
-        out: Float64 = (driven_m + bow) / self._vehicle.speed_m_per_s
-        return out
 
-    def _slowness(self, driven_m: Float64) -> Float64:
-        k = 2 * math.pi / _SPEED_WAVE_M
-        bow = self._vehicle.speed_variation * np.cos(k * driven_m + self._phases[0])
-        out: Float64 = (1.0 + bow) / self._vehicle.speed_m_per_s
-        return out
+def drives_of(scene: Scene, earth: Earth, ride: Surface) -> list[Drive]:
+    """All passes of a scene.
 
-    def _offset_m(self, station_m: Float64) -> Float64:
-        """Offset of the path: the lane's middle and the driver's wander."""
-        long, short = (
-            np.sin(2 * math.pi * station_m / wave + phase)
-            for wave, phase in zip(_WANDER_WAVES_M, self._phases[1:3], strict=True)
+    Raises
+    ------
+    ConfigError
+        where a path leaves the road, stops do not fit, or a pass starts before the one before it has ended.
+    """
+    drives = [Drive(scene, number, earth, ride) for number in range(len(scene.passes))]
+    longest = 0.0
+    for one, following in itertools.pairwise(drives):
+        overlap_s = (one.recorded_span_gps_ns[1] - following.recorded_span_gps_ns[0]) / NS_PER_S + 2 * MARGIN_S
+        longest = max(longest, overlap_s)
+    if longest > 0.0:
+        raise ConfigError(
+            f"passes overlap in time: with run-up, run-out, stops and standstill one takes {longest:.1f} s longer "
+            f"than pause_s leaves ({scene.pause_s:g} s from start to start)",
+            change=f"give pause_s {math.ceil(scene.pause_s + longest)} or more",
         )
-        offset: Float64 = self._lane_m + self._vehicle.wander_m * (0.8 * long + 0.2 * short)
-        return offset
+    return drives
 
-    def _path(self, scene: Scene) -> tuple[CubicSpline, float]:
-        """Station as a function of the path length driven, and the length of the whole pass."""
-        first = float(self._ride.arrays.nodes[0, 12])
-        station = first + NODE_STEP_M / 2 * np.arange(2 * (self._ride.arrays.nodes.shape[0] - 1) + 1)
-        fine = first + NODE_STEP_M / 8 * np.arange(4 * (station.size - 1) + 1, dtype=np.float64)
-        e, n, _ = self._ride.place(fine, self._offset_m(fine))
-        # Chords of 62 mm are shorter than their arcs by 0.02 µm at a radius of 30 m.
-        lengths = np.append(0.0, np.cumsum(np.hypot(np.diff(e), np.diff(n))))[::4]
-        ends = np.interp([0.0, scene.length_m], station, lengths)
-        driven = lengths - ends[0] if self._sign > 0 else (ends[1] - lengths)[::-1]
-        path = CubicSpline(driven, station if self._sign > 0 else station[::-1])
-        return path, float(ends[1] - ends[0])
 
-    def _contact(self, station_m: Float64, ahead_m: float, right_m: float) -> Float64:
-        """ECEF points (n, 3) of the smooth road at the path, shifted along and across it."""
-        station = station_m + ahead_m
-        offset = self._offset_m(station) + right_m
-        return self.earth.ecef_from_map(self._ride.points_at(station, offset))
+class _Springs:
+    """The body on its suspension: waves that fade when the vehicle slows down, and lean."""
 
-    def _springs(self, time_s: Float64) -> tuple[Float64, Rotation]:
-        """Heave (n,) upwards in metres and the body's turn on its springs."""
+    def __init__(self, vehicle: Vehicle, phases: Float64) -> None:
+        self._waves = list(zip((_HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ), phases, strict=True))
+        self._heave_m = vehicle.heave_m
+        self._sway_rad = math.radians(vehicle.sway_deg)
+        self._lean = math.radians(vehicle.lean_deg_per_m_per_s2)
+
+    def at(
+        self, time_s: Float64, speed: Float64, along: Float64, aside: Float64
+    ) -> tuple[Float64, Float64, Float64, Float64]:
+        """Heave (m, upwards), yaw, pitch and roll (rad), (n,) each.
+
+        speed : (m/s); along, aside : acceleration of the body forward and to its right (m/s²).
+        """
+        shaken = speed**2 / (speed**2 + _CALM_M_PER_S**2)
         heave, roll, pitch, yaw = (
-            np.sin(2 * math.pi * hertz * time_s + phase)
-            for hertz, phase in zip((_HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ), self._phases[3:7], strict=True)
+            shaken * np.sin(2 * math.pi * hertz * time_s + phase) for hertz, phase in self._waves
         )
-        sway = self._vehicle.sway_deg
-        turns = np.stack([_YAW_SHARE * sway * yaw, 0.7 * sway * pitch, sway * roll], axis=-1)
-        return self._vehicle.heave_m * heave, Rotation.from_euler("ZYX", turns, degrees=True)
+        sway = self._sway_rad
+        return (
+            self._heave_m * heave,
+            _YAW_SHARE * sway * yaw,
+            _PITCH_SHARE * sway * pitch + self._lean * along,
+            sway * roll - self._lean * aside,
+        )
 
 
-def _unit(vectors: Float64) -> Float64:
-    out: Float64 = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return out
+def _attitude(heading: Float64, pitch: Float64, roll: Float64) -> tuple[Float64, Float64]:
+    """Quaternions (4, n: x, y, z, w) of Z-Y-X angles, and the body's down axis (3, n)."""
+    sh, ch, sp, cp, sr, cr = (f(a / 2) for a in (heading, pitch, roll) for f in (np.sin, np.cos))
+    x, y = sr * cp * ch - cr * sp * sh, cr * sp * ch + sr * cp * sh
+    z, w = cr * cp * sh - sr * sp * ch, cr * cp * ch + sr * sp * sh
+    return np.stack([x, y, z, w]), np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _times(rotation: Rotation) -> Float64:
+    """Matrix (4, 4) that multiplies quaternions (x, y, z, w) by a rotation from the left."""
+    x, y, z, w = rotation.as_quat()
+    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])

@@ -208,6 +208,7 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
     path = survey.resolve(config.path)
     format_ = known.format(path, config.format)
     is_log = isinstance(config, LogConfig)
+    in_map = format_.needs_map or not is_log
     sensor = config.sensor if isinstance(config, LogConfig) else None
     clock = config.clock.clock() if isinstance(config, LogConfig) and config.clock else None
     needs_sensor = bool({"scans", "returns"} & set(format_.yields))
@@ -225,7 +226,7 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
         crs=config.crs,
         height=config.height,
         geoid=Geoid(config.geoid) if config.geoid else None,
-        map=survey.config.map.frame() if not is_log else None,
+        map=survey.config.map.frame() if in_map else None,
     )
     schemas = [
         [(c.name, c.type) for c in table_schema(t).columns] + [table_schema(t).partition_s] for t in format_.yields
@@ -233,7 +234,7 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
     shaping = [
         format_.name, format_.version, content, options.model_dump(mode="json"), clock,
         config.crs, config.height, grid_digest(config.geoid), run, sensor, schemas,
-        None if is_log else [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)],
+        [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)] if in_map else None,
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size)

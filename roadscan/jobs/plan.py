@@ -6,8 +6,8 @@ import datetime as dt
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
+from roadscan.jobs.centre_line import CentreLines
 from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES, survey_records
 from roadscan.jobs.readings import (
@@ -26,7 +26,7 @@ from roadscan.model.rig import Mounting
 from roadscan.model.survey import Survey
 from roadscan.points.place import HeightLimits
 from roadscan.tables.logs import DataFile, LogRecord
-from roadscan.tables.store import Store, file_digest
+from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
 
 _UNMOUNTED = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
@@ -43,6 +43,8 @@ class SurveyPlan:
     sources: tuple[tuple[ReadingSource, tuple[DataFile, ...]], ...]
     """Each sensor's readings in each run, with their data files."""
     passes: tuple[LanePass, ...]
+    centre_lines: CentreLines | None
+    """Layer that points are cut to."""
     tile_key: str
     """Hash of all that shapes any tile, beside its readings."""
 
@@ -60,11 +62,6 @@ class SurveyPlan:
         """What makes a run's tiles stale when its passes change: ids, and the spans that the survey file states."""
         stated = [(p.id, p.start, p.end) for p in self.survey.config.passes if p.run == run]
         return list(stated) or [p.pass_id for p in self.passes if p.run == run]
-
-    def centre_line(self) -> Path | None:
-        """Vector layer of the centre lines, where points are cut to their buffer."""
-        layer = self.survey.config.filters.centre_line
-        return None if layer is None else self.survey.resolve(layer)
 
     def slices(self) -> list[RawSlice]:
         """All data files, whole."""
@@ -100,15 +97,9 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
             "the survey has no readings", expected="at least one log of scans, returns or points with rows in it"
         )
     passes = tuple(_passes(survey, sources))
-    layer = survey.resolve(f.centre_line) if f.centre_line is not None else None
-    if layer is not None and not layer.exists():
-        raise ConfigError("the centre-line layer does not exist", change="check filters.centre_line", file=layer)
-    tile_key = key_of(
-        code_version(),
-        config.tiles.cell_m,
-        None if layer is None else [file_digest(layer), f.centre_line_buffer_m],
-    )
-    return SurveyPlan(survey, store, records, ground, sources, passes, tile_key)
+    centre_lines = CentreLines.of(survey)
+    tile_key = key_of(code_version(), config.tiles.cell_m, None if centre_lines is None else centre_lines.key())
+    return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key)
 
 
 def _sources(

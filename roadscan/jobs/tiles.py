@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.jobs.centre_line import CentreLines, load_buffer
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.footprints import Footprints
@@ -64,7 +65,7 @@ class BlockTask:
     readings: int
     """Readings expected."""
     passes: tuple[LanePass, ...]
-    centre_line: tuple[Path, float] | None
+    centre_lines: CentreLines | None
     products: tuple[WantedProduct, ...]
     context: ProductContext
 
@@ -120,8 +121,6 @@ def block_tasks(
     config = plan.survey.config
     readings = {tile: tiles[tile][1] for tile in chosen}
     blocks = cut_blocks(readings, edge_tiles or config.tiles.block_tiles, config.tiles.max_block_readings)
-    layer = plan.centre_line()
-    centre_line = None if layer is None else (layer, config.filters.centre_line_buffer_m)
     by_tile = _rows_by_tile(footprints, frozenset(chosen))
     return [
         BlockTask(
@@ -132,7 +131,7 @@ def block_tasks(
             slices=_slices_of(block, by_tile, footprints),
             readings=sum(readings[t] for t in block.tiles),
             passes=plan.passes,
-            centre_line=centre_line,
+            centre_lines=plan.centre_lines,
             products=tuple(products),
             context=context,
         )
@@ -200,9 +199,7 @@ def compute_block(task: BlockTask) -> BlockResult:
 def load_points(task: BlockTask) -> Iterator[tuple[TileId, TilePoints]]:
     """Points of every tile of the block and its halo that holds any: filtered, in canonical order, tile by tile."""
     box = task.block.box()
-    buffer = None
-    if task.centre_line is not None:
-        buffer = CentreLineBuffer.load(*task.centre_line, task.ground.map)
+    buffer = None if task.centre_lines is None else load_buffer(task.centre_lines, task.ground.map)
     parts = _Parts()
     placer = Placer(task.store, task.ground, task.slices)
     for one in task.slices:

@@ -60,9 +60,9 @@ class Sensor(Strict):
     body_from_sensor: tuple[tuple[float, float, float], ...] | None = None
     """The whole 3 × 3 rotation as rows, in place of `axes` and `boresight` (from a calibration sheet)."""
     range_min_m: float = Field(default=0.0, ge=0.0)
-    """Readings nearer than this are left out (own vehicle)."""
+    """Returns and readings of profiles nearer than this are left out (own vehicle); points of clouds have no range."""
     range_max_m: float = Field(default=float("inf"), gt=0.0)
-    """Readings farther than this are left out."""
+    """Returns and readings of profiles farther than this are left out."""
     metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
 

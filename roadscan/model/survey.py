@@ -185,7 +185,12 @@ class NavigationConfig(Strict):
 
 
 class FilterConfig(Strict):
-    """Which readings become points."""
+    """Which readings become points, beside the range limits of each sensor in the rig file.
+
+    Points of clouds (LAS, E57, PLY) were placed by another program: of these filters the absolute heights and the
+    centre lines hold for them; neither range limits nor heights relative to the vehicle do, since neither sensor nor
+    pose of such a point is known.
+    """
 
     height_min_m: float | None = None
     """Lowest height kept, above the map's zero (m)."""
@@ -196,9 +201,22 @@ class FilterConfig(Strict):
     above_body_max_m: float | None = None
     """Highest height kept, relative to the IMU reference point at the same instant (m)."""
     centre_line: Path | None = None
-    """Vector layer of road centre lines; only points within `centre_line_buffer_m` of one are kept."""
+    """Vector layer of road centre lines (shapefile, TIGER/Line zipped too, GeoPackage, GeoJSON), relative to the
+    survey file; only points near one of its lines are kept."""
+    centre_line_crs: str | None = None
+    """CRS of the layer, such as "EPSG:4269" or "local"; needed where the layer does not name its own."""
+    centre_line_width: str = "buffer"
+    """How far beside a line points are kept: "buffer", `centre_line_buffer_m` beside every line; "class", half the
+    width of the road's class (MTFCC of TIGER/Line) or of its lanes, and `centre_line_margin_m`; or the name of
+    the attribute with the road's width, of which half is kept, and the margin (a road without one goes by its lanes
+    or class)."""
     centre_line_buffer_m: float = Field(default=15.0, gt=0)
-    """Half width kept beside the centre line (m)."""
+    """Kept beside a line (m), on each side, for "buffer" and for roads whose width is not known."""
+    centre_line_margin_m: float = Field(default=8.0, ge=0)
+    """Kept beyond the edge of a road of known width (m): for roadside features, and for the error of the lines (the
+    Census Bureau aims at 7.6 m in 95 % of cases for TIGER/Line)."""
+    centre_line_options: dict[str, Any] = {}
+    """Settings of the layer (`roadscan formats road_lines`): its name, attributes, units, widths by class."""
 
 
 class TileConfig(Strict):

@@ -52,7 +52,7 @@ class LogSource:
     geoid: Geoid | None = None
     """Geoid that brings orthometric heights to the ellipsoid."""
     map: MapFrame | None = None
-    """The survey's map, for control points only."""
+    """The survey's map, for control points and for formats that need it (`LogFormat.needs_map`)."""
     trajectory_span_gps_ns: tuple[int, int] | None = None
     """Span of the run's trajectory, where it is already ingested."""
 
@@ -184,6 +184,8 @@ class LogFormat(ABC):
     """What the format says about its time system and what the survey file has to state."""
     options: ClassVar[type[Strict]] = NoOptions
     """Model of the format's settings; the docstrings of its fields are the manual."""
+    needs_map: ClassVar[bool] = False
+    """Its rows are in the survey's map, as those of control points are: `LogSource.map` is given."""
     provisional: ClassVar[tuple[Provisional, ...]] = ()
     """Readings that `roadscan inspect` tries first where statements are missing. Needed only where the usual
     clocks, frames and settings, which it then tries one after another, do not open the log."""

@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyogrio
-import pyproj
 import shapely
 
 from roadscan.model.crs import LOCAL_WORLD, crs_from_text
-from roadscan.model.errors import ConfigError, CrsError, FormatError, RoadscanError, nearest
+from roadscan.model.errors import ConfigError, CrsError, FormatError, nearest
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource
 from roadscan.sensors.columns import UNITS
 from roadscan.sensors.control import ControlFrame, ControlReader, RawControl, Role, need_role
 from roadscan.sensors.records import options_of
+from roadscan.sensors.vector_layer import (
+    LINE_KINDS,
+    attribute_values,
+    chosen_layer,
+    feature_batches,
+    flat_crs,
+    gdal_faults,
+    geopackage_kinds,
+    is_geopackage,
+    layer_names,
+    number_of,
+    word_of,
+)
 
 Float64 = npt.NDArray[np.float64]
-
-BATCH_FEATURES: Final = 4_096
-_SQLITE: Final = b"SQLite format 3\x00"
-_GEOPACKAGE_IDS: Final = (b"GPKG", b"GP10", b"GP11")
 
 
 class ControlVectorOptions(Strict):
@@ -69,14 +75,15 @@ class ControlVector(LogFormat):
     options = ControlVectorOptions
 
     def sniff(self, path: Path) -> bool:
-        """True for a GeoPackage, and for GeoJSON with point features."""
+        """True for a GeoPackage, unless it holds lines alone, and for GeoJSON with point features."""
         try:
             with path.open("rb") as stream:
                 head = stream.read(1 << 14)
         except OSError:
             return False
-        if head.startswith(_SQLITE):
-            return head[68:72] in _GEOPACKAGE_IDS
+        if is_geopackage(head):
+            kinds = geopackage_kinds(path)
+            return not kinds or bool(kinds - LINE_KINDS)
         features = re.search(rb'"type"\s*:\s*"FeatureCollection"', head)
         return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{") and features is not None and b'"Point"' in head
 
@@ -90,7 +97,7 @@ class ControlVector(LogFormat):
         plan = _plan(source)
         reader = ControlReader(plan.frame)
         first = 0
-        for batch in _batches(source.path, plan):
+        for batch in feature_batches(source.path, plan.layer):
             yield from reader.items(_raw(batch, plan, first))
             first += batch.num_rows
 
@@ -115,9 +122,9 @@ def _plan(source: LogSource) -> _Plan:
             f"height_unit '{options.height_unit}'", expected="one of: " + ", ".join(UNITS["length"]), file=source.path
         )
     frame = ControlFrame.of(source)
-    with _gdal(source.path):
-        layers = [str(layer[0]) for layer in pyogrio.list_layers(source.path)]
-        layer = _layer_of(layers, options.layer, source.path)
+    with gdal_faults(source.path):
+        layers = layer_names(source.path)
+        layer = chosen_layer(layers, options.layer, source.path)
         info: dict[str, Any] = pyogrio.read_info(source.path, layer=layer)
     _check_crs(info["crs"], frame, source.path)
     attributes = tuple(str(field) for field in info["fields"])
@@ -139,22 +146,6 @@ def _plan(source: LogSource) -> _Plan:
     )
 
 
-def _layer_of(layers: list[str], stated: str | None, file: Path) -> str:
-    if stated is not None and stated not in layers:
-        raise ConfigError(
-            f"there is no layer '{stated}'{nearest(stated, layers)}",
-            expected="one of: " + ", ".join(layers),
-            file=file,
-        )
-    if stated is None and len(layers) != 1:
-        raise ConfigError(
-            f"the file has {len(layers)} layers",
-            expected="options.layer, one of: " + ", ".join(layers),
-            file=file,
-        )
-    return stated or layers[0]
-
-
 def _check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
     """Refuse a layer whose own CRS is another than the stated one."""
     if found is None:
@@ -164,7 +155,7 @@ def _check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
     if frame.crs == LOCAL_WORLD:
         agree = horizontal.is_engineering
     else:
-        agree = _flat(horizontal).equals(_flat(crs_from_text(frame.crs)), ignore_axis_order=True)
+        agree = flat_crs(horizontal).equals(flat_crs(crs_from_text(frame.crs)), ignore_axis_order=True)
     if not agree:
         raise CrsError(
             f"the layer's CRS is {own.name}, the survey file states '{frame.crs}'",
@@ -174,38 +165,6 @@ def _check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
         )
 
 
-def _flat(crs: pyproj.CRS) -> pyproj.CRS:
-    return crs.to_2d() if crs.is_geographic or crs.is_projected else crs
-
-
-def _batches(path: Path, plan: _Plan) -> Iterator[pa.RecordBatch]:
-    with ExitStack() as stack:
-        with _gdal(path):
-            opened = pyogrio.open_arrow(path, layer=plan.layer, batch_size=BATCH_FEATURES, use_pyarrow=True)
-            reader = stack.enter_context(opened)[1]
-        while True:
-            with _gdal(path):
-                batch = next(reader, None)
-            if batch is None:
-                return
-            yield batch
-
-
-@contextmanager
-def _gdal(path: Path) -> Iterator[None]:
-    """GDAL's complaints about the file as a FormatError; its warnings are not ours."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            yield
-        except RoadscanError:
-            raise
-        except (RuntimeError, ValueError, OSError, pa.ArrowException) as error:
-            raise FormatError(
-                f"GDAL cannot read the file: {error}", expected="GeoJSON or GeoPackage points", file=path
-            ) from error
-
-
 def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
     size = batch.num_rows
     options = plan.options
@@ -213,12 +172,12 @@ def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
     def words(attribute: str, otherwise: str) -> list[str]:
         if attribute not in plan.attributes:
             return [otherwise] * size
-        return [_word(value) or otherwise for value in _values(batch.column(attribute))]
+        return [word_of(value) or otherwise for value in attribute_values(batch.column(attribute))]
 
     def number(attribute: str) -> Float64:
         if attribute not in plan.attributes:
             return np.full(size, np.nan)
-        return np.array([_number(v) for v in _values(batch.column(attribute))], dtype=np.float64)
+        return np.array([number_of(v) for v in attribute_values(batch.column(attribute))], dtype=np.float64)
 
     points = _points(batch, plan.geometry)
     height = points[2] if options.height is None else number(options.height)
@@ -240,26 +199,3 @@ def _points(batch: pa.RecordBatch, geometry: str) -> Float64:
     shapes = shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore")
     points = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.POINT, shapes, None)
     return np.stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])
-
-
-def _values(column: pa.Array) -> list[Any]:
-    """Values of an attribute; text as bytes, since GDAL does not check that it is UTF-8."""
-    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-        column = column.cast(pa.large_binary())
-    values: list[Any] = column.to_pylist()
-    return values
-
-
-def _word(value: Any) -> str:
-    """Text of an attribute, "" where it is missing; U+FFFD stands for bytes that are no text."""
-    if value is None:
-        return ""
-    return (value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)).strip()
-
-
-def _number(value: Any) -> float:
-    """Number of an attribute, NaN where it is missing or none."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return float("nan")

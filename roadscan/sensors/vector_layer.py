@@ -1,0 +1,136 @@
+"""Vector layers as GDAL reads them: what formats of points and of lines have in common."""
+
+from __future__ import annotations
+
+import sqlite3
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyogrio
+import pyproj
+
+from roadscan.model.errors import ConfigError, FormatError, RoadscanError, nearest
+
+BATCH_FEATURES: Final = 4_096
+LINE_KINDS: Final = frozenset({"LINESTRING", "MULTILINESTRING", "COMPOUNDCURVE", "MULTICURVE", "CURVE"})
+"""Geometry types of GeoPackage layers that hold lines."""
+
+_SQLITE: Final = b"SQLite format 3\x00"
+_GEOPACKAGE_IDS: Final = (b"GPKG", b"GP10", b"GP11")
+
+
+def is_geopackage(head: bytes) -> bool:
+    """True for the first bytes of a GeoPackage."""
+    return head.startswith(_SQLITE) and head[68:72] in _GEOPACKAGE_IDS
+
+
+def geopackage_kinds(path: Path) -> frozenset[str]:
+    """Geometry types of a GeoPackage's layers, in capitals; empty where its tables cannot be read. Never raises."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+            rows = base.execute("SELECT geometry_type_name FROM gpkg_geometry_columns LIMIT 1000").fetchall()
+    except (sqlite3.Error, OSError, ValueError, OverflowError):
+        return frozenset()
+    return frozenset(str(row[0]).upper() for row in rows)
+
+
+def gdal_name(path: Path) -> str:
+    """Name under which GDAL opens a file, a zipped one too."""
+    return f"/vsizip/{path}" if path.suffix.lower() == ".zip" else str(path)
+
+
+@contextmanager
+def gdal_faults(path: Path, expected: str = "GeoJSON or GeoPackage points") -> Iterator[None]:
+    """GDAL's complaints about the file as a FormatError; its warnings are not ours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        except RoadscanError:
+            raise
+        except UnboundLocalError as error:  # pyogrio (0.13) on a CRS that GDAL cannot export
+            raise FormatError("GDAL cannot understand the layer's CRS", expected="WKT", file=path) from error
+        except (RuntimeError, ValueError, OSError, pa.ArrowException) as error:
+            raise FormatError(f"GDAL cannot read the file: {error}", expected=expected, file=path) from error
+
+
+def layer_names(path: Path) -> list[str]:
+    """Names of a file's layers; to be asked inside :func:`gdal_faults`."""
+    return [str(layer[0]) for layer in pyogrio.list_layers(gdal_name(path))]
+
+
+def chosen_layer(layers: list[str], stated: str | None, file: Path) -> str:
+    """Name of the layer to read: the stated one, or the only one.
+
+    Raises
+    ------
+    ConfigError
+        if there is no such layer, or if there are several and none is stated.
+    """
+    if stated is not None and stated not in layers:
+        raise ConfigError(
+            f"there is no layer '{stated}'{nearest(stated, layers)}",
+            expected="one of: " + ", ".join(layers),
+            file=file,
+        )
+    if stated is None and len(layers) != 1:
+        raise ConfigError(
+            f"the file has {len(layers)} layers",
+            expected="options.layer, one of: " + ", ".join(layers),
+            file=file,
+        )
+    return stated or layers[0]
+
+
+def feature_batches(
+    path: Path, layer: str, expected: str = "GeoJSON or GeoPackage points", **asked: Any
+) -> Iterator[pa.RecordBatch]:
+    """Features of a layer with their geometry as WKB; `asked` goes to GDAL."""
+    with ExitStack() as stack:
+        with gdal_faults(path, expected):
+            opened = pyogrio.open_arrow(
+                gdal_name(path), layer=layer, batch_size=BATCH_FEATURES, use_pyarrow=True, **asked
+            )
+            reader = stack.enter_context(opened)[1]
+            names = reader.schema.names  # refuses names that are no text
+            if len(set(names)) < len(names):
+                raise FormatError("two attributes have the same name", expected=expected, file=path)
+        while True:
+            with gdal_faults(path, expected):
+                batch = next(reader, None)
+            if batch is None:
+                return
+            yield batch
+
+
+def flat_crs(crs: pyproj.CRS) -> pyproj.CRS:
+    """The horizontal part of a CRS."""
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    return horizontal.to_2d() if horizontal.is_geographic or horizontal.is_projected else horizontal
+
+
+def attribute_values(column: pa.Array) -> list[Any]:
+    """Values of an attribute; text as bytes, since GDAL does not check that it is UTF-8."""
+    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+        column = column.cast(pa.large_binary())
+    values: list[Any] = column.to_pylist()
+    return values
+
+
+def word_of(value: Any) -> str:
+    """Text of an attribute, "" where it is missing; U+FFFD stands for bytes that are no text."""
+    if value is None:
+        return ""
+    return (value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)).strip()
+
+
+def number_of(value: Any) -> float:
+    """Number of an attribute, NaN where it is missing or none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")

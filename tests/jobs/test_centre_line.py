@@ -1,0 +1,139 @@
+"""Points cut to a layer of centre lines, as the survey file states it; road lines as a table of the store."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import laspy
+import numpy as np
+import pytest
+import shapely
+
+from roadscan.jobs.centre_line import CentreLines, load_buffer
+from roadscan.jobs.compute import Inline
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.model.errors import ConfigError, CrsError
+from roadscan.model.survey import Survey
+from roadscan.tables.sql import query
+from roadscan.tables.store import Store
+
+NORTH = np.arange(-39.5, 60.0)
+"""Northings of the points, a metre apart; the road's centre line runs at 5 m."""
+
+
+def write_points(path: Path) -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = [0.001] * 3
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.full(NORTH.size, 5.0), NORTH, np.full(NORTH.size, 50.0)
+    las.gps_time = np.full(NORTH.size, 200_000_000.0)
+    las.write(path)
+
+
+def write_layer(path: Path, crs: str | None = "EPSG:32632", **columns: Any) -> None:
+    line = shapely.LineString([[-100, 5], [100, 5]])
+    frame = geopandas.GeoDataFrame({"LINEARID": ["7"]} | {k: [v] for k, v in columns.items()}, geometry=[line], crs=crs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        frame.to_file(path)
+
+
+def survey_of(folder: Path, **filters: Any) -> Survey:
+    logs = [
+        {"path": "points.las", "format": "las", "crs": "EPSG:32632"},
+        {"path": "roads.shp", "crs": "EPSG:32632"},
+    ]
+    values = {
+        "id": "cut",
+        "map": {"crs": "EPSG:32632"},
+        "tiles": {"cell_m": 0.5},
+        "runs": [{"id": "r", "logs": logs}],
+        "filters": {"centre_line": "roads.shp"} | filters,
+    }
+    return Survey.parse(values, folder=folder)
+
+
+def kept(survey: Survey) -> tuple[float, float]:
+    """Lowest and highest northing that stays."""
+    store = Store(survey.store_url, "cut")
+    run_stages(Run(survey, store, Inline()), STAGES)
+    north = np.concatenate([np.array(laspy.read(store.path(p)).y) for p in store.files("tiles/las")])
+    return float(north.min()), float(north.max())
+
+
+@pytest.mark.parametrize(
+    ("filters", "half_width_m"),
+    [
+        ({}, 15.0),
+        ({"centre_line_buffer_m": 20.0}, 20.0),
+        ({"centre_line_width": "class"}, 8.4 / 2 + 8.0),
+        ({"centre_line_width": "class", "centre_line_margin_m": 1.0}, 8.4 / 2 + 1.0),
+        ({"centre_line_width": "class", "centre_line_options": {"class_widths_m": {"S1400": 30.0}}}, 15.0 + 8.0),
+        ({"centre_line_width": "broad", "centre_line_options": {"width_unit": "ft"}}, 20 * 0.3048 / 2 + 8.0),
+        ({"centre_line_width": "blank"}, 8.4 / 2 + 8.0),
+        (
+            {
+                "centre_line_width": "blank",
+                "centre_line_buffer_m": 9.0,
+                "centre_line_options": {"class_column": "LINEARID"},
+            },
+            9.0,
+        ),
+    ],
+)
+def test_how_far_beside_a_line_points_are_kept(tmp_path: Path, filters: dict[str, Any], half_width_m: float) -> None:
+    write_points(tmp_path / "points.las")
+    write_layer(tmp_path / "roads.shp", MTFCC="S1400", broad=20.0, blank=float("nan"))
+    inside = NORTH[np.abs(NORTH - 5.0) <= half_width_m]
+    assert kept(survey_of(tmp_path, **filters)) == (inside.min(), inside.max())
+
+
+def test_attributes_belong_to_the_layers_fingerprint(tmp_path: Path) -> None:
+    write_points(tmp_path / "points.las")
+    survey = survey_of(tmp_path, centre_line_width="class")
+    write_layer(tmp_path / "roads.shp", MTFCC="S1400")
+    shape = (tmp_path / "roads.shp").read_bytes()
+    narrow = kept(survey)
+    write_layer(tmp_path / "roads.shp", MTFCC="S1200")
+    assert (tmp_path / "roads.shp").read_bytes() == shape
+    assert kept(survey)[1] > narrow[1]
+
+
+def test_road_lines_are_a_table(tmp_path: Path) -> None:
+    write_points(tmp_path / "points.las")
+    write_layer(tmp_path / "roads.shp", MTFCC="S1400", FULLNAME="Main St")
+    survey = survey_of(tmp_path)
+    kept(survey)
+    plan = plan_survey(survey, Store(survey.store_url, "cut"))
+    keys = [record.key for record in plan.records]
+    rows = query(plan.store, "SELECT * FROM road_lines", keys).to_pylist()
+    assert [(r["line_id"], r["name"], r["class"], r["width_m"]) for r in rows] == [("7", "Main St", "S1400", 8.4)]
+    assert (rows[0]["easting_m"], rows[0]["northing_m"]) == ([-100.0, 100.0], [5.0, 5.0])
+
+
+def test_what_the_survey_file_has_to_say(tmp_path: Path) -> None:
+    survey = survey_of(tmp_path)
+    with pytest.raises(ConfigError, match="layer does not exist"):
+        CentreLines.of(survey)
+    write_layer(tmp_path / "roads.shp", crs=None)
+
+    def load(**filters: Any) -> object:
+        changed = survey_of(tmp_path, **filters)
+        stated = CentreLines.of(changed)
+        assert stated is not None
+        return load_buffer(stated, changed.config.map.frame())
+
+    with pytest.raises(CrsError, match="neither the layer nor the survey file"):
+        load()
+    assert load(centre_line_crs="EPSG:32632")
+    with pytest.raises(ConfigError, match="no attribute with the road's class"):
+        load(centre_line_crs="EPSG:32632", centre_line_width="class")
+    with pytest.raises(ConfigError, match="no attribute 'breadth'"):
+        load(centre_line_crs="EPSG:32632", centre_line_width="breadth")
+    with pytest.raises(ConfigError, match="unknown key 'class_width_m'"):
+        load(centre_line_options={"class_width_m": {}})

@@ -84,7 +84,12 @@ def read_log_records(store: Store, keys: Iterable[str] | None = None) -> list[Lo
     """Records of all logs in the store, or of those named, sorted by run, sensor, start and key."""
     paths = store.files(_FOLDER, ".json") if keys is None else [f"{_FOLDER}/{k}.json" for k in keys]
     records = [_parse(store.read_bytes(p), p) for p in paths]
-    return sorted(records, key=lambda r: (r.run, r.sensor, min((r.span(t) or (0, 0))[0] for t in r.tables), r.key))
+    return sorted(records, key=lambda r: (r.run, r.sensor, _start(r), r.key))
+
+
+def _start(record: LogRecord) -> int:
+    """First epoch (GPS ns) of a log, 0 for one without rows or epochs."""
+    return min(((record.span(table) or (0, 0))[0] for table in record.tables), default=0)
 
 
 def has_log(store: Store, key: str) -> bool:

@@ -173,9 +173,8 @@ class _Springs:
         speed : (m/s); along, aside : acceleration of the body forward and to its right (m/s²).
         """
         shaken = speed**2 / (speed**2 + _CALM_M_PER_S**2)
-        heave, roll, pitch, yaw = (
-            shaken * np.sin(2 * math.pi * hertz * time_s + phase) for hertz, phase in self._waves
-        )
+        waves = (np.sin(2 * math.pi * hertz * time_s + phase) for hertz, phase in self._waves)
+        heave, roll, pitch, yaw = (shaken * wave for wave in waves)
         sway = self._sway_rad
         return (
             self._heave_m * heave,

@@ -5,6 +5,7 @@ Power spectral density of ISO 8608:2016: G(n) = G(n0) · (n / n0)^−w with n0 =
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Final
 
@@ -121,16 +122,23 @@ def accumulated_iri(height_m: Float64) -> Float64:
 
     The car starts at rest on the mean slope of the first 11 m.
     """
+    top, bottom = _golden_car()
+    slope = np.diff(height_m) / _IRI_STEP_M
+    first = (height_m[round(_IRI_START_M / _IRI_STEP_M)] - height_m[0]) / _IRI_START_M
+    # A constant slope is a state of rest, so it is taken out before and changes nothing.
+    motion = lfilter(top, bottom, slope - first)
+    out: Float64 = np.cumsum(np.abs(motion)) / np.arange(1, slope.size + 1) * 1000.0
+    return out
+
+
+@functools.cache
+def _golden_car() -> tuple[Float64, Float64]:
+    """Numerator and denominator of the filter from the profile's slope to the suspension's slope motion."""
     k1, k2, c, mu = _GOLDEN_CAR
     a = np.array([[0.0, 1.0, 0, 0], [-k2, -c, k2, c], [0, 0, 0, 1], [k2 / mu, c / mu, -(k1 + k2) / mu, -c / mu]])
     dt = _IRI_STEP_M / _IRI_SPEED_M_PER_S
     state = expm(a * dt)
     # The input is the profile's slope; the states are slopes too (derivatives along the road).
     force = np.linalg.solve(a, (state - np.eye(4)) @ np.array([0.0, 0.0, 0.0, k1 / mu]))
-    slope = np.diff(height_m) / _IRI_STEP_M
     top, bottom = ss2tf(state, force[:, None], state[[0]] - state[[2]], (force[0] - force[2])[None, None])
-    first = (height_m[round(_IRI_START_M / _IRI_STEP_M)] - height_m[0]) / _IRI_START_M
-    # A constant slope is a state of rest, so it is taken out before and changes nothing.
-    motion = lfilter(top[0], bottom, slope - first)
-    out: Float64 = np.cumsum(np.abs(motion)) / np.arange(1, slope.size + 1) * 1000.0
-    return out
+    return top[0], bottom

@@ -5,13 +5,13 @@ message                words
 =====================  =================================================================================================
 ``FLASER``, ``RLASER``  n, n ranges (m), pose of the scanner, pose of the robot (each x y θ)
 ``LASER3``, ``LASER4``  n, n ranges
-``RAWLASER1`` …        type, start angle, field, resolution (rad), maximum range, accuracy (m), remission mode,
-                       n, n ranges, k, k remissions
+``RAWLASER1`` …        configuration, n, n ranges, k, k remissions
 ``ROBOTLASER1`` …      the same, pose of the scanner, pose of the robot, velocities and safety distances (4 or 5)
 ``ODOM``               x y θ of the robot, velocities, acceleration
 all of them            behind that: IPC time stamp (s), host, time since the logger's start (s)
 =====================  =================================================================================================
 
+A configuration is seven words: type, start angle, field, resolution (rad), maximum range, accuracy (m), remission mode.
 Other known messages (``PARAM``, ``SYNC``, ``TRUEPOS`` …) and comments are passed over; a line that begins otherwise is
 listed in `rejects`, as is each damaged one. Records are lines, the first is 0. Files may be packed with bzip2, gzip or
 xz.
@@ -116,10 +116,7 @@ class CarmenOptions(Strict):
 
 
 class Carmen(LogFormat):
-    """Text logs of CARMEN: scans, and the poses that come with them.
-
-    See the module's description for messages, axes, poses and ranges.
-    """
+    """Text logs of CARMEN: scans, and the poses that come with them."""
 
     name: ClassVar[str] = "carmen"
     title: ClassVar[str] = "CARMEN log (.clf, .log): laser scans and odometry of a robot, a line a message"

@@ -16,15 +16,17 @@ its scan; where a host stamped telegrams as they arrived, `clock.offset_s` takes
 frame that roadscan gives it, z points along the middle reading, y towards the first reading, x out of the lid, and
 reading i lies at the angle field / 2 − i · resolution from z towards y. So a scanner that looks down at the road, lid
 forward, first reading to the right, has the axes of the body, ``axes = "frd"``; lid backward, the same with
-``boresight = { heading_deg = 180 }``. One that stands upright and looks forward has ::
-
-    body_from_sensor = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+``boresight = { heading_deg = 180 }``. One that stands upright and looks forward has
+``body_from_sensor = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]``.
 
 **Turns.** The mirror turns 75 times a second, and the laser fires once a degree. A scan at 1° is half a turn, 6.67 ms.
 One at 0.5° takes two turns and one at 0.25° four, each turn beginning one step later; at 100 km/h the vehicle drives
 0.37 m from one turn to the next. So every turn becomes a row of its own, with its own epoch, and 0 (no return) where
 the other turns measured. That the turns of a complete scan come in the order of their angles is an assumption; partial
 scans state their angle themselves. The mirror's own variation of speed is not modelled.
+
+The values' codes for "no range" become 0. Their flag bits (fields, dazzle, reflectors) and the scans' status bytes are
+not kept; scans whose status says error or implausible are listed in `rejects`.
 """
 
 from __future__ import annotations
@@ -125,11 +127,7 @@ class SickLmsOptions(Strict):
 
 
 class SickLms(LogFormat):
-    """The serial line of a SICK LMS 200, 211, 220, 221 or 291, byte by byte.
-
-    See the module's description for stamps, axes and turns. The flag bits of the values (fields, dazzle, reflectors)
-    are not kept.
-    """
+    """The serial line of a SICK LMS 200, 211, 220, 221 or 291, byte by byte."""
 
     name: ClassVar[str] = "sick_lms"
     title: ClassVar[str] = "SICK LMS 2xx telegrams: a byte log of the scanner's serial line"

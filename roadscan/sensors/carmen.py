@@ -1,15 +1,15 @@
 """CARMEN logs: laser scans and odometry of the robot toolkit CARMEN, one message a line of text.
 
-=====================  =================================================================================================
-message                words
-=====================  =================================================================================================
-``FLASER``, ``RLASER``  n, n ranges (m), pose of the scanner, pose of the robot (each x y θ)
-``LASER3``, ``LASER4``  n, n ranges
-``RAWLASER1`` …        configuration, n, n ranges, k, k remissions
-``ROBOTLASER1`` …      the same, pose of the scanner, pose of the robot, velocities and safety distances (4 or 5)
-``ODOM``               x y θ of the robot, velocities, acceleration
-all of them            behind that: IPC time stamp (s), host, time since the logger's start (s)
-=====================  =================================================================================================
+========================  ============================================================================================
+message                   words
+========================  ============================================================================================
+``FLASER``, ``RLASER``    n, n ranges (m), pose of the scanner, pose of the robot (each x y θ)
+``LASER3``, ``LASER4``    n, n ranges
+``RAWLASER1`` …           configuration, n, n ranges, k, k remissions
+``ROBOTLASER1`` …         the same, pose of the scanner, pose of the robot, velocities and safety distances (4 or 5)
+``ODOM``                  x y θ of the robot, velocities, acceleration
+all of them               behind that: IPC time stamp (s), host, time since the logger's start (s)
+========================  ============================================================================================
 
 A configuration is seven words: type, start angle, field, resolution (rad), maximum range, accuracy (m), remission mode.
 Other known messages (``PARAM``, ``SYNC``, ``TRUEPOS`` …) and comments are passed over; a line that begins otherwise is

@@ -339,7 +339,7 @@ def _columns(path: Path, words: str) -> FileKind:
         return FileKind(words, details)
     columns = len(layout.names)
     following = first_fields(path, layout, 5)
-    if any(len(name) > _LONGEST_NAME for name in layout.names) or not all(len(f) == columns for f in following):
+    if any(len(name) > _LONGEST_NAME for name in layout.names) or not following:
         return FileKind(words, details)  # prose with a comma in its first line
     if all(_is_number(name) for name in layout.names):
         return FileKind(f"text, {columns} columns of numbers without names", details)

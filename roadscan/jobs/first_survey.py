@@ -69,6 +69,11 @@ class FoundLog:
         return "control_points" in self.format.yields
 
     @property
+    def is_road_lines(self) -> bool:
+        """True for lines of roads."""
+        return "road_lines" in self.format.yields
+
+    @property
     def is_trajectory(self) -> bool:
         """True for poses."""
         return "trajectory" in self.format.yields
@@ -142,7 +147,7 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
     logs: list[FoundLog] = []
     for path in _candidates(found.folder):
         _sort_in(path, found, logs, progress)
-    found.runs = _runs([log for log in logs if not log.is_control and not log.is_reference], found.folder)
+    found.runs = _runs(logs, found.folder)
     for run in found.runs:
         _name_sensors(run)
     return found
@@ -208,11 +213,14 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
     inspection = inspect(path, quick=size > WHOLE_BYTES, progress=progress) if formats_of(path) else None
     if inspection is not None and inspection.readable:
         log = FoundLog(path, inspection)
-        logs.append(log)
         if log.is_control:
             found.control.append(log)
-        if log.is_reference:
+        elif log.is_road_lines:
+            found.lines.append(path)
+        elif log.is_reference:
             found.references.append(log)
+        else:
+            logs.append(log)
         return
     kind = kind_of(path)
     if kind.role in {"survey", "rig", "scene"}:
@@ -284,10 +292,16 @@ def _fit(log: FoundLog, seed: FoundLog, folder: Path) -> tuple[int, int, int, in
     overlap = overlaps(log.report, seed.report)
     if overlap is False:
         return -1, 0, 0, 0
-    shared = Path(os.path.commonpath([log.path.parent, seed.path.parent]))
+    home, there = _home(log, folder), _home(seed, folder)
+    shared = Path(os.path.commonpath([home, there]))
     words = set(_words(log.stem)) & set(_words(seed.stem))
-    depth = len(shared.relative_to(folder).parts) + (log.path.parent in {folder, seed.path.parent})
+    depth = len(shared.relative_to(folder).parts) + (home in {folder, there})
     return int(bool(overlap)), int(bool(overlap)), depth, len(words)
+
+
+def _home(log: FoundLog, folder: Path) -> Path:
+    """Folder that the log lies in; the folder looked through where it is the log itself."""
+    return folder if log.path == folder else log.path.parent
 
 
 def overlaps(one: LogReport, other: LogReport) -> bool | None:

@@ -153,7 +153,7 @@ def _map(found: FoundFolder) -> Iterator[str]:
         yield _question('crs = "????"')
         yield '# The map of the products: a projected CRS ("EPSG:25832"), or, for poses that are not tied to the Earth,'
         yield '# local = { name = "local" } in place of crs.'
-    yield '# height = "orthometric"  # with geoid = "…" and grids = "…"; ellipsoidal unless it is stated'
+    yield '# height = "orthometric"  # and geoid = "…", grids = "…"; ellipsoidal unless it is stated'
 
 
 def _utm_line(log: FoundLog, frame: str, *, is_known: bool) -> Iterator[str]:
@@ -206,7 +206,7 @@ def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
             yield from _remark(reason)
         before = need.reason
         if need.key == "crs":
-            yield '# height = "orthometric", geoid = "…"  # if its heights are not ellipsoidal'
+            yield '# height = "orthometric"  # and geoid = "…", if its heights are not ellipsoidal'
 
 
 def _hint(need: Need, log: FoundLog, run: FoundRun) -> str:
@@ -280,7 +280,7 @@ def _rig(found: FoundFolder) -> Iterator[str]:
     yield "# Lever arms run from the IMU reference point to the sensor's origin, in metres forward, right, down."
     yield ""
     yield 'name = ""'
-    for name, log in found.sensors.items():
+    for name, log in sorted(found.sensors.items()):
         yield from _sensor(name, log)
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import Geoid, HeightKind, MapFrame, crs_from_text
+from roadscan.model.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame, crs_from_text
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
 from roadscan.model.frames import BODY_FROM_AXES
 from roadscan.model.gpstime import (
@@ -51,7 +51,7 @@ SENSOR_KINDS: Final[dict[str, SensorKind]] = {
 """Kind of the sensor that fills a table; other tables come from no sensor of the rig."""
 
 LOOKING_MAP_CRS: Final = "EPSG:3395"
-"""Map that control points in degrees are shown through; they are turned back into degrees."""
+"""Map that points in degrees are shown through; they are turned back into degrees."""
 
 MOST_TRIALS: Final = 120
 _MOST_REJECTS: Final = 50
@@ -87,7 +87,7 @@ class Stated:
             crs=self.crs,
             height=self.height,
             geoid=Geoid(self.geoid) if self.geoid else None,
-            map=_map_for(self.crs) if "control_points" in log_format.yields else None,
+            map=_map_for(self.crs) if log_format.needs_map or "control_points" in log_format.yields else None,
         )
 
 
@@ -353,11 +353,11 @@ def _taste(items: Iterator[Item]) -> None:
 
 
 def _map_for(crs: str | None) -> MapFrame:
-    """A map for control points, whose reader brings them into one."""
-    if crs is None or crs == "local":
+    """A map for logs whose readers bring what they read into one."""
+    if crs == LOCAL_WORLD:
         return MapFrame(crs=None, local_name="looking")
-    known = crs_from_text(crs)
-    own = crs if known.is_projected and not known.is_compound else LOOKING_MAP_CRS
+    known = None if crs is None else crs_from_text(crs)
+    own = crs if known is not None and known.is_projected and not known.is_compound else LOOKING_MAP_CRS
     return MapFrame(crs=own, max_datum_error_m=_ANY_DATUM_ERROR_M)
 
 

@@ -1,0 +1,256 @@
+"""``roadscan init``: a first survey file from a folder of logs, and the way from there to the same tiles."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from roadscan.cli import app
+from roadscan.jobs.first_survey import FoundFolder, find_logs
+from roadscan.jobs.first_survey_text import FirstSurvey, write_first_survey
+from roadscan.model.errors import ConfigError
+from roadscan.model.strict import OPEN_QUESTION
+from roadscan.model.survey import Survey
+
+from .conftest import Simulated, outputs
+from .test_inspect import sbet, written
+
+
+def runs_of(found: FoundFolder) -> dict[str, list[str]]:
+    """Names of the logs by run."""
+    return {run.id: sorted(os.path.relpath(log.path, found.folder) for log in run.logs) for run in found.runs}
+
+
+def complete(file: Path, answers: dict[str, dict[str, str]]) -> None:
+    """Answer questions, and commented settings, with TOML values by key.
+
+    Answers stand under the path of the log that a block of lines begins with, or under its table's header.
+    """
+    place = ""
+    lines = []
+    for line in file.read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            place = line.strip("[]")
+        elif line.startswith("path = "):
+            place = tomllib.loads(line)["path"]
+        key = re.match(r"#\??\s*([\w.]+) = ", line)
+        answer = None if key is None else answers.get(place, {}).get(key[1])
+        lines.append(line if key is None or answer is None else f"{key[1]} = {answer}")
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def toml(value: Any) -> str:
+    """A value as TOML."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def answers_of(original: Survey, first: FirstSurvey) -> dict[str, dict[str, str]]:
+    """What the simulator's own survey and rig files say, for the questions of the first survey."""
+    values = tomllib.loads((original.folder / "SURVEY.toml").read_text())
+    said = {"map": {"crs": toml(values["map"]["crs"])}}
+    names = {str(log.path.relative_to(first.found.folder)): log.sensor for log in first.found.logs}
+    stated = [log for run in values["runs"] for log in run["logs"]]
+    for log in [*stated, *values["control"]]:
+        settings = {f"options.{name}": value for name, value in log.get("options", {}).items()} | log
+        said[f"logs/{log['path']}"] = {name: toml(value) for name, value in settings.items()}
+        if "sensor" in log:
+            sensor = original.rig.sensors[log["sensor"]]
+            keys = ("axes", "lever_arm_body_m", "boresight", "range_min_m", "range_max_m")
+            mounted = sensor.model_dump(include=set(keys))
+            said[f"sensors.{names[log['path']]}"] = {key: toml(mounted[key]) for key in keys}
+    return said
+
+
+@pytest.fixture
+def first(simulated: Simulated, tmp_path: Path) -> FirstSurvey:
+    """A first survey file from the raw logs and control points of the simulated survey."""
+    source = simulated.survey_file.parent
+    shutil.copytree(source / "raw", tmp_path / "logs" / "raw")
+    shutil.copy(source / "control.csv", tmp_path / "logs")
+    return write_first_survey(find_logs(tmp_path / "logs"), tmp_path / "SURVEY.toml")
+
+
+def test_a_simulated_survey_is_found_and_grouped(first: FirstSurvey, simulated: Simulated) -> None:
+    survey = Survey.load(simulated.survey_file)
+    stated = {
+        run.id: sorted(str(log.path) for log in run.logs if log.format in {"sbet", "scans", "velodyne_pcap"})
+        for run in survey.config.runs
+    }
+    found = runs_of(first.found)
+    assert {run: [log for log in logs if log in stated[run]] for run, logs in found.items()} == stated
+    assert set(survey.rig.sensors) <= set(first.found.sensors)
+    assert [log.path.name for log in first.found.control] == ["control.csv"]
+
+
+def test_the_file_names_the_next_thing_to_complete(first: FirstSurvey, simulated: Simulated) -> None:
+    """Question after question is named with its line; each goes away once it is answered."""
+    assert "crs" not in tomllib.loads(first.survey_file.read_text())["map"]
+    assert first.rig_file is not None
+    whole = answers_of(Survey.load(simulated.survey_file), first)
+    asked = 0
+    for file in (first.survey_file, first.rig_file):
+        questions = [x for x in file.read_text().splitlines() if x.startswith(OPEN_QUESTION)]
+        for number, line in enumerate(questions):
+            with pytest.raises(ConfigError) as caught:
+                Survey.load(first.survey_file)
+            told = str(caught.value)
+            lines = file.read_text().splitlines()
+            assert told.startswith(f"{file}: line {lines.index(line) + 1} is not completed")
+            assert f"({len(questions) - number} open in all): {line.removeprefix('#? ')};" in told
+            file.write_text(file.read_text().replace(line + "\n", line.replace("#?", "#!", 1) + "\n", 1))
+            asked += 1
+        file.write_text(file.read_text().replace("#! ", "#? "))
+        complete(file, whole)
+    assert asked == first.questions > 5
+    assert Survey.load(first.survey_file).config.runs
+
+
+def test_what_other_logs_say_is_hinted_and_not_filled_in(first: FirstSurvey) -> None:
+    text = first.survey_file.read_text()
+    assert '#? clock = { system = "gps_week_seconds", week = ???? }' in text
+    assert "week 2417 would make it overlap with" in text  # 2026-05-04 lies in GPS week 2417
+    assert '#? crs = "EPSG:32632"\n# WGS 84 / UTM zone 32N would hold trajectory.sbet' in text
+    assert "week = 2417" not in text
+
+
+def test_completing_it_gives_the_same_tiles(finished: Simulated, first: FirstSurvey) -> None:
+    """All questions answered with what the simulator's own files say: the same tiles, byte for byte."""
+    original = Survey.load(finished.survey_file)
+    assert first.rig_file is not None
+    for file in (first.survey_file, first.rig_file):
+        complete(file, answers_of(original, first))
+        assert OPEN_QUESTION + " " not in "\n".join(file.read_text().splitlines()[4:])
+    config = original.config
+    named = first.survey_file.read_text().replace('id = "logs"', f"id = {toml(config.id)}", 1)
+    first.survey_file.write_text(named.replace('title = ""', f"title = {toml(config.title)}", 1))
+    done = Simulated(first.survey_file)
+    done.run(passes=config.model_dump()["passes"])
+    expected = {path: data for path, data in outputs(finished.store()).items() if path.startswith("tiles/")}
+    made = {path: data for path, data in outputs(done.store()).items() if path.startswith("tiles/")}
+    assert len(expected) > 10
+    assert made.keys() == expected.keys()
+    assert [path for path in expected if made[path] != expected[path]] == []
+
+
+def test_nothing_is_overwritten(first: FirstSurvey) -> None:
+    before = first.survey_file.read_bytes()
+    with pytest.raises(ConfigError, match="never overwritten"):
+        write_first_survey(first.found, first.survey_file)
+    with pytest.raises(ConfigError, match=r"RIG\.toml: .*never overwritten"):
+        write_first_survey(first.found, first.survey_file.with_name("OTHER.toml"))
+    assert first.survey_file.read_bytes() == before
+
+
+def test_the_command_says_what_it_did(first: FirstSurvey, tmp_path: Path) -> None:
+    (tmp_path / "logs" / "notes.txt").write_text("rain from ten o'clock\n")
+    done = CliRunner().invoke(app, ["init", str(tmp_path / "logs"), "--out", str(tmp_path / "second" / "SURVEY.toml")])
+    assert done.exit_code == 0, done.exception
+    assert "not understood: notes.txt: text" in done.stdout
+    assert "lines to complete (they begin with #?)" in done.stdout
+    assert '# "../logs/notes.txt": text' in (tmp_path / "second" / "SURVEY.toml").read_text()
+    again = CliRunner().invoke(app, ["init", str(tmp_path / "logs"), "--out", str(tmp_path / "second" / "SURVEY.toml")])
+    assert again.exit_code != 0
+
+
+# --- grouping ------------------------------------------------------------------------------------------
+
+
+def test_logs_join_the_drive_whose_time_they_share(tmp_path: Path) -> None:
+    """Two drives in one folder, an hour apart: time decides, not names."""
+    written(tmp_path / "a.sbet", sbet(100_000 + np.arange(2_000) / 200))
+    written(tmp_path / "b.sbet", sbet(103_600 + np.arange(2_000) / 200))
+    sigma = np.column_stack([103_600 + np.arange(20) / 2, np.full((20, 9), 0.01)])
+    (tmp_path / "a_accuracy.smrmsg").write_bytes(sigma.astype("<f8").tobytes())
+    found = find_logs(tmp_path)
+    assert runs_of(found) == {"a": ["a.sbet"], "b": ["a_accuracy.smrmsg", "b.sbet"]}
+
+
+def test_logs_without_a_trajectory_are_grouped_by_folder(tmp_path: Path) -> None:
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder).mkdir()
+        sigma = np.column_stack([103_600 + np.arange(20) / 2, np.full((20, 9), 0.01)])
+        (tmp_path / folder / "sigma.smrmsg").write_bytes(sigma.astype("<f8").tobytes())
+    assert runs_of(find_logs(tmp_path)) == {"monday": ["monday/sigma.smrmsg"], "tuesday": ["tuesday/sigma.smrmsg"]}
+
+
+def test_stores_hidden_files_and_links_are_left_out(tmp_path: Path) -> None:
+    for folder in ("store/survey=x", ".hidden", "drive"):
+        (tmp_path / folder).mkdir(parents=True)
+        written(tmp_path / folder / "a.sbet", sbet(100_000 + np.arange(100) / 200))
+    (tmp_path / "link").symlink_to(tmp_path / "drive", target_is_directory=True)
+    assert runs_of(find_logs(tmp_path)) == {"drive": ["drive/a.sbet"]}
+
+
+def test_a_damaged_log_is_listed_with_its_reason(tmp_path: Path) -> None:
+    written(tmp_path / "a.sbet", sbet(100_000 + np.arange(100) / 200))
+    (tmp_path / "cut.las").write_bytes(b"LASF" + bytes(50))
+    found = find_logs(tmp_path)
+    ((path, words),) = found.unknown
+    assert path.name == "cut.las"
+    assert "cannot be read" in words
+    made = write_first_survey(found, tmp_path / "out" / "SURVEY.toml")
+    assert made.rig_file is None
+    assert "rig" not in tomllib.loads(made.survey_file.read_text())
+
+
+def test_a_log_whose_file_states_its_crs_fills_the_map_in(tmp_path: Path) -> None:
+    import laspy
+    import pyproj
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_crs(pyproj.CRS.from_epsg(25832))
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = np.full(3, 500_000.0), np.full(3, 5.4e6), np.full(3, 100.0)
+    cloud.gps_time = np.array([4.6e8, 4.6e8 + 1, 4.6e8 + 2])
+    cloud.write(tmp_path / "street.las")
+    made = write_first_survey(find_logs(tmp_path), tmp_path / "out" / "SURVEY.toml")
+    survey = Survey.load(made.survey_file)
+    assert made.questions == 0
+    assert survey.config.map.crs == "EPSG:25832"
+    assert [log.format for log in survey.config.runs[0].logs] == ["las"]
+
+
+def test_odd_names_stay_valid(tmp_path: Path) -> None:
+    folder = tmp_path / 'Straße "1" \\ ü'
+    folder.mkdir()
+    written(folder / "fähre # 1.sbet", sbet(100_000 + np.arange(100) / 200))
+    made = write_first_survey(find_logs(folder), tmp_path / "SURVEY.toml")
+    values = tomllib.loads(made.survey_file.read_text(encoding="utf-8"))
+    path = values["runs"][0]["logs"][0]["path"]
+    assert (tmp_path / path).is_file()
+    answers = {"map": {"crs": '"EPSG:32632"'}, path: {"clock": '{ system = "gps" }', "crs": '"EPSG:4979"'}}
+    complete(made.survey_file, answers)
+    assert Survey.load(made.survey_file).config.runs[0].id
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no log that roadscan can read"):
+        write_first_survey(find_logs(tmp_path), tmp_path / "SURVEY.toml")
+    with pytest.raises(ConfigError, match="no such folder"):
+        find_logs(tmp_path / "none")
+
+
+def test_the_folder_of_recordings_is_sorted(recordings: Path, tmp_path: Path) -> None:
+    """Passes of the same streets are runs of their own; what belongs to one drive stays together."""
+    found = find_logs(recordings / "two_pass")
+    assert {log.format.name for log in found.logs} == {"pospac"}
+    assert len(found.runs) == len(found.logs) == 4
+    assert [path.name for path, _ in found.unknown] == ["T_radar_lidar.txt"]
+    av2 = find_logs(recordings / "av2_drive")
+    assert [sorted(log.format.name for log in run.logs) for run in av2.runs] == [["argoverse", "pose_quaternions"]]
+    assert next(log.path for log in av2.logs if log.format.name == "argoverse") == av2.folder
+    made = write_first_survey(av2, tmp_path / "SURVEY.toml")
+    assert tomllib.loads(made.survey_file.read_text())["runs"]

@@ -59,6 +59,17 @@ def test_units_are_read_from_the_names(tmp_path: Path) -> None:
     assert b.table["sigma_east_m"].null_count == 3
 
 
+def test_angle_sigmas_become_degrees(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", [line(0) + ",0.05,3,0.001"], f"{NAMES},sigma_roll_deg,sigma_pitch_arcmin,sd_yaw")
+    options = {"columns": {"sigma_heading": {"name": "sd_yaw", "unit": "rad"}}}
+    log = read_log("trajectory_csv", path, options, **STATED)
+    row = log.table.to_pylist()[0]
+    assert [row[f"sigma_{a}_deg"] for a in ("roll", "pitch", "heading")] == pytest.approx(
+        [0.05, 0.05, math.degrees(0.001)]
+    )
+    assert row["sigma_north_m"] is None
+
+
 def test_attitude_of_a_local_frame(tmp_path: Path) -> None:
     names = "time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg"
     log = read_log(

@@ -305,8 +305,7 @@ def test_the_body_stands_square_on_the_road(number):
     body = poses.ecef_from_body.as_matrix()
     for axis, expected in ((0, forward), (2, down)):
         unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
-        away = np.linalg.norm(np.cross(body[:, :, axis], unit), axis=1)
-        assert away.max() < 5e-5
+        assert np.linalg.norm(body[:, :, axis] - unit, axis=1).max() < 5e-5
     np.testing.assert_allclose(poses.position_ecef_m + 0.95 * body[:, :, 2], ecef(0.0, 0.0), atol=2e-6)
 
 
@@ -346,6 +345,17 @@ def test_the_body_leans_outwards_in_turns_and_dives_when_it_brakes(reverse):
     standing = np.abs(driven - 20.0) < 1e-9
     assert np.abs(pitch[standing]).max() < 0.01
     assert np.abs(roll[driven < 30.0]).max() < 1e-3
+
+
+def test_nose_follows_the_acceleration_of_the_path():
+    scene = yard([{"length_m": 60.0}], speed=10.0, vehicle={"lean_deg_per_m_per_s2": 0.5, "speed_variation": 0.3})
+    drive, upright = (drive_of(scene.changed(vehicle={"lean_deg_per_m_per_s2": k})) for k in (0.5, 0.0))
+    epochs = over(drive)
+    driven = drive.driven_m(epochs)
+    acceleration = np.gradient(np.gradient(driven, 0.005), 0.005)
+    pitch = angles(drive, epochs)[:, 1] - angles(upright, epochs)[:, 1]
+    np.testing.assert_allclose(pitch[3:-3], 0.5 * acceleration[3:-3], atol=1e-3)
+    assert np.ptp(pitch) > 0.2
 
 
 def _gap_at_200_hz(drive: Drive) -> tuple[float, float]:

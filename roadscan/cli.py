@@ -166,6 +166,64 @@ def sql(
         typer.echo(f"… {result.num_rows:,} rows in all (--csv prints them)")
 
 
+@app.command()
+def export(
+    survey_file: SurveyFile,
+    format_: Annotated[str, typer.Option("--format", help="psi (a run's profiles) or opencrg (a pass's heights).")],
+    run_id: Annotated[str, typer.Option("--run", help="Run.")],
+    sensor: Annotated[str, typer.Option(help="Sensor of the rig.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to; new or empty.")],
+    length: Annotated[float, typer.Option(help="psi: road a file (m).")] = 5.0,
+    pass_id: Annotated[int | None, typer.Option("--pass", help="opencrg: pass, where the run has several.")] = None,
+    u_step: Annotated[float, typer.Option(help="opencrg: distance from row to row (m).")] = 0.05,
+    v_step: Annotated[float, typer.Option(help="opencrg: distance from column to column (m).")] = 0.05,
+    left: Annotated[float, typer.Option(help="opencrg: reach to the left of the driven path (m).")] = 2.0,
+    right: Annotated[float, typer.Option(help="opencrg: reach to the right of the driven path (m).")] = 2.0,
+    smoothing: Annotated[float, typer.Option(help="opencrg: length over which the path is smoothed (m).")] = 10.0,
+    hole: Annotated[float, typer.Option(help="opencrg: longest hole closed by straight lines (m).")] = 0.25,
+    encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI",
+) -> None:
+    """Ingested readings as files of other programs: PSI containers or an OpenCRG grid."""
+    from roadscan.jobs.export_opencrg import CrgSettings, export_opencrg
+    from roadscan.jobs.export_psi import PsiSettings, export_psi
+    from roadscan.model.errors import ConfigError
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    store = Store(loaded.store_url, loaded.config.id)
+    if format_ == "psi":
+        written = export_psi(loaded, store, run_id, sensor, out, PsiSettings(length))
+    elif format_ == "opencrg":
+        settings = CrgSettings(pass_id, u_step, v_step, left, right, smoothing, hole, encoding)
+        written = export_opencrg(loaded, store, run_id, sensor, out, settings)
+    else:
+        raise ConfigError(f"--format {format_}", expected="psi or opencrg")
+    for note in written.notes:
+        typer.echo(note)
+    typer.echo(f"{len(written.files):,} files in {out}")
+
+
+@app.command()
+def classes(
+    survey_file: SurveyFile,
+    run: Annotated[str, typer.Option(help="Run of the survey file.")],
+    sensor: Annotated[str, typer.Option(help="Sensor whose readings are classed.")],
+    out: Annotated[Path, typer.Option(help="Parquet file to write.")],
+) -> None:
+    """What became of every reading of a sensor, and which filter left it out: one row a reading."""
+    from roadscan.jobs.classes import write_classes
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    reporter = _reporter()
+    store = Store(loaded.store_url, loaded.config.id)
+    counts = write_classes(loaded, store, run, sensor, out, lambda d, t: reporter.progress("classes", d, t))
+    reporter.close()
+    _table(("class", "readings"), [(name, f"{count:,}") for name, count in counts.items()])
+
+
 @app.command("formats")
 def list_formats(
     name: Annotated[str | None, typer.Argument(help="Show the settings of one format.", show_default=False)] = None,
@@ -244,7 +302,7 @@ def first_survey(
         ("run", "sensor", "log", "format", "to state"),
         [
             (run.id, log.sensor or "", os.path.relpath(log.path, found.folder), log.format.name,
-             ", ".join(need.key for need in log.report.opened.needs if need.key != "sensor"))
+             ", ".join(need.key for need in log.needs))
             for run in [*found.runs, *found.further]
             for log in run.logs
         ],

@@ -88,3 +88,11 @@ def _filled(values: Float64, most: int) -> Float64:
     out = values.copy()
     out[gap] = (1 - part) * values[row, left] + part * values[row, right]
     return out
+
+
+def inner_holes(heights_m: Float64) -> int:
+    """How many nodes without a height lie between others of their row, and rows without any."""
+    known = ~np.isnan(heights_m)
+    begun = np.logical_or.accumulate(known, axis=1)
+    goes_on = np.logical_or.accumulate(known[:, ::-1], axis=1)[:, ::-1]
+    return int((begun & goes_on & ~known).sum()) + int((~known.any(axis=1)).sum())

@@ -14,8 +14,8 @@ KDBI  the same with float64
 heading (phi), slope and banking and long sections by number or position. ``$CT``, ``$ROAD_CRG_OPTS`` (how to evaluate
 between and beyond nodes) and ``$ROAD_CRG_MPRO`` (map projection) change no node and are passed over. ``$ROAD_CRG_MODS``
 with anything that would move or scale nodes, and ``$ROAD_CRG_FILE`` (data in another file), are refused. Where the
-header gives a closing position or height of the reference line, the closing error is spread evenly along it, as
-OpenCRG's own tools do.
+header gives a closing position or height of the reference line, the closing error is spread along it as OpenCRG's own
+tools do (crg_check_data.m, calcRefLine of crgLoader.c).
 
 **Memory** grows with the file's true size only: the header may be 8 MB, records are read in blocks.
 """
@@ -99,7 +99,8 @@ class CurvedRegularGrid:
         steps = np.ones(self.rows - 1)
         xy = vertices((self.x_start_m, self.y_start_m), self.phi_rad * steps, self.u_step_m)
         z = self.z_start_m + np.concatenate([[0.0], np.cumsum(self.u_step_m * self.slope * steps)])
-        part = np.linspace(0.0, 1.0, self.rows)
+        # OpenCRG walks forward and blends each vertex with the walk back from the end, by the way already made.
+        part = 1.0 - np.cumprod(1.0 - np.arange(self.rows) / (self.rows - 1))
         if self.end_xy_m is not None:
             xy = xy + part[:, None] * (np.array(self.end_xy_m) - xy[-1])
         if self.end_z_m is not None:
@@ -190,7 +191,7 @@ class CrgFile:
         claimed = self.header.rows_claimed
         waiting: list[CrgBlock] = []
         for block in parts:
-            empty: Bool = np.isnan(block.values).all(axis=1) & ~block.damaged.any(axis=1)
+            empty: Bool = np.asarray(np.isnan(block.values).all(axis=1) & ~block.damaged.any(axis=1))
             if claimed is not None and claimed > 0:
                 empty &= np.arange(block.first_row, block.first_row + len(empty)) >= claimed
             if empty.all():

@@ -137,7 +137,9 @@ def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
             file=path,
         )
     for key, value in assignments(blocks.get("ROAD_CRG_MODS", []), path).items():
-        if key not in _HARMLESS_MODS and value != (1.0 if key.startswith("scale_") else 0.0):
+        # A reference point moves the grid to wherever it is said to lie, 0 included.
+        idle = value == (1.0 if key.startswith("scale_") else 0.0) and not key.startswith("refpoint_")
+        if key not in _HARMLESS_MODS and not idle:
             raise FormatError(
                 f"the block $ROAD_CRG_MODS changes the grid ({key} = {value:g})",
                 expected="a grid as it is",
@@ -150,13 +152,14 @@ def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
 
 def _encoding(definition: list[str], path: Path) -> Encoding:
     found = [line[2:].strip().upper() for line in definition if line.startswith("#:")]
-    if len(found) != 1 or found[0] not in {*BINARY, *TEXT_WIDTH}:
-        raise FormatError(
-            f"the encoding is {' and '.join(found) or 'not stated'}",
-            expected=" or ".join([*TEXT_WIDTH, *BINARY]),
-            file=path,
-        )
-    encoding: Any = found[0]
+    return encoding_named(" and ".join(found) or "not stated", path)
+
+
+def encoding_named(name: str, file: Path | None = None) -> Encoding:
+    """One of the four encodings, or :class:`FormatError`."""
+    if name not in {*BINARY, *TEXT_WIDTH}:
+        raise FormatError(f"the encoding is {name}", expected=" or ".join([*TEXT_WIDTH, *BINARY]), file=file)
+    encoding: Any = name
     return encoding  # type: ignore[no-any-return]
 
 

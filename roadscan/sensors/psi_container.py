@@ -6,7 +6,9 @@ published standard is claimed. The draft, as far as it is public, states no unit
 numbers stand here as the file holds them, and :mod:`roadscan.sensors.psi` asks the survey file for the rest.
 
 **Codecs.** 2D: raw, zip, JPEG, PNG; 3D: raw, zip. "Zip" is read as a zlib or gzip stream or as a PKZIP archive of one
-member, and written as a zlib stream. OpenCRG, zipped OpenCRG and JPEG 2000 inside a PSI file are refused by name.
+member, and written as a zlib stream. OpenCRG, zipped OpenCRG and JPEG 2000 inside a PSI file are refused by name. PNG
+and zip hold checksums; raw images hold none, and a JPEG that is damaged in its coded pixels decodes to wrong pixels, as
+it does everywhere: only its header, size, scans and end are checked.
 
 **Memory.** Every size that the header claims is held against the file's true size first. A compressed image may
 claim at most 64 MB plus 100 times the bytes it is stored in (:data:`INFLATION_FREE_BYTES`,

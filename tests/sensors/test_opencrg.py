@@ -152,9 +152,13 @@ def test_the_closing_error_is_spread(tmp_path: Path) -> None:
          "REFERENCE_LINE_END_X = 14.4", "REFERENCE_LINE_END_Y = 0.8", "REFERENCE_LINE_END_Z = 0.4"]
     )  # fmt: skip
     line = read_crg(written(tmp_path, binary("KDBI", rows, head, channels))).reference_line_m()
-    part = np.arange(5) / 4
-    expected = np.column_stack([10 + 4 * part + 0.4 * part, 0.8 * part, 0.4 * part])
-    assert np.allclose(line, expected, atol=1e-12)
+    x, y, z = [10.0], [0.0], [0.0]
+    for k in range(1, 5):  # the forward loop of crg_check_data.m, written out
+        back, weight = 14.4 - (4 - k), k / 4
+        x.append((1 - weight) * (x[-1] + 1.0) + weight * back)
+        y.append((1 - weight) * y[-1] + weight * 0.8)
+        z.append((1 - weight) * z[-1] + weight * 0.4)
+    assert np.allclose(line, np.column_stack([x, y, z]), atol=1e-12)
 
 
 def test_the_offset_turns_about_the_start_and_shifts() -> None:
@@ -223,7 +227,7 @@ def test_round_trip(
     [
         ("$ROAD_CRG  ", "$ROAD_CRG_FILE\nother.crg\n$\n$ROAD_CRG ", "only refers to the data file 'other.crg'"),
         ("$ROAD_CRG  ", "$ROAD_CRG_MODS\nscale_z_grid = 2\n$\n$ROAD_CRG ", r"changes the grid .scale_z_grid = 2."),
-        ("$ROAD_CRG  ", "$ROAD_CRG_MODS\nrefpoint_x = 7\n$\n$ROAD_CRG ", r"changes the grid .refpoint_x = 7."),
+        ("$ROAD_CRG  ", "$ROAD_CRG_MODS\nrefpoint_x = 0\n$\n$ROAD_CRG ", r"changes the grid .refpoint_x = 0."),
         ("#:LRFI", "#:KRFI", "encoding is KRFI; expected LRFI or LDFI or KRBI or KDBI"),
         ("#:LRFI", "", "encoding is not stated"),
         ("LINE_INCREMENT =  0.50", "LINE_INCREMENT = -0.50", "in steps of -0.5"),

@@ -147,7 +147,7 @@ def geocentric_placement(source: LogSource) -> WorldPlacement:
 
 def signed_square(root: Float64) -> Float64:
     """Covariance of its signed square root, as RTKLIB writes it: sign(c) · √|c|."""
-    return np.sign(root) * root * root
+    return np.sign(root) * root * root + 0.0  # minus zero becomes zero
 
 
 def ned_from_ecef(world: str, xyz_world_m: Float64) -> Float64:

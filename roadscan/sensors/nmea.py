@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.crs import LOCAL_WORLD, Geoid
-from roadscan.model.errors import ConfigError, CrsError, TimeSystemError
+from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
@@ -70,7 +70,7 @@ class Nmea(LogFormat):
     without it needs height = "orthometric" and the geoid, or options.altitude = "ellipsoidal".
 
     Times of the day get their date from RMC (status A) and ZDA, and count on over midnight between them.
-    Epochs whose sentences state no position have quality 'none'. The datum is the receiver's or its
+    Epochs whose sentences state no position with a height have quality 'none'. The datum is the receiver's or its
     corrections': state it as crs.
     """
 
@@ -104,12 +104,22 @@ class Nmea(LogFormat):
         calendar = _Calendar(plan, source.path)
         epochs = _Epochs()
         solutions = _Solutions(source, plan)
+        fixes = heights = 0
         for sentences in _sentences(source.path):
             if isinstance(sentences, Reject):
                 yield sentences
                 continue
+            fixes += int(((sentences.kinds == KINDS.index("RMC")) & (sentences.days != UNDATED)).sum())
+            heights += int((sentences.kinds == KINDS.index("GGA")).sum())
             yield from solutions.items(epochs, *calendar.timed(sentences))
         yield from solutions.items(epochs, *calendar.finish(), last=True)
+        if fixes and not heights:
+            raise FormatError(
+                f"{fixes} RMC sentences state a position, and no GGA sentence its height",
+                expected="GGA sentences: RMC alone places nothing",
+                change="let the receiver write GGA too",
+                file=source.path,
+            )
 
 
 def _sentences(path: Path) -> Iterator[Sentences | Reject]:

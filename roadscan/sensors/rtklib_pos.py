@@ -450,7 +450,7 @@ def _level_columns(block: TextBlock, names: set[str], sieve: Sieve) -> dict[str,
             out[f"velocity_{axis}_m_per_s"] = -velocity if key == "u" else velocity
     for key, ours, sign in (("ne", "ne", 1.0), ("un", "nd", -1.0), ("eu", "ed", -1.0)):
         if key in roots:
-            out[f"covariance_{ours}_m2"] = sign * signed_square(roots[key])
+            out[f"covariance_{ours}_m2"] = signed_square(sign * roots[key])
     return out
 
 

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from roadscan.model.crs import Geoid
-from roadscan.model.errors import ConfigError, CrsError, RoadscanError, TimeSystemError
+from roadscan.model.errors import ConfigError, CrsError, FormatError, RoadscanError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.sensors import text_table
 from roadscan.sensors.base import format_named, format_of
@@ -155,12 +155,12 @@ def test_whose_time_an_untimed_sentence_has(
 
 
 def test_untimed_sentences_without_a_neighbour(tmp_path: Path) -> None:
-    lines = [checked("GNHDT,10.0,T"), rmc("093002.00", "040526"), checked("GNHDT,20.0,T")]
+    lines = [checked("GNHDT,10.0,T"), rmc("093002.00", "040526"), gga("093002.00"), checked("GNHDT,20.0,T")]
     path = write(tmp_path / "a.nmea", *lines)
     (first,) = read_log("nmea", path, **STATED).rejects
     assert (first.record, first.reason) == (0, "the sentence has no time, and none to share")
     (last,) = read_log("nmea", path, {"untimed": "after"}, **STATED).rejects
-    assert (last.record, last.reason) == (2, "the sentence has no time, and none follows to share")
+    assert (last.record, last.reason) == (3, "the sentence has no time, and none follows to share")
 
 
 def test_late_sentences_find_their_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -470,10 +470,16 @@ def test_faulty_fields(tmp_path: Path) -> None:
             "number of satellites is not a whole number from 0 to 255"
         ),
     }
-    path = write(tmp_path / "a.nmea", rmc("093000.00", "040526"), *map(checked, bodies))
+    path = write(tmp_path / "a.nmea", rmc("093000.00", "040526"), *map(checked, bodies), gga("093012.00"))
     log = read_log("nmea", path, **STATED)
     assert {r.record: r.reason for r in log.rejects} == dict(enumerate(bodies.values(), 1))
-    assert log.table.num_rows == 1
+    assert log.table.num_rows == 2
+
+
+def test_positions_without_heights(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.nmea", rmc("093000.00", "040526"), rmc("093001.00", "040526"))
+    with pytest.raises(FormatError, match=r"a\.nmea: 2 RMC sentences state a position, and no GGA"):
+        read_log("nmea", path, **STATED)
 
 
 def test_a_truncated_packed_log(tmp_path: Path) -> None:

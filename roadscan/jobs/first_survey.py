@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.file_kinds import FileKind, kind_of, wrapper_of
 from roadscan.jobs.inspect import Inspection, LogReport, Progress, formats_of, inspect
-from roadscan.jobs.provisional import raw_stamps_ns, sensor_kind
+from roadscan.jobs.provisional import Need, raw_stamps_ns, sensor_kind
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, WEEK_S, TimeSystem
 from roadscan.model.rig import SensorKind
@@ -57,6 +57,16 @@ class FoundLog:
     def format(self) -> LogFormat:
         """Its format."""
         return self.report.opened.format
+
+    @property
+    def needs(self) -> list[Need]:
+        """What the survey file has to state, but for the sensor, which has its name already."""
+        needs = [need for need in self.report.opened.needs if need.key != "sensor"]
+        keys = {need.key for need in needs}
+        if self.is_control:
+            said = (("crs", "CRS of its coordinates"), ("height", "kind of its heights"))
+            needs += [Need(key, f'{key} = "????"', what) for key, what in said if key not in keys]
+        return needs
 
     @property
     def sensor_kind(self) -> SensorKind | None:
@@ -167,7 +177,7 @@ def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[
     if own:
         yield folder
     taken |= own
-    for entry in sorted(folder.iterdir()):
+    for entry in _entries(folder):
         if entry.name.startswith("."):
             continue
         if entry.is_file():
@@ -177,8 +187,16 @@ def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[
             yield from _candidates(entry, taken)
 
 
+def _entries(folder: Path) -> list[Path]:
+    """What lies in a folder, by name; nothing where it may not be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
 def _is_store(folder: Path) -> bool:
-    return folder.name.startswith("survey=") or any(child.name.startswith("survey=") for child in folder.iterdir())
+    return folder.name.startswith("survey=") or any(child.name.startswith("survey=") for child in _entries(folder))
 
 
 def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
@@ -200,7 +218,7 @@ def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
 
 def _holds_logs(folder: Path, own: Set[Path]) -> bool:
     """True if a deeper folder claims to be a log too, and holds all files of this one: it is the log then."""
-    below = [child for child in folder.iterdir() if child.is_dir() and not child.is_symlink()]
+    below = [child for child in _entries(folder) if child.is_dir() and not child.is_symlink()]
     return any(formats_of(child) and all(child in path.parents for path in own) for child in below)
 
 

@@ -196,9 +196,7 @@ def _log(log: FoundLog, folder: Path) -> Iterator[str]:
 
 def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
     before = ""
-    for need in log.report.opened.needs:
-        if need.key == "sensor":
-            continue
+    for need in log.needs:
         yield _question(need.line)
         said = "its time system is not in the file" if need.is_generic else need.reason
         reason = "; ".join(part for part in (said, _hint(need, log, run)) if part)
@@ -237,7 +235,7 @@ def _control(log: FoundLog, folder: Path) -> Iterator[str]:
     yield '# CRS of its coordinates, such as "EPSG:25832", or "local"; never assumed.'
     yield _question('height = "????"')
     yield '# "ellipsoidal" or "orthometric" (then also geoid = "…"); never assumed.'
-    for need in log.report.opened.needs:
+    for need in log.needs:
         if need.key not in {"crs", "height"}:
             yield _question(need.line)
             yield from _remark(need.reason)

@@ -240,6 +240,9 @@ def _inspect(
     if not path.exists():
         found.what, found.error = "nothing", f"{path}: there is no such file or folder"
         return found
+    if not (path.is_file() or path.is_dir()):
+        found.what, found.error = "a device or a pipe", f"{path}: neither a file nor a folder"
+        return found
     try:
         return _look(found, stated, wanted, quick, progress, scratch)
     except OSError as error:

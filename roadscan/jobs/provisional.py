@@ -233,7 +233,7 @@ class _Search:
         if isinstance(error, TimeSystemError):
             order = ("clock", "options")
         for dimension in order:
-            yield from ((dimension, changed) for changed in parts[dimension](trial, error))  # type: ignore[misc]
+            yield from ((dimension, changed) for changed in parts[dimension](trial, error))
 
     def _own_proposals(self) -> Iterator[tuple[Dimension, Stated]]:
         for one in self._format.provisional:

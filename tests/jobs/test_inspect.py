@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import os
 import random
 import struct
 import subprocess
@@ -26,10 +27,10 @@ from roadscan.jobs import inspect as inspect_module
 from roadscan.jobs.inspect import Inspection, inspect
 from roadscan.jobs.inspect_text import print_inspection
 from roadscan.jobs.log_figures import Fault
-from roadscan.jobs.provisional import Stated, parse_clock, parse_option
+from roadscan.jobs.provisional import Stated, open_log, parse_clock, parse_option
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, log_formats
+from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
 from roadscan.tables.schema import table_schema
 
 RECORD = 136
@@ -443,6 +444,11 @@ def test_a_reader_that_breaks_its_promise_ends_in_a_message(
     assert said in found.error
 
 
+def test_a_pipe_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert inspect(tmp_path / "pipe").error.endswith("neither a file nor a folder")
+
+
 def test_damaged_files_never_crash(tmp_path: Path) -> None:
     """Mutants of all samples: told, read, or refused with a message."""
     rng = random.Random(7)
@@ -465,6 +471,34 @@ def test_damaged_files_never_crash(tmp_path: Path) -> None:
         assert found.readable or found.error
         assert str(path) in text_of(found)
         json.dumps(found.as_json())
+
+
+# --- formats that say how to look -----------------------------------------------------------------------
+
+
+class _Particular(_Liar):
+    """Opens with one clock and one CRS only, which nobody would try."""
+
+    name = "particular"
+    provisional = (Provisional(clock=Clock(TimeSystem.UNIX_TAI, unit="ms"), crs="EPSG:4937"),)
+
+    def header(self, source: LogSource) -> LogHeader:
+        if source.need_clock("{ … }").unit != "ms" or source.need_crs() != "EPSG:4937":
+            raise ConfigError("something else was stated")
+        return LogHeader({"world_frame": "local"})
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        return iter(())
+
+
+def test_a_format_may_say_how_to_look(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"x")
+    opened = open_log(_Particular(""), path, Stated())
+    assert (opened.source.clock, opened.source.crs) == (Clock(TimeSystem.UNIX_TAI, unit="ms"), "EPSG:4937")
+    assert [need.key for need in opened.needs] == ["clock", "crs"]
+    with pytest.raises(ConfigError, match="something else was stated"):
+        open_log(_Particular(""), path, Stated(clock=Clock(TimeSystem.GPS)))
 
 
 # --- the command line ----------------------------------------------------------------------------------

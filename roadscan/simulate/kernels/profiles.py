@@ -19,7 +19,7 @@ from roadscan.simulate.kernels.road import (
     node_at,
     on_surface,
     project,
-    texture_height,
+    texture_plane,
     worn_height,
 )
 
@@ -164,14 +164,15 @@ def over_texture(road: RoadArrays, beam: Float64, r: float, station: float, offs
     """Height of the texture where a beam meets it (m).
 
     The beam meets the surface without texture at range `r`; its place was found for the range `plain` above a defect.
-    Beams lean a few degrees at most: after one correction the place is right to a hundredth of a millimetre.
+    Beams lean a few degrees at most, so the place moves by hundredths of a millimetre: the texture's slopes tell the
+    rest (to 0.01 mm, where the beam passes a corner of the texture).
     """
     station += along_beam(beam, 0, r) - along_beam(beam, 0, plain)
     offset += along_beam(beam, 1, r) - along_beam(beam, 1, plain)
-    first = texture_height(road, station, offset)
+    height, along, across = texture_plane(road, station, offset)
     lean_s = beam[0, 1] + 2.0 * r * beam[0, 2]
     lean_o = beam[1, 1] + 2.0 * r * beam[1, 2]
-    return texture_height(road, station - first * lean_s, offset - first * lean_o)
+    return height / (1.0 + along * lean_s + across * lean_o)
 
 
 @inlined
@@ -180,11 +181,11 @@ def plain_range(
 ) -> tuple[float, int, float, float, float]:
     """Range, node, u, offset where a beam in road coordinates meets the surface without defects, and its fall there.
 
-    The slope of a neighbouring reading is right to better than a tenth, so a last step of 1 µm leaves less than 0.1 µm.
+    The slope of a neighbouring reading is right to better than a tenth, so a last step of 10 µm leaves less than 1 µm.
     Where the secant does not settle (the face of a kerb), the beam is walked down.
     """
     r = start
-    enough = 1e-6 if is_fall_known else ROOT_TOLERANCE_M
+    enough = 1e-5 if is_fall_known else ROOT_TOLERANCE_M
     last_gap, moved = 0.0, 0.0
     k, u, offset = 0, 0.0, 0.0
     settled = False

@@ -311,20 +311,29 @@ def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[flo
 @inlined
 def texture_height(road: RoadArrays, station: float, offset: float) -> float:
     """Macrotexture (m) of the paved surface, bilinear; 0 beside it."""
+    return texture_plane(road, station, offset)[0]
+
+
+@inlined
+def texture_plane(road: RoadArrays, station: float, offset: float) -> tuple[float, float, float]:
+    """Macrotexture (m) of the paved surface, bilinear, and its slopes along and across; 0 beside it."""
     texture, section = road.texture, road.section
     if texture.size == 0 or abs(offset) > section[PAVED_EDGE]:
-        return 0.0
-    size = texture.shape[0]
-    along = station * section[TEXTURE_PER_M]
-    across = offset * section[TEXTURE_PER_M]
+        return 0.0, 0.0, 0.0
+    last = texture.shape[0] - 1
+    per_m = section[TEXTURE_PER_M]
+    along = station * per_m
+    across = offset * per_m
     i, j = math.floor(along), math.floor(across)
     x, y = along - i, across - j
-    i0, j0 = i & (size - 1), j & (size - 1)
-    i1, j1 = (i0 + 1) & (size - 1), (j0 + 1) & (size - 1)
-    low = texture[i0, j0] + y * (texture[i0, j1] - texture[i0, j0])
-    high = texture[i1, j0] + y * (texture[i1, j1] - texture[i1, j0])
-    value: float = low + x * (high - low)
-    return value
+    i0, j0 = i & last, j & last
+    i1, j1 = (i0 + 1) & last, (j0 + 1) & last
+    here, right = texture[i0, j0], texture[i0, j1]
+    ahead, beyond = texture[i1, j0], texture[i1, j1]
+    low = here + y * (right - here)
+    high = ahead + y * (beyond - ahead)
+    slope_right = (right - here) + x * ((beyond - ahead) - (right - here))
+    return low + x * (high - low), (high - low) * per_m, slope_right * per_m
 
 
 @inlined

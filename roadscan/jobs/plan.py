@@ -90,6 +90,7 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
         heights=heights,
         max_gap_s=config.navigation.max_gap_s,
         grids=None if config.map.grids is None else str(survey.resolve(config.map.grids)),
+        marks=f.keep_marked,
     )
     sources = tuple(_sources(survey, store, records, ground))
     if not sources:
@@ -130,6 +131,7 @@ def _sources(
                 asdict(ground.heights),
                 ground.max_gap_s,
                 ground.grid.size_m,
+                ground.marks,
                 record.run,
                 record.sensor,
             )

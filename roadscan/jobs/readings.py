@@ -19,7 +19,16 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
-from roadscan.points.place import EVERYWHERE, CloudFrame, HeightLimits, Placed, Placement, Window, place_cloud
+from roadscan.points.place import (
+    EVERYWHERE,
+    CloudFrame,
+    HeightLimits,
+    Placed,
+    Placement,
+    Window,
+    cloud_classes,
+    place_cloud,
+)
 from roadscan.points.readings import ScanGeometry
 from roadscan.tables.logs import DataFile
 from roadscan.tables.schema import table_schema
@@ -75,6 +84,8 @@ class Ground:
     max_gap_s: float
     grids: str | None = None
     """Folder with geoid grids."""
+    marks: bool = False
+    """Readings that a filter leaves out are placed too, with their classes."""
 
 
 @dataclass(frozen=True)
@@ -127,27 +138,40 @@ class Placer:
         for groups in _chunks(one):
             rows = read_groups(self._store, one.file, groups).combine_chunks()
             for batch in rows.to_batches():
-                yield groups[0], self._place_batch(one.source, batch, window)
+                yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
 
     def touched(self, one: RawSlice, group: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
         """Tiles (n, 2) of the points of one row group, and the fates of its readings."""
         batch = read_groups(self._store, one.file, [group]).combine_chunks().to_batches()[0]
         if one.source.table == "cloud":
-            placed = self._place_batch(one.source, batch, EVERYWHERE)
+            placed = self._place_batch(one.source, batch, EVERYWHERE, self._ground.marks)
             return placed.tiles, placed.fates
-        geometry = _geometry(one.source) if one.source.table == "scans" else None
-        return self._placements[one.source.key].touched(batch, geometry)
+        return self._placements[one.source.key].touched(batch, geometry_of(one.source), marked=self._ground.marks)
 
-    def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window) -> Placed:
+    def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Placed]]:
+        """Rows of a slice, chunk by chunk, with the class of every reading in their order, and the points kept.
+
+        Passes and centre lines are not looked at.
+        """
+        for groups in _chunks(one):
+            for batch in read_groups(self._store, one.file, groups).combine_chunks().to_batches():
+                kept = self._place_batch(one.source, batch, EVERYWHERE, marked=False)
+                yield batch, self._classes(one.source, batch), kept
+
+    def _classes(self, source: ReadingSource, batch: pa.RecordBatch) -> npt.NDArray[np.uint8]:
         if source.table == "cloud":
-            attributes = source.attribute
-            cloud = CloudFrame(attributes["crs"], attributes["height"], attributes.get("geoid"))
-            ground = self._ground
-            return place_cloud(batch, cloud, ground.map, ground.heights, ground.grid.size_quanta, window)
-        placement = self._placements[source.key]
-        if source.table == "scans":
-            return placement.profiles(batch, _geometry(source), window)
-        return placement.returns(batch, window)
+            return cloud_classes(batch, _cloud_frame(source), self._ground.map, self._ground.heights)
+        return self._placements[source.key].classes(batch, geometry_of(source))
+
+    def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window, marked: bool) -> Placed:
+        ground = self._ground
+        if source.table == "cloud":
+            cloud = _cloud_frame(source)
+            return place_cloud(batch, cloud, ground.map, ground.heights, ground.grid.size_quanta, window, marked=marked)
+        placement, geometry = self._placements[source.key], geometry_of(source)
+        if geometry is None:
+            return placement.returns(batch, window, marked=marked)
+        return placement.profiles(batch, geometry, window, marked=marked)
 
     def _placement(self, source: ReadingSource, spans: list[tuple[int, int]]) -> Placement:
         if source.trajectory is None:
@@ -236,18 +260,25 @@ def _geometry_of(items: tuple[tuple[str, Any], ...]) -> ScanGeometry:
     return ScanGeometry.parse(dict(items))
 
 
-def _geometry(source: ReadingSource) -> ScanGeometry:
+def geometry_of(source: ReadingSource) -> ScanGeometry | None:
+    """Scan geometry of a source of scans, None for other readings."""
+    if source.table != "scans":
+        return None
     stated = source.attribute.get("scan_geometry")
     if stated is None:
         raise ConfigError(f"the scans of {source.run}/{source.sensor} state no geometry", expected="scan_geometry")
     return _geometry_of(tuple(sorted(stated.items())))
 
 
+def _cloud_frame(source: ReadingSource) -> CloudFrame:
+    attributes = source.attribute
+    return CloudFrame(attributes["crs"], attributes["height"], attributes.get("geoid"))
+
+
 def _chunks(one: RawSlice) -> Iterator[list[int]]:
     """Row groups in pieces of about a million readings, which the working arrays are made for."""
-    readings = table_schema(one.source.table).row_group_rows
-    if one.source.table == "scans":
-        readings *= _geometry(one.source).readings
+    geometry = geometry_of(one.source)
+    readings = table_schema(one.source.table).row_group_rows * (1 if geometry is None else geometry.readings)
     step = max(_CHUNK_READINGS // readings, 1)
     for start in range(0, len(one.groups), step):
         yield list(one.groups[start : start + step])

@@ -26,7 +26,8 @@ from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
 from roadscan.points.centre_line import CentreLineBuffer
-from roadscan.points.cloud import QUANTUM_M, TilePoints
+from roadscan.points.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
+from roadscan.points.cloud import QUANTUM_M, TilePoints, fill_of
 from roadscan.points.order import canonical_order
 from roadscan.points.place import EXTRA_COLUMNS, Placed, Window, passes_of
 from roadscan.products.base import ProductContext, Tile, TileProduct, TileSummary
@@ -183,12 +184,13 @@ def compute_block(task: BlockTask) -> BlockResult:
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     waiting = dict(zip(task.block.tiles, task.keys, strict=True))
-    for tile, points in load_points(task):
-        key = waiting.pop(tile, None)
-        if key is None:
-            continue  # a tile of the halo
+    for loaded in load_tiles(task):
+        tile = loaded.tile
+        if tile not in waiting or loaded.points is None:
+            continue  # a tile of the halo, or one without points
+        key = waiting.pop(tile)
         try:
-            records += _write_tile(task, key, points)
+            records += _write_tile(task, key, loaded.points, loaded.marked)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), _reason(error)))
     for tile, key in waiting.items():
@@ -196,8 +198,26 @@ def compute_block(task: BlockTask) -> BlockResult:
     return BlockResult(tuple(records), tuple(failures))
 
 
+@dataclass(frozen=True)
+class LoadedTile:
+    """What a tile holds."""
+
+    tile: TileId
+    points: TilePoints | None
+    """Points that passed all filters; None without any."""
+    marked: TilePoints | None
+    """Points that a filter leaves out; None without any, or where the survey does not keep them."""
+
+
 def load_points(task: BlockTask) -> Iterator[tuple[TileId, TilePoints]]:
     """Points of every tile of the block and its halo that holds any: filtered, in canonical order, tile by tile."""
+    for loaded in load_tiles(task):
+        if loaded.points is not None:
+            yield loaded.tile, loaded.points
+
+
+def load_tiles(task: BlockTask) -> Iterator[LoadedTile]:
+    """As :func:`load_points`, with the points that filters leave out, where the survey keeps them marked."""
     box = task.block.box()
     buffer = None if task.centre_lines is None else load_buffer(task.centre_lines, task.ground.map)
     parts = _Parts()
@@ -219,10 +239,28 @@ def load_points(task: BlockTask) -> Iterator[tuple[TileId, TilePoints]]:
         index = (tile.row - box[1]) * width + (tile.column - box[0])
         rows = order[ends[index - 1] if index else 0 : ends[index]]
         rows = rows[joined.passes[rows] > 0]
-        if buffer is not None and rows.size:
-            rows = rows[_near(tile, joined.quanta[rows], buffer, task.ground)]
         if rows.size:
-            yield tile, joined.tile(tile, rows)
+            yield _loaded(tile, rows, joined, buffer, task.ground)
+
+
+def _loaded(
+    tile: TileId,
+    rows: npt.NDArray[np.int32],
+    joined: _Joined,
+    buffer: CentreLineBuffer | None,
+    ground: Ground,
+) -> LoadedTile:
+    """Points of a tile at `rows` of the block, those that filters leave out apart."""
+    near = None if buffer is None else near_lines(tile, joined.quanta[rows], buffer, ground)
+    if joined.classes is None:
+        rows = rows if near is None else rows[near]
+        return LoadedTile(tile, joined.tile(tile, rows) if rows.size else None, None)
+    classes = joined.classes[rows]
+    if near is not None:
+        classes[(classes == KEPT) & ~near] = OFF_CENTRE_LINE
+    kept, left = rows[classes == KEPT], rows[classes != KEPT]
+    marked = joined.tile(tile, left, LAS_CLASSES[classes[classes != KEPT]]) if left.size else None
+    return LoadedTile(tile, joined.tile(tile, kept) if kept.size else None, marked)
 
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
@@ -308,6 +346,8 @@ class _Parts:
         columns: dict[str, npt.NDArray[Any]] = {}
         for name in ("tiles", "quanta", "epoch_gps_ns", "intensity", "classification"):
             columns[name] = np.concatenate([getattr(p, name) for p in placed])
+        marks = [p.classes for p in placed if p.classes is not None]
+        classes = np.concatenate(marks) if marks else None
         placed.clear()
         return _Joined(
             passes=np.concatenate(self._passes),
@@ -315,6 +355,7 @@ class _Parts:
             profiles=np.array(self._profiles),
             extra=extra,
             lacking=lacking,
+            classes=classes,
             **columns,
         )
 
@@ -335,9 +376,16 @@ class _Joined:
     extra: dict[str, npt.NDArray[Any]]
     lacking: dict[str, npt.NDArray[np.bool_]]
     """(n,) True for points without a recorded value, for columns that some points lack."""
+    classes: npt.NDArray[np.uint8] | None
+    """(n,) class of each reading, where those that a filter leaves out were placed too."""
 
-    def tile(self, tile: TileId, rows: npt.NDArray[np.integer[Any]]) -> TilePoints:
-        """Points of one tile, in canonical order."""
+    def tile(
+        self,
+        tile: TileId,
+        rows: npt.NDArray[np.integer[Any]],
+        marks: npt.NDArray[np.uint8] | None = None,
+    ) -> TilePoints:
+        """Points of one tile, in canonical order; with `marks` (n,), the classes they get, they are withheld."""
         sources = self.sources[rows]
         # A tile has the columns that its own points have, whatever else was loaded with it.
         extra = {c: v for c, v in self.extra.items() if c not in self.lacking or not self.lacking[c][rows].all()}
@@ -347,6 +395,10 @@ class _Joined:
         )
         if order is not None:
             rows = rows[order]
+            marks = None if marks is None else marks[order]
+        recorded = {c: v[rows] for c, v in extra.items()}
+        if marks is not None:
+            recorded["flags"] = recorded.get("flags", np.zeros(rows.size, np.uint8)) | np.uint8(WITHHELD_FLAG)
         quanta = self.quanta[rows]
         return TilePoints(
             tile=tile,
@@ -355,9 +407,9 @@ class _Joined:
             height_quanta=np.ascontiguousarray(quanta[:, 2]),
             epoch_gps_ns=self.epoch_gps_ns[rows],
             intensity=self.intensity[rows],
-            classification=self.classification[rows],
+            classification=self.classification[rows] if marks is None else marks,
             pass_id=self.passes[rows],
-            extra={c: v[rows] for c, v in extra.items()},
+            extra=recorded,
         )
 
 
@@ -365,24 +417,25 @@ def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
     known = [p.extra[column] for p in parts if column in p.extra]
     if not known:
         return None
-    fill = {"return_number": 1, "number_of_returns": 1}.get(column, 0)
-    return np.concatenate([p.extra.get(column, np.full(p.epoch_gps_ns.size, fill, known[0].dtype)) for p in parts])
+    kind = known[0].dtype
+    return np.concatenate([p.extra.get(column, fill_of(column, p.epoch_gps_ns.size, kind)) for p in parts])
 
 
 def _lacks(parts: list[Placed], column: str) -> npt.NDArray[np.bool_]:
     return np.concatenate([np.full(p.epoch_gps_ns.size, column not in p.extra) for p in parts])
 
 
-def _near(
+def near_lines(
     tile: TileId, quanta: npt.NDArray[np.int32], buffer: CentreLineBuffer, ground: Ground
 ) -> npt.NDArray[np.bool_]:
+    """Which points (n, …) of a tile lie in the buffer about the centre lines; `quanta` from the tile's corner."""
     b = ground.grid.bounds(tile)
     easting = b.easting_min_m + quanta[:, 0].astype(np.float64) * QUANTUM_M
     northing = b.northing_min_m + quanta[:, 1].astype(np.float64) * QUANTUM_M
     return buffer.keeps(easting, northing, (b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m))
 
 
-def _write_tile(task: BlockTask, key: str, points: TilePoints) -> list[OutputRecord]:
+def _write_tile(task: BlockTask, key: str, points: TilePoints, marked: TilePoints | None) -> list[OutputRecord]:
     tile = points.tile
     cells = cells_of(points, task.ground.grid)
     context = dataclasses.replace(task.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
@@ -391,7 +444,7 @@ def _write_tile(task: BlockTask, key: str, points: TilePoints) -> list[OutputRec
         for wanted in task.products:
             suffix = wanted.product.suffix_for(wanted.options)
             path = folder / f"tile{suffix}"
-            wanted.product.write(Tile(points, cells), wanted.options, context, path)
+            wanted.product.write(Tile(points, cells, marked), wanted.options, context, path)
             target = f"tiles/{wanted.product.name}/{tile}{suffix}"
             own_key = key_of(key, wanted.key)
             records.append(_publish(task.store, path, target, wanted.product.name, str(tile), own_key))

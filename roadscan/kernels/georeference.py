@@ -21,6 +21,9 @@ KEPT, NO_POSE, RANGE, HEIGHT, OUTSIDE, NO_RETURN = 0, 1, 2, 3, 4, 5
 """Fates of a reading, the indices of the kernels' `fates` counters."""
 FATES = 6
 
+CLASS_KEPT, CLASS_NO_RETURN, CLASS_NO_POSE, CLASS_TOO_NEAR, CLASS_TOO_FAR, CLASS_TOO_LOW, CLASS_TOO_HIGH = range(7)
+"""Classes of a reading; the window counts in its fate only."""
+
 LIMITS = ("range_min", "range_max", "height_min", "height_max", "above_body_min", "above_body_max")
 """Order of the `limits` array (m)."""
 
@@ -76,6 +79,18 @@ def passes_heights(height, body_height, limits):
 
 
 @inlined
+def range_class(distance, nearest):
+    """Class of a reading outside the range limits (m)."""
+    return CLASS_TOO_NEAR if distance < nearest else CLASS_TOO_FAR
+
+
+@inlined
+def height_class(height, body_height, limits):
+    """Class of a height that :func:`passes_heights` refuses."""
+    return CLASS_TOO_LOW if height < limits[2] or height - body_height < limits[4] else CLASS_TOO_HIGH
+
+
+@inlined
 def tile_and_rest(value_m, quanta_per_m, tile_quanta):
     """Tile number of a coordinate (m), and its quanta from the tile's edge.
 
@@ -102,7 +117,7 @@ def is_wanted(column, row, window):
 @kernel
 def georeference_returns(
     pose_epochs, xyz, mounting, knots, coefficients, valid, lattice, table, centres, charts,
-    limits, quanta_per_m, tile_quanta, window, rows, tiles, quanta, fates,
+    limits, quanta_per_m, tile_quanta, window, rows, tiles, quanta, fates, classes,
 ):  # fmt: skip
     """Place returns of a spinning lidar (or any readings with their own epoch and position).
 
@@ -119,6 +134,7 @@ def georeference_returns(
     rows : (n,) int32, out, index of the return; tiles : (n, 2) int32, out, column and row;
     quanta : (n, 3) int32, out, x and y from the tile's south-west corner, and height.
     fates : (6,) int64, in/out, counts by fate.
+    classes : (n,) uint8, in/out, 0 on entry; the class of each reading that a filter leaves out is written.
 
     Returns
     -------
@@ -139,6 +155,7 @@ def georeference_returns(
         distance2 = x * x + y * y + z * z
         if not (limits[0] * limits[0] <= distance2 <= limits[1] * limits[1]):
             fates[RANGE] += 1
+            classes[i] = range_class(distance2, limits[0] * limits[0])
             continue
         epoch = pose_epochs[i]
         if not (start <= epoch < end):
@@ -150,6 +167,7 @@ def georeference_returns(
                 start, end = knots[k], knots[k + 1]
         if not usable:
             fates[NO_POSE] += 1
+            classes[i] = CLASS_NO_POSE
             continue
         u = (epoch - start) / (end - start)
         px, py, pz = position_at(c, u)
@@ -159,6 +177,7 @@ def georeference_returns(
             chart = chart_index(box, table)
             if chart < 0:
                 fates[NO_POSE] += 1
+                classes[i] = CLASS_NO_POSE
                 continue
             cx, cy, cz = centres[chart, 0], centres[chart, 1], centres[chart, 2]
             east_chart = expansion(charts, chart, 0)
@@ -175,8 +194,10 @@ def georeference_returns(
         dy = py + (r[3] * bx + r[4] * by + r[5] * bz)
         dz = pz + (r[6] * bx + r[7] * by + r[8] * bz)
         height = map_value(height_chart, dx, dy, dz)
-        if not passes_heights(height, map_value(height_chart, px, py, pz), limits):
+        body_height = map_value(height_chart, px, py, pz)
+        if not passes_heights(height, body_height, limits):
             fates[HEIGHT] += 1
+            classes[i] = height_class(height, body_height, limits)
             continue
         column, east = tile_and_rest(map_value(east_chart, dx, dy, dz), quanta_per_m, tile_quanta)
         row, north = tile_and_rest(map_value(north_chart, dx, dy, dz), quanta_per_m, tile_quanta)
@@ -271,7 +292,7 @@ def profile_forms(epoch, k, mounting, knots, coefficients, valid, lattice, table
 def georeference_profiles(
     epochs, ranges, origins, directions, scale, reading_period_ns,
     mounting, knots, coefficients, valid, lattice, table, centres, charts,
-    limits, quanta_per_m, tile_quanta, window, rows, readings, tiles, quanta, fates,
+    limits, quanta_per_m, tile_quanta, window, rows, readings, tiles, quanta, fates, classes,
 ):  # fmt: skip
     """Place the readings of a line scanner's profiles.
 
@@ -287,6 +308,7 @@ def georeference_profiles(
     scale : (2,) tuple, range_offset_m, range_step_m.
     reading_period_ns : float64.
     rows : (n·m,) int32, out, index of the profile; readings : (n·m,) int32, out, index in the profile.
+    classes : (n·m,) uint8, in/out.
     Others as in :func:`georeference_returns`.
 
     Returns
@@ -308,19 +330,23 @@ def georeference_profiles(
                 )
             if ranges[i, j] == 0:
                 fates[NO_RETURN] += 1
+                classes[i * count + j] = CLASS_NO_RETURN
                 continue
             distance = scale[0] + scale[1] * ranges[i, j]
             if not (limits[0] <= distance <= limits[1]):
                 fates[RANGE] += 1
+                classes[i * count + j] = range_class(distance, limits[0])
                 continue
             if not placed:
                 fates[NO_POSE] += 1
+                classes[i * count + j] = CLASS_NO_POSE
                 continue
             y = origins[j, 1] + distance * directions[j, 1]
             z = origins[j, 2] + distance * directions[j, 2]
             height = form_value(forms[2], y, z)
             if not passes_heights(height, forms[3][0], limits):
                 fates[HEIGHT] += 1
+                classes[i * count + j] = height_class(height, forms[3][0], limits)
                 continue
             column, east = tile_and_rest(form_value(forms[0], y, z), quanta_per_m, tile_quanta)
             row, north = tile_and_rest(form_value(forms[1], y, z), quanta_per_m, tile_quanta)

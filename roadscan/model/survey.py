@@ -215,6 +215,10 @@ class FilterConfig(Strict):
     centre_line_margin_m: float = Field(default=8.0, ge=0)
     """Kept beyond the edge of a road of known width (m): for roadside features, and for the error of the lines (the
     Census Bureau aims at 7.6 m in 95 % of cases for TIGER/Line)."""
+    keep_marked: bool = False
+    """Keep the points that a filter leaves out in the point files (LAS without `spacing_m`), withheld and marked by
+    class: 7 too low, 18 too high, 64 nearer and 65 farther than the sensor's range limits, 66 off the centre lines.
+    Cells, rasters and figures never use them; a tile that holds no other point gets no files."""
     centre_line_options: dict[str, Any] = {}
     """Settings of the layer (`roadscan formats road_lines`): its name, attributes, units, widths by class."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
@@ -44,3 +44,23 @@ class TilePoints:
 
     def __len__(self) -> int:
         return int(self.x_quanta.size)
+
+    def and_then(self, other: TilePoints) -> TilePoints:
+        """These points, then `other` of the same tile; values that one side lacks are those of a single return."""
+        size, more = len(self), len(other)
+        extra: dict[str, npt.NDArray[Any]] = {}
+        for name in (*self.extra, *(n for n in other.extra if n not in self.extra)):
+            kind = (self.extra if name in self.extra else other.extra)[name].dtype
+            parts = (self.extra.get(name, fill_of(name, size, kind)), other.extra.get(name, fill_of(name, more, kind)))
+            extra[name] = np.concatenate(parts)
+        arrays = {
+            f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)])
+            for f in fields(self)
+            if f.name not in {"tile", "extra"}
+        }
+        return TilePoints(tile=self.tile, extra=extra, **arrays)
+
+
+def fill_of(column: str, size: int, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Values (n,) of an extra column for points without recorded ones."""
+    return np.full(size, 1 if column in {"return_number", "number_of_returns"} else 0, kind)

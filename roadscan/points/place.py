@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,12 +17,14 @@ from roadscan.model.ids import LanePass
 from roadscan.model.rig import Mounting
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
+from roadscan.points.classes import KEPT, TOO_HIGH, TOO_LOW
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.readings import ScanGeometry
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
+UInt8 = npt.NDArray[np.uint8]
 
 EIGHT_TO_SIXTEEN_BITS: Final = 257
 """An 8-bit intensity of 255 becomes 65,535."""
@@ -52,6 +54,12 @@ class HeightLimits:
         """Lowest and highest height kept (m), never beyond what 32 bits of 10 µm hold."""
         return max(float(self.height_min_m), -FARTHEST_HEIGHT_M), min(float(self.height_max_m), FARTHEST_HEIGHT_M)
 
+    def classes(self, height_m: Float64) -> UInt8:
+        """Class (n,) of points by their absolute heights (n,)."""
+        lowest, highest = self.absolute()
+        below = np.where(height_m < lowest, TOO_LOW, TOO_HIGH)
+        return np.where((height_m >= lowest) & (height_m <= highest), KEPT, below).astype(np.uint8)
+
 
 @dataclass(frozen=True)
 class Window:
@@ -63,6 +71,7 @@ class Window:
     end_row: int
 
 
+_NO_LIMITS: Final = (0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)
 EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
 
 
@@ -79,6 +88,8 @@ class Placed:
     classification: npt.NDArray[np.uint8]
     fates: Int64
     """(6,) counts of readings by fate."""
+    classes: UInt8 | None = None
+    """(n,) class of each point's reading, where readings that a filter leaves out were asked for too."""
     extra: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
@@ -94,13 +105,13 @@ class Placement:
     heights: HeightLimits
     tile_quanta: int
 
-    def _common(self) -> tuple[Any, ...]:
+    def _common(self, limits: tuple[float, ...]) -> tuple[Any, ...]:
         rotation, lever = self.mounting.arrays()
         coefficients, valid = self.trajectory.intervals
         return (
             (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
             tuple(self.charts.lattice.tolist()), self.charts.table, self.charts.centres, self.charts.coefficients,
-            self._limits(), float(QUANTA_PER_M), self.tile_quanta,
+            limits, float(QUANTA_PER_M), self.tile_quanta,
         )  # fmt: skip
 
     def _limits(self) -> tuple[float, ...]:
@@ -110,9 +121,9 @@ class Placement:
             float(h.above_body_min_m), float(h.above_body_max_m),
         )  # fmt: skip
 
-    def returns(self, batch: pa.RecordBatch, window: Window) -> Placed:
-        """Place rows of the table ``returns``."""
-        work = self._place_returns(batch, window)
+    def returns(self, batch: pa.RecordBatch, window: Window, *, marked: bool = False) -> Placed:
+        """Place rows of the table ``returns``; `marked`: those too that a filter leaves out, with their classes."""
+        work = self._work(batch, None, window, marked)
         kept = work.rows
         return Placed(
             work.tiles,
@@ -121,48 +132,71 @@ class Placement:
             _numpy(batch, "intensity")[kept],
             np.ones(kept.size, np.uint8),
             work.fates,
+            work.classes[kept] if marked else None,
         )
 
-    def profiles(self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window) -> Placed:
-        """Place rows of the table ``scans``."""
-        work = self._place_profiles(batch, geometry, window)
+    def profiles(
+        self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window, *, marked: bool = False
+    ) -> Placed:
+        """Place rows of the table ``scans``; `marked` as for :meth:`returns`."""
+        work = self._work(batch, geometry, window, marked)
         row, reading = work.rows, work.readings
-        epoch = _numpy(batch, "epoch_gps_ns")[row]
-        if geometry.reading_period_ns:
-            epoch = epoch + np.floor(reading * geometry.reading_period_ns + 0.5).astype(np.int64)
+        epoch = geometry.reading_epochs(_numpy(batch, "epoch_gps_ns")[row], reading)
         intensity = np.zeros(row.size, np.uint16)
         if batch.column("intensity").null_count == 0:
             digital = _lists(batch, "intensity", geometry.readings)[row, reading]
             intensity = digital.astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
+        classes = work.classes[row.astype(np.int64) * geometry.readings + reading] if marked else None
         # Copies: the working arrays are far larger where a window keeps little.
-        return Placed(work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates)
+        return Placed(
+            work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
+        )
 
-    def touched(self, batch: pa.RecordBatch, geometry: ScanGeometry | None) -> tuple[Int32, Int64]:
-        """Tiles (n, 2) of all points of a batch, and the fates of its readings; `geometry` for scans."""
-        if geometry is None:
-            work = self._place_returns(batch, EVERYWHERE)
-        else:
-            work = self._place_profiles(batch, geometry, EVERYWHERE)
+    def touched(
+        self, batch: pa.RecordBatch, geometry: ScanGeometry | None, *, marked: bool = False
+    ) -> tuple[Int32, Int64]:
+        """Tiles (n, 2) of all points of a batch, and the fates of its readings; `geometry` for scans.
+
+        `marked`: tiles of those too that a filter leaves out.
+        """
+        work = self._work(batch, geometry, EVERYWHERE, marked)
         return work.tiles, work.fates
 
-    def _place_returns(self, batch: pa.RecordBatch, window: Window) -> _Work:
-        n = batch.num_rows
-        xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
-        work = _Work.of(n)
-        made = georeference_returns(
-            _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(), astuple(window),
-            work.rows, work.tiles, work.quanta, work.fates,
-        )  # fmt: skip
-        return work.first(made)
+    def classes(self, batch: pa.RecordBatch, geometry: ScanGeometry | None) -> UInt8:
+        """Class of every reading of a batch, in its order; `geometry` for scans.
 
-    def _place_profiles(self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window) -> _Work:
-        origins, directions = geometry.rays()
-        work = _Work.of(batch.num_rows * geometry.readings)
-        made = georeference_profiles(
-            _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
-            (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns,
-            *self._common(), astuple(window), work.rows, work.readings, work.tiles, work.quanta, work.fates,
-        )  # fmt: skip
+        Returns
+        -------
+        (n,) for returns, (n · readings,) profile by profile for scans, of ``READING_CLASSES``; passes and centre
+        lines are not looked at.
+        """
+        return self._place(batch, geometry, EVERYWHERE, self._limits()).classes
+
+    def _work(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, marked: bool) -> _Work:
+        limited = self._place(batch, geometry, window, self._limits())
+        if not marked:
+            return limited
+        every = self._place(batch, geometry, window, _NO_LIMITS)
+        return replace(every, fates=limited.fates, classes=limited.classes)
+
+    def _place(
+        self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, limits: tuple[float, ...]
+    ) -> _Work:
+        work = _Work.of(batch.num_rows * (1 if geometry is None else geometry.readings))
+        if geometry is None:
+            xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
+            made = georeference_returns(
+                _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(limits), astuple(window),
+                work.rows, work.tiles, work.quanta, work.fates, work.classes,
+            )  # fmt: skip
+        else:
+            origins, directions = geometry.rays()
+            made = georeference_profiles(
+                _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
+                (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns,
+                *self._common(limits), astuple(window),
+                work.rows, work.readings, work.tiles, work.quanta, work.fates, work.classes,
+            )  # fmt: skip
         return work.first(made)
 
 
@@ -175,34 +209,47 @@ class _Work:
     tiles: Int32
     quanta: Int32
     fates: Int64
+    classes: UInt8
+    """Of all readings, kept or not."""
 
     @classmethod
     def of(cls, n: int) -> _Work:
         return cls(
             np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 3), np.int32),
-            np.zeros(FATES, np.int64),
+            np.zeros(FATES, np.int64), np.zeros(n, np.uint8),
         )  # fmt: skip
 
     def first(self, n: int) -> _Work:
-        return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates)
+        return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates, self.classes)
 
 
 def place_cloud(
-    batch: pa.RecordBatch, cloud: CloudFrame, frame: MapFrame, heights: HeightLimits, tile_quanta: int, window: Window
+    batch: pa.RecordBatch,
+    cloud: CloudFrame,
+    frame: MapFrame,
+    heights: HeightLimits,
+    tile_quanta: int,
+    window: Window,
+    *,
+    marked: bool = False,
 ) -> Placed:
-    """Place rows of the table ``cloud``: points that are already georeferenced."""
+    """Place rows of the table ``cloud``: points that are already georeferenced.
+
+    Of the filters only the absolute heights hold for them. `marked`: those too that these leave out, with their
+    classes.
+    """
     enh = cloud.to_map(np.stack([_numpy(batch, f"{a}_m") for a in "xyz"], axis=-1), frame)
     whole = np.floor(enh * QUANTA_PER_M + 0.5).astype(np.int64)
     tiles = whole[:, :2] // tile_quanta
-    lowest, highest = heights.absolute()
-    high = (enh[:, 2] >= lowest) & (enh[:, 2] <= highest)
+    classes = heights.classes(enh[:, 2])
+    high = classes == KEPT
     wanted = (
         (tiles[:, 0] >= window.first_column) & (tiles[:, 0] < window.end_column)
         & (tiles[:, 1] >= window.first_row) & (tiles[:, 1] < window.end_row)
     )  # fmt: skip
-    keep = high & wanted
+    keep = wanted & (high if not marked else HeightLimits().classes(enh[:, 2]) == KEPT)
     quanta = np.column_stack([whole[:, :2] - tiles * tile_quanta, whole[:, 2]])[keep].astype(np.int32)
-    fates = np.array([keep.sum(), 0, 0, (~high).sum(), (high & ~wanted).sum(), 0], dtype=np.int64)
+    fates = np.array([(high & wanted).sum(), 0, 0, (~high).sum(), (high & ~wanted).sum(), 0], dtype=np.int64)
     return Placed(
         tiles[keep].astype(np.int32),
         quanta,
@@ -210,8 +257,14 @@ def place_cloud(
         _numpy(batch, "intensity")[keep],
         _numpy(batch, "classification")[keep],
         fates,
+        classes[keep] if marked else None,
         {c: _numpy(batch, c)[keep] for c in EXTRA_COLUMNS if batch.column(c).null_count == 0},
     )
+
+
+def cloud_classes(batch: pa.RecordBatch, cloud: CloudFrame, frame: MapFrame, heights: HeightLimits) -> UInt8:
+    """Class (n,) of rows of the table ``cloud``, by their heights."""
+    return heights.classes(cloud.to_map(np.stack([_numpy(batch, f"{a}_m") for a in "xyz"], axis=-1), frame)[:, 2])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 
 class ScanGeometry(Strict):
@@ -50,3 +51,10 @@ class ScanGeometry(Strict):
         if self.kind == "cartesian":
             return np.stack([zero, where, zero], axis=-1), np.stack([zero, zero, one], axis=-1)
         return np.zeros((self.readings, 3)), np.stack([zero, np.sin(where), np.cos(where)], axis=-1)
+
+    def reading_epochs(self, epochs_gps_ns: Int64, reading: npt.NDArray[np.integer[Any]]) -> Int64:
+        """Epochs (n,) of readings by their numbers in the profile (n,), from the epochs of their profiles (n,)."""
+        if not self.reading_period_ns:
+            return epochs_gps_ns
+        later_ns: Int64 = np.floor(reading * self.reading_period_ns + 0.5).astype(np.int64)
+        return epochs_gps_ns + later_ns

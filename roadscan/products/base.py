@@ -55,6 +55,8 @@ class Tile:
 
     points: TilePoints
     cells: TileCells
+    marked: TilePoints | None = None
+    """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,9 @@ class Las(TileProduct):
 
     A point that is kept when the others are thinned out is a recorded one, with its own position, time and
     pass; of several at the median height it is the first one recorded.
+
+    With `filters.keep_marked` the points that filters leave out follow the others, withheld, in the classes 7, 18, 64,
+    65 and 66 (see there); thinned-out files do not hold them.
     """
 
     name: ClassVar[str] = "las"
@@ -97,13 +100,13 @@ class Las(TileProduct):
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
         """Write the tile's points."""
         settings = cast(LasOptions, options)
-        points = tile.points if settings.spacing_m is None else thin_out(tile.points, settings.spacing_m, context.grid)
+        points = _points_of(tile, settings, context)
         axes = _axes(points, settings.scale_m, context)
         header = _header(points, axes, context)
         record = _record(points, axes, header)
         digest = _Digest(header)
         digest.add(record.array)
-        facts = _facts(points, tile.points, axes, digest.text(), settings, context)
+        facts = _facts(points, tile, axes, digest.text(), settings, context)
         header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, "survey, tile, rounding", facts))
         backend = laspy.LazBackend.Lazrs if settings.compress else None
         with path.open("wb") as stream:
@@ -118,6 +121,13 @@ class Las(TileProduct):
                 _check_points(reader, path)
         except (laspy.LaspyException, LazrsError, OSError, ValueError, EOFError) as error:
             raise StoreError(f"the point file cannot be read: {error}", change="make it again", file=path) from error
+
+
+def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:
+    """Points to write: thinned out, or all, and behind them those that filters leave out, where they are kept."""
+    if options.spacing_m is not None:
+        return thin_out(tile.points, options.spacing_m, context.grid)
+    return tile.points if tile.marked is None else tile.points.and_then(tile.marked)
 
 
 def thin_out(points: TilePoints, spacing_m: float, grid: TileGrid) -> TilePoints:
@@ -288,7 +298,7 @@ def _gps_time_step_ns(points: TilePoints) -> float:
 
 def _facts(
     points: TilePoints,
-    all_points: TilePoints,
+    tile: Tile,
     axes: tuple[_Axis, _Axis, _Axis],
     blake2b: str,
     options: LasOptions,
@@ -298,12 +308,14 @@ def _facts(
         "survey": context.survey_id,
         "tile": str(points.tile),
         "height": context.map.height,
-        "points_of_tile": len(all_points),
+        "points_of_tile": len(tile.points),
         "spacing_m": options.spacing_m,
         "rounding_error_max_m": {name: round(axis.error_max_m, 9) for name, axis in zip("xyz", axes, strict=True)},
         "gps_time_step_ns": _gps_time_step_ns(points),
         "blake2b": blake2b,
     }
+    if tile.marked is not None and options.spacing_m is None:
+        facts["marked_points"] = len(tile.marked)
     return json.dumps(facts, sort_keys=True).encode("ascii")
 
 

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.simulate import sick
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.imu import AT_BODY, head_imus
 from roadscan.simulate.lidar import RANGE_MIN_M
@@ -57,6 +58,9 @@ def write_rig(scene: Scene, file: Path) -> None:
     if scene.lidar.on:
         limits = (RANGE_MIN_M, scene.lidar.range_max_m + 1.0)
         lines += _sensor("lidar", "lidar", "Velodyne HDL-32E", "flu", scene.lidar.mount, limits)
+    if scene.sick.on:
+        limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
+        lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", scene.sick.mount, limits)
     if scene.imu.on:
         lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", AT_BODY)
     for imu in head_imus(scene):

@@ -17,14 +17,11 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import RUN_UP_S, Drive
-from roadscan.simulate.earth import LocalMap
-from roadscan.simulate.kernels import rays as kernels
-from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.noise import stream
 from roadscan.simulate.pcap import PcapWriter
 from roadscan.simulate.scene import Scene
-from roadscan.simulate.surface import Surface
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -34,6 +31,9 @@ CYCLES: Final = 12
 FIRING_NS: Final = 1_152
 CYCLE_NS: Final = 46_080
 PACKET_NS: Final = CYCLES * CYCLE_NS
+INTERVALS: Final = 4
+"""Within a quarter of a packet the sensor moves evenly."""
+_INTERVAL_NS: Final = PACKET_NS // INTERVALS
 RANGE_STEP_M: Final = 0.002
 RANGE_MIN_M: Final = 0.9
 _LONGEST_RAW: Final = 65_535
@@ -81,8 +81,8 @@ class Packets:
     """(p, 12) hundredths of a degree at each cycle's first firing, as stated."""
     azimuth_deg: Float64
     """(p, 12, 32) true azimuth of each firing, clockwise from the sensor's x, seen from above."""
-    found: Float64
-    """(p, 12, 32, 5) exact range, easting, northing, height (m) of the hit, intensity; range NaN: none."""
+    found: Hits
+    """(p, 384) what each firing met, in the order fired."""
     ranges: npt.NDArray[np.uint16]
     """(p, 12, 32) units of 2 mm, 0: no return."""
     intensity: npt.NDArray[np.uint8]
@@ -95,11 +95,11 @@ class Packets:
         return out
 
 
-def write_lidar(scene: Scene, surface: Surface, drive: Drive, file: Path, hits_file: Path | None) -> Iterator[int]:
+def write_lidar(scene: Scene, world: World, drive: Drive, file: Path, hits_file: Path | None) -> Iterator[int]:
     """Write the capture of one pass, a block of packets a step; yields the returns of each."""
     hits = pq.ParquetWriter(hits_file, _HITS_SCHEMA, use_dictionary=False) if hits_file else None
-    with PcapWriter(file, drive) as capture:
-        for block in measure(scene, surface, drive):
+    with PcapWriter(file, scene, drive) as capture:
+        for block in measure(scene, world, drive):
             capture.write(block.epoch_gps_ns, block.block_azimuth, block.ranges, block.intensity)
             if hits is not None:
                 hits.write_batch(_hits(block))
@@ -108,47 +108,59 @@ def write_lidar(scene: Scene, surface: Surface, drive: Drive, file: Path, hits_f
         hits.close()
 
 
-def measure(scene: Scene, surface: Surface, drive: Drive) -> Iterator[Packets]:
+def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Packets]:
     """Packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
     first = drive.start_gps_ns - round(RUN_UP_S / 2 * 1e9)
     span = drive.duration_s + RUN_UP_S
     count = math.ceil(span * 1e9 / PACKET_NS)
     start_deg = float(stream(scene.seed, drive.number, "lidar head").integers(0, 36_000)) / 100.0
+    key = ray_key(scene, drive, "lidar")
     for block, packet in enumerate(range(0, count, BLOCK_PACKETS)):
         numbers = np.arange(packet, min(packet + BLOCK_PACKETS, count))
-        yield _measure_block(scene, surface, drive, first, start_deg, numbers, block)
+        yield _measure_block(scene, world, drive, first + numbers * PACKET_NS, _azimuths(scene, start_deg, numbers),
+                             key + packet * CYCLES * LASERS, block)  # fmt: skip
 
 
 def _measure_block(
-    scene: Scene, surface: Surface, drive: Drive, first_gps_ns: int, start_deg: float, numbers: Int64, block: int
+    scene: Scene,
+    world: World,
+    drive: Drive,
+    epochs: Int64,
+    azimuths: tuple[npt.NDArray[np.uint16], Float64],
+    key: int,
+    block: int,
 ) -> Packets:
-    epochs = first_gps_ns + numbers * PACKET_NS
-    ends = np.append(epochs, epochs[-1] + PACKET_NS)
-    origins, rotations = drive.poses(ends).sensor(scene.lidar.mount, BODY_FROM_AXES)
-    local = LocalMap.around(drive.earth, origins[origins.shape[0] // 2], surface.origin_enh_m, scene.lidar.range_max_m)
-    stated, azimuth_deg = _azimuths(scene, start_deg, numbers)
+    stated, azimuth_deg = azimuths
     beams = hdl32e_beams()
-    elevation = np.radians(beams.elevation_deg)
-    found = np.zeros((*azimuth_deg.shape, 5))
-    node = (drive.station_m(ends) - surface.arrays.nodes[0, 12]) / NODE_STEP_M
-    kernels.fire_lidar(
-        surface.arrays,
-        local.bases,
-        local.enu_from_ecef(origins),
-        local.ecef_from_enu.T @ rotations,
-        node.astype(np.int64),
-        np.stack([np.sin(elevation), np.cos(elevation), beams.rise_m], axis=-1),
-        np.radians(azimuth_deg),
-        (CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)) / PACKET_NS,
-        np.array([RANGE_MIN_M, scene.lidar.range_max_m]),
-        np.full((LASERS, 3), np.nan),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        found,
+    elevation, azimuth = np.radians(beams.elevation_deg), np.radians(azimuth_deg)
+    flat = np.cos(elevation)
+    up = np.broadcast_to(np.sin(elevation), azimuth.shape)
+    direction = np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], axis=-1)
+    found = world.cast(
+        drive,
+        scene.lidar.mount,
+        BODY_FROM_AXES,
+        epochs[:, None, None] + _INTERVAL_NS * (np.arange(INTERVALS)[:, None] + np.arange(2)),
+        direction.reshape(epochs.size, CYCLES * LASERS, 3),
+        _pattern(scene, beams),
+        key,
     )
-    found[..., 1:4] += surface.origin_enh_m
     ranges, intensity = _recorded(scene, drive, block, found)
     return Packets(epochs, stated, azimuth_deg, found, ranges, intensity)
+
+
+def _pattern(scene: Scene, beams: Beams) -> Pattern:
+    """The firings of a packet."""
+    origin = np.zeros((CYCLES, LASERS, 3))
+    origin[:, :, 2] = beams.rise_m
+    past_ns = (CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)).ravel()
+    return Pattern(
+        origin.reshape(-1, 3),
+        past_ns // _INTERVAL_NS,
+        past_ns % _INTERVAL_NS / _INTERVAL_NS,
+        scene.lidar.divergence_deg,
+        (RANGE_MIN_M, scene.lidar.range_max_m),
+    )
 
 
 def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:
@@ -168,19 +180,20 @@ def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArr
 
 
 def _recorded(
-    scene: Scene, drive: Drive, block: int, found: Float64
+    scene: Scene, drive: Drive, block: int, found: Hits
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
-    """Ranges and intensities with noise, as whole numbers."""
+    """Ranges and intensities (p, 12, 32) with noise, as whole numbers."""
     rng = stream(scene.seed, drive.number, "lidar", block)
     noise = scene.noise
-    seen = np.isfinite(found[..., 0])
+    exact = found.range_m.reshape(-1, CYCLES, LASERS)
+    seen = np.isfinite(exact)
     if noise.dropout > 0.0:
         seen &= rng.random(seen.shape, dtype=np.float32) >= noise.dropout
     errors = rng.standard_normal((2, np.count_nonzero(seen)), dtype=np.float32)
     ranges, intensity = np.zeros(seen.shape, np.uint16), np.zeros(seen.shape, np.uint8)
-    units = np.rint((found[..., 0][seen] + noise.lidar_range_m * errors[0]) / RANGE_STEP_M)
+    units = np.rint((exact[seen] + noise.lidar_range_m * errors[0]) / RANGE_STEP_M)
     ranges[seen] = np.clip(units, 1, _LONGEST_RAW)
-    value = REFLECTIVITY * (found[..., 4][seen] + noise.intensity * errors[1])
+    value = REFLECTIVITY * (found.intensity.reshape(seen.shape)[seen] + noise.intensity * errors[1])
     intensity[seen] = np.clip(np.rint(value), 1, 100)
     return ranges, intensity
 
@@ -194,6 +207,8 @@ _HITS_SCHEMA: Final = pa.schema(
         pa.field("easting_m", pa.float64()),
         pa.field("northing_m", pa.float64()),
         pa.field("height_m", pa.float64()),
+        pa.field("object_id", pa.int32()),
+        pa.field("is_mixed", pa.bool_()),
     ]
 )
 
@@ -201,6 +216,9 @@ _HITS_SCHEMA: Final = pa.schema(
 def _hits(block: Packets) -> pa.RecordBatch:
     """Where the returns of a block come from, one row a return that was recorded."""
     seen = block.ranges > 0
+    flat = seen.reshape(len(seen), -1)
     laser = np.broadcast_to(np.arange(LASERS, dtype=np.uint8), seen.shape)
-    columns = [block.firing_gps_ns()[seen], laser[seen], block.azimuth_deg[seen], *block.found[seen][:, :4].T]
+    found = block.found
+    columns = [block.firing_gps_ns()[seen], laser[seen], block.azimuth_deg[seen], found.range_m[flat]]
+    columns += [*found.enh_m[flat].T, found.object_id[flat], found.is_mixed[flat]]
     return pa.RecordBatch.from_arrays([pa.array(np.ascontiguousarray(c)) for c in columns], schema=_HITS_SCHEMA)

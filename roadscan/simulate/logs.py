@@ -9,7 +9,8 @@ from typing import Literal
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
-from roadscan.simulate import encoder, gnss, imu, trajectory
+from roadscan.simulate import encoder, gnss, imu, sick, trajectory
+from roadscan.simulate.caster import World
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.lidar import write_lidar
@@ -48,6 +49,8 @@ class Pass:
 
     scene: Scene
     surface: Surface
+    world: World | None
+    """What rays meet; None where nothing on the rig casts any."""
     drive: Drive
     raw: Path
     """Folder of the logs."""
@@ -68,7 +71,7 @@ class Pass:
         ConfigError
             where a sensor needs the Earth, and the scene lies in a local frame.
         """
-        makers = (self._profilers, self._lidar, self._trajectory, self._imus, self._gnss, self._encoder)
+        makers = (self._profilers, self._lidar, self._sick, self._trajectory, self._imus, self._gnss, self._encoder)
         return [log for make in makers for log in make()]
 
     def _trajectory(self) -> Iterator[SimulatedLog]:
@@ -104,16 +107,31 @@ class Pass:
             yield SimulatedLog(name, write, "readings", "scans", head.name, stated)
 
     def _lidar(self) -> Iterator[SimulatedLog]:
-        if not self.scene.lidar.on:
+        world = self.world
+        if world is None or not self.scene.lidar.on:
             return
         self._need_earth("lidar", "its packets carry GNSS sentences")
         name = "lidar.pcap"
 
         def write() -> Iterator[int]:
-            return write_lidar(self.scene, self.surface, self.drive, self.raw / name, self.hits("lidar"))
+            return write_lidar(self.scene, world, self.drive, self.raw / name, self.hits("lidar"))
 
         clock = self.clock("lidar", TimeSystem.UTC_HOUR).toml(None, self.drive.start_gps_ns)
         yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", clock)
+
+    def _sick(self) -> Iterator[SimulatedLog]:
+        world = self.world
+        if world is None or not self.scene.sick.on:
+            return
+        clock = self.clock("sick", TimeSystem.UNIX_UTC)
+        name = "sick.lms"
+
+        def write() -> Iterator[int]:
+            return sick.write_sick(self.scene, world, self.drive, clock, self.raw / name, self.hits("sick"))
+
+        stated = clock.toml("ns", self.drive.start_gps_ns)
+        options = sick.Scanner(self.scene.sick).options()
+        yield SimulatedLog(name, write, "other", "sick_lms", "sick", stated, None, options)
 
     def _imus(self) -> Iterator[SimulatedLog]:
         scene = self.scene

@@ -11,8 +11,10 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps
+from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, TimeSystem, leap_seconds_at_gps
+from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
+from roadscan.simulate.scene import Scene
 
 Int64 = npt.NDArray[np.int64]
 
@@ -49,10 +51,14 @@ _RECORD: Final = np.dtype(
 
 
 class PcapWriter:
-    """Writes one capture: data packets as they come, a position packet at the start and after each full second."""
+    """Writes one capture: data packets as they come, a position packet at the start and after each full second.
 
-    def __init__(self, file: Path, drive: Drive) -> None:
+    Stamps within the packets are of the sensor's clock, those of the capture itself of a computer's that is right.
+    """
+
+    def __init__(self, file: Path, scene: Scene, drive: Drive) -> None:
         self._drive = drive
+        self._clock = SensorClock.of(scene, scene.lidar.clock, TimeSystem.UTC_HOUR)
         self._stream = file.open("wb")
         self._stream.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1))
         self._next_position_gps_ns: int | None = None
@@ -77,13 +83,15 @@ class PcapWriter:
         epoch_gps_ns : (p,) first firing; azimuth : (p, 12) hundredths of a degree; ranges : (p, 12, 32) units of 2 mm;
         intensity : (p, 12, 32).
         """
-        records = _data_packets(epoch_gps_ns, azimuth, ranges, intensity)
+        shown = self._clock.shown_gps_ns(epoch_gps_ns)
+        records = _data_packets(epoch_gps_ns, shown, azimuth, ranges, intensity)
         done = 0
-        while self._position_due(epoch_gps_ns[-1], int(epoch_gps_ns[0])):
+        while self._position_due(shown[-1], int(shown[0])):
             due = self._next_position_gps_ns or 0
-            upto = int(np.searchsorted(epoch_gps_ns, due))
+            upto = int(np.searchsorted(shown, due))
             self._stream.write(records[done:upto].tobytes())
-            self._stream.write(self._position_packet(due))
+            at = min(upto, shown.size - 1)
+            self._stream.write(self._position_packet(due, due - int(shown[at] - epoch_gps_ns[at])))
             self._next_position_gps_ns = (due // NS_PER_S + 1) * NS_PER_S + POSITION_DELAY_NS
             done = upto
         self._stream.write(records[done:].tobytes())
@@ -93,15 +101,19 @@ class PcapWriter:
             self._next_position_gps_ns = first_gps_ns
         return self._next_position_gps_ns <= last_gps_ns
 
-    def _position_packet(self, epoch_gps_ns: int) -> bytes:
-        """PCAP record of a position packet: µs past the hour at byte 198, PPS state at 202, GPRMC at 206."""
-        utc = int(_utc_ns(np.array([epoch_gps_ns]))[0])
+    def _position_packet(self, shown_gps_ns: int, epoch_gps_ns: int) -> bytes:
+        """PCAP record of a position packet: µs past the hour at byte 198, PPS state at 202, GPRMC at 206.
+
+        shown_gps_ns : what the sensor's clock shows at the true epoch.
+        """
+        utc = int(_utc_ns(np.array([shown_gps_ns]))[0])
         sentence = self._gprmc(epoch_gps_ns, utc // NS_PER_S)
         payload = bytearray(POSITION_BYTES)
         struct.pack_into("<IB", payload, 198, utc % HOUR_NS // 1_000, 2)
         payload[206 : 206 + len(sentence)] = sentence
         frame = _headers(POSITION_BYTES, POSITION_PORT) + bytes(payload)
-        seconds, rest = divmod(utc + _CAPTURE_DELAY_NS, NS_PER_S)
+        captured = int(_utc_ns(np.array([epoch_gps_ns]))[0]) + _CAPTURE_DELAY_NS
+        seconds, rest = divmod(captured, NS_PER_S)
         return struct.pack("<IIII", seconds, rest // 1_000, len(frame), len(frame)) + frame
 
     def _gprmc(self, epoch_gps_ns: int, utc_s: int) -> bytes:
@@ -123,12 +135,12 @@ class PcapWriter:
 
 def _data_packets(
     epoch_gps_ns: Int64,
+    shown_gps_ns: Int64,
     azimuth: npt.NDArray[np.uint16],
     ranges: npt.NDArray[np.uint16],
     intensity: npt.NDArray[np.uint8],
 ) -> npt.NDArray[np.void]:
-    utc = _utc_ns(epoch_gps_ns)
-    captured = utc + _CAPTURE_DELAY_NS
+    captured = _utc_ns(epoch_gps_ns) + _CAPTURE_DELAY_NS
     records = np.zeros(epoch_gps_ns.size, dtype=_RECORD)
     records["captured_s"], records["captured_us"] = captured // NS_PER_S, captured % NS_PER_S // 1_000
     records["stored"] = records["sent"] = 42 + DATA_BYTES
@@ -137,7 +149,7 @@ def _data_packets(
     records["blocks"]["azimuth"] = azimuth
     records["blocks"]["firings"]["range"] = ranges
     records["blocks"]["firings"]["intensity"] = intensity
-    records["hour_us"] = (utc + 500) // 1_000 % (HOUR_NS // 1_000)
+    records["hour_us"] = (_utc_ns(shown_gps_ns) + 500) // 1_000 % (HOUR_NS // 1_000)
     records["mode"], records["product"] = STRONGEST_RETURN, HDL_32E
     return records
 

@@ -11,6 +11,7 @@ from typing import Final
 
 from roadscan.model.errors import ConfigError
 from roadscan.simulate import files, truth
+from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.logs import Pass, SimulatedLog
@@ -55,7 +56,8 @@ def simulate(
     folder : where to write ``SURVEY.toml``, ``RIG.toml``, ``control.csv``, ``raw/`` and ``truth/``;
         empty, new, or holding the survey of this very scene.
     write_hits : also write ``truth/hits/<run>/<sensor>.parquet``: where each beam met the surface, exactly (for
-        profilers one row a profile, NaN where the beam missed; for the lidar one row a recorded return).
+        profilers one row a profile, NaN where the beam missed; for the line scanner one row a turn of its mirror; for
+        the lidar one row a recorded return).
     progress : called with the name of each log before it is written.
 
     Raises
@@ -69,7 +71,10 @@ def simulate(
     surface, ride = Surface(scene), Surface(scene, ride=True)
     drives = drives_of(scene, earth, ride)
     known = truth.Truth(scene, surface, target / truth.TRUTH_FOLDER)
-    logs = [_pass(known, drive, target, write_hits).logs() for drive in drives]
+    truth.save_objects(scene, surface, target)
+    casts = scene.lidar.on or scene.sick.on or scene.camera.on
+    world = World(scene, surface) if casts else None
+    logs = [_pass(known, world, drive, target, write_hits).logs() for drive in drives]
     counts: Counter[str] = Counter()
     for drive, listed in zip(drives, logs, strict=True):
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
@@ -89,7 +94,7 @@ def simulate(
     )
 
 
-def _pass(known: truth.Truth, drive: Drive, folder: Path, write_hits: bool) -> Pass:
+def _pass(known: truth.Truth, world: World | None, drive: Drive, folder: Path, write_hits: bool) -> Pass:
     """One pass with its folders, which are made."""
     run = files.run_id(drive.number)
     raw = folder / "raw" / run
@@ -99,7 +104,7 @@ def _pass(known: truth.Truth, drive: Drive, folder: Path, write_hits: bool) -> P
     def hits(sensor: str) -> Path | None:
         return known.hits_file(run, sensor) if write_hits else None
 
-    return Pass(known.scene, known.surface, drive, raw, known.trajectory_file(run), hits)
+    return Pass(known.scene, known.surface, world, drive, raw, known.trajectory_file(run), hits)
 
 
 def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:

@@ -8,16 +8,19 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow.parquet as pq
 from pydantic import ValidationError
 
 from roadscan.model.errors import FormatError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
+from roadscan.simulate.things import objects_table
 
 Float64 = npt.NDArray[np.float64]
 
 TRUTH_FOLDER: Final = "truth"
 SCENE_FILE: Final = "scene.json"
+OBJECTS_FILE: Final = "objects.parquet"
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,11 @@ class Truth:
     def trajectory_file(self, run: str) -> Path:
         """Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
         return self.folder / "trajectory" / f"{run}.parquet"
+
+    @property
+    def objects_file(self) -> Path:
+        """Parquet file of all objects beside the road, see :func:`roadscan.simulate.things.objects_table`."""
+        return self.folder / OBJECTS_FILE
 
     def hits_file(self, run: str, sensor: str) -> Path:
         """Parquet file of the points that a sensor's beams hit in a run."""
@@ -84,3 +92,8 @@ def save(scene: Scene, folder: Path) -> None:
     target = folder / TRUTH_FOLDER / SCENE_FILE
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(scene.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def save_objects(scene: Scene, surface: Surface, folder: Path) -> None:
+    """Write the table of objects into the truth folder of the survey in `folder`."""
+    pq.write_table(objects_table(scene, surface), folder / TRUTH_FOLDER / OBJECTS_FILE)

@@ -1,31 +1,128 @@
-"""Rays of spinning lidars, line scanners and cameras: where they meet road and things."""
+"""Rays of lidars, line scanners and cameras: what each meets first, the road or a body beside it."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.simulate.kernels.beams import (
-    ROOT_TOLERANCE_M,
-    along_beam,
-    clearance,
-    into_defect,
-    through,
-    turn_to_road,
+from roadscan.simulate.kernels.beams import along_beam, through
+from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
+from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.profiles import mixed
+from roadscan.simulate.kernels.road import DEFECTS, DEFECTS_END, RoadArrays, brightness, defect_depth, on_surface
+from roadscan.simulate.kernels.things import (
+    BODY_COLUMNS,
+    EASTING,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    HIGH,
+    HIGH_END,
+    KIND,
+    LOW,
+    LOW_END,
+    NORTHING,
+    meet,
+    shade,
 )
-from roadscan.simulate.kernels.options import compiled
-from roadscan.simulate.kernels.road import RoadArrays, brightness, defect_depth, on_surface
 
 Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
-LIDAR_TOLERANCE_M = 1e-7
-"""The same for the lidar."""
+NOTHING, ROAD, LOST = -1, -2, -3
+"""What a ray met, where it is not a body: nothing within reach; the road; the underside or the edge of the road."""
+ON_GROUND, NO_OBJECT = 0, -1
+"""Objects of rays that meet the road, and nothing."""
+
+# Places in the scratch array of a ray's search.
+BEST, HIT, NODE, PAST, OFFSET, DEPTH = 0, 1, 2, 3, 4, 5
+STATE_SIZE = 6
+
+MIXED_WITHIN_M = 0.15
+"""Sub-rays that meet things nearer to one another than this see one and the same (m)."""
+PULSE_M = 1.5
+"""Echoes nearer to one another than this merge into one: half the length of a pulse of 10 ns (m)."""
 
 
-@compiled
+class World(NamedTuple):
+    """All that rays can meet and that stands still."""
+
+    road: RoadArrays
+    cells: Cells
+    bodies: Float64
+    """(n, 18), see :mod:`roadscan.simulate.kernels.things`."""
+    object_id: Int32
+    """(n,) object that each body belongs to."""
+
+
+class Movers(NamedTuple):
+    """Bodies that move, at the beginning of each slot of time; within a slot they move evenly."""
+
+    bodies: Float64
+    """(slots, n, 18)"""
+    velocity: Float64
+    """(slots, n, 3) east, north, up (m/s)."""
+    object_id: Int32
+    """(n,)"""
+    slot_s: float
+    """Length of a slot (s)."""
+
+
+class Poses(NamedTuple):
+    """Poses of a sensor at the beginning and end of each interval; between them it moves evenly."""
+
+    begin_m: Float64
+    """(p, 3) origin in the anchor's east, north, up."""
+    end_m: Float64
+    """(p, 3)"""
+    begin: Float64
+    """(p, 3, 3) rotation from the sensor's axes."""
+    end: Float64
+    """(p, 3, 3)"""
+    time_s: Float64
+    """(p, 2) beginning and end, since the first slot of the movers."""
+
+
+class Rays(NamedTuple):
+    """The rays of g groups (packets, turns of a mirror, pictures) of m rays."""
+
+    direction: Float64
+    """(g, m, 3) unit vectors in the sensor's axes."""
+    origin_m: Float64
+    """(m, 3) in the sensor's axes."""
+    interval: Int64
+    """(m,) interval of poses within the group: group g has the intervals g · n … g · n + n − 1."""
+    share: Float64
+    """(m,) time within the interval, as a share of its length."""
+    fan_rad: Float64
+    """(s, 2) angles of the sub-rays from the ray, to two sides; (1, 2) zeros for rays without width."""
+    weight: Float64
+    """(s,) energy of each sub-ray."""
+    limits_m: Float64
+    """(2,) nearest and farthest range measured."""
+    key: np.uint64
+    """Random key of the first ray: each ray has its own."""
+
+
+class Found(NamedTuple):
+    """What rays have met."""
+
+    place: Float64
+    """(g, m, 5) range, easting, northing, height (m), intensity; range NaN: nothing; intensity NaN: glass."""
+    object_id: Int32
+    """(g, m) 0: the road, −1: nothing."""
+    is_mixed: Flags
+    """(g, m) the range is a mixture of several things', or another's than that in the ray's middle."""
+
+
+# --- frames ------------------------------------------------------------------------------------------
+
+
+@inlined
 def bend(bases: Float64, axis: int, x: float, y: float, z: float) -> float:
     """Easting, northing or height (axis 0, 1, 2) of a point near an anchor: quadratic in its east, north, up.
 
@@ -37,194 +134,376 @@ def bend(bases: Float64, axis: int, x: float, y: float, z: float) -> float:
     return value
 
 
-@compiled
-def turned(rotations: Float64, p: int, share: float, axis: int, x: float, y: float, z: float) -> float:
-    """One component of a sensor's vector in the anchor's frame, between the rotations of packet `p` and the next.
+@inlined
+def turned(poses: Poses, p: int, share: float, axis: int, x: float, y: float, z: float) -> float:
+    """One component of a sensor's vector in the anchor's frame.
 
-    Linear in time: over the 0.55 ms of a packet that is good to 10⁻⁸ at 10 degrees a second.
+    Linear in time: over the 0.55 ms of a lidar's packet that is good to 10⁻⁸ at 10 degrees a second.
     """
-    begin = rotations[p, axis, 0] * x + rotations[p, axis, 1] * y + rotations[p, axis, 2] * z
-    end = rotations[p + 1, axis, 0] * x + rotations[p + 1, axis, 1] * y + rotations[p + 1, axis, 2] * z
+    begin = poses.begin[p, axis, 0] * x + poses.begin[p, axis, 1] * y + poses.begin[p, axis, 2] * z
+    end = poses.end[p, axis, 0] * x + poses.end[p, axis, 1] * y + poses.end[p, axis, 2] * z
     value: float = begin + share * (end - begin)
     return value
 
 
-@compiled
-def between(origins_m: Float64, p: int, share: float, axis: int) -> float:
-    """One coordinate of the sensor between the beginning of packet `p` and the next."""
-    value: float = origins_m[p, axis] + share * (origins_m[p + 1, axis] - origins_m[p, axis])
-    return value
+@inlined
+def lay_beam(
+    bases: Float64, poses: Poses, p: int, share: float, origin: Float64, i: int,
+    dx: float, dy: float, dz: float, reach: float, beam: Float64,
+) -> None:  # fmt: skip
+    """Lay the parabola of a ray through the map: easting, northing, height by its range.
+
+    origin : (m, 3), of which ray `i` takes its own; beam : (3, 3), out.
+    """
+    half = 0.5 * reach
+    ox, oy, oz = origin[i, 0], origin[i, 1], origin[i, 2]
+    x = poses.begin_m[p, 0] + share * (poses.end_m[p, 0] - poses.begin_m[p, 0]) + turned(poses, p, share, 0, ox, oy, oz)
+    y = poses.begin_m[p, 1] + share * (poses.end_m[p, 1] - poses.begin_m[p, 1]) + turned(poses, p, share, 1, ox, oy, oz)
+    z = poses.begin_m[p, 2] + share * (poses.end_m[p, 2] - poses.begin_m[p, 2]) + turned(poses, p, share, 2, ox, oy, oz)
+    ex = half * turned(poses, p, share, 0, dx, dy, dz)
+    ey = half * turned(poses, p, share, 1, dx, dy, dz)
+    ez = half * turned(poses, p, share, 2, dx, dy, dz)
+    for axis in range(3):
+        first = bend(bases, axis, x, y, z)
+        second = bend(bases, axis, x + ex, y + ey, z + ez)
+        third = bend(bases, axis, x + 2.0 * ex, y + 2.0 * ey, z + 2.0 * ez)
+        through(beam, axis, half, first, second, third)
+
+
+# --- one ray -----------------------------------------------------------------------------------------
 
 
 @compiled
-def fire_lidar(
-    road: RoadArrays,
-    bases: Float64,
-    origins_m: Float64,
-    rotations: Float64,
-    near: Int64,
-    elevation: Float64,
-    azimuth_rad: Float64,
-    firing_share: Float64,
-    limits_m: Float64,
-    memory: Float64,
+def cast(
+    world: World,
+    movers: Movers,
+    time_s: float,
     beam: Float64,
-    on_road: Float64,
-    out: Float64,
+    reach: float,
+    key: np.uint64,
+    body: Float64,
+    state: Float64,
 ) -> None:
-    """Ranges of a spinning lidar's firings.
+    """Find what a beam meets first.
+
+    Parameters
+    ----------
+    time_s : since the movers' first slot.
+    beam : (3, 3) easting, northing and height by range.
+    reach : how far to look (m).
+    body : (1, 18) scratch.
+    state : (6,) out: range, what was met (a body's number, those of movers follow on the still ones'; or
+        :data:`ROAD`, :data:`LOST`, :data:`NOTHING`), node, u, offset and depth of the road there.
+    """
+    state[BEST], state[HIT] = reach, NOTHING
+    # The chord of the beam; bodies are met on it first, and where that counts on the beam itself.
+    dx = beam[0, 1] + reach * beam[0, 2]
+    dy = beam[1, 1] + reach * beam[1, 2]
+    dz = beam[2, 1] + reach * beam[2, 2]
+    meet_movers(world, movers, time_s, beam, dx, dy, dz, key, body, state)
+    walk_tiles(world, beam, dx, dy, dz, reach, key, state)
+    hit = int(state[HIT])
+    if hit >= 0:
+        still = world.bodies.shape[0]
+        if hit >= still:
+            place_mover(movers, time_s, hit - still, body)
+        r = state[BEST]
+        for _ in range(2):
+            tx, ox = beam[0, 1] + 2.0 * r * beam[0, 2], beam[0, 0] - r * r * beam[0, 2]
+            ty, oy = beam[1, 1] + 2.0 * r * beam[1, 2], beam[1, 0] - r * r * beam[1, 2]
+            tz, oz = beam[2, 1] + 2.0 * r * beam[2, 2], beam[2, 0] - r * r * beam[2, 2]
+            if hit >= still:
+                again = meet(body, 0, ox, oy, oz, tx, ty, tz, key ^ np.uint64(hit))
+            else:
+                again = meet(world.bodies, hit, ox, oy, oz, tx, ty, tz, key)
+            if abs(again - r) < 0.05:
+                r = again
+        state[BEST] = r
+
+
+@compiled
+def place_mover(movers: Movers, time_s: float, i: int, body: Float64) -> None:
+    """Body `i` of the movers at a time. body : (1, 18), out."""
+    slot = min(max(int(time_s / movers.slot_s), 0), movers.bodies.shape[0] - 1)
+    past = time_s - slot * movers.slot_s
+    for column in range(BODY_COLUMNS):
+        body[0, column] = movers.bodies[slot, i, column]
+    body[0, EASTING] += past * movers.velocity[slot, i, 0]
+    body[0, NORTHING] += past * movers.velocity[slot, i, 1]
+    rise = past * movers.velocity[slot, i, 2]
+    for column in (LOW, HIGH, LOW_END, HIGH_END):
+        body[0, column] += rise
+
+
+@compiled
+def meet_movers(
+    world: World, movers: Movers, time_s: float, beam: Float64, dx: float, dy: float, dz: float, key: np.uint64,
+    body: Float64, state: Float64,
+) -> None:  # fmt: skip
+    """Let the nearest moving body in the way stop a beam."""
+    count = movers.bodies.shape[1]
+    if count == 0:
+        return
+    slot = min(max(int(time_s / movers.slot_s), 0), movers.bodies.shape[0] - 1)
+    past = time_s - slot * movers.slot_s
+    still = world.bodies.shape[0]
+    flat2 = dx * dx + dy * dy
+    for i in range(count):
+        x = movers.bodies[slot, i, EASTING] + past * movers.velocity[slot, i, 0] - beam[0, 0]
+        y = movers.bodies[slot, i, NORTHING] + past * movers.velocity[slot, i, 1] - beam[1, 0]
+        half = movers.bodies[slot, i, HALF_LENGTH] + movers.bodies[slot, i, HALF_WIDTH] + 0.01
+        aside = x * dy - y * dx
+        if aside * aside > half * half * flat2 or movers.bodies[slot, i, KIND] < 0.0:
+            continue
+        place_mover(movers, time_s, i, body)
+        r = meet(body, 0, beam[0, 0], beam[1, 0], beam[2, 0], dx, dy, dz, key ^ np.uint64(still + i))
+        if r < state[BEST]:
+            state[BEST], state[HIT] = r, still + i
+
+
+@inlined
+def next_border(from_m: float, per_m: float, index: int, size: float) -> float:
+    """Range at which a line leaves an interval of a row of equal ones."""
+    if per_m > 0.0:
+        return ((index + 1) * size - from_m) / per_m
+    if per_m < 0.0:
+        return (index * size - from_m) / per_m
+    return np.inf
+
+
+@inlined
+def walk_tiles(
+    world: World, beam: Float64, dx: float, dy: float, dz: float, reach: float, key: np.uint64, state: Float64
+) -> None:
+    """Walk a beam from tile to tile of the map (Amanatides and Woo 1987) up to what it meets first."""
+    cells = world.cells
+    x, y = beam[0, 0] - cells.corner[0], beam[1, 0] - cells.corner[1]
+    rows, columns = cells.tiles.shape
+    begin, end = 0.0, reach
+    for axis in range(2):
+        at, per_m, size = (x, dx, columns * TILE_M) if axis == 0 else (y, dy, rows * TILE_M)
+        if per_m == 0.0:
+            if not 0.0 <= at < size:
+                return
+            continue
+        first, second = -at / per_m, (size - at) / per_m
+        begin, end = max(begin, min(first, second)), min(end, max(first, second))
+    if begin >= end:
+        return
+    i = min(max(int((x + begin * dx) / TILE_M), 0), columns - 1)
+    j = min(max(int((y + begin * dy) / TILE_M), 0), rows - 1)
+    step_i, step_j = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1)
+    r = begin
+    while r < end and r < state[BEST]:
+        to_x, to_y = next_border(x, dx, i, TILE_M), next_border(y, dy, j, TILE_M)
+        leave = min(max(min(to_x, to_y), r), end)
+        tile = cells.tiles[j, i]
+        if tile >= 0 and min(along_beam(beam, 2, r), along_beam(beam, 2, leave)) <= cells.top[tile]:
+            walk_cells(world, tile, i, j, beam, dx, dy, dz, r, leave, key, state)
+        if to_x < to_y:
+            i += step_i
+        else:
+            j += step_j
+        if not (0 <= i < columns and 0 <= j < rows):
+            return
+        r = leave
+
+
+@inlined
+def walk_cells(
+    world: World, tile: int, tile_i: int, tile_j: int, beam: Float64, dx: float, dy: float, dz: float,
+    begin: float, end: float, key: np.uint64, state: Float64,
+) -> None:  # fmt: skip
+    """The same from cell to cell of one tile."""
+    cells = world.cells
+    x = beam[0, 0] - cells.corner[0] - tile_i * TILE_M
+    y = beam[1, 0] - cells.corner[1] - tile_j * TILE_M
+    i = min(max(int((x + begin * dx) / CELL_M), 0), TILE_CELLS - 1)
+    j = min(max(int((y + begin * dy) / CELL_M), 0), TILE_CELLS - 1)
+    step_i, step_j = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1)
+    corner_e = cells.corner[0] + tile_i * TILE_M + 0.5 * CELL_M
+    corner_n = cells.corner[1] + tile_j * TILE_M + 0.5 * CELL_M
+    to_x, to_y = next_border(x, dx, i, CELL_M), next_border(y, dy, j, CELL_M)
+    r = begin
+    while r < end and r < state[BEST]:
+        leave = min(max(min(to_x, to_y), r), end)
+        index = (tile * TILE_CELLS + j) * TILE_CELLS + i
+        for m in range(cells.first[index], cells.first[index + 1]):
+            found = meet(world.bodies, cells.members[m], beam[0, 0], beam[1, 0], beam[2, 0], dx, dy, dz, key)
+            if found < state[BEST]:
+                state[BEST], state[HIT] = found, cells.members[m]
+        if cells.flags[index] and leave > r:
+            meet_ground(world, index, corner_e + i * CELL_M, corner_n + j * CELL_M, beam, r, leave, state)
+        if to_x < to_y:
+            i += step_i
+            to_x = next_border(x, dx, i, CELL_M)
+        else:
+            j += step_j
+            to_y = next_border(y, dy, j, CELL_M)
+        if not (0 <= i < TILE_CELLS and 0 <= j < TILE_CELLS):
+            return
+        r = leave
+
+
+@compiled
+def meet_ground(
+    world: World, index: int, middle_e: float, middle_n: float, beam: Float64, begin: float, end: float, state: Float64
+) -> None:
+    """Let the ground of a cell stop a beam, if it does so before anything else."""
+    road = world.road
+    r, k, u, offset = first_ground(road, world.cells, index, middle_e, middle_n, beam, begin, end)
+    if math.isnan(r):
+        return
+    if r < 0.0 or not on_surface(road, k, u, offset):
+        r = max(r, begin)
+        if r < state[BEST]:
+            state[BEST], state[HIT] = r, LOST
+        return
+    depth = 0.0
+    if road.nodes[k, DEFECTS] < road.nodes[k, DEFECTS_END]:
+        depth, _ = defect_depth(road, k, u, offset)
+        if depth > 0.0:
+            r, depth, k, u, offset = into_hole(road, beam, r, k)
+    if r < state[BEST]:
+        state[BEST], state[HIT] = r, ROAD
+        state[NODE], state[PAST], state[OFFSET], state[DEPTH] = k, u, offset, depth
+
+
+# --- all rays ----------------------------------------------------------------------------------------
+
+
+@compiled
+def cast_rays(
+    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, found: Found, beam: Float64, body: Float64,
+    state: Float64, echoes: Float64,
+) -> None:  # fmt: skip
+    """Cast all rays.
 
     Parameters
     ----------
     bases : (3, 10), see :func:`bend`.
-    origins_m, rotations, near : (p + 1, 3) and (p + 1, 3, 3) pose of the sensor (x forward, y left, z up) in the
-        anchor's east, north, up at the packets' beginnings and the last one's end, and (p + 1,) the node under it.
-    elevation : (l, 3) sine and cosine of each laser's elevation, and its origin's height along the sensor's z (m).
-    azimuth_rad : (p, c, l) clockwise from the sensor's x, seen from above.
-    firing_share : (c, l) time of each firing within its packet, as a share of the packet's time.
-    limits_m : (2,) nearest and farthest range measured.
-    memory : (l, 3) NaN at first, see :func:`first_hit`.
-    beam, on_road : (3, 3) scratch.
-    out : (p, c, l, 5) range, easting, northing, height (m), intensity; all NaN: no return.
+    found : out.
+    beam, body, state, echoes : (3, 3), (1, 18), (6,), (s, 5) scratch.
     """
-    packets, cycles, lasers = azimuth_rad.shape
-    reach = 0.5 * limits_m[1]
-    for p in range(packets):
-        for c in range(cycles):
-            for j in range(lasers):
-                for i in range(5):
-                    out[p, c, j, i] = np.nan
-                share = firing_share[c, j]
-                forward = elevation[j, 1] * math.cos(azimuth_rad[p, c, j])
-                left = -elevation[j, 1] * math.sin(azimuth_rad[p, c, j])
-                up = elevation[j, 0]
-                rise = elevation[j, 2]
-                dx = reach * turned(rotations, p, share, 0, forward, left, up)
-                dy = reach * turned(rotations, p, share, 1, forward, left, up)
-                dz = reach * turned(rotations, p, share, 2, forward, left, up)
-                if dz > -0.01 * reach:
-                    memory[j, 0] = np.nan
-                    continue
-                x = between(origins_m, p, share, 0) + turned(rotations, p, share, 0, 0.0, 0.0, rise)
-                y = between(origins_m, p, share, 1) + turned(rotations, p, share, 1, 0.0, 0.0, rise)
-                z = between(origins_m, p, share, 2) + turned(rotations, p, share, 2, 0.0, 0.0, rise)
-                for axis in range(3):
-                    first = bend(bases, axis, x, y, z)
-                    second = bend(bases, axis, x + dx, y + dy, z + dz)
-                    third = bend(bases, axis, x + 2.0 * dx, y + 2.0 * dy, z + 2.0 * dz)
-                    through(beam, axis, reach, first, second, third)
-                found, k, u, offset, depth = first_hit(road, beam, on_road, limits_m, near[p], memory, j)
-                if math.isnan(found) or not on_surface(road, k, u, offset):
-                    continue
-                out[p, c, j, 0] = found
-                for axis in range(3):
-                    out[p, c, j, 1 + axis] = along_beam(beam, axis, found)
-                out[p, c, j, 4] = brightness(road, k, u, offset, depth, 0.0)
+    groups, count = rays.direction.shape[0], rays.direction.shape[1]
+    intervals = poses.begin_m.shape[0] // groups
+    reach = rays.limits_m[1]
+    for g in range(groups):
+        for i in range(count):
+            p = g * intervals + rays.interval[i]
+            share = rays.share[i]
+            time_s = poses.time_s[p, 0] + share * (poses.time_s[p, 1] - poses.time_s[p, 0])
+            x, y, z = rays.direction[g, i, 0], rays.direction[g, i, 1], rays.direction[g, i, 2]
+            number = np.uint64(g * count + i)
+            # Two directions at right angles to the ray and to one another, by the axis that it is farthest from.
+            ux, uy, uz = (-y, x, 0.0) if abs(z) < 0.7 else (0.0, -z, y)
+            norm = 1.0 / math.sqrt(ux * ux + uy * uy + uz * uz)
+            ux, uy, uz = ux * norm, uy * norm, uz * norm
+            vx, vy, vz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+            for s in range(rays.fan_rad.shape[0] - 1, -1, -1):  # the middle last: its beam is used below
+                a, b = rays.fan_rad[s, 0], rays.fan_rad[s, 1]
+                scale = 1.0 / math.sqrt(1.0 + a * a + b * b)
+                sx, sy, sz = (x + a * ux + b * vx) * scale, (y + a * uy + b * vy) * scale, (z + a * uz + b * vz) * scale
+                lay_beam(bases, poses, p, share, rays.origin_m, i, sx, sy, sz, reach, beam)
+                cast(world, movers, time_s, beam, reach, mixed(rays.key + number) + np.uint64(s), body, state)
+                note_echo(world, movers, time_s, beam, rays.weight[s], body, state, echoes, s)
+            write_found(rays, beam, echoes, found, g, i)
 
 
 @compiled
-def first_hit(
-    road: RoadArrays,
-    beam: Float64,
-    on_road: Float64,
-    limits_m: Float64,
-    near: int,
-    memory: Float64,
-    laser: int,
-) -> tuple[float, int, float, float, float]:
-    """Range at which a beam meets the road, with node, u, offset and depth of the defect there; NaN: it does not.
-
-    The surface without defects is met once by beams steeper than its slopes; the shallower ones are out of range.
-
-    beam : (3, 3) of easting, northing, height, in place of station, offset, height; on_road : (3, 3) scratch;
-    limits_m : (2,) nearest and farthest range; near : node to start from;
-    memory : (lasers, 3) where the laser's last two beams met that surface (m, NaN: nowhere), and its slope along the
-    last; in and out.
-    """
-    guess = 2.0 * memory[laser, 0] - memory[laser, 1]
-    if math.isnan(guess):
-        guess = memory[laser, 0]
-    r, k, u, offset = chased_range(road, beam, limits_m, near, guess, memory, laser)
-    if math.isnan(r):
-        r, k, u, offset = bracketed_range(road, beam, limits_m, near)
-        memory[laser, 2] = 0.0
-    memory[laser, 1] = memory[laser, 0]
-    memory[laser, 0] = r
-    if math.isnan(r):
-        return r, k, u, offset, 0.0
-    depth, _ = defect_depth(road, k, u, offset)
-    found = r
-    if depth > 0.0:
-        fall = -(beam[2, 1] + 2.0 * r * beam[2, 2])
-        for row in range(3):
-            for column in range(3):
-                on_road[row, column] = beam[row, column]
-        turn_to_road(road, on_road, r, 0.1, k)
-        further, depth = into_defect(road, on_road, 0.0, fall)
-        found = r + further
-        _, k, u, offset = clearance(road, beam, found, k)
-    return found, k, u, offset, depth
+def note_echo(
+    world: World, movers: Movers, time_s: float, beam: Float64, weight: float, body: Float64, state: Float64,
+    echoes: Float64, s: int,
+) -> None:  # fmt: skip
+    """Row `s` of the echoes: range (NaN: none), intensity, object, energy."""
+    hit, r = int(state[HIT]), state[BEST]
+    echoes[s, 0], echoes[s, 1], echoes[s, 2], echoes[s, 3] = np.nan, np.nan, NO_OBJECT, 0.0
+    if hit in (NOTHING, LOST):
+        return
+    still = world.bodies.shape[0]
+    if hit == ROAD:
+        value = brightness(world.road, int(state[NODE]), state[PAST], state[OFFSET], state[DEPTH], 0.0)
+        echoes[s, 2] = ON_GROUND
+    elif hit < still:
+        x, y, z = along_beam(beam, 0, r), along_beam(beam, 1, r), along_beam(beam, 2, r)
+        value = shade(world.bodies, hit, x, y, z)
+        echoes[s, 2] = world.object_id[hit]
+    else:
+        place_mover(movers, time_s, hit - still, body)
+        value = shade(body, 0, along_beam(beam, 0, r), along_beam(beam, 1, r), along_beam(beam, 2, r))
+        echoes[s, 2] = movers.object_id[hit - still]
+    echoes[s, 0], echoes[s, 1] = r, value
+    echoes[s, 3] = weight * max(value, 1.0) / (r * r) if value >= 0.0 else 0.0
 
 
 @compiled
-def chased_range(
-    road: RoadArrays,
-    beam: Float64,
-    limits_m: Float64,
-    near: int,
-    guess_m: float,
-    memory: Float64,
-    laser: int,
-) -> tuple[float, int, float, float]:
-    """Range, node, u and offset where a beam meets the surface without defects, by the secant from a guess.
-
-    NaN where there is no guess, or it leads nowhere within a few steps.
-    """
-    k, u, offset = near, 0.0, 0.0
-    r = guess_m
-    descent = -(beam[2, 1] + 2.0 * r * beam[2, 2])
-    fall = descent + memory[laser, 2]
-    last_gap, moved = 0.0, 0.0
-    for _ in range(6):
-        if not limits_m[0] <= r <= limits_m[1] or fall < 0.02:
-            break
-        gap, k, u, offset = clearance(road, beam, r, k)
-        if abs(moved) > 1e-5:
-            fall = (last_gap - gap) / moved
-            memory[laser, 2] = fall - descent
-        if abs(gap) < LIDAR_TOLERANCE_M:
-            return r, k, u, offset
-        last_gap = gap
-        moved = gap / fall
-        r += moved
-    return np.nan, k, u, offset
+def write_found(rays: Rays, beam: Float64, echoes: Float64, found: Found, g: int, i: int) -> None:
+    """What a receiver makes of the echoes of a ray."""
+    r, value, number, is_mixed = echoes[0, 0], echoes[0, 1], echoes[0, 2], False
+    if rays.fan_rad.shape[0] > 1:
+        r, value, number, is_mixed = merged(echoes)
+    is_seen = rays.limits_m[0] <= r <= rays.limits_m[1]
+    found.place[g, i, 0] = r if is_seen else np.nan
+    for axis in range(3):
+        found.place[g, i, 1 + axis] = along_beam(beam, axis, r) if is_seen else np.nan
+    found.place[g, i, 4] = value if is_seen else np.nan
+    found.object_id[g, i] = int(number) if is_seen else NO_OBJECT
+    found.is_mixed[g, i] = is_mixed and is_seen
 
 
 @compiled
-def bracketed_range(road: RoadArrays, beam: Float64, limits_m: Float64, near: int) -> tuple[float, int, float, float]:
-    """Range, node, u and offset where a beam meets the surface without defects; NaN: not within the limits."""
-    low, high = limits_m[0], limits_m[1]
-    high_gap, k, u, offset = clearance(road, beam, high, near)
-    if high_gap > 0.0:
-        return np.nan, k, u, offset
-    low_gap, k, u, offset = clearance(road, beam, low, near)
-    if low_gap <= 0.0:
-        return np.nan, k, u, offset
-    r = low
-    side = 0
-    for _ in range(60):
-        r = (low * high_gap - high * low_gap) / (high_gap - low_gap)
-        gap, k, u, offset = clearance(road, beam, r, k)
-        if abs(gap) < ROOT_TOLERANCE_M or high - low < ROOT_TOLERANCE_M:
-            break
-        if gap > 0.0:
-            low, low_gap = r, gap
-            if side == 1:
-                high_gap *= 0.5
-            side = 1
-        else:
-            high, high_gap = r, gap
-            if side == -1:
-                low_gap *= 0.5
-            side = -1
-    return r, k, u, offset
+def merged(echoes: Float64) -> tuple[float, float, float, bool]:
+    """Range, intensity, object and whether they are mixed, of the echoes (s, 5) of one ray; its middle comes first.
+
+    Echoes within a pulse's length of one another merge, and the range is their mean by energy (mixed pixels of time of
+    flight scanners: Ye and Borenstein 2002; Tuley, Vandapel, Hebert 2005). Of groups farther apart the strongest
+    counts. Where a group lies within :data:`MIXED_WITHIN_M`, it is one surface, and the ray's middle tells its range.
+    """
+    energy, low, high = strongest_group(echoes)
+    if energy == 0.0:
+        return np.nan, np.nan, NO_OBJECT, False
+    if high - low <= MIXED_WITHIN_M and low <= echoes[0, 0] <= high and echoes[0, 3] > 0.0:
+        return echoes[0, 0], echoes[0, 1], echoes[0, 2], False
+    r, value, number, strongest = 0.0, 0.0, -1.0, 0.0
+    for s in range(echoes.shape[0]):
+        if echoes[s, 3] > 0.0 and low <= echoes[s, 0] <= high:
+            r += echoes[s, 3] * echoes[s, 0] / energy
+            value += echoes[s, 3] * echoes[s, 1] / energy
+            if echoes[s, 3] > strongest:
+                number, strongest = echoes[s, 2], echoes[s, 3]
+    return r, value, number, True
+
+
+@compiled
+def strongest_group(echoes: Float64) -> tuple[float, float, float]:
+    """Energy, nearest and farthest range of the echoes that arrive together with the most energy; 0: there are none.
+
+    echoes : (s, 5), of which column 4 is scratch: the group.
+    """
+    count = echoes.shape[0]
+    for s in range(count):
+        echoes[s, 4] = -1.0
+    best, best_low, best_high = 0.0, np.nan, np.nan
+    for s in range(count):
+        if echoes[s, 3] > 0.0 and echoes[s, 4] < 0.0:
+            energy, low, high = grown_group(echoes, s)
+            if energy > best:
+                best, best_low, best_high = energy, low, high
+    return best, best_low, best_high
+
+
+@compiled
+def grown_group(echoes: Float64, s: int) -> tuple[float, float, float]:
+    """Energy, nearest and farthest range of the echoes that merge with that of row `s`, directly or by others."""
+    energy, low, high = echoes[s, 3], echoes[s, 0], echoes[s, 0]
+    echoes[s, 4] = s
+    is_growing = True
+    while is_growing:
+        is_growing = False
+        for t in range(echoes.shape[0]):
+            if echoes[t, 3] > 0.0 and echoes[t, 4] < 0.0 and low - PULSE_M <= echoes[t, 0] <= high + PULSE_M:
+                echoes[t, 4] = s
+                energy += echoes[t, 3]
+                low, high = min(low, echoes[t, 0]), max(high, echoes[t, 0])
+                is_growing = True
+    return energy, low, high

@@ -127,12 +127,15 @@ class Sick(Strict):
     """Scans a second."""
     resolution_deg: float = 0.5
     """From reading to reading: 0.5 or 1 (degrees)."""
-    range_max_m: float = Field(default=30.0, gt=1.0, le=80.0)
-    """Readings farther than this are none (m)."""
+    interlaced: bool = False
+    """Whether a scan takes two turns of the mirror, whole degrees in the first and half degrees in the second, as an
+    LMS 200 does; 37.5 scans a second are then the most. Otherwise all is measured in one turn (LMS …-S14)."""
+    range_max_m: float = Field(default=30.0, gt=1.0, le=32.0)
+    """Readings farther than this are none (m); in millimetres the scanner reaches 32 m."""
     divergence_deg: float = Field(default=0.0, ge=0.0, le=1.0)
     """Width of a beam (degrees), as for the lidar."""
     mount: Mount = Mount(lever_arm_body_m=(-2.9, 0.0, -1.45), roll_deg=0.5, pitch_deg=12.0, heading_deg=-0.8)
-    """Mounting (axes frd: the middle reading looks along z, down; readings run from left to right)."""
+    """Mounting (axes frd: the middle reading looks along z, down; readings run from right to left)."""
     clock: ClockError = ClockError()
     """Clock of the computer that stamps the telegrams: Unix UTC."""
 
@@ -140,6 +143,8 @@ class Sick(Strict):
     def _check(self) -> Self:
         if self.resolution_deg not in {0.5, 1.0}:
             raise ValueError(f"resolution_deg {self.resolution_deg:g}, expected 0.5 or 1")
+        if self.interlaced and (self.scans_per_s > 37.5 or self.resolution_deg != 0.5):
+            raise ValueError("interlaced scans are scans of 0.5 degrees, and at most 37.5 a second")
         return self
 
 

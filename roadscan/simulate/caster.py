@@ -1,0 +1,197 @@
+"""Rays cast into a scene: the world as the kernels see it, and the way from a sensor's poses to what its rays meet."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.simulate.cells import cells_of
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.earth import LocalMap
+from roadscan.simulate.kernels import rays as kernels
+from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, KIND, NORTHING
+from roadscan.simulate.noise import stream
+from roadscan.simulate.scene import Mount, Scene
+from roadscan.simulate.surface import Surface
+from roadscan.simulate.things import Object, mover_bodies, moving_objects, objects_of
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SLOT_NS: Final = 100_000_000
+"""Moving cars drive evenly within slots of this length, counted from a pass's first profile, however the sensors'
+rays come in blocks."""
+_MIDDLE_SHARE: Final = 1.0 - math.exp(-0.5)
+"""Share of a Gaussian beam's energy within half of its radius; the radius is where it has fallen to e⁻²."""
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Rays of one group (a packet of a lidar, a turn of a mirror, a picture) that is the same for all groups."""
+
+    origin_m: Float64
+    """(m, 3) in the sensor's axes."""
+    interval: Int64
+    """(m,) interval of poses within the group."""
+    share: Float64
+    """(m,) time within the interval, as a share of its length."""
+    divergence_deg: float
+    """Width of the rays; 0: none."""
+    limits_m: tuple[float, float]
+    """Nearest and farthest range."""
+
+    def fan(self) -> tuple[Float64, Float64]:
+        """Angles (s, 2) of the sub-rays (rad) and their shares of the energy (s,)."""
+        if self.divergence_deg == 0.0:
+            return np.zeros((1, 2)), np.ones(1)
+        half = math.tan(math.radians(self.divergence_deg / 2))
+        angles = half * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        return angles, np.array([_MIDDLE_SHARE, *[(1.0 - _MIDDLE_SHARE) / 4] * 4])
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What g groups of m rays have met."""
+
+    range_m: Float64
+    """(g, m) exact range; NaN: nothing, or glass."""
+    enh_m: Float64
+    """(g, m, 3) map coordinates."""
+    intensity: Float64
+    """(g, m) digital numbers of a profiler; NaN: nothing, or glass."""
+    object_id: npt.NDArray[np.int32]
+    """(g, m) 0: the road, −1: nothing."""
+    is_mixed: npt.NDArray[np.bool_]
+    """(g, m) True where the range is a mixture: the point then lies in the ray's middle, and on nothing."""
+
+
+class World:
+    """A scene with all that rays can meet. Make one for a survey: it looks at the whole road.
+
+    Parameters
+    ----------
+    scene, surface : the scene and its surface (without `ride`).
+    """
+
+    def __init__(self, scene: Scene, surface: Surface) -> None:
+        self.scene = scene
+        self.surface = surface
+        self.objects: list[Object] = objects_of(scene, surface)
+        """What stands still."""
+        self.moving: list[Object] = moving_objects(scene, surface)
+        """What moves, as it is at a pass's first profile."""
+        bodies = np.concatenate([np.zeros((0, BODY_COLUMNS)), *(o.bodies for o in self.objects)])
+        owners = [np.full(len(o.bodies), o.id, np.int32) for o in self.objects]
+        self.arrays = kernels.World(
+            road=surface.arrays,
+            cells=cells_of(scene.road, surface, bodies),
+            bodies=np.ascontiguousarray(bodies),
+            object_id=np.concatenate([np.zeros(0, np.int32), *owners]),
+        )
+
+    def cast(
+        self,
+        drive: Drive,
+        mount: Mount,
+        body_from_axes: Float64,
+        interval_gps_ns: Int64,
+        direction: Float64,
+        pattern: Pattern,
+        key: int,
+    ) -> Hits:
+        """Cast the rays of some groups.
+
+        Parameters
+        ----------
+        interval_gps_ns : (g, n, 2) beginning and end of each group's intervals of poses, short enough for the sensor
+            to move evenly within.
+        direction : (g, m, 3) unit vectors in the sensor's axes.
+        key : random key of the first ray; each ray takes its own, so count on by g · m.
+        """
+        groups, count = direction.shape[:2]
+        flat = np.ascontiguousarray(interval_gps_ns.reshape(-1, 2))
+        at, rotation = drive.poses(flat.reshape(-1)).sensor(mount, body_from_axes)
+        middle = at[at.shape[0] // 2]
+        reach = pattern.limits_m[1] + float(np.linalg.norm(at - middle, axis=1).max())
+        local = LocalMap.around(drive.earth, middle, self.surface.origin_enh_m, reach)
+        origin = local.enu_from_ecef(at).reshape(-1, 2, 3)
+        turned = (local.ecef_from_enu.T @ rotation).reshape(-1, 2, 3, 3)
+        first_slot = int((flat.min() - drive.start_gps_ns) // SLOT_NS)
+        slots_from = drive.start_gps_ns + first_slot * SLOT_NS
+        centre = local.bases[:2, 0]
+        fan, weight = pattern.fan()
+        found = kernels.Found(
+            np.empty((groups, count, 5)), np.empty((groups, count), np.int32), np.empty((groups, count), np.bool_)
+        )
+        kernels.cast_rays(
+            self.arrays,
+            self._movers(drive, first_slot, int((flat.max() - drive.start_gps_ns) // SLOT_NS), centre, reach),
+            local.bases,
+            kernels.Poses(
+                np.ascontiguousarray(origin[:, 0]),
+                np.ascontiguousarray(origin[:, 1]),
+                np.ascontiguousarray(turned[:, 0]),
+                np.ascontiguousarray(turned[:, 1]),
+                (flat - slots_from).astype(np.float64) * 1e-9,
+            ),
+            kernels.Rays(
+                direction,
+                pattern.origin_m,
+                pattern.interval,
+                pattern.share,
+                fan,
+                weight,
+                np.array(pattern.limits_m),
+                np.uint64(key),
+            ),
+            found,
+            np.empty((3, 3)),
+            np.empty((1, BODY_COLUMNS)),
+            np.empty(kernels.STATE_SIZE),
+            np.empty((weight.size, 5)),
+        )
+        place = found.place
+        return Hits(
+            np.where(np.isnan(place[..., 4]), np.nan, place[..., 0]),
+            place[..., 1:4] + self.surface.origin_enh_m,
+            place[..., 4],
+            found.object_id,
+            found.is_mixed,
+        )
+
+    def _movers(self, drive: Drive, first: int, last: int, centre: Float64, reach_m: float) -> kernels.Movers:
+        """Cars that move within reach of a place (2,) in the slots from `first` to `last`."""
+        slots, slot_s = range(first, last + 1), SLOT_NS * 1e-9
+        bodies, velocities, owners = [], [], []
+        for car, known in zip(self.scene.roadside.moving_cars, self.moving, strict=True):
+            if car.passes and drive.number + 1 not in car.passes:
+                continue
+            placed = [mover_bodies(car, self.surface, slot * slot_s, (slot + 1) * slot_s) for slot in slots]
+            rows = np.zeros((len(slots), len(known.bodies), BODY_COLUMNS))
+            rows[..., KIND] = -1.0
+            velocity = np.zeros((len(slots), len(known.bodies), 3))
+            for i, one in enumerate(placed):
+                if one is not None:
+                    rows[i], velocity[i] = one
+            away = np.hypot(rows[:, 0, EASTING] - centre[0], rows[:, 0, NORTHING] - centre[1])
+            near = away < reach_m + 2 * car.length_m + 2 * abs(car.speed_m_per_s) * slot_s
+            if (near & (rows[:, 0, KIND] >= 0.0)).any():
+                bodies.append(rows)
+                velocities.append(velocity)
+                owners.append(np.full(len(known.bodies), known.id, np.int32))
+        shape = (len(slots), 0)
+        return kernels.Movers(
+            np.ascontiguousarray(np.concatenate([np.zeros((*shape, BODY_COLUMNS)), *bodies], axis=1)),
+            np.ascontiguousarray(np.concatenate([np.zeros((*shape, 3)), *velocities], axis=1)),
+            np.concatenate([np.zeros(0, np.int32), *owners]),
+            slot_s,
+        )
+
+
+def ray_key(scene: Scene, drive: Drive, sensor: str) -> int:
+    """Random key of a sensor's first ray in a pass."""
+    return int(stream(scene.seed, drive.number, f"{sensor} rays").integers(0, 2**62))

@@ -1,0 +1,173 @@
+"""What stands upright beside the road, as simple bodies, and where a beam meets them.
+
+A body is a row of numbers; lengths are metres, coordinates count from the scene's origin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.profiles import mixed
+
+Float64 = npt.NDArray[np.float64]
+
+BOX, CYLINDER, ELLIPSOID, WALL, DISC = 0.0, 1.0, 2.0, 3.0, 4.0
+"""Kinds of bodies. Walls and discs are thin, and seen from both sides."""
+
+# Columns of a body.
+KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
+LOW_END, HIGH_END, SKIRT, ALONG, BAY, WINDOW, STOREY = 9, 10, 11, 12, 13, 14, 15
+INTENSITY, DENSITY = 16, 17
+BODY_COLUMNS = 18
+# Easting, northing: its middle. Sine, cosine: of the grid heading of its length. Half length: radius of a cylinder, of
+# an ellipsoid seen from above, of a disc. A wall runs along its length from LOW … HIGH at its start to LOW_END …
+# HIGH_END; it goes on SKIRT below that, and if BAY > 0 it has windows of WINDOW by WINDOW in bays and storeys, whose
+# pattern is ALONG past its beginning at the wall's start. DENSITY: share of beams that it stops each time they pass.
+
+
+@inlined
+def is_stopped(rows: Float64, i: int, key: np.uint64, side: int) -> bool:
+    """Whether the beam of a key is stopped on a side of body `i`, rather than let through its gaps."""
+    density = rows[i, DENSITY]
+    if density >= 1.0:
+        return True
+    bits = mixed(key ^ mixed(np.uint64(2 * i + side + 1)))
+    stopped: bool = float(bits >> np.uint64(11)) < density * 9007199254740992.0
+    return stopped
+
+
+@inlined
+def slab(from_m: float, per_m: float, half: float) -> tuple[float, float]:
+    """Where a line is within ± `half` of a plane: begin and end; begin > end: nowhere."""
+    if per_m == 0.0:
+        return (-np.inf, np.inf) if abs(from_m) <= half else (np.inf, -np.inf)
+    first, second = (-half - from_m) / per_m, (half - from_m) / per_m
+    return min(first, second), max(first, second)
+
+
+@inlined
+def meet(
+    rows: Float64, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, key: np.uint64
+) -> float:
+    """Range at which a line (origin and change per metre of range) first meets body `i` from outside; NaN: never."""
+    kind = rows[i, KIND]
+    x, y = ox - rows[i, EASTING], oy - rows[i, NORTHING]
+    sine, cosine = rows[i, SINE], rows[i, COSINE]
+    ahead, right = x * sine + y * cosine, x * cosine - y * sine
+    if kind in (BOX, WALL, DISC):
+        ahead_per_m, right_per_m = dx * sine + dy * cosine, dx * cosine - dy * sine
+        if kind == BOX:
+            return meet_box(rows, i, ahead, right, oz, ahead_per_m, right_per_m, dz)
+        return meet_plate(rows, i, ahead, right, oz, ahead_per_m, right_per_m, dz, key)
+    if kind == CYLINDER:
+        return meet_cylinder(rows, i, x, y, oz, dx, dy, dz)
+    return meet_ellipsoid(rows, i, x, y, oz, dx, dy, dz, key)
+
+
+@inlined
+def meet_box(
+    rows: Float64, i: int, ahead: float, right: float, oz: float, ahead_per_m: float, right_per_m: float, dz: float
+) -> float:
+    """Slab method (Kay and Kajiya 1986)."""
+    half = 0.5 * (rows[i, HIGH] - rows[i, LOW])
+    a0, a1 = slab(ahead, ahead_per_m, rows[i, HALF_LENGTH])
+    b0, b1 = slab(right, right_per_m, rows[i, HALF_WIDTH])
+    c0, c1 = slab(oz - rows[i, LOW] - half, dz, half)
+    begin = max(a0, b0, c0)
+    return begin if 0.0 < begin <= min(a1, b1, c1) else np.nan
+
+
+@inlined
+def meet_plate(
+    rows: Float64,
+    i: int,
+    ahead: float,
+    right: float,
+    oz: float,
+    ahead_per_m: float,
+    right_per_m: float,
+    dz: float,
+    key: np.uint64,
+) -> float:
+    """A wall or a disc: its plane is crossed once."""
+    if right_per_m == 0.0:
+        return np.nan
+    r = -right / right_per_m
+    if not r > 0.0:
+        return np.nan
+    along, z = ahead + r * ahead_per_m, oz + r * dz
+    half = rows[i, HALF_LENGTH]
+    if abs(along) > half:
+        return np.nan
+    if rows[i, KIND] == DISC:
+        up = z - 0.5 * (rows[i, LOW] + rows[i, HIGH])
+        inside = along * along + up * up <= half * half
+    else:
+        share = 0.5 + 0.5 * along / half
+        low = rows[i, LOW] + share * (rows[i, LOW_END] - rows[i, LOW]) - rows[i, SKIRT]
+        inside = low <= z <= rows[i, HIGH] + share * (rows[i, HIGH_END] - rows[i, HIGH])
+    return r if inside and is_stopped(rows, i, key, 0) else np.nan
+
+
+@inlined
+def meet_cylinder(
+    rows: Float64, i: int, x: float, y: float, oz: float, dx: float, dy: float, dz: float
+) -> float:  # fmt: skip
+    """An upright cylinder with both of its ends."""
+    radius, low, high = rows[i, HALF_LENGTH], rows[i, LOW], rows[i, HIGH]
+    half = 0.5 * (high - low)
+    c0, c1 = slab(oz - low - half, dz, half)
+    a = dx * dx + dy * dy
+    b = x * dx + y * dy
+    c = x * x + y * y - radius * radius
+    if a < 1e-18:
+        return c0 if c <= 0.0 and 0.0 < c0 <= c1 else np.nan
+    root = b * b - a * c
+    if root < 0.0:
+        return np.nan
+    root = math.sqrt(root)
+    begin = max(c0, (-b - root) / a)
+    return begin if 0.0 < begin <= min(c1, (-b + root) / a) else np.nan
+
+
+@inlined
+def meet_ellipsoid(
+    rows: Float64, i: int, x: float, y: float, oz: float, dx: float, dy: float, dz: float, key: np.uint64
+) -> float:
+    """The crown of a tree: a shell with gaps, which may stop a beam on its near side or on its far side."""
+    flat = 1.0 / rows[i, HALF_LENGTH]
+    half = 0.5 * (rows[i, HIGH] - rows[i, LOW])
+    px, py, pz = x * flat, y * flat, (oz - rows[i, LOW] - half) / half
+    vx, vy, vz = dx * flat, dy * flat, dz / half
+    a = vx * vx + vy * vy + vz * vz
+    b = px * vx + py * vy + pz * vz
+    root = b * b - a * (px * px + py * py + pz * pz - 1.0)
+    if root < 0.0:
+        return np.nan
+    root = math.sqrt(root)
+    near, far = (-b - root) / a, (-b + root) / a
+    first: float = near if near > 0.0 and is_stopped(rows, i, key, 0) else np.nan
+    if math.isnan(first) and far > 0.0 and is_stopped(rows, i, key, 1):
+        first = far
+    return first
+
+
+@compiled
+def shade(rows: Float64, i: int, x: float, y: float, z: float) -> float:
+    """Intensity of body `i` at a point of its outside; NaN in a window, which mirrors beams away."""
+    if rows[i, BAY] > 0.0:
+        along = (x - rows[i, EASTING]) * rows[i, SINE] + (y - rows[i, NORTHING]) * rows[i, COSINE]
+        share = 0.5 + 0.5 * along / rows[i, HALF_LENGTH]
+        up = z - rows[i, LOW] - share * (rows[i, LOW_END] - rows[i, LOW])
+        bay, storey, half = rows[i, BAY], rows[i, STOREY], 0.5 * rows[i, WINDOW]
+        past = along + rows[i, HALF_LENGTH] + rows[i, ALONG]
+        aside = past - bay * math.floor(past / bay) - 0.5 * bay
+        level = up - storey * math.floor(up / storey) - 0.5 * storey
+        if up > 0.0 and abs(aside) < half and abs(level) < half:
+            return np.nan
+    value: float = rows[i, INTENSITY]
+    return value

@@ -79,6 +79,13 @@ def passes_heights(height, body_height, limits):
 
 
 @inlined
+def mark(classes, index, kind):
+    """Write the class of a reading, where classes are wanted: for `None` the compiler leaves all of it out."""
+    if classes is not None:
+        classes[index] = kind
+
+
+@inlined
 def range_class(distance, nearest):
     """Class of a reading outside the range limits (m)."""
     return CLASS_TOO_NEAR if distance < nearest else CLASS_TOO_FAR
@@ -134,7 +141,7 @@ def georeference_returns(
     rows : (n,) int32, out, index of the return; tiles : (n, 2) int32, out, column and row;
     quanta : (n, 3) int32, out, x and y from the tile's south-west corner, and height.
     fates : (6,) int64, in/out, counts by fate.
-    classes : (n,) uint8, in/out, 0 on entry; the class of each reading that a filter leaves out is written.
+    classes : (n,) uint8, in/out, 0 on entry; the class of each reading that a filter leaves out is written. Or None.
 
     Returns
     -------
@@ -155,7 +162,7 @@ def georeference_returns(
         distance2 = x * x + y * y + z * z
         if not (limits[0] * limits[0] <= distance2 <= limits[1] * limits[1]):
             fates[RANGE] += 1
-            classes[i] = range_class(distance2, limits[0] * limits[0])
+            mark(classes, i, range_class(distance2, limits[0] * limits[0]))
             continue
         epoch = pose_epochs[i]
         if not (start <= epoch < end):
@@ -167,7 +174,7 @@ def georeference_returns(
                 start, end = knots[k], knots[k + 1]
         if not usable:
             fates[NO_POSE] += 1
-            classes[i] = CLASS_NO_POSE
+            mark(classes, i, CLASS_NO_POSE)
             continue
         u = (epoch - start) / (end - start)
         px, py, pz = position_at(c, u)
@@ -177,7 +184,7 @@ def georeference_returns(
             chart = chart_index(box, table)
             if chart < 0:
                 fates[NO_POSE] += 1
-                classes[i] = CLASS_NO_POSE
+                mark(classes, i, CLASS_NO_POSE)
                 continue
             cx, cy, cz = centres[chart, 0], centres[chart, 1], centres[chart, 2]
             east_chart = expansion(charts, chart, 0)
@@ -197,7 +204,7 @@ def georeference_returns(
         body_height = map_value(height_chart, px, py, pz)
         if not passes_heights(height, body_height, limits):
             fates[HEIGHT] += 1
-            classes[i] = height_class(height, body_height, limits)
+            mark(classes, i, height_class(height, body_height, limits))
             continue
         column, east = tile_and_rest(map_value(east_chart, dx, dy, dz), quanta_per_m, tile_quanta)
         row, north = tile_and_rest(map_value(north_chart, dx, dy, dz), quanta_per_m, tile_quanta)
@@ -308,7 +315,7 @@ def georeference_profiles(
     scale : (2,) tuple, range_offset_m, range_step_m.
     reading_period_ns : float64.
     rows : (n·m,) int32, out, index of the profile; readings : (n·m,) int32, out, index in the profile.
-    classes : (n·m,) uint8, in/out.
+    classes : (n·m,) uint8, in/out, or None.
     Others as in :func:`georeference_returns`.
 
     Returns
@@ -330,23 +337,23 @@ def georeference_profiles(
                 )
             if ranges[i, j] == 0:
                 fates[NO_RETURN] += 1
-                classes[i * count + j] = CLASS_NO_RETURN
+                mark(classes, i * count + j, CLASS_NO_RETURN)
                 continue
             distance = scale[0] + scale[1] * ranges[i, j]
             if not (limits[0] <= distance <= limits[1]):
                 fates[RANGE] += 1
-                classes[i * count + j] = range_class(distance, limits[0])
+                mark(classes, i * count + j, range_class(distance, limits[0]))
                 continue
             if not placed:
                 fates[NO_POSE] += 1
-                classes[i * count + j] = CLASS_NO_POSE
+                mark(classes, i * count + j, CLASS_NO_POSE)
                 continue
             y = origins[j, 1] + distance * directions[j, 1]
             z = origins[j, 2] + distance * directions[j, 2]
             height = form_value(forms[2], y, z)
             if not passes_heights(height, forms[3][0], limits):
                 fates[HEIGHT] += 1
-                classes[i * count + j] = height_class(height, forms[3][0], limits)
+                mark(classes, i * count + j, height_class(height, forms[3][0], limits))
                 continue
             column, east = tile_and_rest(form_value(forms[0], y, z), quanta_per_m, tile_quanta)
             row, north = tile_and_rest(form_value(forms[1], y, z), quanta_per_m, tile_quanta)

@@ -132,7 +132,7 @@ class Placement:
             _numpy(batch, "intensity")[kept],
             np.ones(kept.size, np.uint8),
             work.fates,
-            work.classes[kept] if marked else None,
+            None if work.classes is None else work.classes[kept],
         )
 
     def profiles(
@@ -146,7 +146,7 @@ class Placement:
         if batch.column("intensity").null_count == 0:
             digital = _lists(batch, "intensity", geometry.readings)[row, reading]
             intensity = digital.astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
-        classes = work.classes[row.astype(np.int64) * geometry.readings + reading] if marked else None
+        classes = None if work.classes is None else work.classes[row.astype(np.int64) * geometry.readings + reading]
         # Copies: the working arrays are far larger where a window keeps little.
         return Placed(
             work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
@@ -170,24 +170,32 @@ class Placement:
         (n,) for returns, (n · readings,) profile by profile for scans, of ``READING_CLASSES``; passes and centre
         lines are not looked at.
         """
-        return self._place(batch, geometry, EVERYWHERE, self._limits()).classes
+        classes = np.zeros(_readings(batch, geometry), np.uint8)
+        self._place(batch, geometry, EVERYWHERE, self._limits(), classes)
+        return classes
 
     def _work(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, marked: bool) -> _Work:
-        limited = self._place(batch, geometry, window, self._limits())
         if not marked:
-            return limited
+            return self._place(batch, geometry, window, self._limits())
+        classes = np.zeros(_readings(batch, geometry), np.uint8)
+        limited = self._place(batch, geometry, window, self._limits(), classes)
         every = self._place(batch, geometry, window, _NO_LIMITS)
-        return replace(every, fates=limited.fates, classes=limited.classes)
+        return replace(every, fates=limited.fates, classes=classes)
 
     def _place(
-        self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, limits: tuple[float, ...]
+        self,
+        batch: pa.RecordBatch,
+        geometry: ScanGeometry | None,
+        window: Window,
+        limits: tuple[float, ...],
+        classes: UInt8 | None = None,
     ) -> _Work:
-        work = _Work.of(batch.num_rows * (1 if geometry is None else geometry.readings))
+        work = _Work.of(_readings(batch, geometry))
         if geometry is None:
             xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
             made = georeference_returns(
                 _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(limits), astuple(window),
-                work.rows, work.tiles, work.quanta, work.fates, work.classes,
+                work.rows, work.tiles, work.quanta, work.fates, classes,
             )  # fmt: skip
         else:
             origins, directions = geometry.rays()
@@ -195,7 +203,7 @@ class Placement:
                 _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
                 (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns,
                 *self._common(limits), astuple(window),
-                work.rows, work.readings, work.tiles, work.quanta, work.fates, work.classes,
+                work.rows, work.readings, work.tiles, work.quanta, work.fates, classes,
             )  # fmt: skip
         return work.first(made)
 
@@ -209,18 +217,22 @@ class _Work:
     tiles: Int32
     quanta: Int32
     fates: Int64
-    classes: UInt8
-    """Of all readings, kept or not."""
+    classes: UInt8 | None = None
+    """Of all readings, kept or not, where they were asked for."""
 
     @classmethod
     def of(cls, n: int) -> _Work:
         return cls(
             np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 3), np.int32),
-            np.zeros(FATES, np.int64), np.zeros(n, np.uint8),
+            np.zeros(FATES, np.int64),
         )  # fmt: skip
 
     def first(self, n: int) -> _Work:
-        return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates, self.classes)
+        return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates)
+
+
+def _readings(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> int:
+    return int(batch.num_rows * (1 if geometry is None else geometry.readings))
 
 
 def place_cloud(

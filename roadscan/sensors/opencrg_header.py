@@ -235,17 +235,25 @@ def _channels(
     numbered.sort()
     if numbered and [n for n, _ in numbered] != list(range(1, len(numbered) + 1)):
         raise FormatError("the long sections are not numbered 1, 2, 3 …", expected="every number once", file=path)
-    v_m = np.array([v for v, _ in at]) if at else _regular(head, len(numbered))
+    v_m = np.array([v for v, _ in at]) if at else _regular(head, len(numbered), path)
     if not (np.diff(v_m) > 0).all():
         raise FormatError("two long sections stand at one v", expected="a distance above 0 between them", file=path)
     return reference, v_m, np.array([k for _, k in (at or numbered)], dtype=np.int64)
 
 
-def _regular(head: dict[str, float], count: int) -> Float64:
+def _regular(head: dict[str, float], count: int, path: Path) -> Float64:
     """(count,) equal steps from the right border to the left, centred where the header names no border."""
     step = head.get("v_step")
     if step is None and "v_right" in head and "v_left" in head:
         step = (head["v_left"] - head["v_right"]) / (count - 1)
     step = _DEFAULT_INCREMENT_M if step is None else step
     right = head.get("v_right", head["v_left"] - step * (count - 1) if "v_left" in head else -0.5 * step * (count - 1))
+    left = right + step * (count - 1)
+    if abs(head.get("v_left", left) - left) > abs(step) / 2:
+        raise FormatError(
+            f"the {count} long sections from v = {right:g} m on, {step:g} m apart, end at {left:g} m, not at the left "
+            f"border, {head['v_left']:g} m",
+            expected="as many long sections as the borders and the increment make",
+            file=path,
+        )
     return np.asarray(right + step * np.arange(count), dtype=np.float64)

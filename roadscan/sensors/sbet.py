@@ -87,7 +87,8 @@ class Sbet(LogFormat):
         # Other binary data read as doubles is full of numbers next to nothing, or not finite.
         ordinary = np.all(np.isfinite(size)) and np.all((size == 0) | (size > 1e-30)) and np.all(size <= _LIMITS)
         somewhere = np.all(np.any(size[:, [LATITUDE, LONGITUDE]] > 0, axis=1))
-        growing = np.all(np.diff(records[:, TIME]) > 0) and records[0, TIME] >= 0
+        time = records[:, TIME]
+        growing = np.all(time[1:] > time[:-1]) and time[0] >= 0
         return bool(ordinary and somewhere and growing and records[0, HEIGHT] > HEIGHT_MIN_M)
 
     def companions(self, path: Path, options: Strict) -> list[Path]:

@@ -70,7 +70,7 @@ class Smrmsg(LogFormat):
         # Other binary data read as doubles is full of numbers next to nothing.
         ordinary = np.all((sigmas == 0) | (sigmas > 1e-9)) and np.all(sigmas <= _LIMITS) and np.all(sigmas >= 0)
         known = np.all(sigmas[:, :3] > 0)  # no solution is without error
-        growing = np.all(np.diff(time) > 0) and time[0] >= 0 and time[-1] <= 2 * WEEK_S
+        growing = np.all(time[1:] > time[:-1]) and time[0] >= 0 and time[-1] <= 2 * WEEK_S
         return bool(ordinary and known and growing and np.all((time == 0) | (time > 1e-6)))
 
     def header(self, source: LogSource) -> LogHeader:

@@ -198,17 +198,17 @@ def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[st
 
 
 def stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
-    """Kind of a column of time stamps, from its first sound value: integer, number or text."""
+    """Kind of a column of time stamps, that of most of its first sound values: integer, number or text."""
     column = layout.names.index(name)
-    for fields in first_fields(path, layout, 20):
-        word = fields[column].strip()
-        if word.lstrip("+-").isdigit():
-            return "integer"
-        if not math.isnan(_number(word)):
-            return "number"
-        if word:
-            return "text"
-    return "number"
+    words = [fields[column].strip() for fields in first_fields(path, layout, 20)]
+    kinds = [_kind_of(word) for word in words if word]
+    return max(kinds, key=kinds.count, default="number")
+
+
+def _kind_of(word: str) -> Kind:
+    if word.lstrip("+-").isdigit():
+        return "integer"
+    return "text" if math.isnan(_number(word)) else "number"
 
 
 def number_stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
@@ -324,10 +324,22 @@ def _lines(data: bytes, comment: str) -> tuple[Int64, Int64]:
         ends = np.append(ends, letters.size)
     starts = np.concatenate([[0], ends[:-1]])
     first = letters[starts]
-    keep = (first != ord("\n")) & (first != ord("\r"))
+    passed_over = (first == ord("\n")) | (first == ord("\r"))
     if comment:
-        keep &= first != ord(comment)
+        passed_over |= first == ord(comment)
+    keep = ~passed_over | _with_inner_return(letters, starts, ends)
     return starts[keep].astype(np.int64), ends[keep].astype(np.int64)
+
+
+def _with_inner_return(letters: npt.NDArray[np.uint8], starts: Int64, ends: Int64) -> npt.NDArray[np.bool_]:
+    """Lines (n,) with a carriage return before their end: passed over, they would hide what only returns divide."""
+    found = np.zeros(starts.size, dtype=bool)
+    returns = np.flatnonzero(letters[:-1] == ord("\r"))
+    inner = returns[letters[returns + 1] != ord("\n")]
+    if inner.size:
+        lines = np.searchsorted(ends, inner, side="right")
+        found[lines[inner + 1 < ends[lines]]] = True
+    return found
 
 
 def _joined(data: bytes, starts: Int64, ends: Int64) -> bytes:

@@ -37,7 +37,9 @@ def main() -> int:
     parser.add_argument("--show", type=int, default=3, help="failures shown a format")
     given = parser.parse_args()
     wanted = given.format or list(log_formats())
-    print(f"{'format':18}{'files':>8}{'refused':>9}{'rejects':>9}{'clean':>8}{'slowest':>9}{'MB':>7}{'fewer':>7}{'failed':>8}{'s':>7}")
+    say(
+        f"{'format':18}{'files':>8}{'refused':>9}{'rejects':>9}{'clean':>8}{'slowest':>9}{'MB':>7}{'fewer':>7}{'failed':>8}{'s':>7}"
+    )
     failed = 0
     for name in wanted:
         samples = [s for s in all_samples() if name in {s.format, s.name}]
@@ -54,6 +56,11 @@ def main() -> int:
     return min(failed, 100)
 
 
+def say(*parts: object) -> None:
+    sys.stdout.write("".join(map(str, parts)) + "\n")
+    sys.stdout.flush()
+
+
 def shares(samples: list[Sample], mutants: int, native: int | None) -> Iterator[tuple[Sample, int]]:
     """How many files of each form make up `mutants` of the format."""
     whole = sum(s.share for s in samples)
@@ -64,17 +71,17 @@ def shares(samples: list[Sample], mutants: int, native: int | None) -> Iterator[
 
 def show(name: str, s: Summary, seconds: float, most: int, seed: int) -> None:
     v = s.verdicts
-    print(
+    say(
         f"{name:18}{s.outcomes:8}{v['refused']:9}{v['rejects']:9}{v['clean']:8}{s.slowest_ms:9.0f}{s.peak_mb:7.0f}"
         f"{len(s.fewer):7}{len(s.failures):8}{seconds:7.0f}",
         *(f" {other}:{count}" for other, count in s.claimed.items()),
-        flush=True,
     )
     for outcome in s.failures[:most]:
-        print(f"  failed: --format {name.split('/')[0]}/{outcome.form} --seed {seed} --only {outcome.number}\n{outcome.said}")
+        form = f"{name.split('/', 1)[0]}/{outcome.form}"
+        say(f"  failed: --format {form} --seed {seed} --only {outcome.number}\n{outcome.said}")
     if s.fewer:
         told = ", ".join(f"{o.form} {o.number}" for o in s.fewer[:8])
-        print(f"  fewer rows without a word: {told}", flush=True)
+        say(f"  fewer rows without a word: {told}")
 
 
 def outcomes(sample: Sample, seed: int, count: int) -> Iterator[Outcome]:
@@ -104,7 +111,9 @@ def _of_process(sample: Sample, seed: int, first: int, end: int, folder: str) ->
                 said = process.stderr.read()
                 if not ready:
                     raise RuntimeError(f"{sample.name}: the sound file cannot be read\n{said}")
-                yield Outcome(number, sample.form, "failed", 0.0, 0.0, said=f"the process ended or hung\n{said[-3000:]}")
+                yield Outcome(
+                    number, sample.form, "failed", 0.0, 0.0, said=f"the process ended or hung\n{said[-3000:]}"
+                )
         finally:
             process.kill()
 
@@ -135,7 +144,7 @@ def repeat(sample: Sample, seed: int, number: int) -> None:
         kept = Path("fuzzed") / target
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_bytes(data)
-        print(f"{kept}: {len(data)} bytes\n{fuzzer.run(number)}\nsound: {fuzzer.sound.rows} rows")
+        say(f"{kept}: {len(data)} bytes\n{fuzzer.run(number)}\nsound: {fuzzer.sound.rows} rows")
 
 
 if __name__ == "__main__":

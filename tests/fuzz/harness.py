@@ -37,7 +37,7 @@ LARGEST_CHUNK_ROWS = 1 << 18
 LARGEST_CHUNK_BYTES = 12 << 20
 
 
-class Broken(Exception):  # noqa: N818
+class Broken(Exception):
     """A reader did what no reader may."""
 
 
@@ -138,7 +138,9 @@ class Fuzzer:
         seed_folder.mkdir(parents=True)
         log = sample.make(seed_folder)
         self._log = log.relative_to(seed_folder)
-        self._files = {p.relative_to(seed_folder): p.read_bytes() for p in sorted(seed_folder.rglob("*")) if p.is_file()}
+        self._files = {
+            p.relative_to(seed_folder): p.read_bytes() for p in sorted(seed_folder.rglob("*")) if p.is_file()
+        }
         self._targets = self._damaged_files(seed_folder)
         self.sound = self._read(seed_folder)
         self.sound = self._read(seed_folder)  # once more: compiled, cached

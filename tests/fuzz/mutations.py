@@ -20,11 +20,13 @@ _ODD_NUMBERS = (
     b"nan", b"NaN", b"-nan", b"inf", b"-Infinity", b"1e308", b"-1e308", b"1e999", b"5e-324", b"0", b"-0", b"-1", b"",
     b" ", b"1_000", b"0x10", b"1,5", b"1.2.3", b"--1", b"+", b"e5", b"9223372036854775807", b"9223372036854775808",
     b"-9223372036854775809", b"4294967296", b"2147483648", b"99999999999999999999999", b"0" * 400 + b"1", b"9" * 5000,
-    b"1." + b"3" * 20_000, "١٢٣".encode(), "１２".encode(), b"1\x00", b"\xff\xfe", b'"5"', b"'5'", b"true", b"null", b"*missing*",
+    b"1." + b"3" * 20_000, "١٢٣".encode(), "１２".encode(), b"1\x00", b"\xff\xfe", b'"5"', b"'5'", b"true", b"null",
+    b"*missing*",
 )  # fmt: skip
 _ODD_TEXT = (
-    b",", b";", b"\t", b" ", b"\n", b"\r", b"\r\n", b"\n\n\n", b'"', b'""', b'"\n', b"\x00", b"\xff", b"\xef\xbb\xbf", b"#", b"%", b"$",
-    b"!", b"*", b"<", b">", b"&", b"{", b"}", b"[", b"]", b"\\", b"\x1a", b"\x0c", b"\x85", "°".encode(), "\u2028".encode(),
+    b",", b";", b"\t", b" ", b"\n", b"\r", b"\r\n", b"\n\n\n", b'"', b'""', b'"\n', b"\x00", b"\xff", b"\xef\xbb\xbf",
+    b"#", b"%", b"$", b"!", b"*", b"<", b">", b"&", b"{", b"}", b"[", b"]", b"\\", b"\x1a", b"\x0c", b"\x85",
+    "°".encode(), "\u2028".encode(),
 )  # fmt: skip
 _INTEGERS = (0, 1, 2, -1, -2, 7, 255, 256, 32_767, 32_768, 65_535, 65_536, 10**6, 1 << 24, 1 << 30, (1 << 31) - 1,
              1 << 31, (1 << 32) - 1, 1 << 32, 10**12, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)  # fmt: skip
@@ -194,13 +196,24 @@ def long_line(data: bytes, rng: random.Random) -> bytes:
     return data[:at] + unit * (rng.choice((70_000, LONG_LINE)) // len(unit)) + data[at:]
 
 
-TEXT: tuple[Change, ...] = (odd_number, odd_number, odd_number, odd_text, odd_text, lines_moved, fields_moved, line_ends)
+TEXT: tuple[Change, ...] = (
+    odd_number,
+    odd_number,
+    odd_number,
+    odd_text,
+    odd_text,
+    lines_moved,
+    fields_moved,
+    line_ends,
+)
 
 
 # --- all together -----------------------------------------------------------------------------------
 
 
-def changed(data: bytes, rng: random.Random, *, text: bool, fields: Sequence[int] = (), inside: Inside | None = None) -> bytes:
+def changed(
+    data: bytes, rng: random.Random, *, text: bool, fields: Sequence[int] = (), inside: Inside | None = None
+) -> bytes:
     """One to three changes, of the file itself or of what it holds inside."""
     if rng.random() < 0.004:
         change: Change = long_line

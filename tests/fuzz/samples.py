@@ -200,7 +200,9 @@ def lines_of_table(data: bytes) -> int:
         at += len(line)
         if line.strip() and not line.strip().startswith(b"#"):
             break
-    return sum(1 for line in data[at:].split(b"\n") if line and line[:1] not in {b"\r", b"#"})
+    return sum(
+        1 for line in data[at:].split(b"\n") if line not in {b"", b"\r"} and (line[:1] != b"#" or b"\r" in line[:-1])
+    )
 
 
 # --- makers ------------------------------------------------------------------------------------------
@@ -215,7 +217,10 @@ def file(name: str, content: Callable[[], bytes] | bytes) -> Callable[[Path], Pa
 
 
 def sbet() -> bytes:
-    rows = ([1000.0 + k, 0.9 + 1e-7 * k, 0.2, 100.0 + k, *[0.1] * 3, 0.01 * k, 0.02, 0.5 + 0.1 * k, *[0.1] * 7] for k in range(RECORDS))
+    rows = (
+        [1000.0 + k, 0.9 + 1e-7 * k, 0.2, 100.0 + k, *[0.1] * 3, 0.01 * k, 0.02, 0.5 + 0.1 * k, *[0.1] * 7]
+        for k in range(RECORDS)
+    )
     return b"".join(struct.pack("<17d", *row) for row in rows)
 
 
@@ -263,9 +268,10 @@ def encoder_wheels() -> bytes:
 def nmea() -> bytes:
     start = test_nmea.at("2026-05-04T23:59:54")
     fixes = [Fix(start + k * 10**9, 50.0 + 1e-5 * k, 10.0, 100.0, 45.0, "fixed", 12, 0.7) for k in range(RECORDS)]
-    return "".join(sentences(fix) for fix in fixes).encode() + "".join(
-        sentences(fix, test_nmea.KINDS) for fix in test_nmea.drive(3)
-    ).encode()
+    return (
+        "".join(sentences(fix) for fix in fixes).encode()
+        + "".join(sentences(fix, test_nmea.KINDS) for fix in test_nmea.drive(3)).encode()
+    )
 
 
 def carmen() -> bytes:
@@ -274,9 +280,7 @@ def carmen() -> bytes:
 
 
 def carmen_raw() -> bytes:
-    lines = [
-        test_carmen.raw("RAWLASER1", k, " ".join(f"{1 + i / 100:.3f}" for i in range(181)), "0") for k in range(4)
-    ]
+    lines = [test_carmen.raw("RAWLASER1", k, " ".join(f"{1 + i / 100:.3f}" for i in range(181)), "0") for k in range(4)]
     return "\n".join(["PARAM laser_front_laser_resolution 1.0 host 0", *lines, ""]).encode()
 
 
@@ -349,7 +353,11 @@ def psi_folder(folder: Path) -> Path:
 def images(folder: Path) -> Path:
     log = folder / "cam"
     log.mkdir()
-    kinds = {".jpg": {"format": "JPEG"}, ".png": {"format": "PNG"}, ".tif": {"format": "TIFF", "compression": "tiff_deflate"}}
+    kinds = {
+        ".jpg": {"format": "JPEG"},
+        ".png": {"format": "PNG"},
+        ".tif": {"format": "TIFF", "compression": "tiff_deflate"},
+    }
     lines = ["file,time_s"]
     for k, (ending, how) in enumerate(kinds.items()):
         (log / f"img_{k}{ending}").write_bytes(test_images.written(**how)()[:])
@@ -418,7 +426,32 @@ _UTM32 = {"crs": "EPSG:25832", "map": MapFrame(crs="EPSG:25832")}
 _DEGREES = {"crs": "EPSG:4979", "map": MapFrame(crs="EPSG:32632")}
 _CLOUD = {"clock": Clock(TimeSystem.GPS_ADJUSTED), "crs": "local"}
 _LAS_FIELDS = (24, 94, 96, 100, 104, 105, 107, 111, 115, 119, 131, 139, 155, 163, 179, 187, 227, 235, 243, 247, 255)
-_PSI_FIELDS = (37, 38, 58, 78, 79, 80, 84, 88, 92, 96, 97, 105, 106, 107, 111, 115, 119, 123, 127, 128, 132, 136, 141, 149)
+_PSI_FIELDS = (
+    37,
+    38,
+    58,
+    78,
+    79,
+    80,
+    84,
+    88,
+    92,
+    96,
+    97,
+    105,
+    106,
+    107,
+    111,
+    115,
+    119,
+    123,
+    127,
+    128,
+    132,
+    136,
+    141,
+    149,
+)
 _PCAP_FIELDS = (0, 16, 20, 24, 28, 32, 36, 40, 52, 54, 56, 60, 74, 76, 78, 80, 82, 84)
 _E57_FIELDS = (8, 12, 16, 24, 32, 40, 48, 56, 64, 72, 80, 81, 82, 84, 86, 88, 90)
 _VIDEO = {"end": test_images.T0}
@@ -441,7 +474,9 @@ def _poses() -> Iterator[Sample]:
     yield Sample("sbet", "smrmsg", sbet_with_accuracy, {"accuracy": "acc.out"}, geographic, ("acc.out", "a.sbet"))
     clock = {"clock": WEEK}
     yield Sample("smrmsg", "plain", file("a.out", smrmsg), {}, clock, spans=every(80), held=wholes_of(80))
-    yield Sample("smrmsg", "gzip", file("a.out.gz", lambda: gzip.compress(smrmsg(), mtime=0)), {}, clock, inside=GZIP, share=0.5)
+    yield Sample(
+        "smrmsg", "gzip", file("a.out.gz", lambda: gzip.compress(smrmsg(), mtime=0)), {}, clock, inside=GZIP, share=0.5
+    )
 
     stated = {"clock": GPS, "crs": "EPSG:4979"}
     lines: dict[str, Any] = {"text": True, "spans": lines_from(1), "held": lines_of_table}
@@ -452,7 +487,9 @@ def _poses() -> Iterator[Sample]:
         "gz": (gzip.compress, GZIP), "bz2": (bz2.compress, BZIP2), "xz": (lzma.compress, XZ),
     }  # fmt: skip
     for ending, (pack, inside) in packs.items():
-        yield Sample("trajectory_csv", ending, file(f"a.csv.{ending}", pack(trajectory_csv())), {}, stated, inside=inside)
+        yield Sample(
+            "trajectory_csv", ending, file(f"a.csv.{ending}", pack(trajectory_csv())), {}, stated, inside=inside
+        )
     axes = {"axes": "flu"}
     yield Sample("pose_matrices", "plain", file("a.csv", pose_matrices), axes, _POSES, **lines)
     yield Sample("pose_quaternions", "lines", file("a.txt", pose_lines), axes, _POSES, text=True, spans=lines_from(0))
@@ -461,8 +498,12 @@ def _poses() -> Iterator[Sample]:
     ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832"}
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
-    yield Sample("rtklib_pos", "plain", file("a.pos", test_rtklib_pos.sample), {}, sat, text=True, spans=lines_from(2), share=2)
-    yield Sample("rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP)
+    yield Sample(
+        "rtklib_pos", "plain", file("a.pos", test_rtklib_pos.sample), {}, sat, text=True, spans=lines_from(2), share=2
+    )
+    yield Sample(
+        "rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP
+    )
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)
 
@@ -477,11 +518,21 @@ def _tables() -> Iterator[Sample]:
     yield Sample("encoder_csv", "total", file("a.csv", encoder), {"record": "total"}, stated, **lines)
     counter = {"record": "total", "counter_bits": 16}
     yield Sample("encoder_csv", "counter", file("a.csv", encoder), counter, stated, text=True, held=lines_of_table)
-    yield Sample("encoder_csv", "increment", file("a.csv", encoder), {"record": "increment"}, stated, text=True, held=lines_of_table)
+    yield Sample(
+        "encoder_csv",
+        "increment",
+        file("a.csv", encoder),
+        {"record": "increment"},
+        stated,
+        text=True,
+        held=lines_of_table,
+    )
     yield Sample("control_csv", "plain", file("a.csv", control_csv), {}, _UTM32, **lines)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)
-    yield Sample("control_vector", "shp", vector(control_layer, "a.shp"), {}, _UTM32, ("a.shp", "a.shx", "a.dbf", "a.prj"))
+    yield Sample(
+        "control_vector", "shp", vector(control_layer, "a.shp"), {}, _UTM32, ("a.shp", "a.shx", "a.dbf", "a.prj")
+    )
     lane = {"map": MapFrame(crs="EPSG:26917")}
     yield Sample("road_lines", "geojson", vector(roads_degrees, "a.geojson"), {}, lane, text=True)
     yield Sample("road_lines", "gpkg", vector(roads, "a.gpkg"), {}, lane)
@@ -496,15 +547,31 @@ def _lidar() -> Iterator[Sample]:
     size = 16 + 42 + 1206
     plain = pcap(sentence=False)
     yield Sample("velodyne_pcap", "hour", plain, hour, stated, fields=_PCAP_FIELDS, spans=every(size, 24))
-    yield Sample("velodyne_pcap", "dual", pcap(dual=True, sentence=False, order=">", nanoseconds=True), hour, stated, fields=_PCAP_FIELDS)
+    yield Sample(
+        "velodyne_pcap",
+        "dual",
+        pcap(dual=True, sentence=False, order=">", nanoseconds=True),
+        hour,
+        stated,
+        fields=_PCAP_FIELDS,
+    )
     by_rate = test_sick_lms.BY_RATE
     one = len(encode_scans(test_sick_lms.scans(1), "mm").tobytes())
     scan_clock = {"clock": GPS}
     yield Sample("sick_lms", "rate", sick(stamped=False), by_rate, scan_clock, spans=every(one), inside=telegram_inside)
-    yield Sample("sick_lms", "stamped", sick(stamped=True), {"stamped": True}, {"clock": test_sick_lms.GPS_NS}, inside=telegram_inside)
+    yield Sample(
+        "sick_lms",
+        "stamped",
+        sick(stamped=True),
+        {"stamped": True},
+        {"clock": test_sick_lms.GPS_NS},
+        inside=telegram_inside,
+    )
     with_table = {"stamps": "stamps.csv"}
     yield Sample("sick_lms", "table", sick_with_table, with_table, scan_clock, ("stamps.csv", "a.log"), text=True)
-    yield Sample("carmen", "plain", file("a.clf", carmen), {}, scan_clock, text=True, spans=lines_from(2))
+    yield Sample("carmen", "plain", file("a.clf", carmen), {}, scan_clock, text=True)
+    step = {"range_step_m": 0.01, "message": "FLASER"}
+    yield Sample("carmen", "step", file("a.clf", carmen), step, scan_clock, text=True, spans=lines_from(2))
     yield Sample("carmen", "raw", file("a.clf", carmen_raw), {}, scan_clock, text=True)
     yield Sample("carmen", "bz2", file("a.clf.bz2", lambda: bz2.compress(carmen())), {}, scan_clock, inside=BZIP2)
     yield Sample("kitti", "sweeps", kitti, {}, {}, ("**/*.bin",))
@@ -522,9 +589,21 @@ def _clouds() -> Iterator[Sample]:
     cloud = {"clock": test_las.ADJUSTED}
     for point_format in (3, 7):
         yield Sample("las", f"las{point_format}", las("a.las", point_format), {}, cloud, fields=_LAS_FIELDS)
-        yield Sample("las", f"laz{point_format}", las("a.laz", point_format), {}, cloud, fields=_LAS_FIELDS, native=True)
-    yield Sample("e57", "checked", file("a.e57", small_e57), {}, {"crs": "local"}, fields=_E57_FIELDS, inside=page_inside)
-    yield Sample("e57", "unchecked", file("a.e57", small_e57), {"check_pages": False}, {"crs": "local"}, fields=_E57_FIELDS, inside=page_inside)
+        yield Sample(
+            "las", f"laz{point_format}", las("a.laz", point_format), {}, cloud, fields=_LAS_FIELDS, native=True
+        )
+    yield Sample(
+        "e57", "checked", file("a.e57", small_e57), {}, {"crs": "local"}, fields=_E57_FIELDS, inside=page_inside
+    )
+    yield Sample(
+        "e57",
+        "unchecked",
+        file("a.e57", small_e57),
+        {"check_pages": False},
+        {"crs": "local"},
+        fields=_E57_FIELDS,
+        inside=page_inside,
+    )
     for coding in test_ply.CODINGS:
         for lists in (False, True):
             content = test_ply.small_ply(coding, lists)
@@ -533,7 +612,9 @@ def _clouds() -> Iterator[Sample]:
             if not lists and coding != "ascii":
                 first = content.index(b"end_header") + 11 + 13 + 5
                 spans = every(29, first, 30)
-                yield Sample("ply", form + " records", file("a.ply", content), {"unit": "metre"}, _CLOUD, spans=spans, share=0.1)
+                yield Sample(
+                    "ply", form + " records", file("a.ply", content), {"unit": "metre"}, _CLOUD, spans=spans, share=0.1
+                )
     crg = {"epoch": test_opencrg.EPOCH}
     for encoding in ("KRBI", "KDBI", "LRFI", "LDFI"):
         make = functools.partial(test_opencrg.sample, encoding)

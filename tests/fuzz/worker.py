@@ -19,9 +19,11 @@ def main(name: str, seed: str, first: str, end: str, folder: str) -> None:
     faulthandler.enable()
     sample = next(s for s in all_samples() if s.name == name)
     fuzzer = Fuzzer(sample, Path(folder), int(seed))
-    print("ready", flush=True)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     for number in range(int(first), int(end)):
-        print(json.dumps(dataclasses.asdict(fuzzer.run(number))), flush=True)
+        sys.stdout.write(json.dumps(dataclasses.asdict(fuzzer.run(number))) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -90,6 +90,12 @@ def test_the_example_of_the_specification(tmp_path: Path) -> None:
         assert line[k + 1] == pytest.approx([x, y, 0.0], abs=1e-12)
 
 
+def test_a_lost_long_section_is_noticed(tmp_path: Path) -> None:
+    lost = SPECIFICATION.replace("D:long section 3,m", "D:lon\x1a section 3,m")
+    with pytest.raises(FormatError, match=r"2 long sections .* end at 0 m, not at the left border, 0\.5 m"):
+        read_crg(written(tmp_path, lost))
+
+
 def test_defaults_of_a_minimal_file(tmp_path: Path) -> None:
     """Rows 0.01 m apart where the header says nothing, columns centred (crg_read.m, crgLoader.c)."""
     head = "$ROAD_CRG\n$\n$KD_DEFINITION\n#:LRFI\nD:long section 2,m\nD:long section 1,m\nD:long section 3,m\n$\n$$$$\n"

@@ -351,6 +351,14 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
     assert [p for p in others if is_pos(p)] == []
 
 
+def test_lines_that_end_in_returns_alone_do_not_vanish(tmp_path: Path) -> None:
+    path = tmp_path / "a.pos"
+    path.write_bytes(sample().replace(b"\n", b"\r"))
+    log = read_log("rtklib_pos", path, **STATED)
+    assert log.table.num_rows == 0
+    assert len(log.rejects) == 1
+
+
 @pytest.mark.parametrize("packed", [False, True])
 def test_mutants(tmp_path: Path, packed: bool) -> None:
     rng = random.Random("roadscan pos")

@@ -164,3 +164,9 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
     assert not is_sbet(tmp_path / "absent")
     others = [p for p in recordings.rglob("*") if p.is_file() and p.suffix != ".sbet"]
     assert [p for p in others if is_sbet(p)] == []
+
+
+@pytest.mark.parametrize("time", [math.inf, -math.inf, math.nan, 1e308])
+def test_sniffing_impossible_times(tmp_path: Path, time: float) -> None:
+    (tmp_path / "a.out").write_bytes(struct.pack("<34d", *([time] + [0.1] * 16), *([-time] + [0.1] * 16)))
+    assert not format_named("sbet").sniff(tmp_path / "a.out")

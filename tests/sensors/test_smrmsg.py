@@ -260,3 +260,9 @@ def test_mutants(tmp_path: Path, carried: bool) -> None:
         except RoadscanError as error:
             assert str(error)
     assert outcomes, "every mutant was refused as a whole"
+
+
+@pytest.mark.parametrize("time", [math.inf, -math.inf, math.nan, 1e308])
+def test_sniffing_impossible_times(tmp_path: Path, time: float) -> None:
+    (tmp_path / "a.out").write_bytes(struct.pack("<20d", *([time] + [0.1] * 9), *([-time] + [0.1] * 9)))
+    assert not format_named("smrmsg").sniff(tmp_path / "a.out")

@@ -172,6 +172,24 @@ def test_time_is_never_guessed(tmp_path: Path, word: str, clock: Clock | None, s
         read_log("trajectory_csv", path, {"columns": {"time": {"name": "time"}}}, clock=clock, crs="EPSG:4979")
 
 
+def test_a_first_stamp_that_lost_its_fraction_costs_no_other(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.csv", [line(0, t="1400000000"), *(line(i, t=f"{1_400_000_000 + i}.5") for i in range(1, 5))]
+    )
+    log = read_log("trajectory_csv", path, **STATED)
+    assert log.rejects == []
+    assert log.epochs[1:].tolist() == [(1_400_000_000 + i) * 10**9 + 500_000_000 for i in range(1, 5)]
+
+
+@pytest.mark.parametrize("start", ["# a comment\r", "\r", "#\r\r\n\r"])
+def test_a_comment_or_blank_line_hides_no_line_that_a_return_ends(tmp_path: Path, start: str) -> None:
+    path = write(tmp_path / "a.csv", [line(0), start + line(1), line(2), "# plain", "", line(3)])
+    log = read_log("trajectory_csv", path, **STATED)
+    assert log.epochs.tolist() == [(1_400_000_000 + i) * 10**9 for i in (0, 2, 3)]
+    assert sum(r.records for r in log.rejects) == start.count("\n") + 1
+    assert all("fields, expected 7" in r.reason for r in log.rejects)
+
+
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress, bytes])
 def test_damaged_lines_cost_themselves(tmp_path: Path, pack: Any) -> None:
     lines = [line(i) for i in range(12)]

@@ -347,3 +347,17 @@ def test_mutants(tmp_path: Path, check: bool) -> None:
     done, refused = survive("e57", path, path, seed=int(check), options=options, make=lambda: {"crs": "local"})
     assert done > 20
     assert refused > 5
+
+
+@pytest.mark.parametrize("bits", [3, 13, 20, 33])
+def test_numbers_go_on_over_the_packets_of_the_library(tmp_path: Path, bits: int) -> None:
+    """Widths that fill no bytes, in files of many packets."""
+    count = 120_000
+    draw = np.random.default_rng(bits)
+    data = {f"cartesian{a}": draw.integers(0, 2**bits, count) * 0.5 for a in "XYZ"}
+    names: dict[str, Any] = dict.fromkeys(data, (0, 0, 2**bits - 1, 0.5, 0.0))
+    path = tmp_path / "wide.e57"
+    write_with_library(path, names, data, 1.4e9)
+    log = read("e57", path, crs="local")
+    assert log.rejects == []
+    assert np.array_equal(xyz_of(log), np.stack(list(data.values()), axis=-1))

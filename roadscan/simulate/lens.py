@@ -1,0 +1,80 @@
+"""A camera's lens: the pinhole with Brown–Conrady distortion, in the parameters of OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import ConfigError
+from roadscan.simulate.scene import Camera
+
+Float64 = npt.NDArray[np.float64]
+
+_STEPS: Final = 30
+_WITHIN: Final = 1e-10
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Interior orientation: pixel = focal · distorted (x, y) + principal, with (x, y) = (right, down) / ahead."""
+
+    focal_px: float
+    principal_px: tuple[float, float]
+    """From the centre of the upper left pixel."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3."""
+
+    @classmethod
+    def of(cls, camera: Camera) -> Self:
+        """The lens of a scene's camera; its principal point is the picture's middle where none is stated."""
+        middle = ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
+        return cls(camera.focal_px, camera.principal_px or middle, camera.distortion)
+
+    def rays(self, column_px: npt.ArrayLike, row_px: npt.ArrayLike) -> Float64:
+        """Unit vectors (n, 3: ahead along the optical axis, right, down) of places (n,) in the picture.
+
+        Raises
+        ------
+        ConfigError
+            where a place has no ray: the distortion folds the picture over before it.
+        """
+        u = (np.asarray(column_px, np.float64) - self.principal_px[0]) / self.focal_px
+        v = (np.asarray(row_px, np.float64) - self.principal_px[1]) / self.focal_px
+        x, y = self._straightened(u, v)
+        ray = np.stack([np.ones_like(x), x, y], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
+    def _straightened(self, u: Float64, v: Float64) -> tuple[Float64, Float64]:
+        """Undistorted coordinates by Newton's method from the picture's middle outwards."""
+        x, y = u.copy(), v.copy()
+        for _ in range(_STEPS):
+            bent_x, bent_y, xx, xy, yy = self._bent(x, y)
+            wrong_x, wrong_y = bent_x - u, bent_y - v
+            if max(np.abs(wrong_x).max(initial=0.0), np.abs(wrong_y).max(initial=0.0)) < _WITHIN:
+                if (xx * yy - xy * xy > 0.0).all() and (xx + yy > 0.0).all():
+                    return x, y
+                break
+            area = xx * yy - xy * xy
+            x, y = x - (yy * wrong_x - xy * wrong_y) / area, y - (xx * wrong_y - xy * wrong_x) / area
+        raise ConfigError(
+            f"camera.distortion {list(self.distortion)} folds the picture over inside its borders",
+            expected="a distortion whose image radius grows up to the picture's corners",
+            change="reduce the coefficients, or the picture's size",
+        )
+
+    def _bent(self, x: Float64, y: Float64) -> tuple[Float64, Float64, Float64, Float64, Float64]:
+        """Distorted coordinates (Brown 1971; signs of OpenCV), and derivatives: x by x, x by y = y by x, y by y."""
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+        return (
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
+            x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y,
+            radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
+        )

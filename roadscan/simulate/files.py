@@ -14,11 +14,12 @@ import numpy.typing as npt
 from roadscan.simulate import sick
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.imu import AT_BODY, head_imus
+from roadscan.simulate.lens import Lens
 from roadscan.simulate.lidar import RANGE_MIN_M
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
 from roadscan.simulate.profiler import Head, heads
-from roadscan.simulate.scene import Mount, MountError, Scene
+from roadscan.simulate.scene import Camera, Mount, MountError, Scene
 from roadscan.simulate.surface import Surface
 
 SURVEY_FILE: Final = "SURVEY.toml"
@@ -61,6 +62,9 @@ def write_rig(scene: Scene, file: Path) -> None:
     if scene.sick.on:
         limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
         lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", scene.sick.mount, limits)
+    if scene.camera.on:
+        lines += _sensor("camera", "camera", "pinhole camera, Brown-Conrady distortion", "frd", scene.camera.mount)
+        lines += _interior(scene.camera)
     if scene.imu.on:
         lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", AT_BODY)
     for imu in head_imus(scene):
@@ -140,6 +144,16 @@ def _sensor(
     if limits_m is not None:
         lines += [f"range_min_m = {limits_m[0]!r}", f"range_max_m = {limits_m[1]!r}"]
     return lines
+
+
+def _interior(camera: Camera) -> list[str]:
+    """Interior orientation as comments, for the reader of the file: the rig has no keys for it."""
+    lens = Lens.of(camera)
+    return [
+        f"# interior orientation, in OpenCV's model: {camera.width_px} x {camera.height_px} pixels,",
+        f"# focal length {lens.focal_px!r} px, principal point {list(lens.principal_px)} px,",
+        f"# distortion k1, k2, p1, p2, k3 = {list(lens.distortion)}; x of the sensor is the optical axis",
+    ]
 
 
 def _profiler_limits(head: Head) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from typing import Literal
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
 from roadscan.simulate import encoder, gnss, imu, sick, trajectory
+from roadscan.simulate.camera import write_camera
 from roadscan.simulate.caster import World
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
@@ -56,6 +57,8 @@ class Pass:
     """Folder of the logs."""
     true_trajectory: Path
     """File of the true poses."""
+    true_camera: Path
+    """File of the camera's true poses."""
     hits: Callable[[str], Path | None]
     """File for a sensor's hits; None where they are not wanted."""
 
@@ -71,7 +74,10 @@ class Pass:
         ConfigError
             where a sensor needs the Earth, and the scene lies in a local frame.
         """
-        makers = (self._profilers, self._lidar, self._sick, self._trajectory, self._imus, self._gnss, self._encoder)
+        makers = (
+            self._camera, self._profilers, self._lidar, self._sick, self._trajectory, self._imus, self._gnss,
+            self._encoder,
+        )  # fmt: skip
         return [log for make in makers for log in make()]
 
     def _trajectory(self) -> Iterator[SimulatedLog]:
@@ -132,6 +138,18 @@ class Pass:
         stated = clock.toml("ns", self.drive.start_gps_ns)
         options = sick.Scanner(self.scene.sick).options()
         yield SimulatedLog(name, write, "other", "sick_lms", "sick", stated, None, options)
+
+    def _camera(self) -> Iterator[SimulatedLog]:
+        world = self.world
+        if world is None or not self.scene.camera.on:
+            return
+        clock = self.clock("camera", TimeSystem.UNIX_UTC)
+
+        def write() -> Iterator[int]:
+            return write_camera(self.scene, world, self.drive, clock, self.raw / "camera", self.true_camera)
+
+        stated = clock.toml("ns", self.drive.start_gps_ns)
+        yield SimulatedLog("camera", write, "other", "images", "camera", stated)
 
     def _imus(self) -> Iterator[SimulatedLog]:
         scene = self.scene

@@ -98,13 +98,16 @@ def _pass(known: truth.Truth, world: World | None, drive: Drive, folder: Path, w
     """One pass with its folders, which are made."""
     run = files.run_id(drive.number)
     raw = folder / "raw" / run
-    for needed in (raw, known.trajectory_file(run).parent, *([known.hits_file(run, "").parent] if write_hits else [])):
-        needed.mkdir(parents=True, exist_ok=True)
+    needed = [raw, known.trajectory_file(run).parent]
+    needed += [known.camera_file(run).parent] if known.scene.camera.on else []
+    needed += [known.hits_file(run, "").parent] if write_hits else []
+    for one in needed:
+        one.mkdir(parents=True, exist_ok=True)
 
     def hits(sensor: str) -> Path | None:
         return known.hits_file(run, sensor) if write_hits else None
 
-    return Pass(known.scene, known.surface, world, drive, raw, known.trajectory_file(run), hits)
+    return Pass(known.scene, known.surface, world, drive, raw, known.trajectory_file(run), known.camera_file(run), hits)
 
 
 def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:

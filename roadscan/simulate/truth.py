@@ -48,6 +48,10 @@ class Truth:
         """Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
         return self.folder / "trajectory" / f"{run}.parquet"
 
+    def camera_file(self, run: str) -> Path:
+        """Parquet file of a run's pictures: epoch, file, and the camera's true pose (world frame ECEF)."""
+        return self.folder / "camera" / f"{run}.parquet"
+
     @property
     def objects_file(self) -> Path:
         """Parquet file of all objects beside the road, see :func:`roadscan.simulate.things.objects_table`."""

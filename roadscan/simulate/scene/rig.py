@@ -286,7 +286,7 @@ class Encoder(Strict):
 
 
 class Camera(Strict):
-    """A camera with a rolling, undistorted or distorted pinhole model (Brown–Conrady, as OpenCV's)."""
+    """A camera: grey pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it)."""
 
     on: bool = False
     """Whether the rig carries it."""

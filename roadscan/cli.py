@@ -315,15 +315,37 @@ def first_survey(
 
 @app.command()
 def simulate(
-    scene: Annotated[str, typer.Argument(help="A scene file (TOML), or the name of a shipped scene.")],
+    scene: Annotated[
+        str, typer.Argument(help="A scene file (TOML), or the name of a shipped scene (roadscan scenes).")
+    ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    hits: Annotated[bool, typer.Option("--hits", help="Also write where each beam hit, into truth/hits.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all errors, in place of the scene's own.")] = None,
 ) -> None:
     """Write a survey with known truth as raw logs."""
     from roadscan.simulate import Scene
     from roadscan.simulate import simulate as write
 
-    made = write(Scene.load(scene), out, progress=typer.echo)
+    loaded = Scene.load(scene)
+    changed = loaded if seed is None else loaded.changed(seed=seed)
+    made = write(changed, out, write_hits=hits, progress=typer.echo)
+    typer.echo(
+        f"{made.poses:,} poses, {made.profiles:,} profiles with {made.readings:,} readings in all, {made.returns:,} returns"
+    )
     typer.echo(f"survey file: {made.survey_file}")
+
+
+@app.command("scenes")
+def list_scenes() -> None:
+    """List the scenes that ship with roadscan."""
+    from roadscan.simulate import Scene
+    from roadscan.simulate.scene import shipped_scenes
+
+    scenes = {name: Scene.load(name) for name in shipped_scenes()}
+    _table(
+        ("scene", "length m", "passes", "what"),
+        [(name, f"{one.length_m:g}", len(one.passes), one.title) for name, one in scenes.items()],
+    )
 
 
 @app.command()

@@ -108,9 +108,14 @@ def write_lidar(scene: Scene, world: World, drive: Drive, file: Path, hits_file:
         hits.close()
 
 
+def starts_gps_ns(drive: Drive) -> int:
+    """Epoch of a pass's first firing."""
+    return drive.start_gps_ns - round(RUN_UP_S / 2 * 1e9)
+
+
 def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Packets]:
     """Packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
-    first = drive.start_gps_ns - round(RUN_UP_S / 2 * 1e9)
+    first = starts_gps_ns(drive)
     span = drive.duration_s + RUN_UP_S
     count = math.ceil(span * 1e9 / PACKET_NS)
     start_deg = float(stream(scene.seed, drive.number, "lidar head").integers(0, 36_000)) / 100.0
@@ -170,11 +175,9 @@ def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArr
     share = FIRING_NS / CYCLE_NS * np.arange(LASERS)
     if scene.lidar.on_azimuth_grid:
         per_cycle = float(round(per_cycle))
-        begins = np.rint(start_deg * 100.0) + per_cycle * cycle
-        hundredths = begins[:, :, None] + np.floor(per_cycle * share + 0.5)
-    else:
-        begins = start_deg * 100.0 + per_cycle * cycle
-        hundredths = begins[:, :, None] + per_cycle * share
+        start_deg = round(start_deg * 100.0) / 100.0
+    begins = start_deg * 100.0 + per_cycle * cycle
+    hundredths = begins[:, :, None] + per_cycle * share
     stated = np.mod(np.rint(begins).astype(np.int64), 36_000).astype(np.uint16)
     return stated, np.mod(hundredths, 36_000.0) / 100.0
 

@@ -9,12 +9,11 @@ from typing import Literal
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
-from roadscan.simulate import encoder, gnss, imu, sick, trajectory
+from roadscan.simulate import encoder, gnss, imu, lidar, sick, trajectory
 from roadscan.simulate.camera import write_camera
 from roadscan.simulate.caster import World
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.lidar import write_lidar
 from roadscan.simulate.profiler import Head, heads, write_profiles
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
@@ -116,14 +115,16 @@ class Pass:
         world = self.world
         if world is None or not self.scene.lidar.on:
             return
-        self._need_earth("lidar", "its packets carry GNSS sentences")
         name = "lidar.pcap"
 
         def write() -> Iterator[int]:
-            return write_lidar(self.scene, world, self.drive, self.raw / name, self.hits("lidar"))
+            return lidar.write_lidar(self.scene, world, self.drive, self.raw / name, self.hits("lidar"))
 
         clock = self.clock("lidar", TimeSystem.UTC_HOUR).toml(None, self.drive.start_gps_ns)
-        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", clock)
+        hour = None
+        if self.drive.earth.is_local:  # no GNSS receiver is attached that would tell the hour
+            hour = f"{{ hour = {utc_from_gps_ns(lidar.starts_gps_ns(self.drive)).hour} }}"
+        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", clock, options=hour)
 
     def _sick(self) -> Iterator[SimulatedLog]:
         world = self.world

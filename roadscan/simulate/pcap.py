@@ -86,7 +86,7 @@ class PcapWriter:
         shown = self._clock.shown_gps_ns(epoch_gps_ns)
         records = _data_packets(epoch_gps_ns, shown, azimuth, ranges, intensity)
         done = 0
-        while self._position_due(shown[-1], int(shown[0])):
+        while not self._drive.earth.is_local and self._position_due(shown[-1], int(shown[0])):
             due = self._next_position_gps_ns or 0
             upto = int(np.searchsorted(shown, due))
             self._stream.write(records[done:upto].tobytes())

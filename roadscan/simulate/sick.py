@@ -46,9 +46,9 @@ STAMPS_FILE: Final = "sick_stamps.csv"
 STAMP_COLUMN: Final = "time_ns"
 OFFSET_COLUMN: Final = "byte"
 
-_QUARTERS: Final = 4
-"""Within a quarter of a scan's half turn the sensor moves evenly."""
-_QUARTER_NS: Final = TURN_NS // (2 * _QUARTERS) + 1
+_PIECES: Final = 10
+"""Within such a part of a scan's half turn the sensor moves evenly."""
+_PIECE_NS: Final = TURN_NS // (2 * _PIECES) + 1
 _CODES: Final = 9
 _TOO_FAR: Final = 0
 """Of the codes: no reading within range."""
@@ -98,11 +98,11 @@ class Scanner:
 
     def pattern(self) -> Pattern:
         """The readings of a scan."""
-        quarter = np.minimum(self.past_ns // _QUARTER_NS, _QUARTERS - 1).astype(np.int64)
+        piece = np.minimum(self.past_ns // _PIECE_NS, _PIECES - 1).astype(np.int64)
         return Pattern(
             np.zeros((self.readings, 3)),
-            self.turn_of * _QUARTERS + quarter,
-            self.past_ns / _QUARTER_NS - quarter,
+            self.turn_of * _PIECES + piece,
+            self.past_ns / _PIECE_NS - piece,
             self.settings.divergence_deg,
             (RANGE_MIN_M, self.settings.range_max_m),
         )
@@ -160,8 +160,8 @@ def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Scans]:
     key = ray_key(scene, drive, "sick")
     a = scanner.angles_rad
     direction = np.stack([np.zeros_like(a), np.sin(a), np.cos(a)], axis=-1)
-    begins = TURN_NS * np.arange(scanner.turns)[:, None] + _QUARTER_NS * np.arange(_QUARTERS)
-    ends = begins.reshape(-1, 1) + _QUARTER_NS * np.arange(2)
+    begins = TURN_NS * np.arange(scanner.turns)[:, None] + _PIECE_NS * np.arange(_PIECES)
+    ends = begins.reshape(-1, 1) + _PIECE_NS * np.arange(2)
     for block, begin in enumerate(range(0, count, BLOCK_SCANS)):
         numbers = np.arange(begin, min(begin + BLOCK_SCANS, count))
         epochs = first + np.rint(numbers * (NS_PER_S / scene.sick.scans_per_s)).astype(np.int64)

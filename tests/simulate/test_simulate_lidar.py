@@ -14,14 +14,18 @@ import velodyne_decoder as vd
 
 from roadscan.model.gpstime import gps_ns_from_utc, utc_from_gps_ns
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.lidar import hdl32e_beams
+from roadscan.simulate.caster import World
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar import hdl32e_beams, measure
 from roadscan.simulate.run import SimulatedSurvey
+from roadscan.simulate.surface import Surface
 from tests.simulate.chain import WEEK_NS, Chain
 
 # Starts 0.9 s before the full hour, so that stamps roll over on the way.
 SCENE = Scene.load("demo").changed(
     start="2026-05-04T09:59:59.100000Z",
-    length_m=12.0,
+    length_m=13.5,
     passes=[{"lane": 2}],
     profilers={"on": False},
 )
@@ -84,8 +88,9 @@ def test_beams_are_the_decoders():
 def test_decoded_returns_are_the_hits(on_grid: SimulatedSurvey):
     decoded, hits = decode(on_grid.folder), true_hits(on_grid)
     assert len(decoded) == hits["range_m"].size == on_grid.returns > 50_000
-    # On the azimuth grid the decoder's directions are exact: what is left is the rounding of ranges to 2 mm.
-    assert np.linalg.norm(decoded[:, :3] - in_sensor(hits), axis=1).max() < 0.00101
+    # What is left is the rounding of ranges to 2 mm, and of each firing's azimuth to 0.01° by this decoder.
+    error = np.linalg.norm(decoded[:, :3] - in_sensor(hits), axis=1)
+    assert (error - np.radians(0.0051) * hits["range_m"]).max() < 0.00101
     # Stamps are rounded to 1 µs; 315,964,800 s lie between the epochs of Unix and GPS time, 18 s are leap seconds.
     utc_s = (hits["epoch_gps_ns"] + (315_964_800 - 18 - 1_777_800_000) * 10**9) / 1e9
     assert np.abs(decoded[:, 4] - utc_s).max() < 1e-6
@@ -103,6 +108,8 @@ def test_hits_lie_on_the_surface(on_grid: SimulatedSurvey):
     hits, known = true_hits(on_grid), truth.load(on_grid.folder)
     height = known.height_m(hits["easting_m"], hits["northing_m"])
     assert np.abs(height - hits["height_m"]).max() < 1e-6
+    assert not hits["object_id"].any()
+    assert not hits["is_mixed"].any()
     assert hits["range_m"].max() <= SCENE.lidar.range_max_m
     assert hits["range_m"].min() > 0.9
     _, offset = known.station_offset_m(hits["easting_m"], hits["northing_m"])
@@ -123,11 +130,6 @@ def test_hits_come_back_through_the_trajectory(on_grid: SimulatedSurvey):
 
 def test_no_beam_passes_through_a_wall():
     """Seen at a low angle, the near rim of a pothole hides its near floor."""
-    from roadscan.simulate.drive import Drive
-    from roadscan.simulate.earth import Earth
-    from roadscan.simulate.lidar import measure
-    from roadscan.simulate.surface import Surface
-
     hole = {"station_m": 4.0, "offset_m": 1.75, "radius_m": 0.8, "depth_m": 0.3}
     scene = SCENE.noiseless().changed(
         length_m=10.0, passes=[{"lane": 1}], road={"potholes": [hole], "cracks": [], "ruts": []}
@@ -135,22 +137,59 @@ def test_no_beam_passes_through_a_wall():
     surface = Surface(scene)
     drive = Drive(scene, 0, Earth(scene.map.crs), Surface(scene, ride=True))
     checked = 0
-    for block in measure(scene, surface, drive):
-        found = block.found[np.isfinite(block.found[..., 0])]
-        station, offset = surface.station_offset_m(found[:, 1], found[:, 2])
+    for block in measure(scene, World(scene, surface), drive):
+        seen = np.isfinite(block.found.range_m)
+        points = block.found.enh_m[seen]
+        station, offset = surface.station_offset_m(points[:, 0], points[:, 1])
         inside = np.hypot(station - 4.0, offset - 1.75) < 0.75
         if not inside.any():
             continue
-        epochs = block.firing_gps_ns()[np.isfinite(block.found[..., 0])][inside]
-        laser = np.broadcast_to(np.arange(32), block.found.shape[:3])[np.isfinite(block.found[..., 0])][inside]
+        epochs = block.firing_gps_ns().reshape(seen.shape)[seen][inside]
+        laser = np.broadcast_to(np.tile(np.arange(32), 12), seen.shape)[seen][inside]
         origins, rotations = drive.poses(epochs).sensor(scene.lidar.mount, np.diag([1.0, -1.0, -1.0]))
         origins += rotations[:, :, 2] * hdl32e_beams().rise_m[laser, None]
-        for origin, hit in zip(drive.earth.map_from_ecef(origins)[::5], found[inside][::5], strict=True):
-            way = origin + np.linspace(0.0, 0.999, 400)[:, None] * (hit[1:4] - origin)
+        for origin, hit in zip(drive.earth.map_from_ecef(origins)[::5], points[inside][::5], strict=True):
+            way = origin + np.linspace(0.0, 0.999, 400)[:, None] * (hit - origin)
             over = way[:, 2] - surface.height_m(way[:, 0], way[:, 1])
             assert over[np.isfinite(over)].min() > -1e-5  # the map bends by 8 µm over 10 m
             checked += 1
     assert checked > 200
+
+
+def test_a_wrong_clock_shifts_stamps_and_sentences(tmp_path: Path):
+    wrong = {"offset_s": 1.25, "drift_ppm": 200.0}
+    scene = SCENE.noiseless().changed(lidar={"on_azimuth_grid": True, "clock": wrong})
+    survey = simulate(scene, tmp_path / "survey", write_hits=True)
+    decoded, hits = decode(survey.folder), true_hits(survey)
+    start = gps_ns_from_utc(scene.start)
+    utc_s = (hits["epoch_gps_ns"] + (315_964_800 - 18 - 1_777_800_000) * 10**9) / 1e9
+    shift = 1.25 + 200e-6 * (hits["epoch_gps_ns"] - start) / 1e9
+    # The capture's own time is right, and it tells the hour: the decoder adds the stamp to it.
+    assert np.abs(decoded[:, 4] - utc_s - shift).max() < 2e-6
+    raw = (survey.folder / "raw" / "run-1" / "lidar.pcap").read_bytes()
+    sentences = [part[:13] for part in raw.split(b"$GPRMC,")[1:]]
+    # The pass starts at 09:59:58.8, and the clock shows a second and a quarter more.
+    assert sentences == [b"100000.00,A,4", b"100001.00,A,4"]
+
+
+def test_packets_cross_objects_and_edges(tmp_path: Path):
+    """Hits tell the object; what is not mixed lies where the beam's middle met it."""
+    side = {"boxes": [{"station_m": 6.0, "offset_m": -1.0, "length_m": 1.0, "width_m": 1.0, "height_m": 1.0}]}
+    quiet = SCENE.noiseless().changed(length_m=5.0, roadside=side)
+    thin = true_hits(simulate(quiet, tmp_path / "thin", write_hits=True))
+    wide = true_hits(simulate(quiet.changed(lidar={"divergence_deg": 0.2}), tmp_path / "wide", write_hits=True))
+    assert set(thin["object_id"]) == {0, 1}
+    assert not thin["is_mixed"].any()
+    assert 0.0 < wide["is_mixed"].mean() < 0.5
+    true_ranges = dict(zip(zip(thin["epoch_gps_ns"], thin["laser"], strict=True), thin["range_m"], strict=True))
+    plain = ~wide["is_mixed"]
+    firings = zip(wide["epoch_gps_ns"][plain], wide["laser"][plain], strict=True)
+    np.testing.assert_array_equal(wide["range_m"][plain], [true_ranges[firing] for firing in firings])
+    table = pq.read_table(truth.load(tmp_path / "thin").objects_file).to_pydict()
+    assert (table["object_id"], table["kind"], table["station_m"]) == ([1], ["box"], [6.0])
+    on_box = thin["object_id"] == 1
+    assert on_box.sum() > 300
+    assert thin["height_m"][on_box].max() <= table["height_m"][0] + 1.0 + 1e-6
 
 
 def test_packets_by_hand(on_grid: SimulatedSurvey):

@@ -215,8 +215,8 @@ def test_a_sensors_clock_shifts_its_stamps_alone(tmp_path: Path):
 
 
 def test_rig_file_states_nominal_mountings(tmp_path: Path):
-    scene = Scene.load("calibration_yard").changed(length_m=60.0, passes=[{"lane": 1, "speed_m_per_s": 5.0}],
-                                                   sick={"on": False}, camera={"on": False})  # fmt: skip
+    off = {"on": False}
+    scene = Scene.load("calibration_yard").changed(length_m=60.0, lidar=off, sick=off, camera=off)
     rig = Survey.load(simulate(scene, tmp_path / "s").survey_file).rig
     true, nominal = scene.profilers.left, rig.sensors["profiler_left"]
     assert nominal.lever_arm_body_m == pytest.approx((-2.32, -1.00, -1.06))
@@ -226,10 +226,8 @@ def test_rig_file_states_nominal_mountings(tmp_path: Path):
 
 
 def test_local_frames_have_no_latitude(tmp_path: Path):
-    scene = Scene.load("demo").changed(map={"crs": "local"}, length_m=10.0, gnss={"on": False})
-    with pytest.raises(ConfigError, match="lidar"):
-        simulate(scene, tmp_path / "a")
+    scene = Scene.load("demo").changed(map={"crs": "local"}, length_m=10.0, lidar={"on": False})
     with pytest.raises(ConfigError, match="gnss"):
-        simulate(scene.changed(lidar={"on": False}, gnss={"on": True}), tmp_path / "b")
-    done = simulate(scene.changed(lidar={"on": False}), tmp_path / "c")
+        simulate(scene.changed(gnss={"on": True}), tmp_path / "b")
+    done = simulate(scene, tmp_path / "c")
     assert Survey.load(done.survey_file).config.map.local is not None

@@ -108,8 +108,8 @@ class Lidar(Strict):
     range_max_m: float = Field(default=20.0, gt=2.0, le=100.0)
     """Returns farther than this are not measured (m)."""
     on_azimuth_grid: bool = False
-    """Fire on the hundredths of a degree that the packets state, at a whole number of them a cycle. The
-    directions of a decoder are then exact; otherwise they are rounded by up to 0.01 degrees."""
+    """Turn a whole number of hundredths of a degree a cycle, so that the azimuths which the packets state are exact;
+    otherwise they are rounded by up to 0.005 degrees."""
     divergence_deg: float = Field(default=0.0, ge=0.0, le=0.5)
     """Width of a beam (degrees): where two of its edges meet things at different ranges, the range is a mixture."""
     mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +17,7 @@ from roadscan.simulate.drive import Drive
 from roadscan.simulate.profiler import Head, heads, write_profiles
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
+from roadscan.simulate.things import Object
 
 Content = Literal["poses", "readings", "returns", "other"]
 
@@ -51,6 +52,8 @@ class Pass:
     surface: Surface
     world: World | None
     """What rays meet; None where nothing on the rig casts any."""
+    things: Sequence[Object]
+    """What stands on and beside the road."""
     drive: Drive
     raw: Path
     """Folder of the logs."""
@@ -104,8 +107,9 @@ class Pass:
             name = f"{head.name}.parquet"
 
             def write(head: Head = head, name: str = name) -> Iterator[int]:
+                hits = self.hits(head.name)
                 return write_profiles(
-                    self.scene, self.surface, self.drive, head, clock, self.raw / name, self.hits(head.name)
+                    self.scene, self.surface, self.drive, head, clock, self.raw / name, hits, self.things
                 )
 
             stated = None if plain else clock.toml("ns", self.drive.start_gps_ns)

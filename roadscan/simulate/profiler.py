@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,15 +21,20 @@ from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.encoder import WheelEncoder
 from roadscan.simulate.kernels import profiles as kernels
+from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, HALF_LENGTH, HALF_WIDTH, NORTHING
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Profilers, Scene
 from roadscan.simulate.surface import Surface
+from roadscan.simulate.things import Object
 
 Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 
 BLOCK_PROFILES: Final = 512
 """Profiles measured at once and a Parquet row group."""
+BESIDE_M: Final = 4.0
+"""Things farther from the middle of a head's profiles are not met (m)."""
 WRONG_WITHIN_M: Final = 0.03
 """Wrong readings lie this near to the road (m)."""
 _BENT_M: Final = 1e-7
@@ -86,6 +91,8 @@ class Profiles:
     """(p, n)"""
     hits: Float64
     """(p, n, 4) easting, northing, height in the map, and exact range (m); (0, 0, 0) if not wanted."""
+    object_id: Int32
+    """(p, n) 0: the road, −1: nothing; (0, 0) if not wanted."""
 
 
 def heads(settings: Profilers) -> list[Head]:
@@ -103,8 +110,12 @@ def write_profiles(
     clock: SensorClock,
     file: Path,
     hits_file: Path | None,
+    things: Sequence[Object] = (),
 ) -> Iterator[int]:
-    """Write the profiles of one head, a row group a step; yields the readings of each."""
+    """Write the profiles of one head, a row group a step; yields the readings of each.
+
+    things : what stands on or beside the road, and may stand in the beams' way.
+    """
     readings = head.settings.readings
     stamp = "epoch_gps_ns" if clock.error.is_right and clock.system is TimeSystem.GPS else "time"
     schema = _scans_schema(head, stamp)
@@ -123,7 +134,7 @@ def write_profiles(
         },
         write_statistics=[stamp, "encoder_ticks"],
     ) as writer:
-        for block in measure(scene, surface, drive, head, with_hits=hits_file is not None):
+        for block in measure(scene, surface, drive, head, things, with_hits=hits_file is not None):
             columns = [
                 pa.array(clock.stamps_ns(block.epoch_gps_ns)),
                 _lists(block.ranges, schema.field("range").type),
@@ -135,21 +146,33 @@ def write_profiles(
                 kind = hits_schema.field("easting_m").type
                 places = [_lists(np.ascontiguousarray(block.hits[:, :, i]), kind) for i in range(4)]
                 hits_writer.write_batch(
-                    pa.RecordBatch.from_arrays([pa.array(block.epoch_gps_ns), *places], schema=hits_schema)
+                    pa.RecordBatch.from_arrays(
+                        [pa.array(block.epoch_gps_ns), *places, _lists(block.object_id, hits_schema.field(5).type)],
+                        schema=hits_schema,
+                    )
                 )
             yield block.ranges.size
     if hits_writer is not None:
         hits_writer.close()
 
 
-def measure(scene: Scene, surface: Surface, drive: Drive, head: Head, *, with_hits: bool = False) -> Iterator[Profiles]:
+def measure(
+    scene: Scene,
+    surface: Surface,
+    drive: Drive,
+    head: Head,
+    things: Sequence[Object] = (),
+    *,
+    with_hits: bool = False,
+) -> Iterator[Profiles]:
     """Profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
     spacing = head.settings.spacing_m
     count = math.floor(drive.length_m / spacing + 1e-9) + 1
     encoder = WheelEncoder(scene, drive)
+    near = _Near.of(things)
     for first in range(0, count, BLOCK_PROFILES):
         driven = np.asarray(spacing * np.arange(first, min(first + BLOCK_PROFILES, count), dtype=np.float64))
-        yield _measure_block(scene, surface, drive, head, encoder, driven, first, with_hits)
+        yield _measure_block(scene, surface, drive, head, encoder, near, driven, first, with_hits)
 
 
 def _measure_block(
@@ -158,6 +181,7 @@ def _measure_block(
     drive: Drive,
     head: Head,
     encoder: WheelEncoder,
+    near: _Near,
     driven_m: Float64,
     first: int,
     with_hits: bool,
@@ -171,6 +195,8 @@ def _measure_block(
     shape = (epochs.size, y.size)
     ranges, intensity = np.empty(shape, np.uint16), np.empty(shape, np.uint8)
     true_range = np.empty(shape if with_hits else (0, 0))
+    body_hit = np.empty(shape if with_hits else (0, 0), np.int32)
+    bodies, owners = near.within(planes.in_map[:, :2, 0])
     noise = scene.noise
     errors = [noise.dropout, noise.profiler_range_m, noise.intensity, noise.impulse]
     kernels.scan_profiles(
@@ -180,16 +206,54 @@ def _measure_block(
         planes.is_bent,
         y,
         np.array([middle, settings.range_offset_m, settings.range_step_m, *errors, WRONG_WITHIN_M]),
+        bodies,
         _normal_numbers() if any(errors) else np.zeros(0, np.float32),
         np.uint64(_random_from(scene, drive, head) + first * y.size),
         np.empty((3, 3)),
         ranges,
         intensity,
         true_range,
+        body_hit,
     )
     ticks = encoder.ticks(epochs)
     hits = _hits(drive, origins, rotations, y, true_range) if with_hits else np.empty((0, 0, 0))
-    return Profiles(epochs, ticks, ranges, intensity, hits)
+    return Profiles(epochs, ticks, ranges, intensity, hits, _object_ids(body_hit, owners, true_range))
+
+
+@dataclass(frozen=True)
+class _Near:
+    """Bodies of all things, to choose from."""
+
+    bodies: Float64
+    """(b, 18)"""
+    object_id: Int32
+    """(b,)"""
+
+    @classmethod
+    def of(cls, things: Sequence[Object]) -> Self:
+        """All bodies of the things, those that stand still."""
+        rows = [np.zeros((0, BODY_COLUMNS)), *(thing.bodies for thing in things)]
+        owners = [np.zeros(0, np.int32), *(np.full(len(thing.bodies), thing.id, np.int32) for thing in things)]
+        return cls(np.concatenate(rows), np.concatenate(owners))
+
+    def within(self, path_m: Float64) -> tuple[Float64, Int32]:
+        """Bodies (m, 18) that profiles through map points (p, 2) can meet, and their objects (m,)."""
+        if not self.bodies.size:
+            return self.bodies, self.object_id
+        low, high = path_m.min(axis=0) - BESIDE_M, path_m.max(axis=0) + BESIDE_M
+        middle = self.bodies[:, [EASTING, NORTHING]]
+        reach = np.hypot(self.bodies[:, HALF_LENGTH], self.bodies[:, HALF_WIDTH])[:, None]
+        chosen = np.all((middle + reach >= low) & (middle - reach <= high), axis=1)
+        return np.ascontiguousarray(self.bodies[chosen]), self.object_id[chosen]
+
+
+def _object_ids(body_hit: Int32, owners: Int32, range_m: Float64) -> Int32:
+    """Object of each reading (p, n): 0 the road, −1 nothing."""
+    if not body_hit.size:
+        return body_hit
+    ids = np.append(owners, 0).astype(np.int32)[body_hit]
+    ids[np.isnan(range_m)] = -1
+    return ids
 
 
 @dataclass(frozen=True)
@@ -273,7 +337,8 @@ def _scans_schema(head: Head, stamp: str) -> pa.Schema:
 def _hits_schema(readings: int) -> pa.Schema:
     lists = _list_of(pa.float64(), readings)
     names = ("easting_m", "northing_m", "height_m", "range_m")
-    return pa.schema([pa.field("epoch_gps_ns", pa.int64()), *(pa.field(name, lists) for name in names)])
+    places = [pa.field(name, lists) for name in names]
+    return pa.schema([("epoch_gps_ns", pa.int64()), *places, ("object_id", _list_of(pa.int32(), readings))])
 
 
 def _list_of(kind: pa.DataType, size: int) -> pa.DataType:

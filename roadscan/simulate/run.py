@@ -17,6 +17,7 @@ from roadscan.simulate.earth import Earth
 from roadscan.simulate.logs import Pass, SimulatedLog
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
+from roadscan.simulate.things import Object, objects_of
 
 _AT_ONCE: Final = 2
 """Logs written at once, each by a thread of its own: the loops let go of the interpreter."""
@@ -74,7 +75,8 @@ def simulate(
     truth.save_objects(scene, surface, target)
     casts = scene.lidar.on or scene.sick.on or scene.camera.on
     world = World(scene, surface) if casts else None
-    logs = [_pass(known, world, drive, target, write_hits).logs() for drive in drives]
+    things = world.objects if world is not None else objects_of(scene, surface)
+    logs = [_pass(known, world, things, drive, target, write_hits).logs() for drive in drives]
     counts: Counter[str] = Counter()
     for drive, listed in zip(drives, logs, strict=True):
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
@@ -94,7 +96,9 @@ def simulate(
     )
 
 
-def _pass(known: truth.Truth, world: World | None, drive: Drive, folder: Path, write_hits: bool) -> Pass:
+def _pass(
+    known: truth.Truth, world: World | None, things: list[Object], drive: Drive, folder: Path, write_hits: bool
+) -> Pass:
     """One pass with its folders, which are made."""
     run = files.run_id(drive.number)
     raw = folder / "raw" / run
@@ -107,7 +111,8 @@ def _pass(known: truth.Truth, world: World | None, drive: Drive, folder: Path, w
     def hits(sensor: str) -> Path | None:
         return known.hits_file(run, sensor) if write_hits else None
 
-    return Pass(known.scene, known.surface, world, drive, raw, known.trajectory_file(run), known.camera_file(run), hits)
+    trajectory, camera = known.trajectory_file(run), known.camera_file(run)
+    return Pass(known.scene, known.surface, world, things, drive, raw, trajectory, camera, hits)
 
 
 def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:

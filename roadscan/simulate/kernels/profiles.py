@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
+from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined
 from roadscan.simulate.kernels.road import (
     DEFECTS,
@@ -22,9 +23,11 @@ from roadscan.simulate.kernels.road import (
     texture_plane,
     worn_height,
 )
+from roadscan.simulate.kernels.things import meet, shade
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 UInt16 = npt.NDArray[np.uint16]
 UInt8 = npt.NDArray[np.uint8]
@@ -75,15 +78,6 @@ def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
         beam[axis, 2] = planes[p, axis, 5]
 
 
-@inlined
-def mixed(counter: np.uint64) -> np.uint64:
-    """64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
-    z = counter * np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return z ^ (z >> np.uint64(31))
-
-
 @compiled
 def scan_profiles(
     road: RoadArrays,
@@ -92,12 +86,14 @@ def scan_profiles(
     is_bent: Flags,
     y_sensor_m: Float64,
     scale: Float64,
+    bodies: Float64,
     normal: Float32,
     random_from: np.uint64,
     beam: Float64,
     ranges: UInt16,
     intensity: UInt8,
     true_range_m: Float64,
+    body_hit: Int32,
 ) -> None:
     """Measure profiles of a triangulation head.
 
@@ -108,11 +104,13 @@ def scan_profiles(
     y_sensor_m : (n,) transverse positions of the readings.
     scale : (8,) middle range of the planes (m), range of raw 0 (m), range step (m), share of lost readings, range
         noise (m), intensity noise, share of wrong readings and how far they lie off (m).
+    bodies : (b, 18) things that may stand in the beams' way, see :mod:`roadscan.simulate.kernels.things`.
     normal : (65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind.
     random_from : where the random numbers of the first reading begin; reading i of profile p has its own.
     beam : (3, 3) scratch.
     ranges, intensity : (p, n), out.
     true_range_m : (p, n), out; NaN where the beam misses. (0, 0): not wanted.
+    body_hit : (p, n), out; row of the body that the beam meets, −1: none. (0, 0): not wanted.
     """
     for p in range(road_planes.shape[0]):
         before = 0.0
@@ -143,11 +141,26 @@ def scan_profiles(
                 stone = over_texture(road, beam, found - scale[0], road.nodes[k, STATION] + u, offset, r)
                 found -= stone / fall
             seen = on_surface(road, k, u, offset)
+            value = brightness(road, k, u, offset, depth, stone)
+            bits = mixed(random_from + np.uint64(p * y_sensor_m.size + i))
+            body = -1
+            if bodies.shape[0]:
+                map_beam(map_planes, p, y, beam)
+                body, found = in_the_way(bodies, beam, scale[0], found, bits)
+                if body >= 0:
+                    r_body = found - scale[0]
+                    value = shade(
+                        bodies,
+                        body,
+                        along_beam(beam, 0, r_body),
+                        along_beam(beam, 1, r_body),
+                        along_beam(beam, 2, r_body),
+                    )
+                    seen = not math.isnan(value)
             if true_range_m.size:
                 true_range_m[p, i] = found if seen else np.nan
-            value = brightness(road, k, u, offset, depth, stone)
+                body_hit[p, i] = body
             if normal.size:
-                bits = mixed(random_from + np.uint64(p * y_sensor_m.size + i))
                 found += scale[4] * normal[bits & np.uint64(0xFFFF)]
                 value += scale[5] * normal[(bits >> np.uint64(16)) & np.uint64(0xFFFF)]
                 seen = seen and float((bits >> np.uint64(32)) & np.uint64(0xFFFF)) >= scale[3] * 65536.0
@@ -157,6 +170,21 @@ def scan_profiles(
             seen = seen and 1.0 <= raw <= 65535.0
             ranges[p, i] = int(raw) if seen else 0
             intensity[p, i] = int(min(max(value, 0.0), 255.0)) if seen else 0
+
+
+@compiled
+def in_the_way(bodies: Float64, beam: Float64, middle_m: float, found_m: float, key: np.uint64) -> tuple[int, float]:
+    """First body that a beam in the map meets before the range `found_m`, and the range there; −1: none.
+
+    The beam is taken as straight: over the metres of a profiler the map bends by less than 10⁻⁷ m.
+    """
+    ox, oy, oz = along_beam(beam, 0, -middle_m), along_beam(beam, 1, -middle_m), along_beam(beam, 2, -middle_m)
+    body, nearest = -1, found_m
+    for b in range(bodies.shape[0]):
+        r = meet(bodies, b, ox, oy, oz, beam[0, 1], beam[1, 1], beam[2, 1], key)
+        if r < nearest:
+            body, nearest = b, r
+    return body, nearest
 
 
 @inlined

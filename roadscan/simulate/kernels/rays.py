@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.simulate.kernels.beams import along_beam, through
+from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
 from roadscan.simulate.kernels.options import compiled, inlined
-from roadscan.simulate.kernels.profiles import mixed
 from roadscan.simulate.kernels.road import DEFECTS, DEFECTS_END, RoadArrays, brightness, defect_depth, on_surface
 from roadscan.simulate.kernels.things import (
     BODY_COLUMNS,

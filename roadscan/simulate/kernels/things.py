@@ -10,8 +10,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined
-from roadscan.simulate.kernels.profiles import mixed
 
 Float64 = npt.NDArray[np.float64]
 

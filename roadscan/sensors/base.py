@@ -78,6 +78,15 @@ class LogSource:
             )
         return self.crs
 
+    def need_file(self) -> None:
+        """Refuse a log that is no file, or one that cannot be opened, for formats of single files."""
+        try:
+            if self.path.is_dir():
+                raise FormatError("the log is a folder", expected="a file", file=self.path)
+            self.path.open("rb").close()
+        except OSError as error:
+            raise FormatError(f"the log cannot be opened: {error.strerror}", file=self.path) from error
+
     def need_sensor(self, *kinds: SensorKind) -> Sensor:
         """The rig's sensor that wrote the log, or an error where none is named or it is of another kind."""
         wanted = " or ".join(kinds)

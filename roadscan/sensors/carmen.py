@@ -136,6 +136,7 @@ class Carmen(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Message, angles, step and poses, from the first scans."""
+        source.need_file()
         source.need_clock('{ system = "unix_utc" }')
         if source.crs not in (None, LOCAL_WORLD):
             raise ConfigError(
@@ -344,8 +345,9 @@ class _Head:
         """True if scanner and robot are not posed alike."""
         if not self.shape.has_pose:
             return False
-        apart = self.pose("laser") - self.pose("robot")
-        apart[:, 2] = (apart[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        with np.errstate(invalid="ignore", over="ignore"):  # a damaged scan says nothing of the others
+            apart = self.pose("laser") - self.pose("robot")
+            apart[:, 2] = (apart[:, 2] + np.pi) % (2 * np.pi) - np.pi
         return bool(np.nanmax(np.abs(apart), initial=0.0) > _SAME_POSE)
 
     def said(self) -> dict[str, Any]:
@@ -607,14 +609,15 @@ class _Reader:
         none = _no_return(numbers, self._plan.shape, self._options.max_range_m)
         metres = numbers[:, self._plan.shape.ranges]
         sieve.drop(_any(np.isnan(metres)), "a range is missing or not a number")
-        steps = np.where(none | np.isnan(metres), 0.0, metres) / self._plan.range_step_m
+        with np.errstate(over="ignore", invalid="ignore"):  # ranges beyond all numbers are dropped
+            steps = np.where(none | np.isnan(metres), 0.0, metres) / self._plan.range_step_m
+            raw = np.rint(steps)
+            fine = _any(np.abs(steps - raw) > 1e-3)
         sieve.drop(_any(steps < 0), "a range is negative")
-        raw = np.rint(steps)
         step = f"{self._plan.range_step_m:g} m"
         sieve.drop(_any(raw > _LARGEST_RAW), f"a range is beyond {_LARGEST_RAW:,} steps of {step}: "
                    "state options.range_step_m or options.max_range_m")  # fmt: skip
         if not self._plan.rounds:
-            fine = _any(np.abs(steps - raw) > 1e-3)
             sieve.drop(fine, f"a range is no multiple of {step}, as the log's first are: state options.range_step_m")
         return np.clip(raw, 0, _LARGEST_RAW).astype(np.uint16)
 
@@ -623,7 +626,8 @@ class _Reader:
         shape = self._plan.shape
         if shape.remissions != shape.readings:
             return None
-        units = np.rint(numbers[:, shape.bright] / self._options.remission_step)
+        with np.errstate(over="ignore"):
+            units = np.rint(numbers[:, shape.bright] / self._options.remission_step)
         fits = ~_any(~((units >= 0) & (units <= 255)))
         sieve.drop(~fits, "a remission is no number from 0 to 255: state options.remission_step")
         return np.where(fits[:, None], units, 0).astype(np.uint8)

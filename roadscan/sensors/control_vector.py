@@ -89,6 +89,7 @@ class ControlVector(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Check layer, attributes, CRS, heights and roles."""
+        source.need_file()
         plan = _plan(source)
         return LogHeader({"crs": plan.frame.crs, "height": plan.frame.height, "layer": plan.layer})
 
@@ -126,6 +127,8 @@ def _plan(source: LogSource) -> _Plan:
         layers = layer_names(source.path)
         layer = chosen_layer(layers, options.layer, source.path)
         info: dict[str, Any] = pyogrio.read_info(source.path, layer=layer)
+    if info["geometry_type"] is None:
+        raise FormatError(f"layer '{layer}' has no geometry", expected="points", file=source.path)
     _check_crs(info["crs"], frame, source.path)
     attributes = tuple(str(field) for field in info["fields"])
     for wanted in (options.name, options.height):
@@ -197,5 +200,6 @@ def _points(batch: pa.RecordBatch, geometry: str) -> Float64:
     """x, y, z (3, n) of the point geometries, NaN for anything else and for a missing z."""
     name = geometry if geometry in batch.schema.names else "wkb_geometry"
     shapes = shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore")
-    points = np.where(shapely.get_type_id(shapes) == shapely.GeometryType.POINT, shapes, None)
+    is_place = (shapely.get_type_id(shapes) == shapely.GeometryType.POINT) & ~shapely.is_empty(shapes)
+    points = np.where(is_place, shapes, None)
     return np.stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])

@@ -85,6 +85,7 @@ class E57Scans(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """CRS, kind of heights, and the scans."""
+        source.need_file()
         with source.path.open("rb") as stream:
             file, plans = _open(source, stream)
             return LogHeader(

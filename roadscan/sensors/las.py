@@ -87,6 +87,7 @@ class Las(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """CRS, kind of heights and time system."""
+        source.need_file()
         with Cloud.open(source.path) as cloud:
             units = _units(source, cloud)
             times = _Times.of(source, cloud)

@@ -95,6 +95,7 @@ class Nmea(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Check clock, CRS and heights, and find the first date."""
+        source.need_file()
         plan = _plan(source)
         return LogHeader({"world_frame": plan.placement.world, "date": _date_of(plan.first_day).isoformat()})
 

@@ -93,6 +93,7 @@ class Ply(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """CRS, kind of heights, and which properties are taken."""
+        source.need_file()
         plan = _Plan.of(source)
         return LogHeader(
             {

@@ -18,6 +18,7 @@ from roadscan.model.errors import FormatError
 from roadscan.model.gpstime import Clock
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
+from roadscan.sensors.parquet_pages import pages_fault
 from roadscan.sensors.poses import (
     PoseReader,
     RawPoses,
@@ -281,15 +282,19 @@ class _Parquet(_Columnar):
             super().__init__(path, file.schema_arrow)
 
     def batches(self, names: list[str]) -> Iterator[pa.RecordBatch | Reject]:
-        with pq.ParquetFile(self._path) as file:
+        with pq.ParquetFile(self._path, page_checksum_verification=True) as file:
             for i in range(file.num_row_groups):
-                rows = file.metadata.row_group(i).num_rows
+                group = file.metadata.row_group(i)
+                rows = group.num_rows
+                reason = pages_fault(self._path, group, names)
                 try:
-                    for batch in file.iter_batches(BATCH_ROWS, row_groups=[i], columns=names):
+                    for batch in [] if reason else file.iter_batches(BATCH_ROWS, row_groups=[i], columns=names):
                         yield batch
                         rows -= batch.num_rows
                 except _ARROW_DAMAGE as error:
-                    yield Reject(f"row group {i} is damaged: {error}", records=max(rows, 1))
+                    reason = str(error)
+                if reason or rows > 0:
+                    yield Reject(f"row group {i} is damaged: {reason or 'rows are missing'}", records=max(rows, 1))
 
 
 def _open(path: Path, options: TextOptions) -> _Table:

@@ -98,6 +98,7 @@ class Sbet(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Check clock, CRS, heights and the accuracy file's name, and that there is a record."""
+        source.need_file()
         _reader(source, _accuracy(source))
         if source.path.stat().st_size < RECORD_BYTES:
             raise FormatError(

@@ -37,6 +37,7 @@ from roadscan.model.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, Clock, TimeSy
 from roadscan.model.strict import Strict
 from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.sensors.parquet_pages import pages_fault
 from roadscan.sensors.records import EpochReader, Sieve, options_of
 
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
@@ -142,21 +143,28 @@ class _Parquet:
     def __init__(self, file: Path) -> None:
         # Reading through a buffer bounds memory, but trusts the page sizes that a damaged file claims.
         large = file.stat().st_size > _LARGE_FILE_BYTES
-        self._file = pq.ParquetFile(file, buffer_size=_BUFFER_BYTES if large else 0, pre_buffer=False)
+        self._file = pq.ParquetFile(
+            file, buffer_size=_BUFFER_BYTES if large else 0, pre_buffer=False, page_checksum_verification=True
+        )
+        self._path = file
         self.schema = self._file.schema_arrow
 
     def parts(self, rows: int) -> Iterator[tuple[int, pa.RecordBatch | _Lost]]:
         columns = [n for n in self.schema.names if n in (_EPOCH, _STAMP, "range", "intensity", "encoder_ticks")]
         metadata = self._file.metadata
         first = 0
-        for group in range(metadata.num_row_groups):
-            count, done = metadata.row_group(group).num_rows, 0
+        for number in range(metadata.num_row_groups):
+            group = metadata.row_group(number)
+            count, done = group.num_rows, 0
+            reason = pages_fault(self._path, group, columns)
             try:
-                for batch in self._file.iter_batches(rows, row_groups=[group], columns=columns):
+                for batch in [] if reason else self._file.iter_batches(rows, row_groups=[number], columns=columns):
                     yield first + done, batch
                     done += batch.num_rows
             except _UNREADABLE as error:
-                yield first + done, _Lost(f"row group is damaged: {_brief(error)}", count - done)
+                reason = _brief(error)
+            if reason or done < count:
+                yield first + done, _Lost(f"row group is damaged: {reason or 'rows are missing'}", max(1, count - done))
             first += max(count, done)
 
 

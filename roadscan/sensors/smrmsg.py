@@ -75,6 +75,7 @@ class Smrmsg(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Check the clock."""
+        source.need_file()
         EpochReader(source.need_clock(CLOCK_EXAMPLE), source.path)
         return LogHeader()
 

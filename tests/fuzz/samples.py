@@ -30,6 +30,7 @@ from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.e57_file import page_checksums
 from roadscan.sensors.nmea_writer import Fix, sentences
 from roadscan.sensors.sick_telegrams import encode_scans, encode_telegram, write_telegrams
+from roadscan.sensors.text_table import LINE_BYTES_MAX
 from tests.fuzz.mutations import Change, Inside
 from tests.sensors import (
     test_argoverse,
@@ -80,8 +81,8 @@ class Sample:
     spans: Callable[[bytes], Spans] | None = None
     """First byte, and the one behind the last, of each record of the sound file, where damage in one record must
     leave all others as they are."""
-    held: Callable[[bytes], int] | None = None
-    """Records that a damaged file holds, where that can be told from its bytes: all have to be read or rejected."""
+    held: Callable[[bytes], int | None] | None = None
+    """Records that a damaged file holds, where its bytes tell: all have to be read or rejected."""
     reads: int = 1
     """Rows a record, for `held`."""
     share: float = 1.0
@@ -192,17 +193,20 @@ def wholes_of(size: int) -> Callable[[bytes], int]:
     return lambda data: -(-len(data) // size)
 
 
-def lines_of_table(data: bytes) -> int:
-    """Lines behind the line of names that are neither blank nor a comment."""
+def lines_of_table(data: bytes) -> int | None:
+    """Lines behind the line of names that are neither blank nor a comment; None with a line so long that it may be
+    rejected whatever it is.
+    """
     data = data.removeprefix(b"\xef\xbb\xbf")
     at = 0
     for line in data.splitlines(keepends=True):
         at += len(line)
         if line.strip() and not line.strip().startswith(b"#"):
             break
-    return sum(
-        1 for line in data[at:].split(b"\n") if line not in {b"", b"\r"} and (line[:1] != b"#" or b"\r" in line[:-1])
-    )
+    lines = data[at:].split(b"\n")
+    if max(map(len, lines)) > LINE_BYTES_MAX:
+        return None
+    return sum(1 for line in lines if line not in {b"", b"\r"} and (line[:1] != b"#" or b"\r" in line[:-1]))
 
 
 # --- makers ------------------------------------------------------------------------------------------
@@ -530,9 +534,6 @@ def _tables() -> Iterator[Sample]:
     yield Sample("control_csv", "plain", file("a.csv", control_csv), {}, _UTM32, **lines)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)
-    yield Sample(
-        "control_vector", "shp", vector(control_layer, "a.shp"), {}, _UTM32, ("a.shp", "a.shx", "a.dbf", "a.prj")
-    )
     lane = {"map": MapFrame(crs="EPSG:26917")}
     yield Sample("road_lines", "geojson", vector(roads_degrees, "a.geojson"), {}, lane, text=True)
     yield Sample("road_lines", "gpkg", vector(roads, "a.gpkg"), {}, lane)

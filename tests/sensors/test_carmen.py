@@ -295,6 +295,20 @@ def test_a_log_is_refused_as_a_whole(tmp_path: Path) -> None:
     assert not format_named("carmen").sniff(tmp_path)
 
 
+@pytest.mark.parametrize("word", ["1e308", "-1e308", "inf", "1e999"])
+def test_numbers_beyond_all_numbers_cost_their_scan(tmp_path: Path, word: str) -> None:
+    lines = [plain(k) for k in range(4)]
+    far = flaser(2, [word] + ["2"] * 180, laser=f"{word} 1 {word}", robot=f"1 2 {word}")
+    path = write(tmp_path / "a.clf", *lines[:2], far, lines[3])
+    options = {"range_step_m": 0.01, "pose": "laser"}
+    with pytest.raises(ConfigError, match="they differ"):
+        read_carmen(path)
+    log = read_carmen(path, options)
+    known = read_carmen(write(tmp_path / "b.clf", *lines[:2], lines[3]), options)
+    assert np.array_equal(log.ranges[[0, 1, -1]], known.ranges)
+    assert sum(r.records for r in log.rejects) >= 1
+
+
 def sample(path: Path) -> Path:
     """A small sound log."""
     return write(path, *[plain(k) for k in range(6)])

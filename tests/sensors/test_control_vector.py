@@ -146,3 +146,14 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
     assert not sniff(path)
     assert not sniff(tmp_path)
     assert [p for p in recordings.rglob("*") if sniff(p)] == []
+
+
+def test_empty_points_and_layers_without_geometry(tmp_path: Path) -> None:
+    shapes = shapely.points(ENH).tolist()
+    log = read_log("control_vector", write(tmp_path / "a.gpkg", layer(geometry=[shapes[0], shapely.Point(), shapes[2]])),
+                   crs="EPSG:25832", map=UTM32)  # fmt: skip
+    assert log.table.num_rows == 2
+    assert [r.record for r in log.rejects] == [1]
+    (tmp_path / "a.csv").write_text("name,role\nA,gcp\n")
+    with pytest.raises(FormatError, match="has no geometry"):
+        read_log("control_vector", tmp_path / "a.csv", crs="EPSG:25832", map=UTM32)

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.simulate import sick
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.imu import AT_BODY, head_imus
@@ -51,33 +52,58 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
-def write_rig(scene: Scene, file: Path) -> None:
-    """Write ``RIG.toml``: the sensors with their nominal mountings."""
-    lines = ['name = "simulated rig"']
+def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
+    """Write ``RIG.toml``: the sensors with their nominal mountings, or with the true ones."""
+    lines = [f'name = "simulated rig{"" if nominal else ", as it is in truth"}"']
+
+    def mounted(mount: Mount) -> Mount:
+        return mount.nominal() if nominal else mount
+
     for head in heads(scene.profilers):
-        lines += _sensor(head.name, "profiler", "laser-triangulation head", "frd", head.mount, _profiler_limits(head))
+        lines += _sensor(
+            head.name, "profiler", "laser-triangulation head", "frd", mounted(head.mount), _profiler_limits(head)
+        )
     if scene.lidar.on:
         limits = (RANGE_MIN_M, scene.lidar.range_max_m + 1.0)
-        lines += _sensor("lidar", "lidar", "Velodyne HDL-32E", "flu", scene.lidar.mount, limits)
+        lines += _sensor("lidar", "lidar", "Velodyne HDL-32E", "flu", mounted(scene.lidar.mount), limits)
     if scene.sick.on:
         limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
-        lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", scene.sick.mount, limits)
+        lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", mounted(scene.sick.mount), limits)
     if scene.camera.on:
-        lines += _sensor("camera", "camera", "pinhole camera, Brown-Conrady distortion", "frd", scene.camera.mount)
+        lines += _sensor(
+            "camera", "camera", "pinhole camera, Brown-Conrady distortion", "frd", mounted(scene.camera.mount)
+        )
         lines += _interior(scene.camera)
     if scene.imu.on:
-        lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", AT_BODY)
+        lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", mounted(AT_BODY))
     for imu in head_imus(scene):
-        lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", imu.mount)
+        lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", mounted(imu.mount))
     if scene.gnss.on:
         error = MountError(lever_arm_body_m=scene.gnss.lever_arm_error_m)
         mount = Mount(lever_arm_body_m=scene.gnss.lever_arm_body_m, error=error)
-        lines += _sensor("gnss", "gnss", "RTK receiver", "frd", mount)
+        lines += _sensor("gnss", "gnss", "RTK receiver", "frd", mounted(mount))
     if scene.encoder.on:
         mount = Mount(lever_arm_body_m=(-1.4, scene.encoder.side_m, scene.vehicle.imu_height_m))
         lines += _sensor("encoder", "encoder", "wheel encoder", "frd", mount)
-        lines.append(f"metres_per_tick = {1.0 / scene.encoder.ticks_per_m!r}")
+        ticks_per_m = scene.encoder.ticks_per_m * (1.0 if nominal else 1.0 + scene.encoder.scale_error)
+        lines.append(f"metres_per_tick = {1.0 / ticks_per_m!r}")
     file.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def write_clocks(scene: Scene, file: Path) -> None:
+    """Write how far the sensors' clocks are ahead: offset at the first profile of the first pass, and drift."""
+    clocks = {head.name: scene.profilers.clock for head in heads(scene.profilers)}
+    clocks |= {imu.name: scene.profilers.clock for imu in head_imus(scene)}
+    for name in ("lidar", "sick", "imu", "encoder", "camera"):
+        sensor = getattr(scene, name)
+        if sensor.on:
+            clocks[name] = sensor.clock
+    start = gps_ns_from_utc(scene.start)
+    with file.open("w", encoding="utf-8", newline="") as out:
+        rows = csv.writer(out, lineterminator="\n")
+        rows.writerow(["sensor", "ahead_s", "drift_ppm", "from_epoch_gps_ns", "stated_in_survey_file"])
+        for name, clock in clocks.items():
+            rows.writerow([name, repr(clock.offset_s), repr(clock.drift_ppm), start, str(clock.known).lower()])
 
 
 def write_control(scene: Scene, surface: Surface, file: Path) -> None:
@@ -127,9 +153,8 @@ def _log(path: str, log: SimulatedLog) -> list[str]:
 
 
 def _sensor(
-    name: str, kind: str, model: str, axes: str, true: Mount, limits_m: tuple[float, float] | None = None
+    name: str, kind: str, model: str, axes: str, mount: Mount, limits_m: tuple[float, float] | None = None
 ) -> list[str]:
-    mount = true.nominal()
     forward, right, down = mount.lever_arm_body_m
     lines = [
         "",

@@ -81,6 +81,8 @@ def simulate(
     for drive, listed in zip(drives, logs, strict=True):
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
     files.write_rig(scene, target / files.RIG_FILE)
+    files.write_rig(scene, known.rig_file, nominal=False)
+    files.write_clocks(scene, known.clocks_file)
     files.write_control(scene, surface, target / files.CONTROL_FILE)
     files.write_survey(scene, earth, logs, target / files.SURVEY_FILE)
     return SimulatedSurvey(

@@ -33,7 +33,7 @@ class Truth:
     """Folder with ``scene.json``, the true trajectories and, if they were asked for, the true hits."""
 
     def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """True ellipsoidal height at map points (any shape, m); NaN where there is no road or verge."""
+        """True ellipsoidal height at map points (any shape, m), with texture; NaN where there is no road or verge."""
         return self.surface.height_m(easting_m, northing_m)
 
     def intensity(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
@@ -51,6 +51,16 @@ class Truth:
     def camera_file(self, run: str) -> Path:
         """Parquet file of a run's pictures: epoch, file, and the camera's true pose (world frame ECEF)."""
         return self.folder / "camera" / f"{run}.parquet"
+
+    @property
+    def rig_file(self) -> Path:
+        """Rig file with the true mountings, and the encoder's true scale."""
+        return self.folder / "RIG.toml"
+
+    @property
+    def clocks_file(self) -> Path:
+        """CSV of the sensors' true clocks: how far each is ahead at an epoch, and its drift."""
+        return self.folder / "clocks.csv"
 
     @property
     def objects_file(self) -> Path:

@@ -29,7 +29,7 @@ def test_same_seed_same_bytes(tmp_path: Path):
     simulate(scene, tmp_path / "a", write_hits=True)
     simulate(scene, tmp_path / "b", write_hits=True)
     first = hashes(tmp_path / "a")
-    assert len(first) == 4 + 2 * (5 + 1 + 3)
+    assert len(first) == 7 + 2 * (5 + 1 + 3)
     assert first == hashes(tmp_path / "b")
     # Again into the same folder: the same files.
     simulate(scene, tmp_path / "a", write_hits=True)

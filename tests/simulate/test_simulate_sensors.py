@@ -15,6 +15,7 @@ from pyins import strapdown
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, gps_ns_from_utc
+from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.clock import SensorClock
@@ -210,14 +211,21 @@ def test_a_sensors_clock_shifts_its_stamps_alone(tmp_path: Path):
     assert a.column("range").equals(b.column("range"))
     hits = Path("truth/hits/run-1/profiler_left.parquet")
     assert pq.read_table(right / hits).equals(pq.read_table(late / hits))
+    clocks = pd.read_csv(truth.load(late).clocks_file).set_index("sensor")
+    assert clocks.ahead_s.profiler_left == 2.0
+    assert not clocks.stated_in_survey_file.profiler_left
     log = next(g for g in Survey.load(late / "SURVEY.toml").config.runs[0].logs if g.sensor == "profiler_left")
     assert log.clock is not None and log.clock.offset_s == 0.0  # an unknown error is not stated
 
 
 def test_rig_file_states_nominal_mountings(tmp_path: Path):
     off = {"on": False}
-    scene = Scene.load("calibration_yard").changed(length_m=60.0, lidar=off, sick=off, camera=off)
+    scene = Scene.load("calibration_yard").changed(lidar=off, sick=off, camera=off)
     rig = Survey.load(simulate(scene, tmp_path / "s").survey_file).rig
+    in_truth = Rig.load(truth.load(tmp_path / "s").rig_file)
+    assert in_truth.sensors["profiler_left"].boresight.roll_deg == 0.7
+    assert in_truth.sensors["encoder"].metres_per_tick == pytest.approx(0.001 / 1.006)
+    assert rig.sensors["encoder"].metres_per_tick == pytest.approx(0.001)
     true, nominal = scene.profilers.left, rig.sensors["profiler_left"]
     assert nominal.lever_arm_body_m == pytest.approx((-2.32, -1.00, -1.06))
     assert nominal.boresight.roll_deg == pytest.approx(0.0)

@@ -355,7 +355,7 @@ def _(one: Guardrail, place: _Place, surface: Surface) -> tuple[tuple[float, flo
     # The posts stand behind the rail, away from the road.
     behind = _RAIL_POST_RADIUS_M + 0.02 if one.offset_m > 0.0 else -_RAIL_POST_RADIUS_M - 0.02
     count = math.floor((one.end_m - one.start_m) / one.post_every_m + 1e-9) + 1
-    stations = one.start_m + one.post_every_m * np.arange(count)
+    stations = one.start_m + one.post_every_m * np.arange(count, dtype=np.float64)
     at, feet = _points(surface, stations, np.full(count, one.offset_m + behind))
     posts = [
         _post((e, n), z, z + one.height_m - 0.02, _RAIL_POST_RADIUS_M, one.shade)

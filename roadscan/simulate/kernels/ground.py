@@ -55,6 +55,8 @@ GROUND, STEEP, EDGE = 1, 2, 4
 """Flags of a cell: it has ground; kerb faces or edges of patches; the surface's edge."""
 GAP_TOLERANCE_M = 1e-7
 """A beam's end lies this near to the surface (m), measured along the height."""
+LAST_STEP_M = 1e-5
+"""A step along the beam that needs no check (m)."""
 UNSEEN_M = 1e-5
 """A beam may cut off a crest by so much (m)."""
 STRIDE_M = 0.25
@@ -291,7 +293,8 @@ def first_ground(
     if cells.flags[index] == GROUND and over0 >= 0.0 >= over1 and over0 > over1:
         fall = (over0 - over1) / (end - begin)
         r, found_fall, k, u, offset = chased(road, beam, begin + over0 / fall, fall, k)
-        if begin - 1e-9 <= r <= end and found_fall > bend * level * level * (r - start):
+        # Before the root the clearance is at least fall · y − bend · y² / 2, y metres of range before it.
+        if begin - 1e-9 <= r <= end and 1.9 * found_fall > bend * level * level * (r - start):
             return r, k, u, offset
     return searched(road, beam, start, end, bend, level, k)
 
@@ -309,15 +312,17 @@ def chased(
     least = 0.3 * fall
     for _ in range(6):
         gap, k, u, offset = clearance(road, beam, r, k)
-        if abs(moved) > 1e-5:
+        is_known = abs(moved) > 1e-5
+        if is_known:
             fall = (last_gap - gap) / moved
             if fall < least:
                 break
-        if abs(gap) < GAP_TOLERANCE_M:
-            return r, fall, k, u, offset
         last_gap = gap
         moved = gap / fall
         r += moved
+        # The secant's slope is right to a hundredth, and so is a last step.
+        if abs(gap) < GAP_TOLERANCE_M or (is_known and abs(moved) < LAST_STEP_M):
+            return r, fall, k, u, offset
     return np.nan, fall, k, u, offset
 
 

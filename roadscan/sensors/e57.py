@@ -232,7 +232,7 @@ def _columns(points: Points, plan: _Plan) -> Columns:
     own, sieve = points.columns, points.sieve
     size = points.offsets.size
     with np.errstate(invalid="ignore", over="ignore"):  # damaged coordinates are dropped
-        xyz = _positions(own, sieve) @ plan.scan.rotation.T + plan.scan.translation_m
+        xyz = np.einsum("ni,ji->nj", _positions(own, sieve), plan.scan.rotation) + plan.scan.translation_m
     columns: Columns = {f"{axis}_m": xyz[:, k] for k, axis in enumerate("xyz")}
     columns["epoch_gps_ns"] = _epochs(own, plan, size, sieve)
     columns["point_source_id"] = np.full(size, plan.number, np.uint16)

@@ -2,83 +2,143 @@
 
 Arrow passes over a page whose type it does not know. Damage in that one number makes a column shorter, and its later
 rows move up beside those of other columns. Here every page has to be of a known type, and the pages of a column have
-to hold as many values as the footer says. (Apache Parquet format, *parquet.thrift*, PageHeader; Thrift's compact
-protocol.)
+to hold as many values as the footer says. The footer is read here too: pyarrow (26) ends the process when it is asked
+for a column chunk with damaged statistics.
+
+(Apache Parquet format, *parquet.thrift*; Thrift's compact protocol.)
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 _HEADER_BYTES: Final = 1 << 16
 """A page's header, with its statistics, is shorter."""
+_LARGEST_FOOTER: Final = 1 << 25
+_LONGEST_WORD: Final = 1 << 10
+"""Longer texts are no names and are not kept."""
+_MOST_NESTED: Final = 12
+
+_FILE_ROW_GROUPS, _GROUP_COLUMNS, _CHUNK_METADATA = 4, 1, 3
+_PATH, _VALUES, _BYTES, _DATA_OFFSET, _DICTIONARY_OFFSET = 3, 5, 7, 9, 11
+"""Fields of a column's metadata."""
+
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
-_TYPE, _COMPRESSED_SIZE = 1, 3
+_PAGE_TYPE, _PAGE_BYTES = 1, 3
 _VALUES_IN: Final = {_DATA: 5, _DATA_V2: 8}
-"""Field of the header of a data page by type of page; its field 1 is the number of values."""
-_MOST_NESTED: Final = 8
+"""Field of a page's header that describes its data, by type of page; field 1 of it is the number of values."""
 
-_TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _DOUBLE, _BINARY, _LIST, _SET, _STRUCT = 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12
+_TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _DOUBLE, _BINARY, _LIST, _SET, _MAP, _STRUCT = range(1, 13)
+
+_DAMAGE: Final = (LookupError, ValueError, TypeError)
 
 
-def pages_fault(path: Path, row_group: Any, columns: list[str]) -> str:
-    """What is wrong with the pages of the columns of a row group, "" where nothing is.
+@dataclass(frozen=True)
+class _Chunk:
+    """Pages of one column in one row group."""
 
-    Parameters
-    ----------
-    row_group : its metadata (:class:`pyarrow.parquet.RowGroupMetaData`).
-    columns : names of top-level columns; others are not looked at.
-    """
-    with path.open("rb") as stream:
-        size = stream.seek(0, 2)
-        for number in range(row_group.num_columns):
-            chunk = row_group.column(number)
-            if chunk.path_in_schema.split(".")[0] in columns:
+    name: str
+    """Name of the top-level column."""
+    values: int
+    start: int
+    size: int
+
+
+class ParquetPages:
+    """Pages of a Parquet file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._groups: list[list[_Chunk]] = []
+        with suppress(*_DAMAGE):  # without them, each row group is at fault
+            self._groups = _row_groups(path)
+
+    def fault(self, row_group: int, columns: list[str]) -> str:
+        """What is wrong with the pages of top-level columns of a row group, "" where nothing is."""
+        if row_group >= len(self._groups):
+            return "the footer is damaged"
+        with self._path.open("rb") as stream:
+            for chunk in self._groups[row_group]:
+                if chunk.name not in columns:
+                    continue
                 try:
-                    fault = _chunk_fault(stream, chunk, size)
-                except (IndexError, ValueError):
+                    fault = _chunk_fault(stream, chunk)
+                except _DAMAGE:
                     fault = "a page's header is damaged"
                 if fault:
-                    return f"column '{chunk.path_in_schema}': {fault}"
-    return ""
+                    return f"column '{chunk.name}': {fault}"
+        return ""
 
 
-def _chunk_fault(stream: BinaryIO, chunk: Any, size: int) -> str:
-    starts = [offset for offset in (chunk.dictionary_page_offset, chunk.data_page_offset) if offset]
-    at = min(starts, default=0)
-    end = at + chunk.total_compressed_size
-    if not 0 <= at <= end <= size:
-        return "its pages lie outside the file"
-    values = 0
+def _row_groups(path: Path) -> list[list[_Chunk]]:
+    """Column chunks of each row group; one of `_DAMAGE` where the footer is damaged."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(max(0, size - 8))
+        length = int.from_bytes(stream.read(4), "little")
+        if not 0 < length <= min(size - 8, _LARGEST_FOOTER):
+            raise ValueError("no footer")
+        stream.seek(size - 8 - length)
+        footer = _Compact(stream.read(length)).struct()
+    groups = _listed(footer.get(_FILE_ROW_GROUPS))
+    return [
+        [_chunk(_struct(column), size) for column in _listed(_struct(group).get(_GROUP_COLUMNS))] for group in groups
+    ]
+
+
+def _listed(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError("not a list")
+    return value
+
+
+def _struct(value: Any) -> dict[int, Any]:
+    if not isinstance(value, dict):
+        raise TypeError("not a struct")
+    return value
+
+
+def _chunk(column: dict[int, Any], file_bytes: int) -> _Chunk:
+    about = _struct(column.get(_CHUNK_METADATA))
+    word = _listed(about.get(_PATH))[0]
+    if not isinstance(word, bytes):
+        raise TypeError("not a name")
+    starts = [offset for offset in (about.get(_DICTIONARY_OFFSET), about.get(_DATA_OFFSET)) if offset]
+    start, size, values = min(starts), about.get(_BYTES), about.get(_VALUES)
+    if not (isinstance(values, int) and isinstance(size, int) and 0 <= start <= start + size <= file_bytes):
+        raise ValueError("pages outside the file")
+    return _Chunk(word.decode("utf-8"), values, start, size)
+
+
+def _chunk_fault(stream: BinaryIO, chunk: _Chunk) -> str:
+    at, end, values = chunk.start, chunk.start + chunk.size, 0
     while at < end:
         stream.seek(at)
         header = _Compact(stream.read(min(_HEADER_BYTES, end - at)))
         fields = header.struct()
-        kind, length = fields.get(_TYPE), fields.get(_COMPRESSED_SIZE)
-        at += header.at + (length if isinstance(length, int) else -1)
-        if kind not in (_DATA, _DICTIONARY, _DATA_V2) or not isinstance(length, int) or length < 0 or at > end:
+        kind, length = fields.get(_PAGE_TYPE), fields.get(_PAGE_BYTES)
+        if kind not in (_DATA, _DICTIONARY, _DATA_V2) or not isinstance(length, int) or length < 0:
             return "a page's header is damaged"
+        at += header.at + length
         if kind in _VALUES_IN:
             values += _count(fields.get(_VALUES_IN[kind]))
-    return "" if values == chunk.num_values else f"its pages hold {values} values of {chunk.num_values}"
+    if at != end:
+        return "a page's length is damaged"
+    return "" if values == chunk.values else f"its pages hold {values} values of {chunk.values}"
 
 
 def _count(page: Any) -> int:
-    held = page.get(1) if isinstance(page, dict) else None
+    held = _struct(page).get(1)
     if not isinstance(held, int) or held < 0:
         raise ValueError("no number of values")
     return held
 
 
 class _Compact:
-    """Reads Thrift's compact protocol.
-
-    Raises
-    ------
-    IndexError, ValueError
-        at damage.
-    """
+    """Reads Thrift's compact protocol; one of `_DAMAGE` at damage."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -86,14 +146,15 @@ class _Compact:
         """Bytes read."""
 
     def struct(self, depth: int = 0) -> dict[int, Any]:
-        """Fields by number: numbers and structs; of anything else None."""
+        """Fields by number: whole numbers, structs, lists and texts; None for anything else."""
         if depth > _MOST_NESTED:
             raise ValueError("nested too deeply")
         fields: dict[int, Any] = {}
         number = 0
         while head := self._byte():
             number = number + (head >> 4) if head >> 4 else self._number()
-            fields[number] = self._value(head & 15, depth)
+            kind = head & 15
+            fields[number] = None if kind in (_TRUE, _FALSE) else self._value(kind, depth)
         return fields
 
     def _value(self, kind: int, depth: int) -> Any:
@@ -102,26 +163,30 @@ class _Compact:
         if kind == _STRUCT:
             return self.struct(depth + 1)
         if kind in (_LIST, _SET):
-            head = self._byte()
-            for _ in range(head >> 4 if head >> 4 < 15 else self._varint()):
-                if head & 15 in (_TRUE, _FALSE):
-                    self._byte()
-                else:
-                    self._value(head & 15, depth + 1)
-        elif kind in (_BYTE, _DOUBLE, _BINARY):
-            self._skip({_BYTE: 1, _DOUBLE: 8}.get(kind) or self._varint())
-        elif kind not in (_TRUE, _FALSE):
-            raise ValueError("unknown type")
-        return None
+            return self._list(depth)
+        if kind == _BINARY:
+            return self._text(self._varint())
+        if kind in (_TRUE, _FALSE, _BYTE, _DOUBLE):
+            self._text(8 if kind == _DOUBLE else 1)
+            return None
+        raise ValueError("a type that Parquet does not use")
+
+    def _list(self, depth: int) -> list[Any]:
+        head = self._byte()
+        count = head >> 4 if head >> 4 < 15 else self._varint()
+        if count > len(self._data) - self.at:  # each takes a byte or more
+            raise ValueError("a list longer than the data")
+        return [self._value(head & 15, depth) for _ in range(count)]
+
+    def _text(self, size: int) -> bytes | None:
+        self.at += size
+        if self.at > len(self._data):
+            raise IndexError
+        return self._data[self.at - size : self.at] if size <= _LONGEST_WORD else None
 
     def _byte(self) -> int:
         self.at += 1
         return self._data[self.at - 1]
-
-    def _skip(self, count: int) -> None:
-        self.at += count
-        if self.at > len(self._data):
-            raise IndexError
 
     def _varint(self) -> int:
         value = 0

@@ -18,7 +18,7 @@ from roadscan.model.errors import FormatError
 from roadscan.model.gpstime import Clock
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
-from roadscan.sensors.parquet_pages import pages_fault
+from roadscan.sensors.parquet_pages import ParquetPages
 from roadscan.sensors.poses import (
     PoseReader,
     RawPoses,
@@ -283,10 +283,10 @@ class _Parquet(_Columnar):
 
     def batches(self, names: list[str]) -> Iterator[pa.RecordBatch | Reject]:
         with pq.ParquetFile(self._path, page_checksum_verification=True) as file:
+            pages = ParquetPages(self._path)
             for i in range(file.num_row_groups):
-                group = file.metadata.row_group(i)
-                rows = group.num_rows
-                reason = pages_fault(self._path, group, names)
+                rows = file.metadata.row_group(i).num_rows
+                reason = pages.fault(i, names)
                 try:
                     for batch in [] if reason else file.iter_batches(BATCH_ROWS, row_groups=[i], columns=names):
                         yield batch

@@ -37,7 +37,7 @@ from roadscan.model.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, Clock, TimeSy
 from roadscan.model.strict import Strict
 from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
-from roadscan.sensors.parquet_pages import pages_fault
+from roadscan.sensors.parquet_pages import ParquetPages
 from roadscan.sensors.records import EpochReader, Sieve, options_of
 
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
@@ -151,12 +151,11 @@ class _Parquet:
 
     def parts(self, rows: int) -> Iterator[tuple[int, pa.RecordBatch | _Lost]]:
         columns = [n for n in self.schema.names if n in (_EPOCH, _STAMP, "range", "intensity", "encoder_ticks")]
-        metadata = self._file.metadata
+        metadata, pages = self._file.metadata, ParquetPages(self._path)
         first = 0
         for number in range(metadata.num_row_groups):
-            group = metadata.row_group(number)
-            count, done = group.num_rows, 0
-            reason = pages_fault(self._path, group, columns)
+            count, done = metadata.row_group(number).num_rows, 0
+            reason = pages.fault(number, columns)
             try:
                 for batch in [] if reason else self._file.iter_batches(rows, row_groups=[number], columns=columns):
                     yield first + done, batch

@@ -24,6 +24,8 @@ from tests.fuzz.harness import SLOWEST_S, Fuzzer, Outcome, Summary
 from tests.fuzz.samples import Sample, all_samples
 
 START_S = 120.0
+SLOW_MS = 500.0
+"""A slower file is named."""
 
 
 def main() -> int:
@@ -72,10 +74,12 @@ def shares(samples: list[Sample], mutants: int, native: int | None) -> Iterator[
 def show(name: str, s: Summary, seconds: float, most: int, seed: int) -> None:
     v = s.verdicts
     say(
-        f"{name:18}{s.outcomes:8}{v['refused']:9}{v['rejects']:9}{v['clean']:8}{s.slowest_ms:9.0f}{s.peak_mb:7.0f}"
+        f"{name:18}{s.outcomes:8}{v['refused']:9}{v['rejects']:9}{v['clean']:8}{0.0 if s.slowest is None else s.slowest.ms:9.0f}{s.peak_mb:7.0f}"
         f"{len(s.fewer):7}{len(s.failures):8}{seconds:7.0f}",
         *(f" {other}:{count}" for other, count in s.claimed.items()),
     )
+    if s.slowest is not None and s.slowest.ms > SLOW_MS:
+        say(f"  slowest: {s.slowest.form} {s.slowest.number}")
     for outcome in s.failures[:most]:
         form = f"{name.split('/', 1)[0]}/{outcome.form}"
         say(f"  failed: --format {form} --seed {seed} --only {outcome.number}\n{outcome.said}")

@@ -357,7 +357,7 @@ class Summary:
 
     outcomes: int = 0
     verdicts: Counter[str] = field(default_factory=Counter)
-    slowest_ms: float = 0.0
+    slowest: Outcome | None = None
     peak_mb: float = 0.0
     fewer: list[Outcome] = field(default_factory=list)
     failures: list[Outcome] = field(default_factory=list)
@@ -366,7 +366,8 @@ class Summary:
     def add(self, outcome: Outcome) -> None:
         self.outcomes += 1
         self.verdicts[outcome.verdict] += 1
-        self.slowest_ms = max(self.slowest_ms, outcome.ms)
+        if self.slowest is None or outcome.ms > self.slowest.ms:
+            self.slowest = outcome
         self.peak_mb = max(self.peak_mb, outcome.peak_mb)
         self.claimed.update(outcome.claimed_by)
         if outcome.verdict == "failed":

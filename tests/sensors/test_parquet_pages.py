@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.sensors.parquet_pages import pages_fault
+from roadscan.sensors.parquet_pages import ParquetPages
 
 ROWS = 20_000
 NUMBERS = np.arange(ROWS, dtype=np.int64)
@@ -26,7 +26,7 @@ def write(path: Path, **how: object) -> bytes:
 
 def faults(path: Path, columns: list[str]) -> list[str]:
     with pq.ParquetFile(path) as file:
-        return [pages_fault(path, file.metadata.row_group(i), columns) for i in range(file.num_row_groups)]
+        return [ParquetPages(path).fault(i, columns) for i in range(file.num_row_groups)]
 
 
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
@@ -66,9 +66,10 @@ def test_damaged_headers_never_shift_rows(tmp_path: Path) -> None:
             file = pq.ParquetFile(tmp_path / "a")
         except (pa.ArrowException, OSError):
             continue
+        pages = ParquetPages(tmp_path / "a")
         with file:
             for i in range(file.num_row_groups):
-                if pages_fault(tmp_path / "a", file.metadata.row_group(i), ["a", "b"]):
+                if pages.fault(i, ["a", "b"]):
                     found += 1
                     continue
                 try:
@@ -78,3 +79,18 @@ def test_damaged_headers_never_shift_rows(tmp_path: Path) -> None:
                 a, b = (np.concatenate([x.column(k).to_numpy() for x in batches]) for k in (0, 1))
                 assert np.count_nonzero(a != b) <= 1100  # values of the page itself, or a first byte of its data
     assert found > 50
+
+
+def test_damaged_statistics_in_the_footer(tmp_path: Path) -> None:
+    """pyarrow's own metadata of a column chunk would end the process here."""
+    data = write(tmp_path / "a", compression="none")
+    rng = random.Random(4)
+    end = len(data) - 8
+    start = end - int.from_bytes(data[end : end + 4], "little")
+    found = 0
+    for _ in range(500):
+        broken = bytearray(data)
+        broken[rng.randrange(start, end)] = rng.randrange(256)
+        (tmp_path / "a").write_bytes(broken)
+        found += ParquetPages(tmp_path / "a").fault(0, ["a", "b", "c", "d"]) != ""
+    assert 50 < found < 500

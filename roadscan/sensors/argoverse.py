@@ -24,6 +24,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.sensors.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.records import Sieve
 
@@ -89,6 +90,9 @@ class Argoverse(LogFormat):
                 yield Reject(f"the sweep cannot be read: {_brief(error)}", 0, -1, 1, name)
                 continue
             yield from _items(sweep, name, stamp, number)
+            unlisted = unlisted_batches(file, sweep.num_record_batches)
+            if unlisted:
+                yield Reject(unlisted_reason(unlisted), -1, -1, unlisted, name)
 
 
 _EXPECTED: Final = "a Feather file with the columns " + ", ".join(_COLUMNS)

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from roadscan.model.errors import FormatError
 from roadscan.model.gpstime import Clock
+from roadscan.sensors.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
 from roadscan.sensors.parquet_pages import ParquetPages
@@ -274,6 +275,9 @@ class _Feather(_Columnar):
                     yield Reject(f"record batch {i} is damaged: {error}")
                     continue
                 yield batch
+            unlisted = unlisted_batches(self._path, reader.num_record_batches)
+            if unlisted:
+                yield Reject(unlisted_reason(unlisted), records=unlisted)
 
 
 class _Parquet(_Columnar):

@@ -36,6 +36,7 @@ from roadscan.model.errors import ConfigError, FormatError
 from roadscan.model.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, Clock, TimeSystem
 from roadscan.model.strict import Strict
 from roadscan.points.readings import ScanGeometry
+from roadscan.sensors.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.parquet_pages import ParquetPages
 from roadscan.sensors.records import EpochReader, Sieve, options_of
@@ -169,6 +170,7 @@ class _Parquet:
 
 class _Arrow:
     def __init__(self, file: Path) -> None:
+        self._path = file
         self._reader = pa.ipc.open_file(pa.memory_map(str(file)))
         self.schema = self._reader.schema
 
@@ -184,6 +186,9 @@ class _Arrow:
             for start in range(0, batch.num_rows, rows):
                 yield first + start, batch.slice(start, rows)
             first += batch.num_rows
+        unlisted = unlisted_batches(self._path, self._reader.num_record_batches)
+        if unlisted:
+            yield first, _Lost(unlisted_reason(unlisted), unlisted)
 
 
 def _open(file: Path) -> _Table:

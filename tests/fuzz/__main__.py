@@ -73,8 +73,9 @@ def shares(samples: list[Sample], mutants: int, native: int | None) -> Iterator[
 
 def show(name: str, s: Summary, seconds: float, most: int, seed: int) -> None:
     v = s.verdicts
+    slowest_ms = 0.0 if s.slowest is None else s.slowest.ms
     say(
-        f"{name:18}{s.outcomes:8}{v['refused']:9}{v['rejects']:9}{v['clean']:8}{0.0 if s.slowest is None else s.slowest.ms:9.0f}{s.peak_mb:7.0f}"
+        f"{name:18}{s.outcomes:8}{v['refused']:9}{v['rejects']:9}{v['clean']:8}{slowest_ms:9.0f}{s.peak_mb:7.0f}"
         f"{len(s.fewer):7}{len(s.failures):8}{seconds:7.0f}",
         *(f" {other}:{count}" for other, count in s.claimed.items()),
     )

@@ -161,11 +161,11 @@ def _first_line(path: Path, options: TextOptions) -> tuple[str, int, int]:
         if value and (len(value) > 1 or not value.isascii() or value in '"\r\n'):
             raise ConfigError(f"{name} = {value!r}", expected="one character, no quote or line end", file=path)
     head = head_of(path)
-    if not head or b"\x00" in head:
-        raise FormatError("the file holds no text", expected="lines with columns", file=path)
     offset = 3 if head.startswith(b"\xef\xbb\xbf") else 0
     skip = options.skip_lines
-    for raw in head[offset:].splitlines(keepends=True):
+    for raw in head[offset:].splitlines(keepends=True) or [b"\x00"]:
+        if b"\x00" in raw:
+            raise FormatError("the file holds no text", expected="lines with columns", file=path)
         line = raw.strip()
         comment = bool(options.comment) and line.startswith(options.comment.encode())
         if skip <= 0 and line and not comment:

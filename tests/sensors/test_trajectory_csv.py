@@ -181,6 +181,19 @@ def test_a_first_stamp_that_lost_its_fraction_costs_no_other(tmp_path: Path) -> 
     assert log.epochs[1:].tolist() == [(1_400_000_000 + i) * 10**9 + 500_000_000 for i in range(1, 5)]
 
 
+def test_a_block_of_zeros_costs_its_lines(tmp_path: Path) -> None:
+    """What a file system leaves of blocks that were never written."""
+    lines = [line(i) for i in range(40)]
+    path = write(tmp_path / "a.csv", [*lines[:20], "\0" * 512 + lines[20][30:], *lines[21:]])
+    assert format_of(path).name == "trajectory_csv"
+    log = read_log("trajectory_csv", path, **STATED)
+    assert [r.record for r in log.rejects] == [20]
+    assert log.table.num_rows == 39
+    path.write_bytes(path.read_bytes().replace(b"height", b"hei\0ght"))
+    with pytest.raises(FormatError, match="holds no text"):
+        read_log("trajectory_csv", path, **STATED)
+
+
 @pytest.mark.parametrize("start", ["# a comment\r", "\r", "#\r\r\n\r"])
 def test_a_comment_or_blank_line_hides_no_line_that_a_return_ends(tmp_path: Path, start: str) -> None:
     path = write(tmp_path / "a.csv", [line(0), start + line(1), line(2), "# plain", "", line(3)])

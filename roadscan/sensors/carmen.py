@@ -304,7 +304,12 @@ def _sorted_lines(data: bytes, message: str | None) -> _Block:
     block = _Block([], [], [], np.cumsum(sizes) - sizes, Counter())
     for number, raw in enumerate(lines):
         line = raw.strip()
-        if not line or line.startswith(b"#"):
+        if not line:
+            continue
+        hides_lines = b"\r" in line  # a comment or message passed over could hold others, which only returns divide
+        if line.startswith(b"#"):
+            if hides_lines:
+                block.unknown.append(number)
             continue
         name = line.split(None, 1)[0]
         if _SCAN_NAME.fullmatch(name):
@@ -313,7 +318,7 @@ def _sorted_lines(data: bytes, message: str | None) -> _Block:
                 block.scans.append((number, line))
         elif name == b"ODOM":
             block.odometry.append((number, line))
-        elif not _OTHER_NAME.fullmatch(name):
+        elif hides_lines or not _OTHER_NAME.fullmatch(name):
             block.unknown.append(number)
     return block
 

@@ -309,6 +309,15 @@ def test_numbers_beyond_all_numbers_cost_their_scan(tmp_path: Path, word: str) -
     assert sum(r.records for r in log.rejects) >= 1
 
 
+@pytest.mark.parametrize("above", ["# a comment", "SYNC 1", "PARAM a 1"])
+def test_lines_that_returns_alone_end_do_not_vanish(tmp_path: Path, above: str) -> None:
+    lines = [plain(k) for k in range(4)]
+    path = write(tmp_path / "a.clf", lines[0], f"{above}\r{lines[1]}\r{lines[2]}", "# plain\r", lines[3])
+    log = read_carmen(path)
+    assert len(log.ranges) == 2
+    assert [(r.record, r.records) for r in log.rejects] == [(3, 1)]
+
+
 def sample(path: Path) -> Path:
     """A small sound log."""
     return write(path, *[plain(k) for k in range(6)])

@@ -87,6 +87,12 @@ def fields_table(model: type[BaseModel]) -> str:
     return markdown_table(("key", "type", "default", "meaning"), rows)
 
 
+def model(target: str) -> str:
+    """What a model is for, by its docstring, and the table of its settings."""
+    kind = _load(target)
+    return "\n\n".join([markdown(inspect.cleandoc(kind.__doc__ or "")), fields_table(kind)])
+
+
 def type_words(info: FieldInfo) -> str:
     """A field's type as a reader of a TOML file would name it, with its limits."""
     limits = [words for limit in info.metadata for words in _limit_words(limit)]
@@ -100,7 +106,7 @@ def default_words(info: FieldInfo) -> str:
     value = info.get_default(call_default_factory=True)
     if value is None or value in ({}, [], ""):
         return "—"
-    if isinstance(value, BaseModel):
+    if isinstance(value, BaseModel) and not value.model_fields_set:
         return "its own defaults"
     return "no limit" if value == float("inf") else f"`{_toml(value)}`"
 
@@ -110,9 +116,15 @@ def _toml(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
+    if isinstance(value, BaseModel):
+        return (
+            "{ " + ", ".join(f"{name} = {_toml(v)}" for name, v in value.model_dump(exclude_unset=True).items()) + " }"
+        )
     if isinstance(value, str):
         return f'"{value}"'
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, dt.datetime):
+        return value.isoformat().replace("+00:00", "Z")
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 _PLAIN: Final[dict[Any, str]] = {
@@ -353,6 +365,7 @@ def _load(target: str) -> Any:
 
 DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "fields": fields,
+    "model": model,
     "members": members,
     "tables": tables,
     "formats": formats,

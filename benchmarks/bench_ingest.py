@@ -48,7 +48,7 @@ HDL_32E_S = 40.0
 T0 = 1_400_000_000
 GPS = Clock(TimeSystem.GPS)
 WEEK = Clock(TimeSystem.GPS_WEEK, week=2405)
-Float64 = np.ndarray
+Float64 = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,12 @@ def ingest_figures(log: Log, folder: Path) -> Iterator[Figure]:
     ]  # fmt: skip
     (folder / "SURVEY.toml").write_text("\n".join(lines))
     survey = Survey.load(folder / "SURVEY.toml")
-    started = time.perf_counter()
-    (result,) = ingest(survey, Store(survey.store_url, "bench"))
-    took = time.perf_counter() - started
+    times = []
+    for name in ("once", "again"):  # the first loads what a process loads once
+        started = time.perf_counter()
+        (result,) = ingest(survey, Store(str(folder / name), "bench"))
+        times.append(time.perf_counter() - started)
+    took = min(times)
     size = log.path.stat().st_size / 1e6
     rows = log.records or result.record.rows
     yield Figure(f"{log.format} → Parquet: {size:,.0f} MB at {size / took:,.0f} MB/s", rows / took / 1e6, "M/s")
@@ -157,9 +160,9 @@ def makers() -> dict[str, Callable[[Path], Log]]:
         "rtklib_pos": rtklib_pos, "nmea": nmea, "imu_csv": imu_csv, "encoder_csv": encoder_csv,
         "control_csv": control_csv, "control_vector": control_vector, "road_lines": road_lines,
         "velodyne_pcap": velodyne_pcap, "sick_lms": sick_lms, "carmen": carmen, "kitti": kitti, "argoverse": argoverse,
-        "scans": scans, "psi": psi, "psi zip": functools.partial(psi, codec="zip"), "las": functools.partial(las, name="a.las"),
-        "las laz": functools.partial(las, name="a.laz"), "e57": e57, "ply": ply, "ply ascii": functools.partial(ply, text=True),
-        "opencrg": opencrg, "images": images,
+        "scans": scans, "psi": psi, "psi zip": functools.partial(psi, codec="zip"),
+        "las": functools.partial(las, name="a.las"), "las laz": functools.partial(las, name="a.laz"), "e57": e57,
+        "ply": ply, "ply ascii": functools.partial(ply, text=True), "opencrg": opencrg, "images": images,
     }  # fmt: skip
 
 
@@ -169,12 +172,9 @@ def moving(n: int) -> tuple[Float64, Float64, Float64]:
     return t, 15 * t, 50 * np.sin(t / 60)
 
 
-def columns_csv(path: Path, columns: dict[str, Float64], form: dict[str, str] | None = None) -> Path:
-    """A CSV file of equal chunks: formatted once, with stamps that go on."""
-    frame = pd.DataFrame(columns)
-    for name, how in (form or {}).items():
-        frame[name] = frame[name].map(how.format)
-    frame.to_csv(path, index=False)
+def columns_csv(path: Path, columns: dict[str, Float64]) -> Path:
+    """A CSV file."""
+    pd.DataFrame(columns).to_csv(path, index=False)
     return path
 
 
@@ -209,8 +209,9 @@ def smrmsg(folder: Path) -> Log:
 def trajectory_csv(folder: Path) -> Log:
     t, east, north = moving(300_000)
     columns = {
-        "time_s": T0 + t, "latitude_deg": 50 + north / 111e3, "longitude_deg": 10 + east / 71e3, "height_m": 100 + 0 * t,
-        "roll_deg": np.sin(t), "pitch_deg": np.cos(t), "heading_deg": 90 + np.sin(t), "sigma_north_m": 0.02 + 0 * t,
+        "time_s": T0 + t, "latitude_deg": 50 + north / 111e3, "longitude_deg": 10 + east / 71e3,
+        "height_m": 100 + 0 * t, "roll_deg": np.sin(t), "pitch_deg": np.cos(t), "heading_deg": 90 + np.sin(t),
+        "sigma_north_m": 0.02 + 0 * t,
     }  # fmt: skip
     path = columns_csv(folder / "a.csv", columns)
     stated = {"clock": GPS, "crs": "EPSG:4979"}
@@ -290,12 +291,14 @@ def rtklib_pos(folder: Path) -> Log:
     n = 100_000
     times = pd.Timestamp("2024-06-18") + pd.to_timedelta(np.arange(n) * 0.2, unit="s")
     lines = [
-        f"{time} {50 + 1e-7 * k:.9f} {10 + 1e-7 * k:.9f} 120.5000 1 12 0.0123 0.0110 0.0300 -0.0050 0.0040 -0.0070 0.25 12.3"
+        f"{time} {50 + 1e-7 * k:.9f} {10 + 1e-7 * k:.9f} 120.5000 1 12 "
+        "0.0123 0.0110 0.0300 -0.0050 0.0040 -0.0070 0.25 12.3"
         for k, time in enumerate(times.strftime("%Y/%m/%d %H:%M:%S.%f").str.slice(stop=-3))
     ]
     head = (
         "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)\n"
-        "%  GPST  latitude(deg) longitude(deg)  height(m)   Q  ns  sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio\n"
+        "%  GPST  latitude(deg) longitude(deg)  height(m)   Q  ns  sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m)"
+        " age(s)  ratio\n"
     )
     path = folder / "a.pos"
     path.write_text(head + "\n".join(lines) + "\n")
@@ -334,8 +337,9 @@ def encoder_csv(folder: Path) -> Log:
 def control_csv(folder: Path) -> Log:
     n = 100_000
     columns = {
-        "name": np.char.add("P", np.arange(n).astype(str)), "role": np.full(n, "gcp"), "easting": 571_600 + np.arange(n) * 0.1,
-        "northing": 5_539_000 + np.arange(n) * 0.1, "height_m": np.full(n, 300.0),
+        "name": np.char.add("P", np.arange(n).astype(str)), "role": np.full(n, "gcp"),
+        "easting": 571_600 + np.arange(n) * 0.1, "northing": 5_539_000 + np.arange(n) * 0.1,
+        "height_m": np.full(n, 300.0),
     }  # fmt: skip
     path = columns_csv(folder / "a.csv", columns)
     stated = {"crs": "EPSG:25832", "map": MapFrame(crs="EPSG:25832")}
@@ -513,7 +517,8 @@ def psi(folder: Path, codec: Any = "raw") -> Log:
         "speed_unit": "km/h",
     }
     stated = {"clock": Clock(TimeSystem.UNIX_UTC, unit="ms")}
-    return Log("psi", f"{codec}, readings", path, options, stated, rows * columns)
+    what = "raw (mapped), readings" if codec == "raw" else "zipped, readings"
+    return Log("psi", what, path, options, stated, rows * columns)
 
 
 def las(folder: Path, name: str) -> Log:

@@ -344,7 +344,7 @@ def list_scenes() -> None:
     scenes = {name: Scene.load(name) for name in shipped_scenes()}
     _table(
         ("scene", "length m", "passes", "what"),
-        [(name, f"{one.length_m:g}", len(one.passes), one.title) for name, one in scenes.items()],
+        [(name, f"{one.length_m:g}", str(len(one.passes)), one.title) for name, one in scenes.items()],
     )
 
 

@@ -330,7 +330,8 @@ def simulate(
     changed = loaded if seed is None else loaded.changed(seed=seed)
     made = write(changed, out, write_hits=hits, progress=typer.echo)
     typer.echo(
-        f"{made.poses:,} poses, {made.profiles:,} profiles with {made.readings:,} readings in all, {made.returns:,} returns"
+        f"{made.poses:,} poses, {made.profiles:,} profiles with {made.readings:,} readings in all, "
+        f"{made.returns:,} returns"
     )
     typer.echo(f"survey file: {made.survey_file}")
 

@@ -39,6 +39,8 @@ _PAGE_BYTES: Final = range(64, (1 << 20) + 1, 4)
 _BLOCK_BYTES: Final = 1 << 20
 _SECTION: Final = struct.Struct("<B7xQQQ")
 _SECTION_ID: Final = 1
+_FILL_POINTS: Final = 8
+"""So many numbers of one bit fill a byte."""
 _INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET = 0, 1, 2
 _REVERSED_CASTAGNOLI: Final = 0x82F63B78
 _INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**63 - 1
@@ -476,6 +478,8 @@ def points_of(file: E57, scan: Scan, names: Sequence[str]) -> Iterator[Points | 
     seen = min(s.first for s in streams.values())
     if seen < scan.claimed:
         yield Reject(end or "the file holds fewer points than its XML claims", seen, -1, scan.claimed - seen)
+    elif end:
+        yield Reject(end, seen)
 
 
 def _has_places(streams: dict[str, _Stream]) -> bool:
@@ -501,7 +505,17 @@ def _streamed(pages: Pages, scan: Scan, streams: dict[str, _Stream]) -> Generato
         if not step and done < scan.claimed:
             return "" if at >= end else f"the packet at byte {pages.physical(at):,} is damaged"
         at += step
-    return fault
+    return fault or _left_over(pages, at, end, order, streams)
+
+
+def _left_over(pages: Pages, at: int, end: int, order: Sequence[_Stream | None], streams: dict[str, _Stream]) -> str:
+    """Says whether points stand behind all that the XML claims; packed numbers may fill up their last byte."""
+    while step := _packet(pages, at, end, order):
+        at += step
+        if min(s.ready for s in streams.values()) >= _FILL_POINTS:
+            break
+    held = min(s.ready for s in streams.values())
+    return "the file holds more points than its XML claims" if held >= _FILL_POINTS else ""
 
 
 def _taken(streams: dict[str, _Stream], first: int, count: int) -> Points:

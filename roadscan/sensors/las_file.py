@@ -97,7 +97,9 @@ class Head:
             compressed = code >= 128
             point_format = code & 0x3F
             wkt, laszip = _walk_records(stream, head_bytes, offset, records, evlr_at, evlrs, size, path)
-            end = evlr_at if evlrs and offset <= evlr_at <= size else size
+            waves_at = int.from_bytes(block[227:235], "little") if minor >= 3 else 0
+            ends = [at for at, present in ((evlr_at, evlrs), (waves_at, True)) if present and offset < at <= size]
+            end = min(ends, default=size)
             room = (end - offset) // max(1, record_bytes)
         version = (major, minor)
         return cls(version, encoding, point_format, compressed, offset, record_bytes, claimed, room, laszip, wkt)
@@ -203,6 +205,15 @@ class Cloud:
         if self.head.claimed > self.count:
             missing = self.head.claimed - self.count
             yield Reject("the header claims points that the file does not hold", self.count, -1, missing)
+        elif (held := self._held()) > self.count:
+            offset = int(self.offsets(np.array([self.count]))[0])
+            yield Reject("the file holds points that the header does not claim", self.count, offset, held - self.count)
+
+    def _held(self) -> int:
+        """Points in the file, as far as its size or its chunks tell; at least those claimed."""
+        if not self.head.compressed:
+            return self.head.room
+        return self.count if self.chunks is None else self.chunks.least
 
     def _batch(self, at: int) -> tuple[int, int, bool]:
         """End of the batch from point `at` on, end of what is lost if it is damaged, and whether to try it."""

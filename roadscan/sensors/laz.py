@@ -109,6 +109,8 @@ class LazChunks:
     """(n,) number of the first point after each chunk."""
     sound: npt.NDArray[np.bool_]
     """(n,) whether the sizes inside a chunk fit into it; others are not decompressed."""
+    least: int
+    """Points that the chunks hold at least: of point formats 0 to 5, the table says too much of the last one."""
 
     @classmethod
     def of(cls, laz: Laz, stream: BinaryIO, offset: int, record_bytes: int, laszip: bytes) -> Self:
@@ -141,7 +143,10 @@ class LazChunks:
             end <= table_at and _layers_fit(stream, start + record_bytes, end, layers)
             for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)
         ]
-        return cls(np.cumsum(points), np.array(sound))
+        if layers and sound[-1]:  # such a chunk says how many points it holds; the table says how many it may
+            points = np.append(points[:-1], min(_points_of_chunk(stream, int(starts[-2]) + record_bytes), points[-1]))
+        ends = np.cumsum(points)
+        return cls(ends, np.array(sound), int(ends[-1] if layers else ends[-1] - points[-1] + 1))
 
 
 def _table_claim(stream: BinaryIO, offset: int, size: int) -> tuple[int, int]:
@@ -155,6 +160,12 @@ def _table_claim(stream: BinaryIO, offset: int, size: int) -> tuple[int, int]:
         return table_at, 0
     stream.seek(table_at)
     return table_at, int.from_bytes(stream.read(8)[4:8], "little")
+
+
+def _points_of_chunk(stream: BinaryIO, at: int) -> int:
+    """Points of a chunk with layers, which says how many they are; 1 where it does not."""
+    stream.seek(at)
+    return max(1, int.from_bytes(stream.read(4), "little"))
 
 
 def _layers_fit(stream: BinaryIO, at: int, end: int, layers: int) -> bool:

@@ -201,6 +201,30 @@ def vertices(path: Path, header: PlyHeader, names: Sequence[str]) -> Iterator[Ve
         yield item
     if seen < vertex.count:
         yield Reject("the header claims points that the file does not hold", seen, -1, vertex.count - seen)
+    elif header.elements[-1] is vertex and (more := _left_over(path, header, vertex)):
+        yield Reject("the file holds points that the header does not claim", vertex.count, -1, more)
+
+
+def _left_over(path: Path, header: PlyHeader, vertex: Element) -> int:
+    """Points behind all that the header claims: lines that are not blank, or whole records of a binary file."""
+    if header.coding == "ascii":
+        start = _line_offset(path, header.body, sum(e.count for e in header.elements))
+        return 0 if start is None else sum(1 for _ in _lines(path, start))
+    with path.open("rb") as stream:
+        at: int | None = header.body
+        for element in header.elements:
+            at = None if at is None else _behind(stream, element, header.order, at)
+        shortest = vertex.dtype(header.order, [0] * len(vertex.properties)).itemsize
+        return 0 if at is None else (stream.seek(0, 2) - at) // shortest
+
+
+def _lines(path: Path, at: int) -> Iterator[bytes]:
+    """Lines from a byte on that are not blank."""
+    with path.open("rb") as stream:
+        stream.seek(at)
+        while line := stream.readline(LINE_BYTES_MAX):
+            if line.strip():
+                yield line
 
 
 # --- binary ------------------------------------------------------------------------------------------

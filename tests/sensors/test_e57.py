@@ -361,3 +361,11 @@ def test_numbers_go_on_over_the_packets_of_the_library(tmp_path: Path, bits: int
     log = read("e57", path, crs="local")
     assert log.rejects == []
     assert np.array_equal(xyz_of(log), np.stack(list(data.values()), axis=-1))
+
+
+@pytest.mark.parametrize(("claimed", "rejected"), [(24, 1), (160, 1), (240, 0), (250, 10)])
+def test_points_that_the_xml_does_not_claim_are_told(tmp_path: Path, claimed: int, rejected: int) -> None:
+    scan = ScanSpec(triple(240), claimed=claimed)
+    log = read("e57", written(tmp_path, e57(scan)), NOON, crs="local")
+    assert len(log) == min(claimed, 240)
+    assert log.rejected == rejected

@@ -260,3 +260,15 @@ def test_mutants(tmp_path: Path, coding: str, lists: bool) -> None:
     done, refused = survive("ply", path, path, count=100, options={"unit": "metre"}, make=lambda: made)
     assert done > 20
     assert refused > 5
+
+
+@pytest.mark.parametrize("coding", CODINGS)
+@pytest.mark.parametrize(("claimed", "read_", "lost"), [(0, 0, 30), (3, 3, 27), (29, 29, 1), (30, 30, 0), (31, 30, 1)])
+def test_points_that_the_header_does_not_claim_are_told(
+    tmp_path: Path, coding: str, claimed: int, read_: int, lost: int
+) -> None:
+    top = head(coding, f"element vertex {claimed}", *XYZ)
+    order = "<" if "little" in coding else ">"
+    rows = [f"{k} 2 3\n".encode() if coding == "ascii" else struct.pack(order + "ddf", k, 2, 3) for k in range(30)]
+    log = read("ply", written(tmp_path, top + b"".join(rows)), NOON, crs="local")
+    assert (len(log), log.rejected) == (read_, lost)

@@ -227,12 +227,12 @@ def _scale(scan: Scan, name: str, stated: tuple[float, float] | None) -> Brightn
     return Brightness(field.low * field.scale + field.offset, (field.low + field.span) * field.scale + field.offset)
 
 
+@np.errstate(invalid="ignore", over="ignore")  # damaged numbers are dropped
 def _columns(points: Points, plan: _Plan) -> Columns:
     """Columns of ``cloud``, (n,) each; points without a place or time are dropped from the sieve."""
     own, sieve = points.columns, points.sieve
     size = points.offsets.size
-    with np.errstate(invalid="ignore", over="ignore"):  # damaged coordinates are dropped
-        xyz = np.einsum("ni,ji->nj", _positions(own, sieve), plan.scan.rotation) + plan.scan.translation_m
+    xyz = np.einsum("ni,ji->nj", _positions(own, sieve), plan.scan.rotation) + plan.scan.translation_m
     columns: Columns = {f"{axis}_m": xyz[:, k] for k, axis in enumerate("xyz")}
     columns["epoch_gps_ns"] = _epochs(own, plan, size, sieve)
     columns["point_source_id"] = np.full(size, plan.number, np.uint16)

@@ -369,3 +369,14 @@ def test_points_that_the_xml_does_not_claim_are_told(tmp_path: Path, claimed: in
     log = read("e57", written(tmp_path, e57(scan)), NOON, crs="local")
     assert len(log) == min(claimed, 240)
     assert log.rejected == rejected
+
+
+def test_a_signalling_nan_costs_its_point(tmp_path: Path) -> None:
+    scan = ScanSpec([*triple(8), single("timeStamp", [k / 4 for k in range(8)])], start(1.4e9))
+    data = e57(scan)
+    good = struct.pack("<f", 1.25)
+    at = data.index(struct.pack("<f", 1.0) + good) + 4
+    path = written(tmp_path, data[:at] + b"\x01\x00\x80\x7f" + data[at + 4 :])
+    log = read("e57", path, {"check_pages": False}, crs="local")
+    assert [r.record for r in log.rejects] == [5]
+    assert len(log) == 7

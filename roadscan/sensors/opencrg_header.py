@@ -148,6 +148,11 @@ def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
             )
     if "KD_DEFINITION" not in blocks:
         raise FormatError("there is no block $KD_DEFINITION", expected="an OpenCRG file", file=path)
+    if "ROAD_CRG" not in blocks:  # its defaults would put the grid elsewhere
+        raise FormatError("there is no block $ROAD_CRG", expected="an OpenCRG file", file=path)
+    for line in blocks["ROAD_CRG"]:
+        if not line.replace("\t", " ").isprintable():
+            raise FormatError(f"'{line}' holds bytes that are no text", expected="key = number", file=path)
 
 
 def _encoding(definition: list[str], path: Path) -> Encoding:

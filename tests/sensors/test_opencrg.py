@@ -96,6 +96,13 @@ def test_a_lost_long_section_is_noticed(tmp_path: Path) -> None:
         read_crg(written(tmp_path, lost))
 
 
+def test_damage_in_the_geometry_is_not_read_as_defaults(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"no block \$ROAD_CRG"):
+        read_crg(written(tmp_path, SPECIFICATION.replace("$ROAD_CRG", "$ROAD_CR\0")))
+    with pytest.raises(FormatError, match="no text"):
+        read_crg(written(tmp_path, SPECIFICATION.replace("REFERENCE_LINE_INCREMENT", "REFEREN\x1a\0LINE_INCREMENT")))
+
+
 def test_defaults_of_a_minimal_file(tmp_path: Path) -> None:
     """Rows 0.01 m apart where the header says nothing, columns centred (crg_read.m, crgLoader.c)."""
     head = "$ROAD_CRG\n$\n$KD_DEFINITION\n#:LRFI\nD:long section 2,m\nD:long section 1,m\nD:long section 3,m\n$\n$$$$\n"

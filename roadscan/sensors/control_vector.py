@@ -32,6 +32,8 @@ from roadscan.sensors.vector_layer import (
     is_geopackage,
     layer_names,
     number_of,
+    unread_features,
+    wkb_of,
     word_of,
 )
 
@@ -101,6 +103,7 @@ class ControlVector(LogFormat):
         for batch in feature_batches(source.path, plan.layer):
             yield from reader.items(_raw(batch, plan, first))
             first += batch.num_rows
+        yield from unread_features(source.path, first)
 
 
 @dataclass(frozen=True)
@@ -198,8 +201,7 @@ def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
 
 def _points(batch: pa.RecordBatch, geometry: str) -> Float64:
     """x, y, z (3, n) of the point geometries, NaN for anything else and for a missing z."""
-    name = geometry if geometry in batch.schema.names else "wkb_geometry"
-    shapes = shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore")
+    shapes = shapely.from_wkb(wkb_of(batch, geometry), on_invalid="ignore")
     is_place = (shapely.get_type_id(shapes) == shapely.GeometryType.POINT) & ~shapely.is_empty(shapes)
     points = np.where(is_place, shapes, None)
     return np.stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])

@@ -50,6 +50,8 @@ from roadscan.sensors.vector_layer import (
     is_geopackage,
     layer_names,
     number_of,
+    unread_features,
+    wkb_of,
     word_of,
 )
 
@@ -396,6 +398,7 @@ def read_lines(layer: LineLayer, place: Place) -> Iterator[Lines | Reject]:
     for batch in feature_batches(layer.path, layer.name, _EXPECTED, columns=list(dict.fromkeys(columns))):
         yield from _lines(batch, layer, place, first)
         first += batch.num_rows
+    yield from unread_features(layer.path, first)
 
 
 def _lines(batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int) -> Iterator[Lines | Reject]:
@@ -432,8 +435,7 @@ def _lines(batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int) ->
 
 def _shapes(batch: pa.RecordBatch, layer: LineLayer, sieve: Sieve) -> npt.NDArray[np.object_]:
     """Geometries (n,) of the features, empty where there is no line."""
-    name = layer.geometry if layer.geometry in batch.schema.names else "wkb_geometry"
-    shapes = shapely.force_2d(shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore"))
+    shapes = shapely.force_2d(shapely.from_wkb(wkb_of(batch, layer.geometry), on_invalid="ignore"))
     kinds = shapely.get_type_id(shapes)
     lines = np.isin(kinds, (shapely.GeometryType.LINESTRING, shapely.GeometryType.MULTILINESTRING))
     lines &= ~shapely.is_empty(shapes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import warnings
 from collections.abc import Iterator
@@ -9,13 +10,17 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyogrio
 import pyproj
 
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, nearest
+from roadscan.sensors.base import Reject
 
 BATCH_FEATURES: Final = 4_096
+_LARGEST_JSON: Final = 16 << 20
 LINE_KINDS: Final = frozenset({"LINESTRING", "MULTILINESTRING", "COMPOUNDCURVE", "MULTICURVE", "CURVE"})
 """Geometry types of GeoPackage layers that hold lines."""
 
@@ -105,6 +110,31 @@ def feature_batches(
             if batch is None:
                 return
             yield batch
+
+
+def wkb_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
+    """Geometries (n,) of features as WKB, None where there is none; `geometry` names their column, "" the default."""
+    name = geometry if geometry and geometry in batch.schema.names else "wkb_geometry"
+    wkb: npt.NDArray[np.object_] = batch.column(name).to_numpy(zero_copy_only=False)
+    return wkb
+
+
+def unread_features(path: Path, read: int) -> Iterator[Reject]:
+    """A reject for members of a GeoJSON file's list of features that GDAL passed over; larger files are not looked at.
+
+    GDAL reads members whose type is "Feature", and leaves out others without a word.
+    """
+    if path.suffix.lower() == ".zip" or path.stat().st_size > _LARGEST_JSON:
+        return
+    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    if not data.lstrip().startswith(b"{"):
+        return
+    try:
+        listed = json.loads(data).get("features")
+    except (ValueError, AttributeError, RecursionError):
+        return
+    if isinstance(listed, list) and len(listed) > read:
+        yield Reject("the list of features holds something that is no feature", records=len(listed) - read)
 
 
 def flat_crs(crs: pyproj.CRS) -> pyproj.CRS:

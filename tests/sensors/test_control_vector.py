@@ -150,10 +150,29 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
 
 def test_empty_points_and_layers_without_geometry(tmp_path: Path) -> None:
     shapes = shapely.points(ENH).tolist()
-    log = read_log("control_vector", write(tmp_path / "a.gpkg", layer(geometry=[shapes[0], shapely.Point(), shapes[2]])),
-                   crs="EPSG:25832", map=UTM32)  # fmt: skip
+    path = write(tmp_path / "a.gpkg", layer(geometry=[shapes[0], shapely.Point(), shapes[2]]))
+    log = read_log("control_vector", path, crs="EPSG:25832", map=UTM32)
     assert log.table.num_rows == 2
     assert [r.record for r in log.rejects] == [1]
     (tmp_path / "a.csv").write_text("name,role\nA,gcp\n")
     with pytest.raises(FormatError, match="has no geometry"):
         read_log("control_vector", tmp_path / "a.csv", crs="EPSG:25832", map=UTM32)
+
+
+def test_a_member_that_is_no_feature_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.geojson", layer().to_crs("EPSG:4326"))
+    text = path.read_text()
+    at = text.index('"Feature",', text.index("P1"))
+    path.write_text(text[:at] + '"Peature",' + text[at + 10 :])
+    log = read_log("control_vector", path, crs="EPSG:4979", map=MapFrame(crs="EPSG:32632"))
+    assert log.table.num_rows == 2
+    assert [(r.reason, r.records) for r in log.rejects] == [
+        ("the list of features holds something that is no feature", 1)
+    ]
+
+
+def test_an_attribute_without_a_name_is_not_taken_for_the_geometry(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.geojson", layer().to_crs("EPSG:4326"))
+    path.write_text(path.read_text().replace('"level"', '""'))
+    log = read_log("control_vector", path, crs="EPSG:4979", map=MapFrame(crs="EPSG:32632"))
+    assert log.table.num_rows == 3

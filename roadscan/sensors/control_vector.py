@@ -32,8 +32,8 @@ from roadscan.sensors.vector_layer import (
     is_geopackage,
     layer_names,
     number_of,
+    shapes_of,
     unread_features,
-    wkb_of,
     word_of,
 )
 
@@ -178,12 +178,12 @@ def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
     def words(attribute: str, otherwise: str) -> list[str]:
         if attribute not in plan.attributes:
             return [otherwise] * size
-        return [word_of(value) or otherwise for value in attribute_values(batch.column(attribute))]
+        return [word_of(value) or otherwise for value in attribute_values(batch, attribute)]
 
     def number(attribute: str) -> Float64:
         if attribute not in plan.attributes:
             return np.full(size, np.nan)
-        return np.array([number_of(v) for v in attribute_values(batch.column(attribute))], dtype=np.float64)
+        return np.array([number_of(v) for v in attribute_values(batch, attribute)], dtype=np.float64)
 
     points = _points(batch, plan.geometry)
     height = points[2] if options.height is None else number(options.height)
@@ -201,7 +201,8 @@ def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
 
 def _points(batch: pa.RecordBatch, geometry: str) -> Float64:
     """x, y, z (3, n) of the point geometries, NaN for anything else and for a missing z."""
-    shapes = shapely.from_wkb(wkb_of(batch, geometry), on_invalid="ignore")
+    shapes = shapes_of(batch, geometry)
     is_place = (shapely.get_type_id(shapes) == shapely.GeometryType.POINT) & ~shapely.is_empty(shapes)
-    points = np.where(is_place, shapes, None)
+    points = shapes.copy()
+    points[~is_place] = None
     return np.stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])

@@ -19,7 +19,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +50,8 @@ from roadscan.sensors.vector_layer import (
     is_geopackage,
     layer_names,
     number_of,
+    shapes_of,
     unread_features,
-    wkb_of,
     word_of,
 )
 
@@ -129,7 +129,7 @@ class RoadLinesOptions(Strict):
     """Attribute with the width of the road."""
     width_unit: str = "m"
     """Unit of the widths: m, mm, cm, km, ft or ft_us."""
-    class_widths_m: dict[str, float] = {}
+    class_widths_m: dict[str, Annotated[float, Field(gt=0, le=_WIDEST_M, allow_inf_nan=False)]] = {}
     """Width of the roads of a class (m) by class, such as { S1100 = 22.0 }; stands above the table for TIGER/Line."""
 
 
@@ -391,17 +391,24 @@ class Lines:
     """(n,) Shapely lines, easting and northing (m)."""
 
 
-def read_lines(layer: LineLayer, place: Place) -> Iterator[Lines | Reject]:
-    """Stream a layer's lines in the map; features without a line are rejected."""
+def read_lines(layer: LineLayer, place: Place, *, need_widths: bool = True) -> Iterator[Lines | Reject]:
+    """Stream a layer's lines in the map; features without a line are rejected.
+
+    Parameters
+    ----------
+    need_widths : features whose width cannot be that of a road are rejected too; otherwise their width is unknown.
+    """
     first = 0
     columns = [name for name in layer.columns.values() if name is not None]
     for batch in feature_batches(layer.path, layer.name, _EXPECTED, columns=list(dict.fromkeys(columns))):
-        yield from _lines(batch, layer, place, first)
+        yield from _lines(batch, layer, place, first, need_widths)
         first += batch.num_rows
     yield from unread_features(layer.path, first)
 
 
-def _lines(batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int) -> Iterator[Lines | Reject]:
+def _lines(
+    batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int, need_widths: bool
+) -> Iterator[Lines | Reject]:
     sieve = Sieve(batch.num_rows)
     shapes = _shapes(batch, layer, sieve)
     parts, feature = shapely.get_parts(shapes, return_index=True)
@@ -413,7 +420,9 @@ def _lines(batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int) ->
     sieve.drop(lost, "a vertex has no place in the map")
     words = _Words.of(batch, layer)
     sieve.drop(words.damaged, "an attribute is not UTF-8 text")
-    width, origin = _widths(words, layer.options, sieve)
+    width, origin, odd = _widths(words, layer.options)
+    if need_widths:
+        sieve.drop(odd, f"the width is outside 0 to {_WIDEST_M:g} m")
     yield from sieve.rejects(first + np.arange(batch.num_rows), np.full(batch.num_rows, -1))
     kept = sieve.good[feature]
     chosen = feature[kept]
@@ -435,7 +444,7 @@ def _lines(batch: pa.RecordBatch, layer: LineLayer, place: Place, first: int) ->
 
 def _shapes(batch: pa.RecordBatch, layer: LineLayer, sieve: Sieve) -> npt.NDArray[np.object_]:
     """Geometries (n,) of the features, empty where there is no line."""
-    shapes = shapely.force_2d(shapely.from_wkb(wkb_of(batch, layer.geometry), on_invalid="ignore"))
+    shapes = shapely.force_2d(shapes_of(batch, layer.geometry))
     kinds = shapely.get_type_id(shapes)
     lines = np.isin(kinds, (shapely.GeometryType.LINESTRING, shapely.GeometryType.MULTILINESTRING))
     lines &= ~shapely.is_empty(shapes)
@@ -474,7 +483,7 @@ class _Words:
     def of(cls, batch: pa.RecordBatch, layer: LineLayer) -> _Words:
         def values(what: str) -> list[Any]:
             name = layer.columns[what]
-            return [None] * batch.num_rows if name is None else attribute_values(batch.column(name))
+            return [None] * batch.num_rows if name is None else attribute_values(batch, name)
 
         ids, names, classes = ([word_of(v) for v in values(what)] for what in ("id", "name", "class"))
         lanes = [number_of(v) for v in values("lanes")]
@@ -490,21 +499,23 @@ class _Words:
         )
 
 
-def _widths(words: _Words, options: RoadLinesOptions, sieve: Sieve) -> tuple[Float64, list[str | None]]:
-    """Width (n,) of each feature's road (m), NaN where unknown, and what it comes from."""
+def _widths(words: _Words, options: RoadLinesOptions) -> tuple[Float64, list[str | None], Bool]:
+    """Width (n,) of each feature's road (m), NaN where unknown, what it comes from, and whether it cannot be one."""
     stated = words.widths * UNITS["length"][options.width_unit]
-    sieve.drop((stated < 0) | (stated > _WIDEST_M), f"the width is outside 0 to {_WIDEST_M:g} m")
+    odd = (stated < 0) | (stated > _WIDEST_M)
     out = np.full(stated.size, np.nan)
     origin: list[str | None] = [None] * stated.size
     for i, (width, lanes, kind) in enumerate(zip(stated.tolist(), words.lanes, words.classes, strict=True)):
         by_class = class_width_m(kind, options)
+        if odd[i]:
+            continue
         if width > 0:
             out[i], origin[i] = width, "width"
         elif lanes:
             out[i], origin[i] = lanes * options.lane_width_m, "lanes"
         elif by_class is not None:
             out[i], origin[i] = by_class, "class"
-    return out, origin
+    return out, origin, odd
 
 
 def class_width_m(kind: str, options: RoadLinesOptions) -> float | None:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyogrio
 import pyproj
+import shapely
 
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, nearest
 from roadscan.sensors.base import Reject
@@ -112,11 +113,12 @@ def feature_batches(
             yield batch
 
 
-def wkb_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
-    """Geometries (n,) of features as WKB, None where there is none; `geometry` names their column, "" the default."""
+def shapes_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
+    """Geometries (n,) of features, None where there is no sound one; `geometry` names their column, "" the default."""
     name = geometry if geometry and geometry in batch.schema.names else "wkb_geometry"
-    wkb: npt.NDArray[np.object_] = batch.column(name).to_numpy(zero_copy_only=False)
-    return wkb
+    with np.errstate(invalid="ignore"):  # coordinates that are no numbers
+        shapes = shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore")
+    return np.asarray(shapes, dtype=object)
 
 
 def unread_features(path: Path, read: int) -> Iterator[Reject]:
@@ -143,8 +145,17 @@ def flat_crs(crs: pyproj.CRS) -> pyproj.CRS:
     return horizontal.to_2d() if horizontal.is_geographic or horizontal.is_projected else horizontal
 
 
-def attribute_values(column: pa.Array) -> list[Any]:
-    """Values of an attribute; text as bytes, since GDAL does not check that it is UTF-8."""
+def attribute_values(batch: pa.RecordBatch, name: str) -> list[Any]:
+    """Values of an attribute; text as bytes, since GDAL does not check that it is UTF-8.
+
+    Raises
+    ------
+    FormatError
+        if GDAL lists the attribute and does not hand it out, as with some damaged names.
+    """
+    if name not in batch.schema.names:
+        raise FormatError(f"the attribute '{name}' cannot be read", expected="one attribute of each name")
+    column = batch.column(name)
     if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
         column = column.cast(pa.large_binary())
     values: list[Any] = column.to_pylist()

@@ -258,3 +258,15 @@ def test_mutated_layers(tmp_path: Path, suffix: str) -> None:
         assert format_named("control_vector").sniff(path) in {True, False}
         outcomes.append(survives("road_lines", path, {}, {"map": UTM17}))
     assert any(o is not None for o in outcomes)
+
+
+def test_vertices_that_are_no_numbers_and_doubled_attributes(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.geojson", tiger().to_crs("EPSG:4326"))
+    text = path.read_text()
+    at = text.index("25.77", text.index("Riverwalk"))
+    (tmp_path / "b.geojson").write_text(f"{text[:at]}nan{text[text.index(' ', at) :]}")
+    log = read_log("road_lines", tmp_path / "b.geojson", map=UTM17)
+    assert [(r.record, r.reason) for r in log.rejects] == [(3, "a vertex has no place in the map")]
+    (tmp_path / "c.geojson").write_text(text.replace('"FULLNAME": "Riverwalk"', '"FULlNAME": "Riverwalk"'))
+    with pytest.raises(FormatError, match="attribute 'FULLNAME' cannot be read"):
+        read_log("road_lines", tmp_path / "c.geojson", map=UTM17)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +17,7 @@ from roadscan.sensors.base import Reject
 from roadscan.sensors.road_lines import (
     LineLayer,
     Lines,
+    Place,
     RoadLines,
     RoadLinesOptions,
     place_in_map,
@@ -78,7 +79,8 @@ def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
     Raises
     ------
     FormatError, ConfigError, CrsError
-        if the layer cannot be read as stated, or if it has no line.
+        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: the road along it
+        would be cut away without a word.
     """
     options = RoadLinesOptions.model_validate_json(stated.options)
     layer = LineLayer.of(stated.path, options, stated.crs)
@@ -89,13 +91,29 @@ def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
             change='name it in filters.centre_line_options, or keep "buffer"',
             file=stated.path,
         )
-    place = place_in_map(layer.crs, frame, stated.path)
-    parts = [item for item in read_lines(layer, place) if not isinstance(item, Reject)]
+    parts = _all_lines(layer, place_in_map(layer.crs, frame, stated.path), stated)
     if not parts:
         raise ConfigError("the layer has no centre lines", expected="at least one line", file=stated.path)
     return CentreLineBuffer(
         np.concatenate([part.shapes for part in parts]), np.concatenate([_half_widths_m(p, stated) for p in parts])
     )
+
+
+def _all_lines(layer: LineLayer, place: Place, stated: CentreLines) -> list[Lines]:
+    """Every line of the layer; attributes that do not matter here are not read, so they cannot be at fault."""
+    needed: set[str] = set() if stated.width == BUFFER else {"class", "lanes", "width"}
+    plain = replace(layer, columns={what: name if what in needed else None for what, name in layer.columns.items()})
+    parts: list[Lines] = []
+    for item in read_lines(plain, place, need_widths=False):
+        if isinstance(item, Reject):
+            raise ConfigError(
+                f"feature {item.record} of the centre lines (counted from 0) cannot be used: {item.reason}",
+                expected="a line that lies in the map; without it, the road along it would be cut away",
+                change="mend the feature, or take it out of the layer",
+                file=stated.path,
+            )
+        parts.append(item)
+    return parts
 
 
 def _half_widths_m(lines: Lines, stated: CentreLines) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

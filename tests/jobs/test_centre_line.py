@@ -18,6 +18,7 @@ from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.model.errors import ConfigError, CrsError
 from roadscan.model.survey import Survey
+from roadscan.points.centre_line import CentreLineBuffer
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 
@@ -137,3 +138,50 @@ def test_what_the_survey_file_has_to_say(tmp_path: Path) -> None:
         load(centre_line_crs="EPSG:32632", centre_line_width="breadth")
     with pytest.raises(ConfigError, match="unknown key 'class_width_m'"):
         load(centre_line_options={"class_width_m": {}})
+
+
+def buffer_of(folder: Path, **filters: Any) -> CentreLineBuffer:
+    survey = survey_of(folder, **filters)
+    stated = CentreLines.of(survey)
+    assert stated is not None
+    return load_buffer(stated, survey.config.map.frame())
+
+
+@pytest.mark.parametrize("width", [900.0, -3.0, float("inf")])
+def test_a_line_with_an_impossible_width_is_kept_with_the_buffer(tmp_path: Path, width: float) -> None:
+    lines = [shapely.LineString([[-100, y], [100, y]]) for y in (5, 500)]
+    frame = geopandas.GeoDataFrame({"broad": [20.0, width], "MTFCC": ["S1400"] * 2}, geometry=lines, crs="EPSG:32632")
+    frame.to_file(tmp_path / "roads.gpkg")
+    found = buffer_of(tmp_path, centre_line="roads.gpkg", centre_line_width="broad", centre_line_buffer_m=12.0)
+    inside = found.keeps(np.zeros(4), np.array([511.9, 512.1, 22.9, 23.1]), (-10.0, 0.0, 10.0, 600.0))
+    assert inside.tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    "broken",
+    ["null", '{"type": "Point", "coordinates": [0, 0]}', '{"type": "LineString", "coordinates": [[0, 0], [1e30, 0]]}'],
+)
+def test_a_feature_that_cannot_be_used_is_refused_by_its_number(tmp_path: Path, broken: str) -> None:
+    sound = '{"type": "LineString", "coordinates": [[0, 0], [9, 0]]}'
+    features = ", ".join(f'{{"type": "Feature", "properties": {{}}, "geometry": {g}}}' for g in (sound, broken, sound))
+    crs = '{"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}'
+    (tmp_path / "roads.geojson").write_text(
+        f'{{"type": "FeatureCollection", "crs": {crs}, "features": [{features}]}}', encoding="utf-8"
+    )
+    with pytest.raises(ConfigError, match=r"roads\.geojson: feature 1 of the centre lines .* cannot be used"):
+        buffer_of(tmp_path, centre_line="roads.geojson")
+
+
+def test_a_name_that_is_no_text_does_not_matter(tmp_path: Path) -> None:
+    write_layer(tmp_path / "roads.gpkg", FULLNAME="Main St", MTFCC="S1400")
+    data = (tmp_path / "roads.gpkg").read_bytes()
+    (tmp_path / "roads.gpkg").write_bytes(data.replace(b"Main St", b"Ma\xffn St"))
+    assert buffer_of(tmp_path, centre_line="roads.gpkg", centre_line_width="class")
+
+
+@pytest.mark.parametrize("width", [-1.0, 0.0, float("nan"), 1e9])
+def test_class_widths_are_widths(tmp_path: Path, width: float) -> None:
+    write_layer(tmp_path / "roads.shp", MTFCC="S1400")
+    options = {"class_widths_m": {"S1400": width}}
+    with pytest.raises(ConfigError, match="class_widths_m"):
+        buffer_of(tmp_path, centre_line_width="class", centre_line_options=options)

@@ -10,9 +10,10 @@ reference range + v · vertical resolution (ranges grow downwards); with ``value
 reference range − v · vertical resolution, and the table holds 65,536 − v, so that its ranges grow as they must. The
 value 0, and those named in ``no_return``, are no return.
 
-**Time.** The stamp is that of a file's first row; row k follows after k · longitudinal resolution / speed. Files that
-`roadscan export` wrote hold the epoch of every row. Positions in the header (longitude, latitude, distance) are kept
-out of the tables: the run's trajectory places the profiles.
+**Time.** Rows count in order of travel: from row 0 where ``first_row = "start"``, from the last row backwards where it
+is "end". The stamp is that of the row that was passed first; the k-th row behind it follows after k · longitudinal
+resolution / speed. Files that `roadscan export` wrote hold the epoch of every row. Positions in the header (longitude,
+latitude, distance) are kept out of the tables: the run's trajectory places the profiles.
 
 **Intensity** comes from the 2D image where it is registered to the 3D image and both cover the same ground with pixels
 whose sizes are whole multiples of each other: of several pixels to a reading the middle one is taken. Any other 2D
@@ -50,7 +51,7 @@ Int64 = npt.NDArray[np.int64]
 STATEMENT_KEY: Final = "roadscan_psi"
 """Key of the metadata (a JSON object) under which a file states what the draft leaves open."""
 ROW_EPOCHS_KEY: Final = "row_epochs_ns"
-"""Key of the metadata with each row's time since the file's stamp (ns)."""
+"""Key of the metadata with each row's time since the file's stamp (ns), in order of travel."""
 
 SPEED_UNITS_M_PER_S: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 
@@ -71,7 +72,7 @@ class PsiStatement(Strict):
     values: Literal["range", "height"] | None = None
     """What a 3D value grows with: "range" (away from the sensor) or "height" (towards it)."""
     first_row: Literal["start", "end"] | None = None
-    """Which end of the piece row 0 is, in the direction of travel."""
+    """Which end of the piece row 0 is, in the direction of travel; the stamp is that of the row passed first."""
     first_column: Literal["left", "right"] | None = None
     """Which side of the lane column 0 is, in the direction of travel (the sensor's −y, or its +y)."""
     speed_unit: Literal["m/s", "km/h", "mph"] | None = None
@@ -98,8 +99,8 @@ class Psi(LogFormat):
     title: ClassVar[str] = "PSI pavement surface images (FHWA draft), one file or a folder of them: line scanners"
     yields: ClassVar[tuple[str, ...]] = ("scans",)
     time: ClassVar[str] = (
-        "the stamp of a file's first row is in the clock that the survey file states (files of `roadscan export` "
-        "state GPS time themselves); rows follow by resolution and speed"
+        "the stamp, that of a file's first row in order of travel, is in the clock that the survey file states (files "
+        "of `roadscan export` state GPS time themselves); rows follow by resolution and speed"
     )
     options: ClassVar[type[Strict]] = PsiOptions
 
@@ -202,7 +203,7 @@ def statement_text(statement: PsiStatement, row_epochs_ns: Int64) -> str:
 
     Parameters
     ----------
-    row_epochs_ns : (rows,) time of each row since the file's stamp (ns).
+    row_epochs_ns : (rows,) time of each row, in order of travel, since the file's stamp (ns).
     """
     stated = statement.model_dump(mode="json", exclude_none=True)
     return json.dumps({STATEMENT_KEY: stated, ROW_EPOCHS_KEY: row_epochs_ns.tolist()}, separators=(",", ":"))
@@ -351,7 +352,7 @@ def _profiles(piece: _Piece, epoch_gps_ns: int, series: _Series) -> Iterator[Ite
 
 
 def _row_epochs(piece: _Piece, series: _Series) -> Int64:
-    """(rows,) time of each row, in the direction of travel, since the file's stamp (ns)."""
+    """(rows,) time of each row, in order of travel, since the file's stamp (ns)."""
     rows = piece.surface.rows
     if piece.has_row_epochs:
         listed = _notes(piece.file)[ROW_EPOCHS_KEY]

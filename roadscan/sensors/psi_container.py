@@ -119,7 +119,7 @@ class PsiHeader:
     longitude_deg: float = 0.0
     latitude_deg: float = 0.0
     dmi: float = 0.0
-    """Reading of the distance-measuring instrument at the first row; the draft states no unit."""
+    """Reading of the distance-measuring instrument at the first row in order of travel; the draft states no unit."""
     date: str = ""
     """yyyymmdd."""
     time: str = ""
@@ -142,7 +142,7 @@ class PsiHeader:
     speed: float = 0.0
     """Speed of the vehicle; the draft states no unit."""
     timestamp: int = 0
-    """Time of the first row; the draft states neither unit nor origin."""
+    """Time of the first row in order of travel; the draft states neither unit nor origin."""
     vehicle: str = ""
     operator: str = ""
     contractor: str = ""

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.psi import PsiStatement, statement_text
+from roadscan.sensors.psi import Psi, PsiStatement, statement_text
 from roadscan.sensors.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
 from tests.sensors.readings import read, survive
 
@@ -295,6 +295,21 @@ def test_directions_and_invalid_codes(tmp_path: Path) -> None:
     assert np.array_equal(lists(log, "intensity"), IMAGE[::-1])
     geometry = log.attributes["scan_geometry"]
     assert (geometry["first"], geometry["step"]) == (0.25, pytest.approx(-0.001))
+
+
+def test_the_stamp_is_that_of_the_row_passed_first(tmp_path: Path) -> None:
+    """Whichever end of the piece row 0 is, and with the epochs of the metadata too."""
+    stored = written(tmp_path, handmade())
+    forth, back = (read("psi", stored, {**STATED, "first_row": end}, clock=UNIX_MS) for end in ("start", "end"))
+    assert np.array_equal(lists(back, "range"), lists(forth, "range")[::-1])
+    assert np.array_equal(back.epochs, forth.epochs)
+    since = np.array([0, 1, 5, 9, 14, 20])
+    statement = PsiStatement(length_unit="mm", values="range", first_row="end", first_column="left", timestamp="gps_ns")
+    path = written(tmp_path, handmade(metadata=statement_text(statement, since).encode(), o149=("<q", GPS_NS)))
+    log = read("psi", path)
+    assert np.array_equal(log.epochs, GPS_NS + since)
+    assert np.array_equal(lists(log, "range"), RANGES[::-1])
+    assert "first row in order of travel" in Psi.time
 
 
 def test_what_the_draft_leaves_open_has_to_be_stated(tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ class BlockResult:
 
 def plan_tiles(footprints: Footprints, plan: SurveyPlan) -> dict[TileId, tuple[str, int]]:
     """Key and expected readings of every tile that a raw block touches."""
+    if not footprints.tile_column.size:
+        return {}
     order = np.lexsort((footprints.row_group, footprints.slice_index, footprints.tile_column, footprints.tile_row))
     column, row = footprints.tile_column[order], footprints.tile_row[order]
     starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))

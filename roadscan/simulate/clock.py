@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,9 @@ from roadscan.model.gpstime import (
 from roadscan.simulate.scene import ClockError, Scene
 
 Int64 = npt.NDArray[np.int64]
+
+_NOTHING_S: Final = 1e-9
+"""Stands for no offset where the survey file has to state one."""
 
 
 @dataclass(frozen=True)
@@ -63,26 +67,32 @@ class SensorClock:
             expected="gps, gps_week_seconds, unix_gps, unix_utc or free",
         )
 
-    def toml(self, unit: str | None, run_start_gps_ns: int) -> str:
-        """The survey file's ``clock = …`` for a log that starts at `run_start_gps_ns` and is stamped in `unit`."""
+    def toml(self, unit: str | None, first_gps_ns: int) -> str:
+        """The survey file's ``clock = …`` for a log whose first stamp is of the epoch `first_gps_ns`, in `unit`.
+
+        Week and date are those that the clock shows then.
+        """
         parts = [f'system = "{self.system}"']
         if unit is not None:
             parts.append(f'unit = "{unit}"')
-        if self.system in {TimeSystem.GPS_WEEK, TimeSystem.UTC_HOUR}:
-            parts.append(f"date = {utc_from_gps_ns(run_start_gps_ns):%Y-%m-%d}")
-        if self.error.known or self.system is TimeSystem.FREE:
-            parts += self._correction(run_start_gps_ns)
+        shown = self.shown_gps_ns(np.array([first_gps_ns]))
+        if self.system is TimeSystem.GPS_WEEK:
+            parts.append(f"week = {int(shown[0]) // (WEEK_S * NS_PER_S)}")
+        if self.system is TimeSystem.UTC_HOUR:
+            parts.append(f"date = {utc_from_gps_ns(int(shown[0])):%Y-%m-%d}")
+        if self.error.known:
+            parts += self._correction()
+        elif self.system is TimeSystem.FREE:
+            parts.append(f"offset_s = {_NOTHING_S!r}")
         return "{ " + ", ".join(parts) + " }"
 
-    def _correction(self, run_start_gps_ns: int) -> list[str]:
-        """The stamp's formula turned round; a clock that starts anew each hour states the correction of this run."""
-        if self.system is TimeSystem.UTC_HOUR:
-            ahead_ns = int(self.shown_gps_ns(np.array([run_start_gps_ns]))[0]) - run_start_gps_ns
-            return [f"offset_s = {-ahead_ns / NS_PER_S!r}"]
+    def _correction(self) -> list[str]:
+        """The stamp's formula turned round. A clock that starts anew each hour counts as one of POSIX seconds."""
         rate = self.error.drift_ppm * 1e-6
-        reference_s = int(self.stamps_ns(np.array([self.start_gps_ns]))[0]) / NS_PER_S
-        # A free-running clock without a stated offset is refused: nothing to correct is stated as a nanosecond.
-        offset_s = -self.error.offset_s or 1e-9
+        system = TimeSystem.UNIX_UTC if self.system is TimeSystem.UTC_HOUR else self.system
+        counting = SensorClock(self.error, system, self.start_gps_ns)
+        reference_s = int(counting.stamps_ns(np.array([self.start_gps_ns]))[0]) / NS_PER_S
+        offset_s = -self.error.offset_s or (_NOTHING_S if self.system is TimeSystem.FREE else 0.0)
         return [
             f"offset_s = {offset_s!r}",
             f"drift_ppm = {-rate / (1.0 + rate) * 1e6!r}",

@@ -91,6 +91,11 @@ class Drive:
         return self._motion.duration_s
 
     @property
+    def sign(self) -> float:
+        """1 where the body looks along the path, −1 where it drives backwards."""
+        return self._sign
+
+    @property
     def recorded_span_gps_ns(self) -> tuple[int, int]:
         """First and last epoch that trajectory, IMU, GNSS and encoder record: with run-up, run-out and standstill."""
         first, last = self._motion.recorded_span_s

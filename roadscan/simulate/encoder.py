@@ -38,10 +38,13 @@ class WheelEncoder:
             self._turned -= np.interp(drive.start_gps_ns, self._grid, self._turned)
 
     def ticks(self, epoch_gps_ns: Int64) -> Int64:
-        """Count (n,) at epochs (n,). In a right turn the right wheel drives less than the middle of the vehicle."""
+        """Count (n,) at epochs (n,), upwards both ways.
+
+        In a right turn forwards the right wheel drives less than the middle of the vehicle, backwards more.
+        """
         path = self._drive.driven_m(epoch_gps_ns)
         if self._side_m != 0.0:
-            path = path - self._side_m * np.interp(epoch_gps_ns, self._grid, self._turned)
+            path = path - self._drive.sign * self._side_m * np.interp(epoch_gps_ns, self._grid, self._turned)
         return np.floor(path * self._ticks_per_m + 0.5).astype(np.int64)
 
 

@@ -154,6 +154,8 @@ def _quality(scene: Scene, drive: Drive, epochs: Int64) -> Int64:
 def _jumps(scene: Scene, epochs: Int64, rng: np.random.Generator) -> Float64:
     """Multipath errors (n, 3), north-east-down (m)."""
     out = np.zeros((epochs.size, 3))
+    if not epochs.size:
+        return out
     seconds = (epochs - epochs[0]) / NS_PER_S
     count = rng.poisson(scene.gnss.jumps_per_minute * float(seconds[-1]) / 60.0)
     for start in np.sort(rng.uniform(0.0, float(seconds[-1]), count)):

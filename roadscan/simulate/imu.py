@@ -44,6 +44,21 @@ class ImuOnRig:
     errors: ImuErrors
     rate_hz: float
 
+    @property
+    def step_ns(self) -> int:
+        """From sample to sample."""
+        return round(NS_PER_S / self.rate_hz)
+
+    @property
+    def stride(self) -> int:
+        """Samples over which motion is differentiated, to each side."""
+        return max(1, round(_STENCIL_S * self.rate_hz))
+
+
+def first_gps_ns(drive: Drive, imu: ImuOnRig) -> int:
+    """Epoch of the first sample of a pass."""
+    return drive.recorded_span_gps_ns[0] + 2 * imu.stride * imu.step_ns
+
 
 def imu_of(scene: Scene) -> ImuOnRig:
     """The vehicle's IMU."""
@@ -61,16 +76,16 @@ def head_imus(scene: Scene) -> list[ImuOnRig]:
 
 def write_imu(scene: Scene, drive: Drive, imu: ImuOnRig, clock: SensorClock, file: Path) -> Iterator[int]:
     """Write the samples of one pass, a chunk a step; yields the samples of each."""
-    step = round(NS_PER_S / imu.rate_hz)
-    stride = max(1, round(_STENCIL_S * imu.rate_hz))
-    first, last = drive.recorded_span_gps_ns
-    margin = 2 * stride * step
-    errors = _SensorErrors(imu, stream(scene.seed, drive.number, imu.name))
+    step, stride = imu.step_ns, imu.stride
+    begins, last = first_gps_ns(drive, imu), drive.recorded_span_gps_ns[1] - 2 * stride * step
+    errors = _SensorErrors(
+        imu, stream(scene.seed, drive.number, imu.name), stream(scene.seed, drive.number, f"{imu.name} bias")
+    )
     schema = pa.schema([(c, pa.int64() if c == "time_ns" else pa.float64()) for c in COLUMNS])
     options = pa_csv.WriteOptions(quoting_style="none")
     with pa_csv.CSVWriter(file, schema, write_options=options) as writer:
-        for begin in range(first + margin, last - margin + 1, step * CHUNK):
-            epochs = np.arange(begin, min(begin + step * CHUNK, last - margin + 1), step)
+        for begin in range(begins, last + 1, step * CHUNK):
+            epochs = np.arange(begin, min(begin + step * CHUNK, last + 1), step)
             rate, force = errors.applied(*felt(drive, imu.mount, epochs, step, stride))
             columns = [clock.stamps_ns(epochs), *np.round(rate, 9).T, *np.round(force, 8).T]
             writer.write_batch(pa.RecordBatch.from_arrays([pa.array(c) for c in columns], schema=schema))
@@ -100,9 +115,11 @@ def felt(drive: Drive, mount: Mount, epochs: Int64, step_ns: int, stride: int = 
 
 
 class _SensorErrors:
-    """Scale, drifting bias and noise on six axes, continued from chunk to chunk."""
+    """Scale, drifting bias and noise on six axes, continued from chunk to chunk: two streams, so that chunks change
+    nothing.
+    """
 
-    def __init__(self, imu: ImuOnRig, rng: np.random.Generator) -> None:
+    def __init__(self, imu: ImuOnRig, rng: np.random.Generator, bias_rng: np.random.Generator) -> None:
         e = imu.errors
         gyro_bias = np.radians(e.gyro_bias_deg_per_h) / 3600.0
         accel_bias = e.accel_bias_mg * 1e-3 * STANDARD_GRAVITY_M_PER_S2
@@ -111,7 +128,9 @@ class _SensorErrors:
         accel_noise = e.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_M_PER_S2 * np.sqrt(imu.rate_hz)
         self._noise = np.repeat([gyro_noise, accel_noise], 3)
         self._rng = rng
-        self._bias = GaussMarkov(rng, np.repeat([gyro_bias, accel_bias], 3), e.bias_time_constant_s, 1.0 / imu.rate_hz)
+        self._bias = GaussMarkov(
+            bias_rng, np.repeat([gyro_bias, accel_bias], 3), e.bias_time_constant_s, 1.0 / imu.rate_hz
+        )
 
     def applied(self, rate: Float64, force: Float64) -> tuple[Float64, Float64]:
         """Rates and forces (n, 3) as the sensor states them."""

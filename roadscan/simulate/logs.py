@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
 from roadscan.simulate import encoder, gnss, imu, lidar, sick, trajectory
@@ -15,7 +17,7 @@ from roadscan.simulate.caster import World
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.profiler import Head, heads, write_profiles
-from roadscan.simulate.scene import Scene
+from roadscan.simulate.scene import ClockError, Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object
 
@@ -93,7 +95,8 @@ class Pass:
             clock, options = '{ system = "gps", unit = "ns" }', '{ axes = "frd" }'
             yield SimulatedLog(name, write, "poses", "pose_quaternions", None, clock, "local", options)
             return
-        clock = f'{{ system = "gps_week_seconds", date = {utc_from_gps_ns(drive.start_gps_ns):%Y-%m-%d} }}'
+        right = SensorClock.of(scene, ClockError(), TimeSystem.GPS_WEEK)
+        clock = right.toml(None, trajectory.first_gps_ns(scene, drive))
         companion = "trajectory.smrmsg"
         accuracy = f'{{ accuracy = "{companion}" }}' if scene.trajectory.accuracy else None
         yield SimulatedLog(name, write, "poses", "sbet", None, clock, drive.earth.geographic_crs, accuracy)
@@ -124,11 +127,13 @@ class Pass:
         def write() -> Iterator[int]:
             return lidar.write_lidar(self.scene, world, self.drive, self.raw / name, self.hits("lidar"))
 
-        clock = self.clock("lidar", TimeSystem.UTC_HOUR).toml(None, self.drive.start_gps_ns)
+        clock, first = self.clock("lidar", TimeSystem.UTC_HOUR), lidar.starts_gps_ns(self.drive)
         hour = None
         if self.drive.earth.is_local:  # no GNSS receiver is attached that would tell the hour
-            hour = f"{{ hour = {utc_from_gps_ns(lidar.starts_gps_ns(self.drive)).hour} }}"
-        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", clock, options=hour)
+            shown = int(clock.shown_gps_ns(np.array([first]))[0])
+            hour = f"{{ hour = {utc_from_gps_ns(shown).hour} }}"
+        stated = clock.toml(None, first)
+        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", stated, options=hour)
 
     def _sick(self) -> Iterator[SimulatedLog]:
         world = self.world
@@ -166,7 +171,7 @@ class Pass:
             def write(one: imu.ImuOnRig = one, clock: SensorClock = clock, name: str = name) -> Iterator[int]:
                 return imu.write_imu(scene, self.drive, one, clock, self.raw / name)
 
-            stated = clock.toml("ns", self.drive.start_gps_ns)
+            stated = clock.toml("ns", imu.first_gps_ns(self.drive, one))
             yield SimulatedLog(name, write, "other", "imu_csv", one.name, stated)
 
     def _gnss(self) -> Iterator[SimulatedLog]:
@@ -192,7 +197,7 @@ class Pass:
         def write() -> Iterator[int]:
             return encoder.write_encoder(self.scene, self.drive, clock, self.raw / "encoder.csv")
 
-        stated = clock.toml("ns", self.drive.start_gps_ns)
+        stated = clock.toml("ns", self.drive.recorded_span_gps_ns[0])
         yield SimulatedLog(
             "encoder.csv", write, "other", "encoder_csv", "encoder", stated, None, '{ record = "total" }'
         )

@@ -31,6 +31,8 @@ class GaussMarkov:
 
     def take(self, count: int) -> Float64:
         """The next (count, k) values, for k components of standard deviation `sigma` (k,)."""
+        if count == 0:
+            return np.zeros((0, self._sigma.size))
         steps = self._sigma * np.sqrt(1.0 - self._keep**2) * self._rng.standard_normal((count, self._sigma.size))
         out, _ = lfilter([1.0], [1.0, -self._keep], steps, axis=0, zi=self._keep * self._last[None])
         self._last = out[-1]

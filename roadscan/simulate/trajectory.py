@@ -54,11 +54,16 @@ def wander_rad(number: int) -> float:
     return math.radians((2.75, -1.5, 0.6)[number % 3])
 
 
+def first_gps_ns(scene: Scene, drive: Drive) -> int:
+    """Epoch of the first pose."""
+    step = NS_PER_S // scene.trajectory.poses_per_s
+    return drive.recorded_span_gps_ns[0] // step * step
+
+
 def write_trajectory(scene: Scene, drive: Drive, file: Path, truth_file: Path) -> Iterator[int]:
     """Write the poses of one pass, a chunk a step; yields the poses of each."""
     step = NS_PER_S // scene.trajectory.poses_per_s
-    first, last = drive.recorded_span_gps_ns
-    first = first // step * step
+    first, last = first_gps_ns(scene, drive), drive.recorded_span_gps_ns[1]
     errors = _Errors(scene, drive.number)
     with pq.ParquetWriter(truth_file, _TRUTH_SCHEMA, use_dictionary=False) as truth, _Log(drive, file) as log:
         for begin in range(first, last + step, step * CHUNK_POSES):

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
 import pynmea2
 import pytest
 from pyins import strapdown
 
+from roadscan.jobs.ingest import ingest
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, gps_ns_from_utc
 from roadscan.model.rig import Rig
@@ -25,6 +27,8 @@ from roadscan.simulate.gnss import FIXED, FLOAT, solve
 from roadscan.simulate.imu import AT_BODY, felt, imu_of
 from roadscan.simulate.scene import ClockError
 from roadscan.simulate.surface import Surface
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.store import Store
 
 BARE = {"profilers": {"on": False}, "lidar": {"on": False}}
 
@@ -95,7 +99,9 @@ def test_imu_grades_have_their_errors():
         still = np.zeros((40_000, 3))
         biases = []
         for seed in range(12):
-            rate, force = _SensorErrors(one, np.random.default_rng(seed)).applied(still, still)
+            rate, force = _SensorErrors(one, np.random.default_rng(seed), np.random.default_rng(100 + seed)).applied(
+                still, still
+            )
             biases.append(np.degrees(rate.mean(axis=0)) * 3600.0)
         density = np.diff(force, axis=0).std() / math.sqrt(2) / math.sqrt(one.rate_hz) / 9.80665e-6
         assert density == pytest.approx(noise, rel=0.05)
@@ -156,10 +162,10 @@ def test_nmea_says_what_pos_says(tmp_path: Path):
     assert {str(s.datestamp) for s in rmc} == {"2026-05-04"}
 
 
-@pytest.mark.parametrize("side", [0.0, 0.8])
-def test_encoder_counts_the_wheels_way(tmp_path: Path, side: float):
+@pytest.mark.parametrize(("side", "reverse"), [(0.0, False), (0.8, False), (0.8, True)])
+def test_encoder_counts_the_wheels_way(tmp_path: Path, side: float, reverse: bool):
     pieces = [{"length_m": 20.0}, {"length_m": math.pi * 30.0, "radius_m": 30.0}, {"length_m": 20.0}]
-    route = {"station_m": 5.0, "offset_m": -30.0, "pieces": pieces}
+    route = {"station_m": 5.0, "offset_m": -30.0, "pieces": pieces, "reverse": reverse}
     scene = Scene.load("calibration_yard").changed(
         passes=[{"route": route}], vehicle={"sway_deg": 0.0, "wander_m": 0.0},
         encoder={"on": True, "scale_error": 0.01, "side_m": side}, sick={"on": False}, camera={"on": False}, **BARE,
@@ -169,8 +175,9 @@ def test_encoder_counts_the_wheels_way(tmp_path: Path, side: float):
     log = pa_csv.read_csv(folder / "raw" / "run-1" / "encoder.csv").to_pandas()
     inside = (log.time_ns >= drive.start_gps_ns) & (log.time_ns <= drive.start_gps_ns + drive.duration_s * NS_PER_S)
     counted = log.ticks[inside].iloc[-1] - log.ticks[inside].iloc[0]
-    # A half turn to the right: the right wheel's way is shorter by π · side.
-    assert counted / 1010.0 == pytest.approx(drive.length_m - math.pi * side, abs=0.3)
+    # Half a turn to the right: the right wheel's way is shorter by π · side; looking backwards it is the outer one.
+    sign = -1.0 if reverse else 1.0
+    assert counted / 1010.0 == pytest.approx(drive.length_m - sign * math.pi * side, abs=0.15)
 
 
 def test_accuracy_file_states_the_errors(tmp_path: Path):
@@ -181,6 +188,71 @@ def test_accuracy_file_states_the_errors(tmp_path: Path):
     assert np.allclose(rows[:, 7], scene.noise.attitude_deg * 60.0)
     assert np.allclose(rows[:, 9], 2 * scene.noise.attitude_deg * 60.0)
     assert np.all(np.diff(rows[:, 0]) == 1.0)
+
+
+STARTS = {
+    "a week ends": "2026-05-09T23:59:42.2Z",
+    "a week begins": "2026-05-10T00:00:05Z",
+    "a day begins": "2026-05-12T00:00:00.1Z",
+    "an hour ends": "2026-05-12T09:59:59.5Z",
+}
+DRIFTING = {"offset_s": -0.9, "drift_ppm": 300.0, "known": True}
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "local"])
+@pytest.mark.parametrize("start", list(STARTS))
+def test_every_log_comes_back_to_its_true_epochs(tmp_path: Path, start: str, crs: str):
+    """Over the ends of weeks, days and hours, with clocks whose errors are known: ingest gives true epochs."""
+    weekly = DRIFTING | {"system": "gps_week_seconds"}
+    scene = Scene.load("demo").changed(
+        start=STARTS[start],
+        map={"crs": crs},
+        length_m=6.0,
+        passes=[{"lane": 2}],
+        road={"lead_m": 100.0},
+        vehicle={"speed_m_per_s": 8.0, "standstill_s": 9.0},
+        profilers={"spacing_m": 0.2, "readings": 20, "clock": weekly, "head_imus": "mems"},
+        lidar={"range_max_m": 8.0, "clock": DRIFTING},
+        imu={"on": True, "clock": weekly},
+        encoder={"on": True, "clock": weekly},
+    )
+    folder = simulate(scene, tmp_path / "s", write_hits=True).folder
+    survey = Survey.load(folder / "SURVEY.toml")
+    store = Store(survey.store_url, survey.config.id)
+    ingest(survey, store)
+    drive = drive_of(scene)
+    first, last = drive.recorded_span_gps_ns
+    true = truth.load(folder)
+    for record in read_log_records(store):
+        if record.run == "survey":
+            continue
+        table = next(t for t in record.tables if t != "rejects")
+        files = [store.path(f.path) for f in record.tables[table]]
+        found = np.sort(pq.ParquetDataset(files).read(["epoch_gps_ns"]).column(0).to_numpy())
+        if record.sensor in ("lidar", "profiler_left", "profiler_right"):
+            expected = np.sort(pq.read_table(true.hits_file("run-1", record.sensor)).column("epoch_gps_ns").to_numpy())
+            assert np.abs(found - expected).max() < 1_500, record.sensor
+        else:
+            assert abs(found[0] - first) < 0.1 * NS_PER_S, record.sensor
+            assert abs(found[-1] - last) < 0.1 * NS_PER_S, record.sensor
+
+
+def test_scenes_that_the_survey_file_could_not_state():
+    with pytest.raises(ConfigError, match="full UTC hour"):
+        Scene.load("demo").changed(lidar={"clock": {"system": "gps"}})
+
+
+def test_noiseless_scenes_have_no_error_left(tmp_path: Path):
+    quiet = Scene.load("urban_street").noiseless()
+    assert quiet.profilers.head_imus == "perfect"
+    assert quiet.lidar.divergence_deg == quiet.sick.divergence_deg == 0.0
+    assert quiet.noiseless() == quiet
+
+
+def test_a_pass_without_a_solution(tmp_path: Path):
+    scene = Scene.load("demo").changed(length_m=10.0, passes=[{"lane": 2}], gnss={"on": True, "rate_hz": 0.1}, **BARE)
+    assert solve(scene, drive_of(scene)).epoch_gps_ns.size <= 1
+    simulate(scene, tmp_path / "s")
 
 
 @pytest.mark.parametrize("system", ["gps", "unix_utc", "unix_gps", "gps_week_seconds", "free"])
@@ -194,15 +266,13 @@ def test_stated_clocks_bring_stamps_back(system: str):
     stamps = clock.stamps_ns(epochs)
     back = Clock(**stated | {"system": TimeSystem(system)}).to_epoch_gps_ns(stamps)
     assert np.abs(back - epochs).max() < 300  # reference_s has 15 digits
-    wrong = Clock(TimeSystem(system), "ns", date=stated.get("date"), offset_s=1e-9).to_epoch_gps_ns(stamps)
+    wrong = Clock(TimeSystem(system), "ns", week=stated.get("week"), offset_s=1e-9).to_epoch_gps_ns(stamps)
     assert (wrong - epochs).min() > 0.3e9
 
 
 def test_a_sensors_clock_shifts_its_stamps_alone(tmp_path: Path):
     profilers = {"spacing_m": 0.5, "readings": 50}
     scene = Scene.load("demo").changed(length_m=10.0, passes=[{"lane": 2}], profilers=profilers, lidar={"on": False})
-    import pyarrow.parquet as pq
-
     right = simulate(scene, tmp_path / "right", write_hits=True).folder
     late = simulate(scene.changed(profilers={"clock": {"offset_s": 2.0}}), tmp_path / "late", write_hits=True).folder
     name = Path("raw/run-1/profiler_left.parquet")

@@ -172,7 +172,10 @@ class Scene(Strict):
         return self.parse(_merged(self.model_dump(), values))
 
     def noiseless(self) -> Self:
-        """The scene without any error but the rounding of the logs: no noise, true mountings stated, right clocks."""
+        """The scene without any error but the rounding of the logs.
+
+        No noise, true mountings stated, right clocks, perfect IMUs, beams without width.
+        """
         values: dict[str, Any] = self.model_dump() | {"noise": Noise()}
         right = {"offset_s": 0.0, "drift_ppm": 0.0}
         for name in ("profilers", "lidar", "sick", "imu", "encoder", "camera"):
@@ -181,7 +184,11 @@ class Scene(Strict):
             mount["error"] = {}
         for name in ("lidar", "sick", "camera"):
             values[name]["mount"]["error"] = {}
+        for name in ("lidar", "sick"):
+            values[name]["divergence_deg"] = 0.0
         values["imu"] |= {"grade": "perfect", "errors": None}
+        if self.profilers.head_imus is not None:
+            values["profilers"]["head_imus"] = "perfect"
         values["gnss"] |= {"sigma_horizontal_m": 0.0, "sigma_vertical_m": 0.0, "float_sigma_m": 0.0}
         values["gnss"] |= {"jumps_per_minute": 0.0, "lever_arm_error_m": (0.0, 0.0, 0.0)}
         values["encoder"]["scale_error"] = 0.0

@@ -115,7 +115,13 @@ class Lidar(Strict):
     mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)
     """Mounting of the head (axes flu); it leans back, so that the road behind is seen."""
     clock: ClockError = ClockError()
-    """Its clock; the packets count microseconds past the hour of UTC."""
+    """Its clock; the packets count microseconds past the hour of UTC, and nothing else."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.clock.system not in {None, TimeSystem.UTC_HOUR}:
+            raise ValueError(f"clock.system '{self.clock.system}', but its packets count from the full UTC hour")
+        return self
 
 
 class Sick(Strict):

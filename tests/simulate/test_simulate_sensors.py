@@ -97,12 +97,14 @@ def test_imu_grades_have_their_errors():
     for grade, noise in (("tactical", 50.0), ("mems", 150.0)):
         one = imu_of(scene.changed(imu={"on": True, "grade": grade}))
         still = np.zeros((40_000, 3))
-        biases = []
+        biases, scales = [], []
         for seed in range(12):
-            rate, force = _SensorErrors(one, np.random.default_rng(seed), np.random.default_rng(100 + seed)).applied(
-                still, still
-            )
+            made = [_SensorErrors(one, np.random.default_rng(seed), np.random.default_rng(99 + seed)) for _ in range(2)]
+            rate, force = made[0].applied(still, still)
+            turning, _ = made[1].applied(still + 1.0, still)
             biases.append(np.degrees(rate.mean(axis=0)) * 3600.0)
+            scales.append((turning - rate).mean(axis=0) - 1.0)
+        assert np.std(scales) == pytest.approx(one.errors.gyro_scale_ppm * 1e-6, rel=0.35)
         density = np.diff(force, axis=0).std() / math.sqrt(2) / math.sqrt(one.rate_hz) / 9.80665e-6
         assert density == pytest.approx(noise, rel=0.05)
         assert np.std(biases) == pytest.approx(one.errors.gyro_bias_deg_per_h, rel=0.35)
@@ -141,6 +143,19 @@ def _ecef(geographic: np.ndarray) -> np.ndarray:
         [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1 - e2) + h) * np.sin(lat)],
         axis=-1,
     )
+
+
+def test_gaps_and_lever_arms_of_one_pass(tmp_path: Path):
+    gap = {"start_s": 0.0, "duration_s": 1.0, "passes": [2]}
+    gnss = {"on": True, "rate_hz": 10.0, "gaps": [gap], "lever_arm_error_m": (0.3, -0.2, 0.1)}
+    scene = Scene.load("demo").changed(length_m=40.0, gnss=gnss, **BARE)
+    sizes = [solve(scene, drive_of(scene, number)).epoch_gps_ns.size for number in (0, 1)]
+    assert sizes[0] - sizes[1] == pytest.approx(10, abs=2)
+    rig = Survey.load(simulate(scene, tmp_path / "s").survey_file).rig
+    true = Rig.load(truth.load(tmp_path / "s").rig_file)
+    stated = np.array(rig.sensors["gnss"].lever_arm_body_m) - true.sensors["gnss"].lever_arm_body_m
+    assert stated == pytest.approx([0.3, -0.2, 0.1])
+    assert true.sensors["gnss"].lever_arm_body_m == pytest.approx(scene.gnss.lever_arm_body_m)
 
 
 def test_nmea_says_what_pos_says(tmp_path: Path):

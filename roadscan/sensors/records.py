@@ -207,8 +207,8 @@ class EpochReader:
 
     def _unrolled(self, stamps: npt.NDArray[np.generic], sieve: Sieve, records: Int64) -> Float64:
         """Seconds of the first stamp's week, growing over a week's end."""
-        seconds = stamps.astype(np.float64) * self._stamp_s
-        with np.errstate(invalid="ignore"):  # a stamp that is not a number is dropped already
+        with np.errstate(invalid="ignore", over="ignore"):  # a stamp that is not a number is dropped already
+            seconds = stamps.astype(np.float64) * self._stamp_s
             impossible = ~((seconds >= 0) & (seconds < 2 * WEEK_S))  # some programs count on past the week's end
         if impossible[sieve.good].all() and sieve.good.any():
             first = seconds[sieve.good][0]

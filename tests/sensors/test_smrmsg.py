@@ -266,3 +266,12 @@ def test_mutants(tmp_path: Path, carried: bool) -> None:
 def test_sniffing_impossible_times(tmp_path: Path, time: float) -> None:
     (tmp_path / "a.out").write_bytes(struct.pack("<20d", *([time] + [0.1] * 9), *([-time] + [0.1] * 9)))
     assert not format_named("smrmsg").sniff(tmp_path / "a.out")
+
+
+def test_a_signalling_nan_costs_its_record_without_a_warning(tmp_path: Path) -> None:
+    data = bytearray(sample())
+    data[160:168] = bytes.fromhex("010000000000f07f")  # arithmetic on it is 'invalid', unlike on a quiet NaN
+    (tmp_path / "a.out").write_bytes(data)
+    log = read_log("smrmsg", tmp_path / "a.out", clock=CLOCK)
+    assert [(r.record, r.reason) for r in log.rejects] == [(2, "time stamp is missing or not a number")]
+    assert seconds(log) == [1000.0, 1001.0, 1003.0, 1004.0, 1005.0]

@@ -256,7 +256,8 @@ def _listed_images(table: _StampTable, source: LogSource) -> Iterator[Item]:
 def _words(block: TextBlock, table: _StampTable) -> list[str]:
     if table.stamps.kind == "text":
         return block.text(table.stamps.column)
-    return [str(value) for value in block.stamps(table.stamps.column).tolist()]
+    values = block.stamps(table.stamps.column).tolist()
+    return [str(int(value) if value == value // 1 else value) for value in values]
 
 
 def _stamped(block: TextBlock, rows: Int64, names: list[str], words: list[str], epochs: Int64) -> _Stamped:

@@ -115,7 +115,7 @@ def _plan(source: LogSource) -> _Plan:
     stamp = stamp_column(options.stamp, layout.names, STAMPS, source.path)
     need_stamp_unit(stamp, clock, source.path)
     kinds: dict[str, Kind] = dict.fromkeys((*MATRIX, *TRANSLATION), "number")
-    kinds[stamp.column] = number_stamp_kind(source.path, layout, stamp.column)
+    kinds[stamp.column] = number_stamp_kind(source.path, layout, stamp.column, clock.unit)
     return _Plan(
         layout=layout,
         stamp=stamp.column,

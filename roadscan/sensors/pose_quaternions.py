@@ -101,7 +101,7 @@ class PoseQuaternions(LogFormat):
         """Stream poses; a record that is no pose is rejected."""
         plan = _plan(source)
         reader = PoseReader(source, plan.clock, plan.placement)
-        for block in plan.table.blocks(plan.columns):
+        for block in plan.table.blocks(plan.columns, plan.clock.unit):
             if isinstance(block, Reject):
                 yield block
                 continue
@@ -181,8 +181,8 @@ class _Table(ABC):
         """True if no column holds words, and numbers without names look like poses."""
 
     @abstractmethod
-    def blocks(self, columns: Mapping[str, str]) -> Iterator[_Block | Reject]:
-        """Stream the columns of stamp, quaternion and translation."""
+    def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
+        """Stream the columns of stamp (in `unit`), quaternion and translation."""
 
 
 class _Text(_Table):
@@ -207,10 +207,10 @@ class _Text(_Table):
             length = np.linalg.norm(values[:, 4:], axis=1)
         return len(lines) > 0 and bool(np.all(np.abs(length - 1) < 1e-3))
 
-    def blocks(self, columns: Mapping[str, str]) -> Iterator[_Block | Reject]:
+    def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
         kinds: dict[str, Kind] = {columns[part]: "number" for part in (*QUATERNION, *TRANSLATION)}
         stamp = columns["stamp"]
-        kinds[stamp] = number_stamp_kind(self._path, self._layout, stamp)
+        kinds[stamp] = number_stamp_kind(self._path, self._layout, stamp, unit)
         for block in text_blocks(self._path, self._layout, kinds):
             if isinstance(block, Reject):
                 yield block
@@ -240,7 +240,7 @@ class _Columnar(_Table):
     def batches(self, names: list[str]) -> Iterator[pa.RecordBatch | Reject]:
         """Stream the columns `names` in batches of some 65,000 rows."""
 
-    def blocks(self, columns: Mapping[str, str]) -> Iterator[_Block | Reject]:
+    def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
         for name in columns.values():
             if not _is_number(self._schema.field(name).type):
                 raise FormatError(

@@ -135,11 +135,12 @@ def _plan(source: LogSource) -> _Plan:
             file=source.path,
         )
     kinds: dict[str, Kind] = dict.fromkeys(names, "number")
-    kinds[STAMP] = number_stamp_kind(source.path, layout, STAMP)
+    clock = source.need_clock('{ system = "unix_utc", unit = "us" }')
+    kinds[STAMP] = number_stamp_kind(source.path, layout, STAMP, clock.unit)
     return _Plan(
         layout=layout,
         kinds=kinds,
-        clock=source.need_clock('{ system = "unix_utc", unit = "us" }'),
+        clock=clock,
         placement=_placement(source, options),
         axes=options.axes or "",
         sensor_from_body=body_quaternion(options.axes, source.path),

@@ -51,7 +51,7 @@ class StampColumn:
         TimeSystemError
             if the clock is not stated, or fits neither the column's unit nor the way times are written.
         """
-        kind = stamp_kind(file, layout, found.column)
+        kind = stamp_kind(file, layout, found.column, "s" if source.clock is None else source.clock.unit)
         if kind != "text":
             clock = source.need_clock('{ system = "gps", unit = "s" }')
             need_stamp_unit(found, clock, file)

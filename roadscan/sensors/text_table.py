@@ -197,11 +197,17 @@ def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[st
     return found
 
 
-def stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
-    """Kind of a column of time stamps, that of most of its first sound values: integer, number or text."""
+def stamp_kind(path: Path, layout: TextLayout, name: str, unit: str) -> Kind:
+    """Kind of a column of time stamps, that of most of its first sound values: number, text or integer.
+
+    Only nanoseconds are read as integers: they alone have more digits than float64 holds. Stamps in another
+    `unit` may be whole at first and decimal later.
+    """
     column = layout.names.index(name)
     words = [fields[column].strip() for fields in first_fields(path, layout, 20)]
     kinds = [_kind_of(word) for word in words if word]
+    if unit != "ns":
+        kinds = ["number" if kind == "integer" else kind for kind in kinds]
     return max(kinds, key=kinds.count, default="number")
 
 
@@ -211,9 +217,9 @@ def _kind_of(word: str) -> Kind:
     return "text" if math.isnan(_number(word)) else "number"
 
 
-def number_stamp_kind(path: Path, layout: TextLayout, name: str) -> Kind:
+def number_stamp_kind(path: Path, layout: TextLayout, name: str, unit: str) -> Kind:
     """As :func:`stamp_kind`, for formats whose stamps are numbers."""
-    kind = stamp_kind(path, layout, name)
+    kind = stamp_kind(path, layout, name, unit)
     if kind == "text":
         raise FormatError(f"time stamps in column '{name}' are text", expected="numbers", file=path)
     return kind

@@ -275,3 +275,32 @@ def test_the_recorded_drive(recordings: Path, tmp_path: Path) -> None:
     assert path_m == pytest.approx(1_011.8, abs=0.1)
     assert np.mean(ways) == pytest.approx(1_002.8, abs=0.2)
     assert path_m / np.mean(ways) == pytest.approx(1.009, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("unit", "whole", "decimals"),
+    [
+        ("s", 1_400_000_000, [(50, "050.0", 50_000_000_000), (900, "900.5", 900_500_000_000)]),
+        ("ms", 1_400_000_000_000, [(50, "050.25", 50_250_000), (900, "900.5", 900_500_000)]),
+        ("us", 1_400_000_000_000_000, [(50, "050.0", 50_000), (900, "900.5", 900_500)]),
+    ],
+)
+def test_stamps_may_be_whole_first_and_decimal_later(
+    tmp_path: Path, unit: str, whole: int, decimals: list[tuple[int, str, int]]
+) -> None:
+    step_ns = {"s": 10**9, "ms": 10**6, "us": 10**3}[unit]
+    lines = [f"{whole + i},{i}" for i in range(30)]
+    lines += [f"{str(whole)[:-3]}{word},{ticks}" for ticks, word, _ in decimals]
+    path = write(tmp_path / "a.csv", f"time_{unit},ticks", *lines)
+    clock = Clock(TimeSystem.GPS, unit=unit)
+    log = read_log("encoder_csv", path, TOTAL, clock=clock, sensor=ENCODER)
+    assert log.rejects == []
+    expected = [(whole + i) * step_ns for i in range(30)] + [whole * step_ns + after for *_, after in decimals]
+    assert log.epochs.tolist() == expected
+
+
+def test_whole_nanoseconds_stay_exact(tmp_path: Path) -> None:
+    stamps = [1_400_000_000_123_456_789 + 1_000_000_001 * i for i in range(5)]  # beyond the digits of a float64
+    path = write(tmp_path / "a.csv", "time_ns,ticks", *(f"{stamp},{i}" for i, stamp in enumerate(stamps)))
+    log = read_log("encoder_csv", path, TOTAL, clock=Clock(TimeSystem.GPS, unit="ns"), sensor=ENCODER)
+    assert log.epochs.tolist() == stamps

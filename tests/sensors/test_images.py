@@ -83,6 +83,15 @@ def test_a_folder_with_a_table(tmp_path: Path) -> None:
     assert [p.name for p in format_named("images").files(path)] == [*(f"img_{i}.jpg" for i in range(4)), "stamps.csv"]
 
 
+def test_whole_and_decimal_stamps_in_one_table(tmp_path: Path) -> None:
+    path = folder_of(tmp_path / "cam")
+    table(path / "stamps.csv", *(f"img_{i}.jpg,{T0 + i}{'.5' if i == 3 else ''}" for i in range(4)))
+    log = read_log("images", path, **STATED)
+    assert log.rejects == []
+    assert log.epochs.tolist() == [T0 * S, (T0 + 1) * S, (T0 + 2) * S, (T0 + 3) * S + S // 2]
+    assert log.column("stamp").tolist() == [str(T0), str(T0 + 1), str(T0 + 2), f"{T0 + 3}.5"]
+
+
 def test_a_table_beside_the_folder(tmp_path: Path) -> None:
     path = folder_of(tmp_path / "cam" / "left", 2, ".png")
     beside = table(

@@ -159,7 +159,7 @@ WORDS = st.one_of(st.floats().map(repr), st.text("0123456789.,-+eExn_\"'# \r\x00
 @given(rows=st.lists(st.lists(WORDS, min_size=1, max_size=4), max_size=8), end=st.sampled_from(["\n", "\r\n", ""]))
 def test_a_line_of_text_is_read_or_rejected_on_its_own(rows: list[list[str]], end: str) -> None:
     """Lines in one file, and each in a file of its own: the same values, the same rejects."""
-    lines = [",".join(row) for row in rows]
+    lines = [",".join(row).rstrip("\r") for row in rows]  # at its end, a return is part of the line feed
     with folder() as place:
         together = _lines_of(place / "a.csv", lines, end)
         apart = [found for line in lines for found in _lines_of(place / "b.csv", [line], end)]

@@ -24,7 +24,7 @@ from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import ConfigError, FormatError
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
 from roadscan.sensors.las_crs import UNIT_M, LengthUnit
-from roadscan.sensors.ply_file import Element, PlyHeader, Vertices, read_header, vertices
+from roadscan.sensors.ply_file import TYPE_NAMES, Element, PlyHeader, Vertices, read_header, vertices
 from roadscan.sensors.records import Sieve, UnorderedStamps, options_of
 from roadscan.sensors.reference_scan import (
     Brightness,
@@ -77,6 +77,8 @@ class Ply(LogFormat):
     )
     options: ClassVar[type[PlyOptions]] = PlyOptions
     provisional: ClassVar[tuple[Provisional, ...]] = (
+        Provisional(crs=LOCAL_WORLD, options={"unit": "metre"}),
+        Provisional(crs=LOCAL_WORLD, options={"unit": "metre", "epoch": "1980-01-06T00:00:00Z"}),
         Provisional(crs=LOCAL_WORLD, options={"unit": "metre", "epoch": "1980-01-06T00:00:00Z", "intensity": False}),
     )
 
@@ -118,6 +120,7 @@ class Ply(LogFormat):
             if plan.epoch_gps_ns is None and times is None:
                 times = _times(source, item.columns[plan.taken["time"]])
             sieve = Sieve(item.records.size)
+            _drop_outside_types(item, plan.vertex, sieve)
             columns = _columns(item, plan, times, sieve)
             yield from cloud_items(columns, sieve, item.records, item.offsets, plan.record_bytes)
 
@@ -216,6 +219,16 @@ def _times(source: LogSource, stamps: npt.NDArray[Any]) -> UnorderedStamps:
     clock = source.need_clock('{ system = "gps_adjusted" }')
     own = stamps.astype(np.float64)
     return UnorderedStamps.of(clock, own[np.isfinite(own)], source.path)
+
+
+def _drop_outside_types(points: Vertices, vertex: Element, sieve: Sieve) -> None:
+    """Drop points with a number, written as text, that the property's declared integer type cannot hold."""
+    types = {p.name: p.type for p in vertex.properties}
+    for name, values in points.columns.items():
+        if types[name][0] != "f" and values.dtype.kind == "f":
+            limits = np.iinfo(types[name])
+            fits = (values >= limits.min) & (values <= limits.max)  # False with a NaN
+            sieve.drop(~fits, f"{name} is outside {TYPE_NAMES[types[name]]}")
 
 
 def _columns(points: Vertices, plan: _Plan, times: UnorderedStamps | None, sieve: Sieve) -> Columns:

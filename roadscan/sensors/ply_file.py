@@ -37,6 +37,8 @@ _TYPES: Final = {
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
 """NumPy type by PLY's name, without the byte order."""
+TYPE_NAMES: Final = {kind: name for name, kind in reversed(_TYPES.items())}
+"""PLY's name by NumPy type, such as uchar for u1."""
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,22 @@ def test_scales_of_intensity_and_colour(tmp_path: Path) -> None:
     assert log.attributes["left_out"] == ["red"]
 
 
+@pytest.mark.parametrize("lists", [False, True])
+def test_text_that_the_declared_type_cannot_hold(tmp_path: Path, lists: bool) -> None:
+    lines = ["element vertex 6", *XYZ, "property uchar intensity", "property short classification"]
+    lines += ["property list uchar uchar extra"] if lists else []
+    words = [("255", "2"), ("300", "2"), ("-1", "2"), ("0", "70000"), ("nan", "2"), ("7", "3")]
+    rows = "".join(f"0 0 {k} {i} {c}{' 0' if lists else ''}\n" for k, (i, c) in enumerate(words))
+    log = read("ply", written(tmp_path, head("ascii", *lines) + rows.encode()), NOON, crs="local")
+    assert log["intensity"].tolist() == [65_535, 7 * 257]
+    assert log["z_m"].tolist() == [0, 5]
+    assert [(r.reason, r.record, r.records) for r in log.rejects] == [
+        ("intensity is outside uchar", 1, 2),
+        ("intensity is outside uchar", 4, 1),
+        ("classification is outside short", 3, 1),
+    ]
+
+
 @pytest.mark.parametrize("coding", CODINGS)
 def test_the_twin_of_a_las_file(tmp_path: Path, recordings: Path, coding: str) -> None:
     las = tmp_path / "strips.las"
@@ -227,7 +243,7 @@ def test_a_damaged_record_costs_itself(tmp_path: Path) -> None:
     assert len(log) == 8
     lines[5] = b"5 0 0 300"
     log = read("ply", written(tmp_path, top + b"\n".join(lines)), NOON, crs="local")
-    assert [(r.record, r.reason) for r in log.rejects] == [(5, "classification is no whole number from 0 to 255")]
+    assert [(r.record, r.reason) for r in log.rejects] == [(5, "classification is outside uchar")]
 
 
 def test_claims_are_held_against_the_file(tmp_path: Path) -> None:

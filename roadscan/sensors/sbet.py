@@ -53,7 +53,8 @@ class SbetOptions(Strict):
 
     accuracy: Path | None = None
     """SMRMSG file of the same mission, relative to the log's folder: its σ of position and attitude are
-    carried with the poses, linear in time; poses beyond its span have none."""
+    carried with the poses, linear in time; poses beyond its span have none, and none in a gap: between records
+    more than 2.5 usual intervals apart (the median of the first 1,000 records)."""
 
 
 class Sbet(LogFormat):

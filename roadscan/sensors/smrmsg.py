@@ -20,6 +20,7 @@ from roadscan.sensors.text_table import byte_pieces, head_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
 FIELDS: Final = 10
 RECORD_BYTES: Final = 8 * FIELDS
@@ -40,6 +41,11 @@ SIGMAS: Final = {
 become degrees."""
 CARRIED: Final = tuple(name for name in SIGMAS if "velocity" not in name)
 """Those that a pose has a column for."""
+
+GAP_INTERVALS: Final = 2.5
+"""Between records more than so many usual intervals apart σ is not known: one lost record is bridged, two are not."""
+USUAL_RECORDS: Final = 1_000
+"""The usual interval is the median one of so many first records."""
 
 _LIMITS: Final = np.array([SIGMA_MAX_M] * 6 + [SIGMA_MAX_DEG * 60] * 3)
 
@@ -156,7 +162,9 @@ class CarriedAccuracy:
     """The σ of an SMRMSG file at the epochs of the poses it belongs to.
 
     Both files are read side by side, in order of time: only the records about the poses at hand are
-    held. Between two records σ is linear in time; beyond the file's span there is none.
+    held. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
+    where two records are more than 2.5 usual intervals apart (:data:`GAP_INTERVALS`; the usual interval is the
+    median of the file's first 1,000).
 
     Parameters
     ----------
@@ -175,18 +183,22 @@ class CarriedAccuracy:
         self._rejects: list[Reject] = []
         self._epochs = np.empty(0, dtype=np.int64)
         self._sigmas = np.empty((len(SIGMAS), 0))
+        self._gap_ns: float | None = None
         self._asked = self._answered = 0
 
     def at(self, epochs: Int64) -> dict[str, Float64]:
-        """σ by column name (:data:`CARRIED`), (n,) with NaN beyond the file's span, at GPS epochs (n,)."""
+        """σ by column name (:data:`CARRIED`), (n,) with NaN beyond the file's span and in its gaps, at epochs (n,)."""
+        if self._gap_ns is None:
+            self._gap_ns = self._measured_gap_ns()
         self._advance(int(epochs.min()), int(epochs.max()))
+        unknown = self._in_gap(epochs, self._gap_ns)
         origin = self._epochs[0] if self._epochs.size else 0
         known, wanted = (self._epochs - origin).astype(np.float64), (epochs - origin).astype(np.float64)
         out: dict[str, Float64] = {}
         for name, sigma in zip(SIGMAS, self._sigmas, strict=True):
             if name in CARRIED:
                 out[name] = (
-                    np.interp(wanted, known, sigma, left=np.nan, right=np.nan)
+                    np.where(unknown, np.nan, np.interp(wanted, known, sigma, left=np.nan, right=np.nan))
                     if known.size
                     else np.full(epochs.size, np.nan)
                 )
@@ -232,13 +244,32 @@ class CarriedAccuracy:
     def _advance(self, first: int, last: int) -> None:
         """Hold the records about the span of epochs, with one on either side."""
         while (not self._epochs.size or self._epochs[-1] < last) and (block := self._next()) is not None:
-            self._epochs = np.concatenate([self._epochs, block.epochs])
-            self._sigmas = np.concatenate([self._sigmas, block.sigmas], axis=1)
-            if np.any(np.diff(self._epochs) < 0):
-                order = np.argsort(self._epochs, kind="stable")
-                self._epochs, self._sigmas = self._epochs[order], self._sigmas[:, order]
+            self._hold(block)
             self._forget(first)
         self._forget(first)
+
+    def _hold(self, block: AccuracyBlock) -> None:
+        self._epochs = np.concatenate([self._epochs, block.epochs])
+        self._sigmas = np.concatenate([self._sigmas, block.sigmas], axis=1)
+        if np.any(np.diff(self._epochs) < 0):
+            order = np.argsort(self._epochs, kind="stable")
+            self._epochs, self._sigmas = self._epochs[order], self._sigmas[:, order]
+
+    def _measured_gap_ns(self) -> float:
+        """Time between two records from which on they have a gap between them, from the file's first records."""
+        while self._epochs.size < USUAL_RECORDS and (block := self._next()) is not None:
+            self._hold(block)
+        intervals = np.diff(self._epochs[:USUAL_RECORDS])
+        intervals = intervals[intervals > 0]
+        return GAP_INTERVALS * float(np.median(intervals)) if intervals.size else np.inf
+
+    def _in_gap(self, epochs: Int64, gap_ns: float) -> Bool:
+        """Epochs (n,) that lie in a gap, and on no record."""
+        if self._epochs.size < 2:
+            return np.zeros(epochs.size, dtype=bool)
+        behind = np.clip(np.searchsorted(self._epochs, epochs), 1, self._epochs.size - 1)
+        after, before = self._epochs[behind], self._epochs[behind - 1]
+        return np.asarray((after - before > gap_ns) & (epochs != after) & (epochs != before))
 
     def _forget(self, first: int) -> None:
         """Let go of the records long before `first`; poses may be a little out of order."""

@@ -205,7 +205,7 @@ def test_either_file_may_start_in_the_other_week(tmp_path: Path, start: float) -
 def test_many_blocks_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interpolation does not depend on how either file is cut into blocks."""
     rng = np.random.default_rng(2)
-    known = np.sort(rng.uniform(1000, 1100, 300))
+    known = 1000 + (np.arange(300) + rng.uniform(-0.2, 0.2, 300)) / 3
     sigma = rng.uniform(0.01, 0.1, 300)
     write(tmp_path / "acc.out", [record(t, east=s) for t, s in zip(known, sigma, strict=True)])
     times = np.sort(rng.uniform(990, 1110, 2000))
@@ -215,6 +215,21 @@ def test_many_blocks_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     log = sbet_with(poses, "acc.out")
     expected = np.interp(times, known, sigma, left=np.nan, right=np.nan)
     np.testing.assert_allclose(log.table.column("sigma_east_m").to_numpy(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("block", [1 << 20, 200])
+def test_no_sigma_is_made_up_in_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    """One record that is lost is bridged; two or more are not, and poses on the records about the gap keep theirs."""
+    monkeypatch.setattr(text_table, "BLOCK_BYTES", block)
+    times = [95.0, 96.0, 98.0, 99.0, 200.0, 201.0, 204.0, 205.0]
+    write(tmp_path / "acc.out", [record(t, north=0.001 * t) for t in times])
+    poses = [97.0, 98.5, 99.0, 99.01, 150.0, 199.99, 200.0, 200.5, 201.0, 202.5, 204.0, 204.5, 206.0]
+    log = sbet_with(sbet(tmp_path / "a.sbet", poses), "acc.out")
+    unknown = {99.01, 150.0, 199.99, 202.5, 206.0}
+    assert log.table.column("sigma_north_m").to_pylist() == [
+        None if t in unknown else pytest.approx(0.001 * t, rel=1e-6) for t in poses
+    ]
+    assert log.table.column("sigma_heading_deg").null_count == len(unknown)
 
 
 def test_damaged_accuracy_records_are_listed_with_their_file(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -43,9 +43,15 @@ class Pattern:
     """Width of the rays; 0: none."""
     limits_m: tuple[float, float]
     """Nearest and farthest range."""
+    beside: Int64 | None = None
+    """(m, 4) the group's ray that comes next on each side: after and before along the scan, above and below across it;
+    −1, or no array: not known. Sub-rays are cast where neighbours meet different things, and where they are not known.
+    """
+    steps: tuple[int, int] = (1, 1)
+    """Rays on each side, along and across the scan, that half the width reaches to; see :func:`steps_within`."""
 
     def fan(self) -> tuple[Float64, Float64]:
-        """Angles (s, 2) of the sub-rays (rad) and their shares of the energy (s,)."""
+        """Tangents (s, 2) of the sub-rays' angles and their shares of the energy (s,): the middle, then each side."""
         if self.divergence_deg == 0.0:
             return np.zeros((1, 2)), np.ones(1)
         half = math.tan(math.radians(self.divergence_deg / 2))
@@ -67,6 +73,17 @@ class Hits:
     """(g, m) 0: the road, −1: nothing."""
     is_mixed: npt.NDArray[np.bool_]
     """(g, m) True where the range is a mixture: the point then lies in the ray's middle, and on nothing."""
+
+    def of_groups(self, groups: int) -> Self:
+        """The same rays in another number of groups."""
+        shape = (groups, -1)
+        return type(self)(
+            self.range_m.reshape(shape),
+            self.enh_m.reshape(*shape, 3),
+            self.intensity.reshape(shape),
+            self.object_id.reshape(shape),
+            self.is_mixed.reshape(shape),
+        )
 
 
 class World:
@@ -124,6 +141,7 @@ class World:
         slots_from = drive.start_gps_ns + first_slot * SLOT_NS
         centre = local.bases[:2, 0]
         fan, weight = pattern.fan()
+        beside = np.full((count, 4), -1) if pattern.beside is None else pattern.beside
         found = kernels.Found(
             np.empty((groups, count, 5)), np.empty((groups, count), np.int32), np.empty((groups, count), np.bool_)
         )
@@ -143,16 +161,22 @@ class World:
                 pattern.origin_m,
                 pattern.interval,
                 pattern.share,
+                beside,
+                np.array(pattern.steps),
                 fan,
                 weight,
                 np.array(pattern.limits_m),
                 np.uint64(key),
             ),
             found,
-            np.empty((3, 3)),
-            np.empty((1, BODY_COLUMNS)),
-            np.empty(kernels.STATE_SIZE),
-            np.empty((weight.size, 5)),
+            kernels.Scratch(
+                np.empty((3, 3)),
+                np.empty((1, BODY_COLUMNS)),
+                np.empty(kernels.STATE_SIZE),
+                np.empty((2, 3)),
+                np.empty((weight.size, 5)),
+                np.empty((count, 5)),
+            ),
         )
         place = found.place
         return Hits(
@@ -190,6 +214,11 @@ class World:
             np.concatenate([np.zeros(0, np.int32), *owners]),
             slot_s,
         )
+
+
+def steps_within(divergence_deg: float, step_deg: float) -> int:
+    """Steps from ray to ray after which half of a ray's width has been passed."""
+    return 1 + math.floor(0.5 * divergence_deg / step_deg)
 
 
 def ray_key(scene: Scene, drive: Drive, sensor: str) -> int:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.simulate.caster import Hits, Pattern, World, ray_key
+from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.noise import stream
 from roadscan.simulate.pcap import PcapWriter
@@ -33,12 +33,14 @@ CYCLE_NS: Final = 46_080
 PACKET_NS: Final = CYCLES * CYCLE_NS
 INTERVALS: Final = 4
 """Within a quarter of a packet the sensor moves evenly."""
+GROUP_PACKETS: Final = 8
+"""Packets whose firings know one another as neighbours. A pass has whole groups of them."""
 _INTERVAL_NS: Final = PACKET_NS // INTERVALS
 RANGE_STEP_M: Final = 0.002
 RANGE_MIN_M: Final = 0.9
 _LONGEST_RAW: Final = 65_535
 BLOCK_PACKETS: Final = 128
-"""Packets measured at once: the noise is drawn by the block, so this changes bytes."""
+"""Packets measured at once, whole groups: the noise is drawn by the block, so this changes bytes."""
 BODY_FROM_AXES: Final = np.diag([1.0, -1.0, -1.0])
 """Axes flu: x forward, y left, z up."""
 REFLECTIVITY: Final = 0.35
@@ -117,7 +119,7 @@ def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Packets]:
     """Packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
     first = starts_gps_ns(drive)
     span = drive.duration_s + RUN_UP_S
-    count = math.ceil(span * 1e9 / PACKET_NS)
+    count = GROUP_PACKETS * math.ceil(span * 1e9 / (GROUP_PACKETS * PACKET_NS))
     start_deg = float(stream(scene.seed, drive.number, "lidar head").integers(0, 36_000)) / 100.0
     key = ray_key(scene, drive, "lidar")
     for block, packet in enumerate(range(0, count, BLOCK_PACKETS)):
@@ -141,31 +143,55 @@ def _measure_block(
     flat = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), azimuth.shape)
     direction = np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], axis=-1)
-    found = world.cast(
+    intervals = _INTERVAL_NS * (np.arange(GROUP_PACKETS * INTERVALS)[:, None] + np.arange(2))
+    groups = world.cast(
         drive,
         scene.lidar.mount,
         BODY_FROM_AXES,
-        epochs[:, None, None] + _INTERVAL_NS * (np.arange(INTERVALS)[:, None] + np.arange(2)),
-        direction.reshape(epochs.size, CYCLES * LASERS, 3),
+        epochs[::GROUP_PACKETS, None, None] + intervals,
+        direction.reshape(epochs.size // GROUP_PACKETS, -1, 3),
         _pattern(scene, beams),
         key,
     )
+    found = groups.of_groups(epochs.size)
     ranges, intensity = _recorded(scene, drive, block, found)
     return Packets(epochs, stated, azimuth_deg, found, ranges, intensity)
 
 
 def _pattern(scene: Scene, beams: Beams) -> Pattern:
-    """The firings of a packet."""
-    origin = np.zeros((CYCLES, LASERS, 3))
+    """The firings of a group of packets."""
+    cycles = GROUP_PACKETS * CYCLES
+    origin = np.zeros((cycles, LASERS, 3))
     origin[:, :, 2] = beams.rise_m
-    past_ns = (CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)).ravel()
+    past_ns = (CYCLE_NS * np.arange(cycles)[:, None] + FIRING_NS * np.arange(LASERS)).ravel()
     return Pattern(
         origin.reshape(-1, 3),
         past_ns // _INTERVAL_NS,
         past_ns % _INTERVAL_NS / _INTERVAL_NS,
         scene.lidar.divergence_deg,
         (RANGE_MIN_M, scene.lidar.range_max_m),
+        _beside(beams, cycles),
+        (
+            steps_within(scene.lidar.divergence_deg, _degrees_a_cycle(scene)),
+            steps_within(scene.lidar.divergence_deg, 4.0 / 3.0),
+        ),
     )
+
+
+def _degrees_a_cycle(scene: Scene) -> float:
+    """How far the head turns from cycle to cycle."""
+    return scene.lidar.turns_per_s * 360.0 * CYCLE_NS * 1e-9
+
+
+def _beside(beams: Beams, cycles: int) -> Int64:
+    """Neighbours (32 · cycles, 4) of each firing: its laser one cycle later and earlier, the lasers above and below."""
+    number = np.full((cycles + 2, LASERS + 2), -1)
+    order = np.argsort(beams.elevation_deg)
+    number[1:-1, 1:-1] = np.arange(cycles * LASERS).reshape(cycles, LASERS)[:, order]
+    sides = np.stack([number[2:, 1:-1], number[:-2, 1:-1], number[1:-1, 2:], number[1:-1, :-2]], axis=-1)
+    beside = np.empty_like(sides)
+    beside[:, order] = sides
+    return beside.reshape(-1, 4)
 
 
 def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:

@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.simulate.caster import Hits, Pattern, World, ray_key
+from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.noise import stream
@@ -105,7 +105,16 @@ class Scanner:
             self.past_ns / _PIECE_NS - piece,
             self.settings.divergence_deg,
             (RANGE_MIN_M, self.settings.range_max_m),
+            self.beside(),
+            (steps_within(self.settings.divergence_deg, self.settings.resolution_deg * self.turns), 1),
         )
+
+    def beside(self) -> Int64:
+        """Neighbours (n, 4) of each reading: the next and the last one of the same turn; none across the scan."""
+        number = np.arange(self.readings)
+        after, before = number + self.turns, number - self.turns
+        after[after >= self.readings] = -1
+        return np.stack([after, np.maximum(before, -1), np.full_like(number, -1), np.full_like(number, -1)], axis=-1)
 
     def options(self) -> str:
         """The log's ``options = …`` in the survey file."""

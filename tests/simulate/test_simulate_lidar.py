@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import struct
 import tomllib
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -180,7 +181,7 @@ def test_packets_cross_objects_and_edges(tmp_path: Path):
     wide = true_hits(simulate(quiet.changed(lidar={"divergence_deg": 0.2}), tmp_path / "wide", write_hits=True))
     assert set(thin["object_id"]) == {0, 1}
     assert not thin["is_mixed"].any()
-    assert 0.0 < wide["is_mixed"].mean() < 0.5
+    assert 0.0 < wide["is_mixed"].mean() < 0.02
     true_ranges = dict(zip(zip(thin["epoch_gps_ns"], thin["laser"], strict=True), thin["range_m"], strict=True))
     plain = ~wide["is_mixed"]
     firings = zip(wide["epoch_gps_ns"][plain], wide["laser"][plain], strict=True)
@@ -190,6 +191,39 @@ def test_packets_cross_objects_and_edges(tmp_path: Path):
     on_box = thin["object_id"] == 1
     assert on_box.sum() > 300
     assert thin["height_m"][on_box].max() <= table["height_m"][0] + 1.0 + 1e-6
+
+
+def test_wide_beams_mix_beside_edges_only():
+    """A mixed firing has another object, or nothing, beside it; and what is not mixed is what thin beams meet."""
+    side = {
+        "boxes": [{"station_m": 3.0, "offset_m": -1.0, "length_m": 1.0, "width_m": 1.0, "height_m": 1.0}],
+        "facades": [{"offset_m": 7.0, "start_m": -10.0, "end_m": 20.0}],
+    }
+    quiet = SCENE.noiseless().changed(length_m=3.0, roadside=side)
+    surface = Surface(quiet)
+    world = World(quiet, surface)
+    drive = Drive(quiet, 0, Earth(quiet.map.crs), Surface(quiet, ride=True))
+
+    def found(divergence_deg: float) -> tuple[np.ndarray, ...]:
+        scene = quiet.changed(lidar={"divergence_deg": divergence_deg})
+        hits = [block.found for block in islice(measure(scene, world, drive), 6)]
+        ranges, ids, is_mixed = (
+            np.concatenate([getattr(h, n) for h in hits]) for n in ("range_m", "object_id", "is_mixed")
+        )
+        return ranges, np.where(np.isnan(ranges), -1, ids), is_mixed
+
+    thin, wide = found(0.0), found(0.15)
+    assert not thin[2].any()
+    is_mixed = wide[2]
+    for before, now in zip(thin[:2], wide[:2], strict=True):
+        np.testing.assert_array_equal(now[~is_mixed], before[~is_mixed])
+    assert 0.001 < is_mixed[np.isfinite(wide[0])].mean() < 0.03
+    order = np.argsort(hdl32e_beams().elevation_deg)
+    grid = thin[1].reshape(-1, 32)[:, order]
+    padded = np.pad(grid, 1, constant_values=-2)
+    around = [padded[2:, 1:-1], padded[:-2, 1:-1], padded[1:-1, 2:], padded[1:-1, :-2]]
+    at_edge = np.any([grid != one for one in around], axis=0)
+    assert at_edge[is_mixed.reshape(-1, 32)[:, order]].all()
 
 
 def test_packets_by_hand(on_grid: SimulatedSurvey):

@@ -53,11 +53,14 @@ def place(station: float, offset: float) -> np.ndarray:
     return station * AHEAD + offset * RIGHT
 
 
-def cast(world: World, at, direction: np.ndarray, *, time_s=0.0, key=1, reach=80.0, wide_deg=0.0) -> Hits:
+def cast(
+    world: World, at, direction: np.ndarray, *, time_s=0.0, key=1, reach=80.0, wide_deg=0.0, beside=None, steps=1
+) -> Hits:
     """Rays (n, 3) from a tripod, all at one time."""
     tripod = Tripod(tuple(at))
     n = len(direction)
-    pattern = Pattern(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n), wide_deg, (0.0, reach))
+    limits = (0.0, reach)
+    pattern = Pattern(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n), wide_deg, limits, beside, (steps, 1))
     begin = tripod.start_gps_ns + round(time_s * 1e9)
     interval = np.array([[[begin, begin + 1_000]]])
     found = world.cast(tripod, HERE, np.eye(3), interval, np.ascontiguousarray(direction[None]), pattern, key)
@@ -412,12 +415,12 @@ def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch):
         return tuple(np.concatenate(column)[:600] for column in zip(*blocks, strict=True))
 
     first = whole()
-    monkeypatch.setattr("roadscan.simulate.lidar.BLOCK_PACKETS", 37)
+    monkeypatch.setattr("roadscan.simulate.lidar.BLOCK_PACKETS", 40)
     for a, b in zip(first, whole(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert first[1].max() > len(world.objects)  # the moving car was seen
     assert first[2].any()
-    assert SLOT_NS > 37 * 552_960  # so the slots of time are not the blocks
+    assert SLOT_NS > 40 * 552_960  # so the slots of time are not the blocks
 
 
 def test_wide_beams_mix_at_edges():
@@ -445,6 +448,53 @@ def test_wide_beams_mix_at_edges():
             # The stronger group alone: never anything in the air between box and wall.
             ahead = wide.enh_m[:, :2] @ AHEAD
             assert ((np.abs(ahead - 9.75) < 0.03) | (np.abs(ahead - 9.75 - gap_m) < 0.03)).all()
+
+
+@pytest.mark.parametrize(("step_deg", "steps"), [(0.3, 1), (0.02, 11)])
+def test_neighbours_tell_where_edges_are(step_deg: float, steps: int):
+    """Rays that know their neighbours look for edges less often, and find the same ones."""
+    boxes = [
+        {"station_m": 10.0, "offset_m": -1.0, "length_m": 0.5, "width_m": 1.0, "height_m": 1.5},
+        {"station_m": 11.0, "offset_m": 0.0, "length_m": 0.5, "width_m": 9.0, "height_m": 4.0},
+    ]
+    poles = [{"station_m": 9.5, "offset_m": 1.5, "height_m": 3.0, "diameter_m": 0.3}]
+    world = world_of(flat(boxes=boxes, poles=poles))
+    angle = AZIMUTH + np.radians(np.arange(-40.0, 40.0, step_deg))
+    way = np.column_stack([np.sin(angle), np.cos(angle), np.zeros(angle.size)])
+    number = np.arange(angle.size)
+    after = np.where(number + 1 < angle.size, number + 1, -1)
+    sides = np.column_stack([after, number - 1, np.full((angle.size, 2), -1)])
+    at = (*place(0.0, 0.0), 1.0)
+    blind = cast(world, at, way, wide_deg=0.4)
+    known = cast(world, at, way, wide_deg=0.4, beside=sides, steps=steps)
+    np.testing.assert_array_equal(known.is_mixed, blind.is_mixed)
+    np.testing.assert_array_equal(known.object_id, blind.object_id)
+    np.testing.assert_allclose(known.range_m, blind.range_m, rtol=1e-14)  # sums in another order
+    assert 1 <= known.is_mixed.sum() < 0.5 * angle.size
+    if steps > 1:  # fine enough to see each edge: none is farther than half of the width from a mixed ray
+        thin = cast(world, at, way)
+        is_edge = (np.diff(thin.object_id) != 0) | (np.abs(np.diff(thin.range_m)) > 0.05)
+        away = np.abs(np.flatnonzero(known.is_mixed)[:, None] - np.flatnonzero(is_edge) - 0.5).min(axis=1)
+        assert away.max() <= steps
+        assert known.is_mixed.mean() < 0.06
+
+
+def test_long_spots_on_smooth_ground_mix_nothing():
+    """At a low angle a beam lights metres of ground at a time: one surface still, and the middle tells the range."""
+    world = world_of(flat())
+    at = (*place(0.0, 0.0), 2.0)
+    down = np.radians(np.linspace(2.5, 12.0, 400))
+    way = np.column_stack([np.cos(down)[:, None] * AHEAD, -np.sin(down)])
+    thin, wide = cast(world, at, way), cast(world, at, way, wide_deg=0.4)
+    near, far = 2.0 / np.sin(down[0] + np.radians(0.2)), 2.0 / np.sin(down[0] - np.radians(0.2))
+    assert far - near > 5.0
+    assert not wide.is_mixed.any()
+    assert (wide.object_id == 0).all()
+    np.testing.assert_array_equal(wide.range_m, thin.range_m)
+    # With a box on it there are two surfaces.
+    box = {"station_m": 25.0, "offset_m": 0.0, "length_m": 0.5, "width_m": 3.0, "height_m": 0.5}
+    wide = cast(world_of(flat(boxes=[box])), at, way, wide_deg=0.4)
+    assert 0 < wide.is_mixed.sum() < 40
 
 
 def test_objects_stand_on_the_true_surface():

@@ -44,6 +44,9 @@ STATE_SIZE = 6
 
 MIXED_WITHIN_M = 0.15
 """Sub-rays that meet things nearer to one another than this see one and the same (m)."""
+BENT_SHARE = 0.5
+"""Ranges across a beam, and from ray to ray, leave a plane by less than this share of their change where they lie on
+one smooth surface: at a low angle they change fast, and small bumps move them far."""
 PULSE_M = 1.5
 """Echoes nearer to one another than this merge into one: half the length of a pulse of 10 ns (m)."""
 
@@ -98,8 +101,14 @@ class Rays(NamedTuple):
     """(m,) interval of poses within the group: group g has the intervals g · n … g · n + n − 1."""
     share: Float64
     """(m,) time within the interval, as a share of its length."""
+    beside: Int64
+    """(m, 4) the group's ray that comes next on each side: after and before along the scan, above and below across it;
+    −1: not known. Each is the neighbour of its neighbour."""
+    steps: Int64
+    """(2,) rays to look at on a side, along and across the scan, for edges within the width."""
     fan_rad: Float64
-    """(s, 2) angles of the sub-rays from the ray, to two sides; (1, 2) zeros for rays without width."""
+    """(5, 2) tangents of the sub-rays' angles from the ray, along and across the scan: the ray's middle, then towards
+    the sides in the order of `beside`; (1, 2) zeros for rays without width."""
     weight: Float64
     """(s,) energy of each sub-ray."""
     limits_m: Float64
@@ -117,6 +126,23 @@ class Found(NamedTuple):
     """(g, m) 0: the road, −1: nothing."""
     is_mixed: Flags
     """(g, m) the range is a mixture of several things', or another's than that in the ray's middle."""
+
+
+class Scratch(NamedTuple):
+    """Room for the work on rays; what is written here counts for one ray, and `centres` for one group."""
+
+    beam: Float64
+    """(3, 3) easting, northing and height by range."""
+    body: Float64
+    """(1, 18) a moving body at the time of a ray."""
+    state: Float64
+    """(6,) see :func:`cast`."""
+    axes: Float64
+    """(2, 3) see :func:`lay_axes`."""
+    echoes: Float64
+    """(s, 5) what the sub-rays of one ray met, see :func:`note_echo`; column 4: whether it was cast, then its group."""
+    centres: Float64
+    """(m, 5) the same of the middles of a group's rays."""
 
 
 # --- frames ------------------------------------------------------------------------------------------
@@ -374,40 +400,220 @@ def meet_ground(
 
 @compiled
 def cast_rays(
-    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, found: Found, beam: Float64, body: Float64,
-    state: Float64, echoes: Float64,
-) -> None:  # fmt: skip
-    """Cast all rays.
+    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, found: Found, scratch: Scratch
+) -> None:
+    """Cast all rays: the middles of a group's rays first, then sub-rays where an edge may lie within a ray's width.
 
     Parameters
     ----------
     bases : (3, 10), see :func:`bend`.
     found : out.
-    beam, body, state, echoes : (3, 3), (1, 18), (6,), (s, 5) scratch.
     """
     groups, count = rays.direction.shape[0], rays.direction.shape[1]
-    intervals = poses.begin_m.shape[0] // groups
-    reach = rays.limits_m[1]
+    centres, echoes = scratch.centres, scratch.echoes
     for g in range(groups):
         for i in range(count):
-            p = g * intervals + rays.interval[i]
-            share = rays.share[i]
-            time_s = poses.time_s[p, 0] + share * (poses.time_s[p, 1] - poses.time_s[p, 0])
-            x, y, z = rays.direction[g, i, 0], rays.direction[g, i, 1], rays.direction[g, i, 2]
-            number = np.uint64(g * count + i)
-            # Two directions at right angles to the ray and to one another, by the axis that it is farthest from.
-            ux, uy, uz = (-y, x, 0.0) if abs(z) < 0.7 else (0.0, -z, y)
-            norm = 1.0 / math.sqrt(ux * ux + uy * uy + uz * uz)
-            ux, uy, uz = ux * norm, uy * norm, uz * norm
-            vx, vy, vz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
-            for s in range(rays.fan_rad.shape[0] - 1, -1, -1):  # the middle last: its beam is used below
-                a, b = rays.fan_rad[s, 0], rays.fan_rad[s, 1]
-                scale = 1.0 / math.sqrt(1.0 + a * a + b * b)
-                sx, sy, sz = (x + a * ux + b * vx) * scale, (y + a * uy + b * vy) * scale, (z + a * uz + b * vz) * scale
-                lay_beam(bases, poses, p, share, rays.origin_m, i, sx, sy, sz, reach, beam)
-                cast(world, movers, time_s, beam, reach, mixed(rays.key + number) + np.uint64(s), body, state)
-                note_echo(world, movers, time_s, beam, rays.weight[s], body, state, echoes, s)
-            write_found(rays, beam, echoes, found, g, i)
+            cast_one(world, movers, bases, poses, rays, g, i, 0, scratch, centres, i)
+            write_found(rays, scratch.beam, found, g, i, centres[i, 0], centres[i, 1], centres[i, 2], False)
+        if rays.fan_rad.shape[0] == 1:
+            continue
+        for i in range(count):
+            if not may_meet_edge(centres, rays, i):
+                continue
+            for column in range(4):
+                echoes[0, column] = centres[i, column]
+            if meets_edge(world, movers, bases, poses, rays, g, i, scratch):
+                for s in range(1, 5):
+                    cast_once(world, movers, bases, poses, rays, g, i, s, scratch)
+                r, value, number, is_mixed = merged(echoes)
+                if is_mixed:
+                    lay_ray(bases, poses, rays, g, i, 0, scratch)
+                    write_found(rays, scratch.beam, found, g, i, r, value, number, True)
+
+
+@inlined
+def lay_axes(rays: Rays, g: int, i: int, axes: Float64) -> None:
+    """Directions along and across the scan at right angles to a ray and to one another.
+
+    They point to the sides of the neighbours. A ray without any takes the axis that it is farthest from.
+
+    axes : (2, 3), out.
+    """
+    x, y, z = rays.direction[g, i, 0], rays.direction[g, i, 1], rays.direction[g, i, 2]
+    ux, uy, uz = between(rays, g, i, 0)
+    vx, vy, vz = between(rays, g, i, 2)
+    if ux == 0.0 and uy == 0.0 and uz == 0.0:
+        ux, uy, uz = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
+    if ux == 0.0 and uy == 0.0 and uz == 0.0:
+        ux, uy, uz = (-y, x, 0.0) if abs(z) < 0.7 else (0.0, -z, y)
+    ahead = ux * x + uy * y + uz * z
+    ux, uy, uz = ux - ahead * x, uy - ahead * y, uz - ahead * z
+    norm = 1.0 / math.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux * norm, uy * norm, uz * norm
+    wx, wy, wz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    sign = -1.0 if wx * vx + wy * vy + wz * vz < 0.0 else 1.0
+    axes[0, 0], axes[0, 1], axes[0, 2] = ux, uy, uz
+    axes[1, 0], axes[1, 1], axes[1, 2] = sign * wx, sign * wy, sign * wz
+
+
+@inlined
+def between(rays: Rays, g: int, i: int, side: int) -> tuple[float, float, float]:
+    """From the neighbour of a ray on the side after `side` (or itself) to that on `side` (or itself)."""
+    on, back = rays.beside[i, side], rays.beside[i, side + 1]
+    on, back = (on if on >= 0 else i), (back if back >= 0 else i)
+    first, second = rays.direction[g, back], rays.direction[g, on]
+    return second[0] - first[0], second[1] - first[1], second[2] - first[2]
+
+
+@inlined
+def lay_ray(bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch) -> float:
+    """Lay the beam of sub-ray `s`, whose axes are laid; its time since the movers' first slot (s)."""
+    p = g * (poses.begin_m.shape[0] // rays.direction.shape[0]) + rays.interval[i]
+    share = rays.share[i]
+    x, y, z = rays.direction[g, i, 0], rays.direction[g, i, 1], rays.direction[g, i, 2]
+    if s > 0:
+        a, b = rays.fan_rad[s, 0], rays.fan_rad[s, 1]
+        axes, scale = scratch.axes, 1.0 / math.sqrt(1.0 + a * a + b * b)
+        x = (x + a * axes[0, 0] + b * axes[1, 0]) * scale
+        y = (y + a * axes[0, 1] + b * axes[1, 1]) * scale
+        z = (z + a * axes[0, 2] + b * axes[1, 2]) * scale
+    lay_beam(bases, poses, p, share, rays.origin_m, i, x, y, z, rays.limits_m[1], scratch.beam)
+    time_s: float = poses.time_s[p, 0] + share * (poses.time_s[p, 1] - poses.time_s[p, 0])
+    return time_s
+
+
+@inlined
+def cast_one(
+    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch,
+    echoes: Float64, row: int,
+) -> None:  # fmt: skip
+    """Cast sub-ray `s` (0: the middle) of a ray, and note what it meets in a row of the echoes."""
+    number = np.uint64(g * rays.direction.shape[1] + i)
+    time_s = lay_ray(bases, poses, rays, g, i, s, scratch)
+    key = mixed(rays.key + number) + np.uint64(s)
+    cast(world, movers, time_s, scratch.beam, rays.limits_m[1], key, scratch.body, scratch.state)
+    note_echo(world, movers, time_s, scratch.beam, rays.weight[s], scratch.body, scratch.state, echoes, row)
+
+
+@compiled
+def cast_once(
+    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch
+) -> None:
+    """Cast a sub-ray unless that has been done."""
+    if scratch.echoes[s, 4] == 0.0:
+        cast_one(world, movers, bases, poses, rays, g, i, s, scratch, scratch.echoes, s)
+        scratch.echoes[s, 4] = 1.0
+
+
+@compiled
+def may_meet_edge(centres: Float64, rays: Rays, i: int) -> bool:
+    """Whether an edge may lie on any side of a ray."""
+    found = False
+    for side in range(4):
+        found = found or may_lie_edge(centres, rays.beside, i, side, rays.steps[side // 2])
+    return found
+
+
+@compiled
+def meets_edge(
+    world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, scratch: Scratch
+) -> bool:
+    """Whether the sub-rays on those sides of a ray where an edge may lie meet another surface than its middle.
+
+    What is smaller than the distance between rays, and met by no middle, is missed.
+    """
+    echoes = scratch.echoes
+    for s in range(1, 5):
+        echoes[s, 4] = 0.0
+    lay_axes(rays, g, i, scratch.axes)
+    for s in range(1, 5):
+        if not may_lie_edge(scratch.centres, rays.beside, i, s - 1, rays.steps[(s - 1) // 2]):
+            continue
+        cast_once(world, movers, bases, poses, rays, g, i, s, scratch)
+        if is_other(echoes, s):
+            return True
+        # Where nothing is met ranges are NaN, and nothing more is asked.
+        if abs(echoes[s, 0] - echoes[0, 0]) > MIXED_WITHIN_M:
+            across = ((s - 1) ^ 1) + 1
+            cast_once(world, movers, bases, poses, rays, g, i, across, scratch)
+            if is_other(echoes, across) or is_bent(echoes, s, across):
+                return True
+    return False
+
+
+@inlined
+def may_lie_edge(centres: Float64, beside: Int64, i: int, side: int, steps: int) -> bool:
+    """Whether an edge may lie between a ray and those up to some steps to a side, by what their middles met.
+
+    So it is where a neighbour is not known, where it sees another object, or where its range is explained neither by
+    the ranges before, nor this ray's by the ranges beyond. Beside a neighbour that sees nothing, an edge costs the ray
+    energy, but mixes nothing into it.
+    """
+    number = object_seen(centres, i)
+    for step in range(1, steps + 1):
+        j = stepped(beside, i, side, step)
+        if j < 0:
+            return True
+        seen = object_seen(centres, j)
+        if seen == NO_OBJECT:
+            continue
+        if seen != number:
+            return True
+        if abs(centres[j, 0] - centres[i, 0]) > MIXED_WITHIN_M:
+            before, beyond = stepped(beside, i, side ^ 1, step), stepped(beside, j, side, step)
+            near, here, there, far = centres[before, 0], centres[i, 0], centres[j, 0], centres[beyond, 0]
+            is_before = before >= 0 and object_seen(centres, before) == number and is_smooth(near, here, there)
+            is_beyond = beyond >= 0 and object_seen(centres, beyond) == number and is_smooth(here, there, far)
+            if not is_before and not is_beyond:
+                return True
+    return False
+
+
+@inlined
+def stepped(beside: Int64, i: int, side: int, steps: int) -> int:
+    """The ray that lies some steps to a side of another; −1: not known."""
+    for _ in range(steps):
+        if i >= 0:
+            i = beside[i, side]
+    return i
+
+
+@inlined
+def object_seen(echoes: Float64, row: int) -> int:
+    """Object that an echo comes from; :data:`NO_OBJECT`: there is none, as from glass."""
+    return int(echoes[row, 2]) if echoes[row, 3] > 0.0 else NO_OBJECT
+
+
+@inlined
+def is_other(echoes: Float64, s: int) -> bool:
+    """Whether row `s` of the echoes of one ray comes from another object than its middle.
+
+    Nothing is no other object, and where two touch within :data:`MIXED_WITHIN_M` they are taken for one.
+    """
+    number, middle = object_seen(echoes, s), object_seen(echoes, 0)
+    if number not in (NO_OBJECT, middle):
+        return middle == NO_OBJECT or abs(echoes[s, 0] - echoes[0, 0]) > MIXED_WITHIN_M
+    return False
+
+
+@inlined
+def is_bent(echoes: Float64, s: int, across: int) -> bool:
+    """Whether two opposite sub-rays see the object in the middle of their ray, but not one smooth surface of it."""
+    middle = object_seen(echoes, 0)
+    if object_seen(echoes, s) != middle or object_seen(echoes, across) != middle:
+        return False
+    return not is_smooth(echoes[s, 0], echoes[0, 0], echoes[across, 0])
+
+
+@inlined
+def is_smooth(before: float, middle: float, after: float) -> bool:
+    """Whether three ranges, equally far from one another in angle, lie on one smooth surface.
+
+    On a plane, at however low an angle, the inverse ranges of rays from one place change evenly.
+    """
+    bent = abs(1.0 / before + 1.0 / after - 2.0 / middle) * middle * middle
+    change = abs(1.0 / before - 1.0 / after) * middle * middle
+    return bent <= max(MIXED_WITHIN_M, BENT_SHARE * change)
 
 
 @compiled
@@ -437,11 +643,10 @@ def note_echo(
 
 
 @compiled
-def write_found(rays: Rays, beam: Float64, echoes: Float64, found: Found, g: int, i: int) -> None:
-    """What a receiver makes of the echoes of a ray."""
-    r, value, number, is_mixed = echoes[0, 0], echoes[0, 1], echoes[0, 2], False
-    if rays.fan_rad.shape[0] > 1:
-        r, value, number, is_mixed = merged(echoes)
+def write_found(
+    rays: Rays, beam: Float64, found: Found, g: int, i: int, r: float, value: float, number: float, is_mixed: bool
+) -> None:
+    """What a receiver makes of the range, intensity and object of a ray whose middle is `beam`."""
     is_seen = rays.limits_m[0] <= r <= rays.limits_m[1]
     found.place[g, i, 0] = r if is_seen else np.nan
     for axis in range(3):
@@ -453,25 +658,48 @@ def write_found(rays: Rays, beam: Float64, echoes: Float64, found: Found, g: int
 
 @compiled
 def merged(echoes: Float64) -> tuple[float, float, float, bool]:
-    """Range, intensity, object and whether they are mixed, of the echoes (s, 5) of one ray; its middle comes first.
+    """Range, intensity, object and whether they are mixed, of the echoes (5, 5) of one ray; its middle comes first.
 
     Echoes within a pulse's length of one another merge, and the range is their mean by energy (mixed pixels of time of
     flight scanners: Ye and Borenstein 2002; Tuley, Vandapel, Hebert 2005). Of groups farther apart the strongest
-    counts. Where a group lies within :data:`MIXED_WITHIN_M`, it is one surface, and the ray's middle tells its range.
+    counts. Where a group comes from one surface, the ray's middle tells its range, however long the spot on it is.
     """
     energy, low, high = strongest_group(echoes)
-    if energy == 0.0:
-        return np.nan, np.nan, NO_OBJECT, False
-    if high - low <= MIXED_WITHIN_M and low <= echoes[0, 0] <= high and echoes[0, 3] > 0.0:
+    if energy == 0.0 or is_one_surface(echoes, low, high):
         return echoes[0, 0], echoes[0, 1], echoes[0, 2], False
     r, value, number, strongest = 0.0, 0.0, -1.0, 0.0
     for s in range(echoes.shape[0]):
-        if echoes[s, 3] > 0.0 and low <= echoes[s, 0] <= high:
+        if is_within(echoes, s, low, high):
             r += echoes[s, 3] * echoes[s, 0] / energy
             value += echoes[s, 3] * echoes[s, 1] / energy
             if echoes[s, 3] > strongest:
                 number, strongest = echoes[s, 2], echoes[s, 3]
     return r, value, number, True
+
+
+@inlined
+def is_within(echoes: Float64, s: int, low: float, high: float) -> bool:
+    """Whether row `s` of the echoes belongs to the group of these ranges."""
+    inside: bool = echoes[s, 3] > 0.0 and low <= echoes[s, 0] <= high
+    return inside
+
+
+@compiled
+def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
+    """Whether the echoes (5, 5) within ranges come from the surface in the ray's middle and from no other.
+
+    So it is where other objects are met only where they touch it, and ranges on its own change evenly across the ray;
+    where only one side of an axis belongs to the echoes, the object alone tells.
+    """
+    if not is_within(echoes, 0, low, high):
+        return False
+    for s in range(1, 5):
+        if is_within(echoes, s, low, high) and is_other(echoes, s):
+            return False
+    for s in (1, 3):
+        if is_within(echoes, s, low, high) and is_within(echoes, s + 1, low, high) and is_bent(echoes, s, s + 1):
+            return False
+    return True
 
 
 @compiled

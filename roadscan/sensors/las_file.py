@@ -30,6 +30,8 @@ _RECORD_HEAD: Final = 54
 _LONG_RECORD_HEAD: Final = 60
 _LONGEST_WKT: Final = 1 << 20
 _WKT_RECORD: Final = 2112
+_MOST_POINTS: Final = 1 << 62
+"""A count is listed as a signed number of 64 bits."""
 _TIME_OFFSET_BIT: Final = 0x40
 _FORMATS_WITH_TIME: Final = frozenset({1, 3, 4, 5, 6, 7, 8, 9, 10})
 
@@ -102,6 +104,7 @@ class Head:
             end = min(ends, default=size)
             room = (end - offset) // max(1, record_bytes)
         version = (major, minor)
+        claimed = min(claimed, _MOST_POINTS)
         return cls(version, encoding, point_format, compressed, offset, record_bytes, claimed, room, laszip, wkt)
 
 

@@ -87,6 +87,8 @@ _CODES: Final = 9
 _ERROR_LEVEL: Final = 3
 _IMPLAUSIBLE: Final = 0x40
 _SNIFFED_BYTES: Final = 1 << 16
+_SEARCHED_BYTES: Final = 16 << 20
+"""A log without a telegram of measured values in so many bytes is none."""
 _MOST_LAYOUTS: Final = 32
 _BATCH_READINGS: Final = 1 << 21
 _LARGEST_STAMPS_BYTES: Final = 1 << 28
@@ -168,8 +170,10 @@ class SickLms(LogFormat):
             fitting = fields.fit()
             if fitting.any():
                 return _header(source, options, piece, fields, fitting)
+            if piece.offset > _SEARCHED_BYTES:
+                break
         raise FormatError(
-            "the file holds no telegram with measured values",
+            f"the file's first {_SEARCHED_BYTES >> 20} MB hold no telegram with measured values",
             expected="telegrams 0xB0, 0xB7 or 0xC4 with a valid CRC",
             file=source.path,
         )
@@ -329,9 +333,13 @@ def _field(
 def _check_time(source: LogSource, options: SickLmsOptions) -> None:
     """Exactly one source of stamps has to be stated, and a clock."""
     by_rate = options.first_stamp_s is not None or options.scans_per_s is not None
-    if (options.stamps is not None) + by_rate + options.stamped != 1:
+    sources = {"stamps": options.stamps is not None, "stamped": options.stamped, "first_stamp_s, scans_per_s": by_rate}
+    stated = [name for name, is_stated in sources.items() if is_stated]
+    if len(stated) != 1:
+        count = {0: "no source", 2: "two sources", 3: "three sources"}[len(stated)]
         raise ConfigError(
-            "the telegrams hold no time, and the options do not state one source of it",
+            f"the telegrams hold no time, and the options state {count} of it"
+            + (f" ({', '.join(stated)})" if stated else ""),
             expected="one of options.stamps, options.first_stamp_s with options.scans_per_s, options.stamped = true",
             file=source.path,
         )

@@ -283,8 +283,14 @@ def test_time_has_to_be_stated(tmp_path: Path) -> None:
     path = log(tmp_path / "a.log", encode_scans(scans(2), "mm"))
     with pytest.raises(ConfigError, match=r"hold no time.*options\.stamps.*options\.first_stamp_s.*options\.stamped"):
         read_lms(path, {})
-    with pytest.raises(ConfigError, match="one source"):
+    with pytest.raises(ConfigError, match=r"state no source of it; expected one of"):
+        read_lms(path, {})
+    with pytest.raises(ConfigError, match=r"state two sources of it \(stamped, first_stamp_s, scans_per_s\)"):
         read_lms(path, BY_RATE | {"stamped": True})
+    with pytest.raises(ConfigError, match=r"two sources of it \(stamps, stamped\)"):
+        read_lms(path, {"stamps": "a.csv", "stamped": True})
+    with pytest.raises(ConfigError, match=r"three sources of it \(stamps, stamped, first_stamp_s, scans_per_s\)"):
+        read_lms(path, BY_RATE | {"stamps": "a.csv", "stamped": True})
     with pytest.raises(ConfigError, match="belong together"):
         read_lms(path, {"first_stamp_s": 0.0})
     with pytest.raises(TimeSystemError, match="time system is not stated"):
@@ -293,6 +299,19 @@ def test_time_has_to_be_stated(tmp_path: Path) -> None:
         read_lms(path, BY_RATE, Clock(TimeSystem.UNIX_UTC, offset_s=-2e9))
     with pytest.raises(ConfigError, match=r"a field of 180° at 0\.5°, and scans of 181 readings; expected 361"):
         read_lms(path, BY_RATE | {"field_deg": 180.0, "resolution_deg": 0.5})
+
+
+def test_a_file_without_telegrams_is_given_up_early(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    telegrams = encode_scans(scans(2), "mm").tobytes()
+    path.write_bytes(bytes(15 << 20) + telegrams)
+    assert len(read("sick_lms", path, BY_RATE, clock=GPS)) == 2
+    with path.open("wb") as stream:
+        stream.truncate(20 << 20)
+        stream.seek(0, 2)
+        stream.write(telegrams)
+    with pytest.raises(FormatError, match="first 16 MB hold no telegram with measured values"):
+        read("sick_lms", path, BY_RATE, clock=GPS)
 
 
 # --- damage -----------------------------------------------------------------------------------------

@@ -30,6 +30,8 @@ _RECORD_HEAD: Final = 54
 _LONG_RECORD_HEAD: Final = 60
 _LONGEST_WKT: Final = 1 << 20
 _WKT_RECORD: Final = 2112
+_NO_POINT_BYTES: Final = 64
+"""Behind the headers of an empty file stands less: a table of no chunks."""
 _MOST_POINTS: Final = 1 << 62
 """A count is listed as a signed number of 64 bits."""
 _TIME_OFFSET_BIT: Final = 0x40
@@ -59,6 +61,8 @@ class Head:
     """Points the header claims."""
     room: int
     """Points that there is room for in a LAS file."""
+    point_bytes: int
+    """Bytes from the first point to the end of the points, compressed or not."""
     laszip: bytes
     """Content of the LASzip record, empty for LAS."""
     wkt: str | None
@@ -105,7 +109,9 @@ class Head:
             room = (end - offset) // max(1, record_bytes)
         version = (major, minor)
         claimed = min(claimed, _MOST_POINTS)
-        return cls(version, encoding, point_format, compressed, offset, record_bytes, claimed, room, laszip, wkt)
+        return cls(
+            version, encoding, point_format, compressed, offset, record_bytes, claimed, room, end - offset, laszip, wkt
+        )  # fmt: skip
 
 
 def _walk_records(
@@ -214,6 +220,8 @@ class Cloud:
 
     def _held(self) -> int:
         """Points in the file, as far as its size or its chunks tell; at least those claimed."""
+        if not self.head.claimed and self.head.point_bytes > _NO_POINT_BYTES:
+            return max(1, 0 if self.head.compressed else self.head.room)
         if not self.head.compressed:
             return self.head.room
         return self.count if self.chunks is None else self.chunks.least

@@ -355,12 +355,30 @@ def test_points_that_the_header_does_not_claim_are_told(
     """A LAZ chunk of point formats 0–5 does not say how many points it holds: there the loss cannot be seen."""
     path = cloud(tmp_path / name, version="1.4" if point_format == 7 else "1.2", point_format=point_format, n=400)
     data = bytearray(path.read_bytes())
-    struct.pack_into("<I", data, 107, claimed & 0xFFFFFFFF)
+    struct.pack_into("<I", data, 107, min(claimed, 2**32 - 1))
     if point_format == 7:
         struct.pack_into("<Q", data, 247, claimed)
-    elif claimed >= 2**32:
-        pytest.skip("LAS 1.2 counts to 4,294,967,295")
+    else:
+        claimed = min(claimed, 2**32 - 1)  # LAS 1.2 counts no further
     path.write_bytes(data)
     log = read("las", path, clock=ADJUSTED)
     assert len(log) == min(claimed, 400)
     assert log.rejected == abs(min(claimed, 2**62) - 400)
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+@pytest.mark.parametrize("point_format", [3, 7])
+def test_a_header_that_claims_no_point(tmp_path: Path, name: str, point_format: int) -> None:
+    version = "1.4" if point_format == 7 else "1.2"
+    empty = cloud(tmp_path / f"empty_{name}", version=version, point_format=point_format, n=0)
+    log = read("las", empty, clock=ADJUSTED)
+    assert (len(log), log.rejects) == (0, [])
+    path = cloud(tmp_path / name, version=version, point_format=point_format, n=400)
+    data = bytearray(path.read_bytes())
+    data[107:111] = bytes(4)
+    if point_format == 7:
+        data[247:255] = bytes(8)
+    path.write_bytes(data)
+    log = read("las", path, clock=ADJUSTED)
+    assert len(log) == 0
+    assert [r.reason for r in log.rejects] == ["the file holds points that the header does not claim"]

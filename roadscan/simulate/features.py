@@ -58,6 +58,14 @@ def by_node(rows: Float64, reach_m: Float64, station: Float64) -> tuple[Float64,
     return np.ascontiguousarray(rows[items[order]]), np.stack([edges[:-1], edges[1:]], axis=-1).astype(np.float64)
 
 
+def humps(road: Road) -> tuple[Float64, Float64]:
+    """(m, 4) speed humps, and the stations that they reach over (m, 2)."""
+    half = [h.top_m / 2 + h.ramp_m for h in road.humps]
+    rows = [[h.station_m, reach, 1.0 / h.ramp_m, h.height_m] for h, reach in zip(road.humps, half, strict=True)]
+    reach = [[h.station_m - reach, h.station_m + reach] for h, reach in zip(road.humps, half, strict=True)]
+    return _table(rows, 4), _table(reach, 2)
+
+
 def lines(road: Road) -> Float64:
     """(m, 6) markings along the road."""
     rows = []

@@ -34,8 +34,8 @@ _GOLDEN_CAR: Final = (653.0, 63.3, 6.0, 0.15)
 
 
 def track_offsets_m(road: Road) -> Float64:
-    """Offsets of the tracks (t,), a quarter of a lane apart, over the paved width."""
-    step = min(road.lane_width_m / 4, 1.0)
+    """Offsets of the tracks (t,), a tenth of a lane and at most 0.35 m apart, over the paved width."""
+    step = min(road.lane_width_m / 10, 0.35)
     count = max(2, math.ceil(road.paved_m / step))
     return np.linspace(-road.paved_m, road.paved_m, 2 * count + 1)
 

@@ -27,10 +27,10 @@ RIDE_WAVELENGTH_M = 10.0
 class Surface:
     """Height and intensity of the road, known everywhere on it.
 
-    The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grades, humps
-    and waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
-    1 µm for waves of 2 m). On it lie cross-section, ruts, unevenness, patches, and potholes, cracks or joints, all
-    functions of station and offset; and the texture, which only the profilers see.
+    The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grades and
+    waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
+    1 µm for waves of 2 m). On it lie cross-section, humps, ruts, unevenness, patches, and potholes, cracks or joints,
+    all functions of station and offset; and the texture, which only the profilers see.
 
     Parameters
     ----------
@@ -49,9 +49,11 @@ class Surface:
         defects, defect_ranges = features.by_node(worn.defects, worn.defect_reach_m, station)
         patches, patch_ranges = features.by_node(worn.patches, worn.patch_reach_m, station)
         items, item_ranges = features.by_node(worn.items, worn.item_reach_m, station)
+        humps, hump_ranges = features.by_node(*features.humps(road), station)
         line = _reference_line(road, station, math.radians(scene.map.azimuth_deg))
         height = _profile(road, station, ride)
-        columns = [line, height, station[:, None], defect_ranges, patch_ranges, item_ranges, _sides(road, station)]
+        columns = [line, height, station[:, None], defect_ranges, patch_ranges, item_ranges]
+        columns += [_sides(road, station), hump_ranges]
         tracks, first_m = _tracks(scene, station, ride)
         textured = road.texture is not None and not ride
         self.arrays = RoadArrays(
@@ -60,6 +62,7 @@ class Surface:
             defects=defects,
             patches=patches,
             lines=features.lines(road),
+            humps=humps,
             items=items,
             tracks=tracks,
             texture=_texture(road, scene.seed) if textured else np.zeros((0, 0), np.float32),
@@ -237,7 +240,10 @@ def _kerb_height(kerb: Kerb | None, station: Float64) -> Float64:
         return np.zeros(station.size)
     height = np.full(station.size, kerb.height_m)
     for ramp in kerb.ramps:
-        beyond = (np.abs(station - ramp.station_m) - ramp.length_m / 2) / ramp.transition_m
+        # From node to node, so that no straight line between nodes cuts into the low part.
+        low = math.floor((ramp.station_m - ramp.length_m / 2) / NODE_STEP_M + 1e-6) * NODE_STEP_M
+        high = math.ceil((ramp.station_m + ramp.length_m / 2) / NODE_STEP_M - 1e-6) * NODE_STEP_M
+        beyond = np.maximum(low - station, station - high) / ramp.transition_m
         height = np.minimum(height, ramp.height_m + (kerb.height_m - ramp.height_m) * np.clip(beyond, 0.0, 1.0))
     return height
 
@@ -254,9 +260,6 @@ def _profile(road: Road, station: Float64, ride: bool) -> Float64:
         slope = slope + step * x / change.curve_m
         bend = bend + step / change.curve_m * ((x > 0) & (beyond == 0.0))
         grade = change.grade
-    for hump in road.humps:
-        lift, tilt, arch = _hump(station - hump.station_m, hump.top_m / 2, hump.ramp_m)
-        value, slope, bend = value + hump.height_m * lift, slope + hump.height_m * tilt, bend + hump.height_m * arch
     for wave in road.waves:
         if ride and wave.wavelength_m < RIDE_WAVELENGTH_M:
             continue
@@ -275,11 +278,3 @@ def _profile(road: Road, station: Float64, ride: bool) -> Float64:
     out[:-1, 4] = (-15 * gap / h + 7 * lean - arch * h) / h**3
     out[:-1, 5] = (6 * gap / h - 3 * lean + arch * h / 2) / h**4
     return out
-
-
-def _hump(away_m: Float64, half_top_m: float, ramp_m: float) -> tuple[Float64, Float64, Float64]:
-    """Shape of a hump of height 1, its slope and curvature: each ramp is 10 x³ − 15 x⁴ + 6 x⁵."""
-    x = np.clip((half_top_m + ramp_m - np.abs(away_m)) / ramp_m, 0.0, 1.0)
-    rise = -np.sign(away_m) / ramp_m
-    shape = x**3 * (10 - 15 * x + 6 * x * x)
-    return shape, rise * 30 * x**2 * (1 - x) ** 2, rise**2 * 60 * x * (1 - x) * (1 - 2 * x)

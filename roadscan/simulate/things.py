@@ -40,6 +40,8 @@ BURIED_M: Final = 0.3
 _POST_RADIUS_M: Final = 0.03
 _RAIL_POST_RADIUS_M: Final = 0.05
 _PLATE_BEFORE_POST_M: Final = 0.04
+_PLATE_M: Final = 1e-6
+"""From a sign's face to its back: two thin bodies, of which a beam meets the one on its side (m)."""
 _ARM_M: Final = 0.12
 _LAMP_M: Final = (0.5, 0.25, 0.12)
 _WHEEL_M: Final = (0.62, 0.20, 0.60)
@@ -98,7 +100,9 @@ def objects_table(scene: Scene, surface: Surface) -> pa.Table:
     size_up_m, heading_deg (of its length, clockwise from grid north), intensity, speed_m_per_s (along the road; what
     moves is stated where it is at the first profile of each pass in which it drives).
     """
-    found = objects_of(scene, surface) + moving_objects(scene, surface)
+    first, last = scene.stations_m
+    found = objects_of(scene, surface)
+    found += [o for o in moving_objects(scene, surface) if first <= o.station_m <= last]
     places = np.array([o.enh_m for o in found], dtype=np.float64).reshape(-1, 3) + surface.origin_enh_m
     sizes = np.array([o.size_m for o in found], dtype=np.float64).reshape(-1, 3)
     heading = np.degrees(np.mod([o.heading_rad for o in found], 2 * math.pi))
@@ -131,17 +135,25 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
     )  # fmt: skip
     for kind, described in kinds:
         for one in described:
-            for station in _stations(one, scene.length_m + scene.road.lead_m):
-                yield kind, one, station
+            on_road = _on_road(one, *scene.stations_m)
+            for station in _stations(on_road, *scene.stations_m):
+                yield kind, on_road, station
 
 
-def _stations(one: Standing | Barrier, end_m: float) -> list[float]:
-    """Stations of one description's objects; repetitions end with the road."""
+def _on_road(one: Standing | Barrier, first_m: float, last_m: float) -> Standing | Barrier:
+    """The description, a barrier as far as the road goes."""
+    if not isinstance(one, Barrier) or first_m <= one.start_m <= one.end_m <= last_m:
+        return one
+    return one.model_copy(update={"start_m": max(one.start_m, first_m), "end_m": min(one.end_m, last_m)})
+
+
+def _stations(one: Standing | Barrier, first_m: float, last_m: float) -> list[float]:
+    """Stations of one description's objects, as far as the road goes."""
     if isinstance(one, Barrier):
-        return [one.start_m]
+        return [one.start_m] if one.start_m < one.end_m else []
     count = one.count if one.every_m > 0.0 else 1
     stations = [one.station_m + n * one.every_m for n in range(count)]
-    return stations[:1] + [s for s in stations[1:] if s <= end_m]
+    return [s for s in stations if first_m <= s <= last_m]
 
 
 @dataclass(frozen=True)
@@ -285,9 +297,13 @@ def _(one: Sign, place: _Place, surface: Surface) -> tuple[tuple[float, float, f
     side = 1.0 if one.faces == "forward" else -1.0
     at = place.beside(side * _PLATE_BEFORE_POST_M, 0.0, place.heading_rad)
     kind = body.DISC if one.shape == "round" else body.WALL
-    plate = _body(kind, at, place.heading_rad + math.pi / 2, (one.width_m / 2, 0.0), (low, high), one.shade)
+    behind = place.beside(side * (_PLATE_BEFORE_POST_M - _PLATE_M), 0.0, place.heading_rad)
+    face, back = (
+        _body(kind, middle, place.heading_rad + math.pi / 2, (one.width_m / 2, 0.0), (low, high), shade)
+        for middle, shade in ((at, one.shade), (behind, one.back_shade))
+    )
     post = _post(place.enh_m[:2], z, high, _POST_RADIUS_M, 120.0)
-    return (one.width_m, 2 * _PLATE_BEFORE_POST_M, high - z), math.pi / 2, np.stack([plate, post])
+    return (one.width_m, 2 * _PLATE_BEFORE_POST_M, high - z), math.pi / 2, np.stack([face, back, post])
 
 
 @_made.register

@@ -71,19 +71,38 @@ def test_iso_8608_spectrum():
     assert 0.7 < low / high < 1.4  # the slope is −2
 
 
+def test_spectrum_between_the_tracks():
+    """Halfway between two tracks, where interpolation takes most away, as the description of the field says."""
+    s = scene(roughness={"iso_class": "C"}).changed(length_m=6000.0)
+    surface = Surface(s)
+    offsets = track_offsets_m(s.road)
+    station = np.arange(0.0, 6000.0, STEP_M)
+
+    def spectrum(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        lines = [surface.points_at(station, np.full(station.size, offset))[:, 2] for offset in at[3:-3]]
+        n, density = welch(np.stack(lines), 1.0 / STEP_M, nperseg=4096, axis=1)
+        return n, density.mean(axis=0)
+
+    n, on_tracks = spectrum(offsets)
+    ratio = spectrum((offsets[:-1] + offsets[1:]) / 2)[1] / on_tracks
+    for low, high, share in ((0.2, 0.3, 0.96), (0.4, 0.6, 0.93), (0.9, 1.1, 0.87)):
+        assert ratio[(n > low) & (n < high)].mean() == pytest.approx(share, abs=0.03)
+
+
 def test_neighbouring_profiles_share_long_waves():
     s = scene(roughness={"iso_class": "B"}).changed(length_m=8000.0)
     tracks = Surface(s).arrays.tracks
     spectra = np.fft.rfft(tracks[:, : 2**16], axis=1)
     n = np.fft.rfftfreq(2**16, STEP_M)
     offsets = track_offsets_m(s.road)
+    first, second = np.searchsorted(offsets, [-2.7, -0.1])
 
     def likeness(low: float, high: float) -> float:
         band = (n > low) & (n < high)
-        a, b = spectra[1, band], spectra[4, band]
+        a, b = spectra[first, band], spectra[second, band]
         return float(np.abs(np.vdot(a, b)) / np.sqrt(np.vdot(a, a).real * np.vdot(b, b).real))
 
-    apart = offsets[4] - offsets[1]
+    apart = offsets[second] - offsets[first]
     for low, high in ((0.02, 0.04), (0.15, 0.25)):
         assert likeness(low, high) == pytest.approx(np.exp(-5.0 * (low + high) / 2 * apart / 3.0), abs=0.12)
 

@@ -73,6 +73,28 @@ def test_profile_is_the_sum_of_its_waves():
     np.testing.assert_allclose(height_at(surface, station, 1.0), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("ride", [False, True])
+@pytest.mark.parametrize(("top", "ramp"), [(0.0, 0.8), (1.1, 0.8), (2.0, 1.2), (0.0, 3.0)])
+def test_humps_are_exact_between_the_nodes(ride: bool, top: float, ramp: float):
+    hump = {"station_m": 12.37, "height_m": 0.1, "top_m": top, "ramp_m": ramp}
+    surface = Surface(FLAT.changed(road={"humps": [hump]}), ride=ride)
+    station = np.append(12.37, np.linspace(5.0, 20.0, 1501))
+    x = np.clip((top / 2 + ramp - np.abs(station - 12.37)) / ramp, 0.0, 1.0)
+    np.testing.assert_allclose(height_at(surface, station, 1.0), 0.1 * (10 * x**3 - 15 * x**4 + 6 * x**5), atol=1e-9)
+    assert height_at(surface, 12.37, -2.0) == pytest.approx(0.1, abs=1e-9)
+
+
+@pytest.mark.parametrize(("middle", "length", "slope"), [(30.17, 3.5, 0.8), (30.0, 5.0, 1.0), (30.49, 0.5, 0.5)])
+def test_dropped_kerbs_are_low_over_their_length(middle: float, length: float, slope: float):
+    ramp = {"station_m": middle, "length_m": length, "transition_m": slope, "height_m": 0.02}
+    surface = Surface(FLAT.changed(road={"kerbs": [{"side": "right", "height_m": 0.12, "ramps": [ramp]}]}))
+    low = np.linspace(middle - length / 2, middle + length / 2, 301)
+    np.testing.assert_allclose(height_at(surface, low, 3.7), 0.02, atol=1e-9)
+    # Half a metre for the low part's end, and half for the slope's.
+    away = length / 2 + slope + 1.0
+    np.testing.assert_allclose(height_at(surface, np.array([middle - away, middle + away]), 3.7), 0.12, atol=1e-9)
+
+
 def test_alignment_is_the_integral_of_its_curvature():
     pieces = [
         Element(kind="straight", length_m=10.0),

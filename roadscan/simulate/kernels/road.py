@@ -26,7 +26,8 @@ NODE_TOLERANCE_M = 1e-9
 STATION = 12
 DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18
 FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25
-NODE_COLUMNS = 27
+HUMPS, HUMPS_END = 27, 28
+NODE_COLUMNS = 29
 
 # Places in the section.
 CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7
@@ -42,11 +43,11 @@ class RoadArrays(NamedTuple):
     """The road as the kernels see it."""
 
     nodes: Float64
-    """(n, 27), the last node only ends the line: easting, northing (m, from the origin), sine and cosine of the grid
+    """(n, 29), the last node only ends the line: easting, northing (m, from the origin), sine and cosine of the grid
     heading, curvature (1/m, right positive), its change per metre up to the next node; from column 6 on the
     reference line's height as coefficients of u⁰ … u⁵; station; first row and end row in `defects`, `patches` and
     `items`; fall to the left (m/m) and its change per metre, fall to the right, height of the left kerb (m; 0: none)
-    and of the right kerb, likewise."""
+    and of the right kerb, likewise; first row and end row in `humps`."""
     section: Float64
     """(20 + 6m,) constants, see the names above; then offset, 1 / half width, depth, variation, its wave number
     (rad/m) and phase of each rut."""
@@ -58,6 +59,8 @@ class RoadArrays(NamedTuple):
     intensity."""
     lines: Float64
     """(m, 6) offset, half width, dash and period (0: solid), first and last station of each marking."""
+    humps: Float64
+    """(m, 4) by node. Station, half of the top with both ramps, 1 / length of a ramp, height."""
     items: Float64
     """(m, 8) by node, what is painted or spilt: kind, intensity, station, offset, and
     0 rectangle: half length, half width; 1 ellipse with a soft edge: the same; 2 ring: inner and outer radius;
@@ -273,6 +276,10 @@ def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     station = nodes[k, STATION] + u
     if road.tracks.size:
         height += unevenness(road, station, offset)
+    humps = road.humps
+    for i in range(int(nodes[k, HUMPS]), int(nodes[k, HUMPS_END])):
+        x = min(max((humps[i, 1] - abs(station - humps[i, 0])) * humps[i, 2], 0.0), 1.0)
+        height += humps[i, 3] * x * x * x * (10.0 - x * (15.0 - 6.0 * x))
     patches = road.patches
     for i in range(int(nodes[k, PATCHES]), int(nodes[k, PATCHES_END])):
         inward = edge_distance(patches, i, station, offset)

@@ -6,11 +6,13 @@ Lengths are metres of the map; *station* runs along the reference line, *offset*
 from __future__ import annotations
 
 import datetime as dt
+import math
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.strict import Strict, load_toml
@@ -33,7 +35,7 @@ from roadscan.simulate.scene.rig import (
     Trajectory,
 )
 from roadscan.simulate.scene.road import Element, Road
-from roadscan.simulate.scene.roadside import Roadside
+from roadscan.simulate.scene.roadside import Barrier, Roadside
 from roadscan.simulate.scene.vehicle import PassScene, Route, Vehicle
 
 __all__ = [
@@ -64,6 +66,7 @@ __all__ = [
     "shipped_scenes",
 ]
 
+_EARLIEST, _LATEST = dt.datetime(1981, 1, 1, tzinfo=dt.UTC), dt.datetime(2080, 1, 1, tzinfo=dt.UTC)
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 
 
@@ -93,7 +96,7 @@ class Scene(Strict):
     seed: int = Field(default=1, ge=0)
     """Same seed, same bytes."""
     start: dt.datetime = dt.datetime(2026, 5, 4, 9, 30, tzinfo=dt.UTC)
-    """First profile of the first pass, with zone (2026-05-04T09:30:00Z)."""
+    """First profile of the first pass, with zone (2026-05-04T09:30:00Z), in the years 1981 to 2079."""
     pause_s: float = Field(default=600.0, ge=10.0)
     """From the start of one pass to the start of the next (s)."""
     length_m: float = Field(default=100.0, ge=1.0, le=100_000.0)
@@ -129,6 +132,18 @@ class Scene(Strict):
     control: Control = Control()
     """Control points."""
 
+    @property
+    def stations_m(self) -> tuple[float, float]:
+        """First and last station of the road (m)."""
+        return -self.road.lead_m, self.length_m + self.road.lead_m
+
+    @model_validator(mode="after")
+    def _numbers(self) -> Self:
+        for where, value in _floats(self, ""):
+            if math.isnan(value) or (math.isinf(value) and not _is_open_end(where, value)):
+                raise ValueError(f"'{where}' is {value:g}, expected a finite number")
+        return self
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         for one in self.passes:
@@ -148,7 +163,26 @@ class Scene(Strict):
                 )
         if self.start.tzinfo is None:
             raise ValueError("start has no time zone; write it as 2026-05-04T09:30:00Z")
+        if not _EARLIEST <= self.start < _LATEST:
+            raise ValueError(f"start {self.start.isoformat()} is not in the years 1981 to 2079")
+        for i, target in enumerate(self.road.targets):
+            self._refuse_beyond(f"road.targets.{i}.station_m", target.station_m)
         return self
+
+    def _refuse_beyond(self, where: str, station_m: float) -> None:
+        first, last = self.stations_m
+        if not first <= station_m <= last:
+            raise ValueError(
+                f"'{where}' {station_m:g} lies beyond the road, which goes from {first:g} to {last:g} "
+                "(road.lead_m before station 0 and after length_m)"
+            )
+
+    def _check_roadside(self) -> None:
+        """Refuse what does not stand on the road; a scene that is shortened by `changed` leaves it out instead."""
+        for kind, listed in self.roadside:
+            for i, one in enumerate(listed):
+                for key in ("start_m", "end_m") if isinstance(one, Barrier) else ("station_m",):
+                    self._refuse_beyond(f"roadside.{kind}.{i}.{key}", getattr(one, key))
 
     @classmethod
     def load(cls, source: str | Path) -> Self:
@@ -156,13 +190,22 @@ class Scene(Strict):
         shipped = shipped_scenes()
         if isinstance(source, str) and source in shipped:
             with resources.as_file(shipped[source]) as file:
-                return cls.parse(load_toml(file), file=f"scene {source}")
+                return cls._read(file, f"scene {source}")
         if not Path(source).is_file():
             raise ConfigError(
                 f"there is no scene '{source}'{nearest(str(source), shipped)}",
                 expected="a TOML file, or one of: " + ", ".join(shipped),
             )
-        return cls.parse(load_toml(source), file=source)
+        return cls._read(Path(source), source)
+
+    @classmethod
+    def _read(cls, file: Path, name: str | Path) -> Self:
+        scene = cls.parse(load_toml(file), file=name)
+        try:
+            scene._check_roadside()
+        except ValueError as error:
+            raise ConfigError(str(error), file=name) from error
+        return scene
 
     def changed(self, **values: Any) -> Self:
         """The scene with some values replaced; dictionaries are merged, key by key.
@@ -200,6 +243,24 @@ def shipped_scenes() -> dict[str, Any]:
     """Scenes that come with roadscan: name → resource."""
     folder = resources.files("roadscan.simulate") / "scenes"
     return {f.name.removesuffix(".toml"): f for f in sorted(folder.iterdir(), key=lambda f: f.name)}
+
+
+def _floats(value: object, where: str) -> Iterator[tuple[str, float]]:
+    """All floats of a model, with the keys that lead to them."""
+    if isinstance(value, float):
+        yield where, value
+    elif isinstance(value, BaseModel):
+        for key, part in value:
+            yield from _floats(part, f"{where}.{key}" if where else key)
+    elif isinstance(value, list | tuple):
+        for i, part in enumerate(value):
+            yield from _floats(part, f"{where}.{i}")
+
+
+def _is_open_end(where: str, value: float) -> bool:
+    """Whether an infinity says that markings or joints go as far as the road does."""
+    is_open = where.startswith(("road.markings.", "road.joints."))
+    return is_open and where.endswith(".start_m" if value < 0.0 else ".end_m")
 
 
 def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:

@@ -42,7 +42,7 @@ class GradeChange(Strict):
     """Middle of the parabola, where the two straight grades would meet (m)."""
     grade: float = Field(ge=-0.15, le=0.15)
     """Rise from here on (m/m)."""
-    curve_m: float = Field(default=40.0, gt=0.0)
+    curve_m: float = Field(default=40.0, ge=2.0)
     """Length of the parabola (m)."""
 
 
@@ -71,7 +71,9 @@ class Wave(Strict):
 class Roughness(Strict):
     """Random unevenness of the longitudinal profiles: ISO 8608, G(n) = G(n0) · (n / n0)^−w, n0 = 0.1 cycles/m.
 
-    Wavelengths run from 0.7 to 80 m. Profiles at other offsets differ, the more the shorter the wave.
+    Wavelengths run from 0.7 to 80 m. Profiles at other offsets differ, the more the shorter the wave. They are made at
+    offsets at most 0.35 m apart and interpolated between: halfway between two of them, with the default coherence,
+    waves of 4 m hold 96 % of their power, waves of 2 m 93 %, waves of 1 m 87 %.
     """
 
     iso_class: Literal["A", "B", "C", "D", "E"] | None = None
@@ -186,7 +188,8 @@ class Hump(Strict):
     top_m: float = Field(default=0.0, ge=0.0)
     """Length of the flat top (m)."""
     ramp_m: float = Field(default=1.5, ge=0.8)
-    """Length of each ramp (m), a raised cosine."""
+    """Length of each ramp (m): at the share x of it, 10 x³ − 15 x⁴ + 6 x⁵ of the height, so that it begins and ends
+    without a bend."""
 
 
 class Patch(Strict):
@@ -205,9 +208,19 @@ class Patch(Strict):
     height_m: float = Field(default=-0.004, ge=-0.05, le=0.02)
     """Height of its surface above the road around it (m); negative: sunk."""
     edge_m: float = Field(default=0.03, ge=0.01, le=0.5)
-    """Width of the slope along its edge, inside the outline (m)."""
+    """Width of the slope along its edge, inside the outline (m); at most half of its shorter extent."""
     shade: Shade = 52.0
     """Intensity."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        extent = self.length_m if self.shape == "circle" else min(self.length_m, self.width_m)
+        if self.edge_m > extent / 2:
+            raise ValueError(
+                f"edge_m {self.edge_m:g} is more than half of the patch's extent of {extent:g} m, so that height_m is "
+                f"nowhere reached; give {extent / 2:g} or less"
+            )
+        return self
 
 
 class Stain(Strict):
@@ -303,10 +316,11 @@ class KerbRamp(Strict):
 
     station_m: float
     """Station of its middle (m)."""
-    length_m: float = Field(default=4.0, gt=0.2)
-    """Length of the low part (m)."""
+    length_m: float = Field(default=4.0, ge=0.5)
+    """Length of the low part (m); both of its ends are moved out to the next half metre of station."""
     transition_m: float = Field(default=1.0, ge=0.5)
-    """Length of the slope on each side of it (m)."""
+    """Length of the slope on each side of it (m); it is made of straight pieces from half metre to half metre, so
+    one that is no multiple of 0.5 m ends at the half metre after it."""
     height_m: float = Field(default=0.02, ge=0.0, le=0.3)
     """Height of the low part (m)."""
 
@@ -346,7 +360,7 @@ class Road(Strict):
 
     alignment: list[Element] = [Element(kind="straight", length_m=100.0)]
     """Pieces of the reference line from station 0 on, repeated in both directions as far as the road goes."""
-    lead_m: float = Field(default=45.0, ge=20.0)
+    lead_m: float = Field(default=45.0, ge=20.0, le=1000.0)
     """Length of road before station 0 and after the last one (m)."""
     lanes: int = Field(default=2, ge=1, le=12)
     """Number of lanes; the reference line is the middle of them. Lane 1 is the leftmost."""

@@ -40,7 +40,9 @@ class Sign(Standing):
     faces: Literal["forward", "backward"] = "backward"
     """Whom it faces: backward is read by traffic towards growing stations."""
     shade: Shade = 250.0
-    """Intensity of the plate (retroreflecting)."""
+    """Intensity of the plate's face (retroreflecting)."""
+    back_shade: Shade = 90.0
+    """Intensity of its back."""
 
 
 class Pole(Standing):

@@ -17,15 +17,30 @@ import pyarrow.parquet as pq
 from scipy.special import ndtri
 
 from roadscan.model.gpstime import TimeSystem
+from roadscan.simulate.caster import SLOT_NS
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.encoder import WheelEncoder
 from roadscan.simulate.kernels import profiles as kernels
-from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, HALF_LENGTH, HALF_WIDTH, NORTHING
+from roadscan.simulate.kernels.road import STATION
+from roadscan.simulate.kernels.things import (
+    BODY_COLUMNS,
+    BOX,
+    EASTING,
+    HALF_LENGTH,
+    HALF_WIDTH,
+    HIGH,
+    HIGH_END,
+    KIND,
+    LOW,
+    LOW_END,
+    NORTHING,
+)
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Profilers, Scene
+from roadscan.simulate.scene.roadside import MovingCar
 from roadscan.simulate.surface import Surface
-from roadscan.simulate.things import Object
+from roadscan.simulate.things import Object, mover_bodies, moving_objects
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -35,6 +50,7 @@ BLOCK_PROFILES: Final = 512
 """Profiles measured at once and a Parquet row group."""
 BESIDE_M: Final = 4.0
 """Things farther from the middle of a head's profiles are not met (m)."""
+_OUT_OF_REACH_M: Final = 1e9
 WRONG_WITHIN_M: Final = 0.03
 """Wrong readings lie this near to the road (m)."""
 _BENT_M: Final = 1e-7
@@ -170,9 +186,10 @@ def measure(
     count = math.floor(drive.length_m / spacing + 1e-9) + 1
     encoder = WheelEncoder(scene, drive)
     near = _Near.of(things)
+    movers = _Movers.of(scene, surface, drive)
     for first in range(0, count, BLOCK_PROFILES):
         driven = np.asarray(spacing * np.arange(first, min(first + BLOCK_PROFILES, count), dtype=np.float64))
-        yield _measure_block(scene, surface, drive, head, encoder, near, driven, first, with_hits)
+        yield _measure_block(scene, surface, drive, head, encoder, near, movers, driven, first, with_hits)
 
 
 def _measure_block(
@@ -182,6 +199,7 @@ def _measure_block(
     head: Head,
     encoder: WheelEncoder,
     near: _Near,
+    movers: _Movers,
     driven_m: Float64,
     first: int,
     with_hits: bool,
@@ -196,7 +214,10 @@ def _measure_block(
     ranges, intensity = np.empty(shape, np.uint16), np.empty(shape, np.uint8)
     true_range = np.empty(shape if with_hits else (0, 0))
     body_hit = np.empty(shape if with_hits else (0, 0), np.int32)
-    bodies, owners = near.within(planes.in_map[:, :2, 0])
+    path = planes.in_map[:, :2, 0]
+    bodies, owners = near.within(path)
+    moved, movers_owners = movers.at(epochs, path)
+    owners = np.concatenate([owners, movers_owners])
     noise = scene.noise
     errors = [noise.dropout, noise.profiler_range_m, noise.intensity, noise.impulse]
     kernels.scan_profiles(
@@ -206,7 +227,8 @@ def _measure_block(
         planes.is_bent,
         y,
         np.array([middle, settings.range_offset_m, settings.range_step_m, *errors, WRONG_WITHIN_M]),
-        bodies,
+        np.concatenate([bodies, np.zeros(moved.shape[1:])]),
+        moved,
         _normal_numbers() if any(errors) else np.zeros(0, np.float32),
         np.uint64(_random_from(scene, drive, head) + first * y.size),
         np.empty((3, 3)),
@@ -245,6 +267,64 @@ class _Near:
         reach = np.hypot(self.bodies[:, HALF_LENGTH], self.bodies[:, HALF_WIDTH])[:, None]
         chosen = np.all((middle + reach >= low) & (middle - reach <= high), axis=1)
         return np.ascontiguousarray(self.bodies[chosen]), self.object_id[chosen]
+
+
+@dataclass(frozen=True)
+class _Movers:
+    """Cars that move while a pass is recorded, and what they are made of at an epoch."""
+
+    surface: Surface
+    start_gps_ns: int
+    cars: tuple[tuple[MovingCar, Object], ...]
+
+    @classmethod
+    def of(cls, scene: Scene, surface: Surface, drive: Drive) -> Self:
+        """The cars of this pass."""
+        cars = zip(scene.roadside.moving_cars, moving_objects(scene, surface), strict=True)
+        driving = ((car, known) for car, known in cars if not car.passes or drive.number + 1 in car.passes)
+        return cls(surface, drive.start_gps_ns, tuple(driving))
+
+    def at(self, epoch_gps_ns: Int64, path_m: Float64) -> tuple[Float64, Int32]:
+        """Bodies (p, m, 18) of the cars that profiles (p,) through map points (p, 2) can meet, their objects (m,).
+
+        Cars move evenly within slots of time, as for all other rays, so blocks of profiles change nothing.
+        """
+        rows, owners = [np.zeros((epoch_gps_ns.size, 0, BODY_COLUMNS))], [np.zeros(0, np.int32)]
+        for car, known in self.cars:
+            near = self._near(car, epoch_gps_ns, path_m)
+            if near.any():
+                rows.append(self._moved(car, len(known.bodies), epoch_gps_ns, near))
+                owners.append(np.full(len(known.bodies), known.id, np.int32))
+        return np.concatenate(rows, axis=1), np.concatenate(owners)
+
+    def _near(self, car: MovingCar, epoch_gps_ns: Int64, path_m: Float64) -> npt.NDArray[np.bool_]:
+        """Whether each profile (p,) can meet a car."""
+        nodes = self.surface.arrays.nodes
+        station = car.station_m + car.speed_m_per_s * (epoch_gps_ns - self.start_gps_ns) * 1e-9
+        easting, northing, _ = self.surface.place(np.clip(station, nodes[0, STATION], nodes[-1, STATION]), car.offset_m)
+        origin = self.surface.origin_enh_m
+        away = np.hypot(easting - origin[0] - path_m[:, 0], northing - origin[1] - path_m[:, 1])
+        return np.asarray(away < BESIDE_M + car.length_m + car.width_m)
+
+    def _moved(self, car: MovingCar, count: int, epoch_gps_ns: Int64, near: npt.NDArray[np.bool_]) -> Float64:
+        """Bodies (p, count, 18) of a car at each profile; out of reach where it is not `near` or not on the road."""
+        rows = np.zeros((epoch_gps_ns.size, count, BODY_COLUMNS))
+        rows[..., KIND] = BOX
+        rows[..., EASTING] = _OUT_OF_REACH_M
+        slots = (epoch_gps_ns - self.start_gps_ns) // SLOT_NS
+        for slot in np.unique(slots[near]).tolist():
+            begin_s = slot * SLOT_NS * 1e-9
+            placed = mover_bodies(car, self.surface, begin_s, (slot + 1) * SLOT_NS * 1e-9)
+            if placed is None:
+                continue
+            inside = np.flatnonzero(near & (slots == slot))
+            bodies, velocity = placed
+            past = (epoch_gps_ns[inside] - self.start_gps_ns - slot * SLOT_NS) * 1e-9
+            moved = np.repeat(bodies[None], inside.size, axis=0)
+            for columns, speed in zip(((EASTING,), (NORTHING,), (LOW, HIGH, LOW_END, HIGH_END)), velocity, strict=True):
+                moved[:, :, columns] += (past * speed)[:, None, None]
+            rows[inside] = moved
+        return rows
 
 
 def _object_ids(body_hit: Int32, owners: Int32, range_m: Float64) -> Int32:

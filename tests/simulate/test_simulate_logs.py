@@ -18,6 +18,7 @@ from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, SimulatedSurvey, simulate, truth
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.files import write_control
 from roadscan.simulate.surface import Surface
 from tests.simulate.chain import WEEK_NS, Chain, read_sbet
 
@@ -154,12 +155,22 @@ def test_survey_file_loads(survey: SimulatedSurvey):
 def test_control_points_lie_on_the_road(survey: SimulatedSurvey):
     known = truth.load(survey.folder)
     rows = list(csv.DictReader(survey.control_file.read_text().splitlines()))
-    assert {row["role"] for row in rows} == {"gcp", "check"}
+    assert [row["role"] for row in rows] == ["gcp", "gcp", "check", "gcp"]
+    assert [row["name"][0] for row in rows] == ["G", "G", "C", "G"]
     assert len({row["name"] for row in rows}) == len(rows) == 4
     enh = np.array([[float(row[c]) for c in ("easting_m", "northing_m", "height_m")] for row in rows])
     np.testing.assert_allclose(enh[:, 2], known.height_m(enh[:, 0], enh[:, 1]), atol=1e-4)
     _, offset = known.station_offset_m(enh[:, 0], enh[:, 1])
     np.testing.assert_allclose(np.abs(offset), 3.05, atol=2e-4)
+
+
+def test_painted_targets_keep_their_roles(tmp_path: Path):
+    roles = ["check", "gcp", "gcp", "check", "gcp"]
+    targets = [{"station_m": 4.0 * i, "offset_m": 1.0, "role": role} for i, role in enumerate(roles)]
+    scene = CURVE.noiseless().changed(road={"targets": targets})
+    write_control(scene, Surface(scene), tmp_path / "control.csv")
+    rows = list(csv.DictReader((tmp_path / "control.csv").read_text().splitlines()))
+    assert [row["role"] for row in rows] == roles
 
 
 def test_noise_has_the_stated_size(tmp_path: Path):

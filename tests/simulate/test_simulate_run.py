@@ -6,10 +6,14 @@ import hashlib
 import tracemalloc
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from roadscan.model.errors import ConfigError, FormatError
 from roadscan.simulate import Scene, profiler, simulate, trajectory, truth
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.earth import Earth
+from roadscan.simulate.surface import Surface
 
 TINY = Scene.load("demo").changed(
     length_m=20.0,
@@ -57,14 +61,53 @@ def test_chunks_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def _ranges(scene: Scene) -> bytes:
-    from roadscan.simulate.drive import Drive
-    from roadscan.simulate.earth import Earth
-    from roadscan.simulate.surface import Surface
-
     surface = Surface(scene)
     drive = Drive(scene, 0, Earth(scene.map.crs), Surface(scene, ride=True))
     head = profiler.heads(scene.profilers)[1]
     return b"".join(block.ranges.tobytes() for block in profiler.measure(scene, surface, drive, head))
+
+
+STREET = Scene().changed(
+    length_m=25.0,
+    map={"crs": "local", "azimuth_deg": 33.0},
+    road={"cross_slope": 0.0, "grade": 0.0, "verge_slope": 0.0, "brightness": {"asphalt": 70.6}},
+    vehicle={"heave_m": 0.0, "sway_deg": 0.0, "speed_m_per_s": 10.0},
+    profilers={"spacing_m": 0.05, "readings": 120, "left": {"lever_arm_body_m": [-2.35, -0.98, -1.08]}},
+)
+CAR = {"station_m": 20.0, "offset_m": -0.6, "speed_m_per_s": -10.0, "height_m": 0.8}
+
+
+def _left_profiles(scene: Scene) -> list[np.ndarray]:
+    """Epochs since the start (s), station and offset of each hit, its object, intensity and range of the left head."""
+    surface = Surface(scene)
+    drive = Drive(scene, 0, Earth(scene.map.crs), Surface(scene, ride=True))
+    head = profiler.heads(scene.profilers)[0]
+    blocks = list(profiler.measure(scene, surface, drive, head, with_hits=True))
+    time_s = (np.concatenate([b.epoch_gps_ns for b in blocks]) - drive.start_gps_ns) * 1e-9
+    hits = np.concatenate([b.hits for b in blocks])
+    station, offset = surface.station_offset_m(hits[:, :, 0], hits[:, :, 1])
+    rest = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("object_id", "intensity", "ranges"))
+    return [np.broadcast_to(time_s[:, None], station.shape), station, offset, *rest]
+
+
+def test_moving_cars_block_profiler_beams(monkeypatch: pytest.MonkeyPatch):
+    """The beams are upright: what is under each is the car (4.4 m by 1.8 m) as it stands at the profile's epoch."""
+    found = _left_profiles(STREET.changed(roadside={"moving_cars": [CAR]}))
+    time_s, station, offset, object_id, intensity, _ = found
+    away = np.maximum(np.abs(station - (20.0 - 10.0 * time_s)) - 2.2, np.abs(offset + 0.6) - 0.91)
+    assert (object_id == 1).sum() > 1000
+    assert away[object_id == 1].max() < 1e-6  # wheels stand out by a centimetre
+    side = np.maximum(np.abs(station - (20.0 - 10.0 * time_s)) - 2.2, np.abs(offset + 0.6) - 0.9)
+    assert side[object_id == 0].min() > -1e-6
+    assert set(intensity[(object_id == 0) & (np.abs(offset) < 3.4)].tolist()) == {71}  # 70.6, rounded
+    assert {170, 71} <= set(intensity.ravel().tolist())
+    # Blocks of profiles change nothing.
+    monkeypatch.setattr(profiler, "BLOCK_PROFILES", 37)
+    for a, b in zip(found, _left_profiles(STREET.changed(roadside={"moving_cars": [CAR]})), strict=True):
+        np.testing.assert_array_equal(a, b)
+    # Nor is it there in a pass that it does not drive in.
+    empty = _left_profiles(STREET.changed(roadside={"moving_cars": [CAR | {"passes": [2]}]}))
+    assert (empty[3] == 0).all()
 
 
 def test_row_groups_and_encoding(tmp_path: Path):

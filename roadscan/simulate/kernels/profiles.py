@@ -87,6 +87,7 @@ def scan_profiles(
     y_sensor_m: Float64,
     scale: Float64,
     bodies: Float64,
+    movers: Float64,
     normal: Float32,
     random_from: np.uint64,
     beam: Float64,
@@ -104,7 +105,9 @@ def scan_profiles(
     y_sensor_m : (n,) transverse positions of the readings.
     scale : (8,) middle range of the planes (m), range of raw 0 (m), range step (m), share of lost readings, range
         noise (m), intensity noise, share of wrong readings and how far they lie off (m).
-    bodies : (b, 18) things that may stand in the beams' way, see :mod:`roadscan.simulate.kernels.things`.
+    bodies : (b, 18) things that may stand in the beams' way, see :mod:`roadscan.simulate.kernels.things`; the last m
+        rows are overwritten by what moves.
+    movers : (p, m, 18) what moves, as it is at each profile.
     normal : (65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind.
     random_from : where the random numbers of the first reading begin; reading i of profile p has its own.
     beam : (3, 3) scratch.
@@ -113,6 +116,7 @@ def scan_profiles(
     body_hit : (p, n), out; row of the body that the beam meets, −1: none. (0, 0): not wanted.
     """
     for p in range(road_planes.shape[0]):
+        place_movers(bodies, movers, p)
         before = 0.0
         r = before
         fall = 1.0
@@ -169,7 +173,16 @@ def scan_profiles(
             raw = math.floor((found - scale[1]) / scale[2] + 0.5)
             seen = seen and 1.0 <= raw <= 65535.0
             ranges[p, i] = int(raw) if seen else 0
-            intensity[p, i] = int(min(max(value, 0.0), 255.0)) if seen else 0
+            intensity[p, i] = int(min(max(value + 0.5, 0.0), 255.0)) if seen else 0
+
+
+@compiled
+def place_movers(bodies: Float64, movers: Float64, p: int) -> None:
+    """Overwrite the last of the bodies (b, 18) by what moves (p, m, 18), as it is at profile `p`."""
+    first = bodies.shape[0] - movers.shape[1]
+    for m in range(movers.shape[1]):
+        for column in range(movers.shape[2]):
+            bodies[first + m, column] = movers[p, m, column]
 
 
 @compiled

@@ -107,6 +107,8 @@ def _check(columns: dict[str, Float64], sieve: Sieve) -> None:
             sieve.drop(~whole, "number of satellites is not a whole number from 0 to 255")
         elif name.startswith("velocity_"):
             _limit(name, values, -VELOCITY_MAX_M_PER_S, VELOCITY_MAX_M_PER_S, sieve)
+        elif name == "speed_m_per_s":
+            _limit(name, values, 0.0, VELOCITY_MAX_M_PER_S, sieve)
         elif name in _ANGLES:
             _limit(name, values, -360.0, 360.0, sieve)
         elif not name.startswith("sigma_"):

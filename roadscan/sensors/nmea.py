@@ -25,9 +25,11 @@ from roadscan.sensors.nmea_sentences import (
     VALUES,
     Sentences,
     find_sentences,
+    is_address,
     kinds_of,
     parse_sentences,
 )
+from roadscan.sensors.pcap import MAGICS, PCAPNG
 from roadscan.sensors.poses import GeodeticPlacement
 from roadscan.sensors.records import EpochReader, Sieve, drop_failing, few_rejects, options_of
 from roadscan.sensors.text_table import head_of, line_blocks
@@ -41,6 +43,8 @@ LATE_NS: Final = 2 * NS_PER_S
 HELD_MAX: Final = 20_000
 """So many sentences are held for late ones; more in so short a time are a clock that stands still."""
 SNIFF_BYTES: Final = 1 << 14
+MIXED_SENTENCES: Final = 3
+"""So many known sentences with right checksums at the start make a log with binary messages one of NMEA."""
 
 _EPOCH_DAY: Final = dt.date(1970, 1, 1)
 _UNKNOWN: Final = np.iinfo(np.int64).min
@@ -63,8 +67,10 @@ class Nmea(LogFormat):
     GGA gives position, quality, satellites, hdop and age; RMC date, speed and course; VTG speed and
     course; GST σ of the position; ZDA the date; HDT the heading; PASHR (the form of $PASHR,hhmmss.sss,
     heading,T,roll,pitch,heave,σ,σ,σ,…) heading, roll and pitch with σ. Others are passed over. Velocity
-    north and east come from speed and course. Words before the ``$`` are passed over; a sentence without
-    its right checksum is rejected, and so is a line without one. A record is a line.
+    north and east come from speed and course; without a course (at rest) the speed alone is kept. Words
+    before the ``$`` are passed over; a sentence without its right checksum is rejected, and so is a line
+    without one. A record is a line. Binary messages of a receiver (UBX, RTCM) may stand between the
+    sentences; where they look like damage, each stretch of them is one reject.
 
     GGA's altitude is above the geoid: the separation that the sentence states makes it ellipsoidal. A log
     without it needs height = "orthometric" and the geoid, or options.altitude = "ellipsoidal".
@@ -84,14 +90,17 @@ class Nmea(LogFormat):
     options = NmeaOptions
 
     def sniff(self, path: Path) -> bool:
-        """True if the text's first sentences are known, with right checksums for the most part."""
+        """True if the first sentences are known, with right checksums for the most part; several in binary data."""
         head = head_of(path, SNIFF_BYTES) if path.is_file() else b""
-        if b"$" not in head or b"\x00" in head:
+        if b"$" not in head or head[:4] in {*MAGICS, PCAPNG}:  # captures hold the sentences of a lidar's receiver
             return False
         whole = head[: head.rfind(b"\n") + 1] or head
         found = find_sentences(whole)
-        known = kinds_of(whole, found.starts, found.ends) >= 0
-        return bool(known.any()) and found.starts.size >= len(found.faulty)
+        known = int((kinds_of(whole, found.starts, found.ends) >= 0).sum())
+        if b"\x00" not in head and known and found.starts.size >= len(found.faulty):
+            return True
+        damaged = sum(is_address(whole, dollar) for dollar, _ in found.faulty)
+        return known >= MIXED_SENTENCES and found.starts.size >= damaged
 
     def header(self, source: LogSource) -> LogHeader:
         """Check clock, CRS and heights, and find the first date."""
@@ -291,7 +300,7 @@ class _Calendar:
 
     def _days(self, timed: Sentences, passed: Int64, sieve: Sieve) -> Int64:
         """Date (n,) of the log's first time as each sentence has it: its epoch's own, or the last before it."""
-        run = np.cumsum(np.diff(timed.times_ns, prepend=timed.times_ns[0]) != 0)
+        run = _epoch_runs(timed)
         dated = np.flatnonzero(timed.days != UNDATED)[::-1]  # the first of an epoch stands
         of_run = np.full(run[-1] + 1, UNDATED, dtype=np.int64)
         of_run[run[dated]] = timed.days[dated] - passed[dated]
@@ -312,6 +321,22 @@ class _Calendar:
         lent = np.concatenate([[self._last_epoch], own])[at]
         self._last_epoch = int(own[-1]) if own.size else self._last_epoch
         return lent, np.zeros(untimed.size, dtype=bool)
+
+
+def _epoch_runs(timed: Sentences) -> Int64:
+    """Number (n,) of the epoch each sentence stands in: of one time of the day, and of one date as a kind states it.
+
+    Where one kind states two dates at the same time of the day, a day or more is missing from the log; its
+    epochs then begin where the kind that came first comes again.
+    """
+    new = np.diff(timed.times_ns, prepend=-1) != 0
+    run = np.cumsum(new) - 1
+    dated = np.flatnonzero(timed.days != UNDATED)
+    dated = dated[np.lexsort((dated, timed.kinds[dated], run[dated]))]
+    same = (np.diff(run[dated]) == 0) & (np.diff(timed.kinds[dated]) == 0)
+    split = run[dated[1:]][same & (np.diff(timed.days[dated]) != 0)]
+    again = np.isin(run, split) & (timed.kinds == timed.kinds[new][run])
+    return np.asarray(np.cumsum(new | again) - 1)
 
 
 def _single(sieve: Sieve, sentences: Sentences) -> list[Reject]:
@@ -458,9 +483,9 @@ def _degrees(merged: _Merged, rows: Int64) -> tuple[Float64, Float64]:
 
 def _columns(merged: _Merged) -> dict[str, Float64]:
     """Columns of `gnss` beside epoch, position and quality."""
-    computed = ("latitude_deg", "longitude_deg", "altitude_m", "quality", "speed_m_per_s")
+    computed = ("latitude_deg", "longitude_deg", "altitude_m", "quality")
     columns = {name: merged.value(name) for name in VALUES if name not in computed}
-    speed, course = merged.value("speed_m_per_s"), np.radians(columns["course_deg"])
+    speed, course = columns["speed_m_per_s"], np.radians(columns["course_deg"])
     still = speed == 0  # a receiver at rest states no course
     with np.errstate(invalid="ignore"):
         columns["velocity_north_m_per_s"] = np.where(still, 0.0, speed * np.cos(course))

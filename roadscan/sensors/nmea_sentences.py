@@ -7,8 +7,9 @@ Everything here works on whole blocks of text; fields are parsed by Arrow, a kin
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -56,6 +57,11 @@ GGA_QUALITY: Final = {
 }
 """Quality of GGA by its number; 9 is NovAtel's for SBAS."""
 
+BINARY_SHARE: Final = 4
+"""A stretch between two sentences is binary where one of so many bytes, or more, is neither text nor blank."""
+
+_ADDRESS: Final = re.compile(rb"\$(?:P[A-Z0-9]{2,6}|[A-Z]{2}[A-Z0-9]{3}),")
+_IS_BINARY: Final[Bool] = np.isin(np.arange(256), [*range(32, 127), *b"\t\r\n"], invert=True)
 _DOLLAR, _STAR, _COMMA, _FEED = (ord(c) for c in "$*,\n")
 _HEX: Final[npt.NDArray[np.int16]] = np.full(256, -1, dtype=np.int16)
 for _digit, _letters in enumerate(zip("0123456789ABCDEF", "0123456789abcdef", strict=True)):
@@ -146,6 +152,11 @@ def _next(marks: Int64, positions: Int64, none: int) -> Int64:
     return np.append(marks, none)[np.searchsorted(marks, positions)]
 
 
+def is_address(data: bytes, dollar: int) -> bool:
+    """True if the ``$`` at byte `dollar` opens a sentence, and is not any byte of binary data."""
+    return _ADDRESS.match(data, dollar) is not None
+
+
 def kinds_of(data: bytes, starts: Int64, ends: Int64) -> Int64:
     """Number in :data:`KINDS` of each sentence, −1 for others."""
     letters = np.frombuffer(data, dtype=np.uint8)
@@ -177,11 +188,10 @@ def parse_sentences(data: bytes, first_line: int, offset: int) -> tuple[Sentence
     feeds = np.flatnonzero(letters == _FEED)
     lines = feeds.size + (not data.endswith(b"\n"))
     found = find_sentences(data)
-    rejects = [
-        Reject(reason, first_line + int(np.searchsorted(feeds, start)), offset + start)
-        for start, reason in found.faulty
-    ]
-    rejects += _lines_without(letters, feeds, lines, first_line, offset)
+    rejects = [Reject(reason, int(np.searchsorted(feeds, start)), start) for start, reason in found.faulty]
+    rejects += _lines_without(letters, feeds, lines)
+    rejects = _stretches_as_one(data, found, rejects)
+    rejects = [replace(r, record=first_line + r.record, offset=offset + r.offset) for r in rejects]
     kinds = kinds_of(data, found.starts, found.ends)
     commas = np.flatnonzero(letters == _COMMA)
     fields = np.searchsorted(commas, found.ends) - np.searchsorted(commas, found.starts)
@@ -199,7 +209,31 @@ def parse_sentences(data: bytes, first_line: int, offset: int) -> tuple[Sentence
     return joined.take(np.argsort(joined.offsets)), few_rejects(rejects), lines
 
 
-def _lines_without(letters: Bytes, feeds: Int64, lines: int, first_line: int, offset: int) -> list[Reject]:
+def _stretches_as_one(data: bytes, found: Found, rejects: list[Reject]) -> list[Reject]:
+    """One reject for each stretch of binary data between sentences; damaged sentences in it keep their own."""
+    if not rejects:
+        return rejects
+    letters = np.frombuffer(data, dtype=np.uint8)
+    starts = np.concatenate([[0], found.ends + 3])
+    ends = np.append(found.starts, letters.size)
+    binary = np.concatenate([[0], np.cumsum(_IS_BINARY[letters])])
+    count = binary[ends] - binary[np.minimum(starts, ends)]
+    is_stretch = (count > 0) & (count * BINARY_SHARE >= ends - starts)
+    kept: list[Reject] = []
+    merged: dict[int, Reject] = {}
+    line_behind: dict[int, int] = {}
+    gaps = np.searchsorted(found.starts, [r.offset for r in rejects], side="right").tolist()
+    for gap, reject in sorted(zip(gaps, rejects, strict=True), key=lambda pair: pair[1].offset):
+        if not is_stretch[gap] or is_address(data, reject.offset):
+            kept.append(reject)
+            continue
+        merged.setdefault(gap, reject)
+        line_behind[gap] = max(line_behind.get(gap, 0), reject.record + reject.records)
+    reason = "binary data between the sentences"
+    return kept + [Reject(reason, r.record, r.offset, line_behind[gap] - r.record) for gap, r in merged.items()]
+
+
+def _lines_without(letters: Bytes, feeds: Int64, lines: int) -> list[Reject]:
     """Lines that are neither blank nor hold a sentence, runs of them together."""
     if np.unique(np.searchsorted(feeds, np.flatnonzero(letters == _DOLLAR))).size == lines:
         return []
@@ -213,7 +247,7 @@ def _lines_without(letters: Bytes, feeds: Int64, lines: int, first_line: int, of
         return []
     runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
     reason = "there is no sentence ($…) in the line"
-    return [Reject(reason, first_line + int(run[0]), offset + int(starts[run[0]]), run.size) for run in runs]
+    return [Reject(reason, int(run[0]), int(starts[run[0]]), run.size) for run in runs]
 
 
 def _sentences(kind: int, part: _Part, lines: Int64, offsets: Int64) -> Sentences:

@@ -141,6 +141,19 @@ def test_sentences_of_one_epoch_are_one_row(tmp_path: Path) -> None:
     assert log.rows[0].first_record == 0
 
 
+def test_speed_without_a_course_is_kept(tmp_path: Path) -> None:
+    """A receiver at rest states a little speed and no course."""
+    still = checked("GNRMC,093000.00,A,5000.0,N,01000.0,E,0.05,,040526,,,R")
+    vtg = checked("GNVTG,,T,,M,,N,0.18,K,D")
+    lines = [still, gga("093000.00"), rmc("093001.00", "040526"), gga("093001.00"), gga("093002.00"), vtg]
+    log = read_log("nmea", write(tmp_path / "a.nmea", *lines), **STATED)
+    assert log.rejects == []
+    np.testing.assert_allclose(log.column("speed_m_per_s"), [0.05 * KNOT, 10 * KNOT, 0.05])
+    for axis, moving in (("north", 0.0), ("east", 10 * KNOT)):
+        values = log.table.column(f"velocity_{axis}_m_per_s").to_pylist()
+        assert values == [None, pytest.approx(moving, abs=1e-12), None]
+
+
 @pytest.mark.parametrize(("untimed", "headings"), [("before", [10.0, 20.0, None]), ("after", [None, 10.0, 20.0])])
 @pytest.mark.parametrize("block", [1 << 20, 90])
 def test_whose_time_an_untimed_sentence_has(
@@ -295,6 +308,27 @@ def test_days_that_are_missing_from_a_log(tmp_path: Path) -> None:
     assert [(r.record, r.reason) for r in log.rejects] == [
         (2, "its date is not known: the dates before and after it do not follow")
     ]
+
+
+@pytest.mark.parametrize("order", [(gga, rmc), (rmc, gga)])
+def test_the_same_time_of_a_later_day(tmp_path: Path, order: tuple[Any, Any]) -> None:
+    """Whole days are missing between two epochs: the stated dates tell them apart, whichever sentence comes first."""
+    dates = ["040526", "050526", "090526"]
+    lines = [make("093000.00", *([date] if make is rmc else [])) for date in dates for make in order]
+    log = read_log("nmea", write(tmp_path / "a.nmea", *lines), **STATED)
+    assert log.rejects == []
+    assert log.epochs.tolist() == [at(f"2026-05-{day}T09:30:00") for day in ("04", "05", "09")]
+    assert log.column("quality").tolist() == ["fixed"] * 3
+    np.testing.assert_allclose(log.column("speed_m_per_s"), 10 * KNOT)
+
+
+def test_the_first_date_of_an_epoch_stands(tmp_path: Path) -> None:
+    """RMC and ZDA that contradict each other are one epoch all the same."""
+    zda = checked("GNZDA,093000.00,05,05,2026,00,00")
+    row = only(
+        read_log("nmea", write(tmp_path / "a.nmea", rmc("093000.00", "040526"), zda, gga("093000.00")), **STATED)
+    )
+    assert (row["epoch_gps_ns"], row["quality"]) == (at("2026-05-04T09:30:00"), "fixed")
 
 
 def test_a_leap_second(tmp_path: Path) -> None:
@@ -453,6 +487,48 @@ def test_each_damaged_sentence_costs_itself(tmp_path: Path) -> None:
     assert seconds.tolist() == [0, 1, 6, 8, 9]
 
 
+def ubx(rng: random.Random, size: int) -> bytes:
+    """A frame of u-blox: two sync bytes, class, length, anything, two of checksum."""
+    return b"\xb5\x62\x02\x15" + size.to_bytes(2, "little") + rng.randbytes(size + 2)
+
+
+def mixed(frames: int = 8, seconds: int = 20) -> tuple[bytes, list[int]]:
+    """A log with binary frames between the epochs, and where each stretch of them starts."""
+    rng = random.Random("roadscan mixed")
+    data, stretches = b"", []
+    for i in range(seconds):
+        stretches.append(len(data))
+        data += b"".join(ubx(rng, 400) for _ in range(frames))
+        data += f"{rmc(f'0930{i:02d}.00', '040526')}\r\n{gga(f'0930{i:02d}.00')}\r\n".encode()
+    return data, stretches
+
+
+def test_binary_messages_between_the_sentences(tmp_path: Path) -> None:
+    data, stretches = mixed()
+    path = tmp_path / "a.ubx"
+    path.write_bytes(data)
+    assert format_of(path).name == "nmea"
+    log = read_log("nmea", path, **STATED)
+    assert log.epochs.tolist() == [at(f"2026-05-04T09:30:{i:02d}") for i in range(20)]
+    assert log.column("quality").tolist() == ["fixed"] * 20
+    assert {r.reason for r in log.rejects} == {"binary data between the sentences"}
+    places = [int(np.searchsorted(stretches, r.offset, side="right")) for r in log.rejects]
+    assert len(places) == len(set(places)), "a stretch is rejected twice"
+    assert b"$" in data[stretches[0] : stretches[0] + 3000], "nothing in the data looks like a sentence"
+
+
+def test_a_damaged_sentence_in_binary_data_keeps_its_reason(tmp_path: Path) -> None:
+    data, stretches = mixed(seconds=3)
+    damaged = gga("093000.50").replace("5000.0", "5000.1").encode() + b"\r\n"
+    cut = stretches[1] + 1000
+    path = tmp_path / "a.ubx"
+    path.write_bytes(data[:cut] + b"\n" + damaged + data[cut:])
+    log = read_log("nmea", path, **STATED)
+    assert log.table.num_rows == 3
+    assert [r.offset for r in log.rejects if r.reason == "the sentence does not fit its checksum"] == [cut + 1]
+    assert len(log.rejects) <= 4, "three stretches and the sentence"
+
+
 def test_faulty_fields(tmp_path: Path) -> None:
     bodies = {
         "GNGGA,093001,5000.0,N,01000.0,E,X,12,0.8,100.0,M,40.0,M,,": "quality 'X' is not a number",
@@ -511,6 +587,11 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
     assert not is_nmea(write(tmp_path / "c", GGA[:30], RMC[:30]))
     assert not is_nmea(write(tmp_path / "d", "a,b,c", "1,$5,3"))
     assert not is_nmea(write(tmp_path / "e", "\x00" + GGA))
+    capture = b"\xd4\xc3\xb2\xa1" + b"\x00" * 20 + mixed()[0]  # position packets of a lidar hold sentences too
+    (tmp_path / "f").write_bytes(capture)
+    assert not is_nmea(tmp_path / "f")
+    (tmp_path / "g").write_bytes(random.Random(5).randbytes(40_000))
+    assert not is_nmea(tmp_path / "g")
     assert not is_nmea(tmp_path)
     assert not is_nmea(tmp_path / "absent")
     assert [p for p in recordings.rglob("*") if p.is_file() and is_nmea(p)] == []

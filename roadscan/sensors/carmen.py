@@ -57,7 +57,7 @@ from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
 from roadscan.sensors.poses import LevelPlacement, PoseReader, RawPoses, ned_from_rph
 from roadscan.sensors.records import EpochReader, Sieve, options_of
-from roadscan.sensors.text_table import head_of, line_blocks
+from roadscan.sensors.text_table import SEARCHED_BYTES, head_of, line_blocks
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -375,13 +375,13 @@ def _head(source: LogSource, options: CarmenOptions) -> _Head:
     Raises
     ------
     FormatError
-        if there is none in the log.
+        if there is none near the log's beginning.
     ConfigError
         if several messages hold scans and the options do not choose.
     """
     params: dict[str, str] = {}
     odometry = 0
-    for _, data in line_blocks(source.path):
+    for _, data in line_blocks(source.path, limit=SEARCHED_BYTES):
         if isinstance(data, Reject):
             continue
         block = _sorted_lines(data, options.message)
@@ -403,7 +403,8 @@ def _head(source: LogSource, options: CarmenOptions) -> _Head:
             if np.isfinite(numbers[:, usual.count_at]).any():
                 return _Head(usual, lines, numbers, odometry > 0, params, dict(sorted(block.names.items())))
     raise FormatError(
-        f"the log holds no scan{'' if options.message is None else ' of message ' + options.message}",
+        f"the log holds no scan{'' if options.message is None else ' of message ' + options.message} in its first "
+        f"{SEARCHED_BYTES >> 20} MB",
         expected="lines that begin with FLASER, RLASER, RAWLASER1 … or ROBOTLASER1 …",
         file=source.path,
     )

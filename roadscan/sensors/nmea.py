@@ -32,7 +32,7 @@ from roadscan.sensors.nmea_sentences import (
 from roadscan.sensors.pcap import MAGICS, PCAPNG
 from roadscan.sensors.poses import GeodeticPlacement
 from roadscan.sensors.records import EpochReader, Sieve, drop_failing, few_rejects, options_of
-from roadscan.sensors.text_table import head_of, line_blocks
+from roadscan.sensors.text_table import SEARCHED_BYTES, head_of, line_blocks
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -132,10 +132,10 @@ class Nmea(LogFormat):
             )
 
 
-def _sentences(path: Path) -> Iterator[Sentences | Reject]:
-    """All sentences of a log, block by block."""
+def _sentences(path: Path, limit: int | None = None) -> Iterator[Sentences | Reject]:
+    """All sentences of a log, or of its first `limit` bytes, block by block."""
     line = 0
-    for offset, data in line_blocks(path):
+    for offset, data in line_blocks(path, limit=limit):
         if isinstance(data, Reject):
             yield replace(data, record=line, offset=offset)
             line += 1
@@ -210,6 +210,9 @@ def _first_day(source: LogSource) -> int:
 
 
 def _first_dated_day(path: Path) -> int | None:
+    head = (s for s in _sentences(path, SEARCHED_BYTES) if not isinstance(s, Reject))
+    if not any((sentences.times_ns != UNTIMED).any() for sentences in head):
+        return None  # whatever the file is, it need not be read to its end
     midnights = _Midnights()
     for sentences in _sentences(path):
         if isinstance(sentences, Reject):

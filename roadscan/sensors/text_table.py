@@ -33,6 +33,8 @@ Float64 = npt.NDArray[np.float64]
 BLOCK_BYTES: Final = 1 << 20
 LINE_BYTES_MAX: Final = 1 << 16
 """A line without an end for so long is no text line."""
+SEARCHED_BYTES: Final = 16 << 20
+"""A text in which so many bytes hold nothing of a format is not of that format."""
 HEAD_BYTES: Final = 1 << 16
 """The column names have to stand in so many bytes."""
 
@@ -270,10 +272,14 @@ def parse_lines(
         yield from _parse_singly(data, starts, ends, layout, kinds, records, offsets)
 
 
-def line_blocks(path: Path, start: int = 0) -> Iterator[tuple[int, bytes | Reject]]:
+def line_blocks(path: Path, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, bytes | Reject]]:
     """Pieces of whole lines from byte `start` of the text on, each with its offset.
 
     A reject stands for a line without end, or for all that follows the break of a compressed stream.
+
+    Parameters
+    ----------
+    limit : bytes of the text after which no more is read.
     """
     carry, offset, skipping = b"", 0, False
     for chunk in byte_pieces(path):
@@ -295,6 +301,8 @@ def line_blocks(path: Path, start: int = 0) -> Iterator[tuple[int, bytes | Rejec
         if len(carry) > LINE_BYTES_MAX:
             yield offset, Reject(f"a line longer than {LINE_BYTES_MAX} bytes")
             offset, carry, skipping = offset + len(carry), b"", True
+        if limit is not None and offset >= limit:
+            return
     if carry:
         yield offset, carry
 

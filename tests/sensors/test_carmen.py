@@ -287,6 +287,11 @@ def test_a_log_is_refused_as_a_whole(tmp_path: Path) -> None:
     assert len(read_carmen(path, crs="local").ranges) == 2
     with pytest.raises(FormatError, match="no scan of message RLASER"):
         read_carmen(path, {"message": "RLASER"})
+    with path.open("wb") as stream:
+        stream.write(b"# nothing here\n" * (1_200_000))
+        stream.write(plain(0).encode())
+    with pytest.raises(FormatError, match="holds no scan in its first 16 MB"):
+        read_carmen(path)
     for text in ("", "ODOM 1 2 3 0 0 0 1 host 0\n", plain(0)[:500], "FLASER\n", "FLASER 3\n"):
         path.write_text(text)
         assert not format_named("carmen").sniff(path)

@@ -198,6 +198,7 @@ def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
     before = ""
     for need in log.needs:
         yield _question(need.line)
+        yield from _alternatives(need)
         said = "its time system is not in the file" if need.is_generic else need.reason
         reason = "; ".join(part for part in (said, _hint(need, log, run)) if part)
         if need.reason != before:
@@ -205,6 +206,13 @@ def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
         before = need.reason
         if need.key == "crs":
             yield '# height = "orthometric"  # and geoid = "…", if its heights are not ellipsoidal'
+
+
+def _alternatives(need: Need) -> Iterator[str]:
+    """What may stand in place of a question, as comments."""
+    for lines in need.alternatives:
+        yield "# or, in its place:"
+        yield from (f"# {line}" for line in lines)
 
 
 def _hint(need: Need, log: FoundLog, run: FoundRun) -> str:
@@ -238,6 +246,7 @@ def _control(log: FoundLog, folder: Path) -> Iterator[str]:
     for need in log.needs:
         if need.key not in {"crs", "height"}:
             yield _question(need.line)
+            yield from _alternatives(need)
             yield from _remark(need.reason)
 
 

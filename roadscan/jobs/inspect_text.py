@@ -11,6 +11,7 @@ from rich.text import Text
 
 from roadscan.jobs.inspect import Inspection, LogReport, TimeSpan
 from roadscan.jobs.log_figures import ColumnFigures, Extent, Fault, TableFigures
+from roadscan.jobs.provisional import OpenedLog
 from roadscan.model.crs import LOCAL_WORLD, world_title
 from roadscan.model.gpstime import NS_PER_S, WEEK_S, TimeSystem, iso_from_gps_ns
 
@@ -75,7 +76,7 @@ def _log(log: LogReport) -> Iterator[Line]:
         yield "time", "not known, and the log holds no stamps of its own", ""
     for table in log.figures.tables.values():
         if table.extent is not None:
-            yield from (("extent", line, "") for line in _extent(table.extent, table, log.opened.needs_key("crs")))
+            yield from (("extent", line, "") for line in _extent(table.extent, table, log.opened))
         if table.readings is not None:
             yield from (("readings", line, "") for line in _readings(table))
         yield from (("columns", line, "") for line in _columns(table))
@@ -83,6 +84,7 @@ def _log(log: LogReport) -> Iterator[Line]:
     before = ""
     for need in log.opened.needs:
         yield "to state", need.line, "bold yellow"
+        yield from (("to state", "or " + ", ".join(lines), "bold yellow") for lines in need.alternatives)
         if need.reason != before:
             yield "to state", f"  {need.reason}", ""
         before = need.reason
@@ -120,18 +122,19 @@ def _time(time: TimeSpan) -> Iterator[str]:
         yield f"  as {system} the first would be {moment}"
 
 
-def _extent(extent: Extent, table: TableFigures, is_assumed: bool) -> Iterator[str]:
+def _extent(extent: Extent, table: TableFigures, opened: OpenedLog) -> Iterator[str]:
     if extent.degrees_low is not None and extent.degrees_high is not None:
         (west, south), (east, north) = extent.degrees_low, extent.degrees_high
         yield f"longitude {west:.7f}° to {east:.7f}°, latitude {south:.7f}° to {north:.7f}°"
     if extent.low is not None and extent.high is not None:
         frame = f"in {'the local frame' if extent.frame == LOCAL_WORLD else world_title(extent.frame)}"
-        if is_assumed:
+        if opened.needs_key("crs"):
             frame = "as written" if extent.frame == LOCAL_WORLD else f"{frame}, which is not stated"
         box = ", ".join(
             f"{axis} {low:,.3f} to {high:,.3f}" for axis, low, high in zip("xyz", extent.low, extent.high, strict=True)
         )
-        yield f"{box} m {frame}"
+        unit = "in a unit that is not stated," if opened.needs_key("options.unit") else "m"
+        yield f"{box} {unit} {frame}"
     if table.path_m:
         yield f"a way of {table.path_m:,.3f} m"
 

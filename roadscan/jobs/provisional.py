@@ -9,6 +9,7 @@ line that the survey file has to state. Nothing of this reaches ingest.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 import tomllib
 from collections.abc import Iterator
@@ -38,7 +39,7 @@ from roadscan.model.survey import ClockConfig
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Rows
 
 Int64 = npt.NDArray[np.int64]
-Dimension = Literal["clock", "crs", "height", "options", "sensor"]
+Dimension = Literal["clock", "crs", "height", "options", "proposal", "sensor"]
 
 SENSOR_KINDS: Final[dict[str, SensorKind]] = {
     "scans": "profiler",
@@ -63,7 +64,10 @@ _TABLE_IN_TEXT: Final = re.compile(r"clock = (\{[^{}]*\})")
 _NOT_STATED: Final = "the log's time system is not stated"
 _PLAIN_ADVICE: Final = re.compile(r"^add clock = \{[^{}]*\} to this log$")
 """Advice that says no more than the line itself."""
+_UNKNOWN: Final = '"????"'
 _OPTION_IN_TEXT: Final = re.compile(r"options(?:\.| = \{ *)(\w+)")
+_ONE_OF_IN_TEXT: Final = re.compile(r"one of (options\..+)")
+_STATED_IN_TEXT: Final = re.compile(r"options\.(\w+)(?: = ([^\s,;]+))?")
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,8 @@ class Need:
     """What the reader said."""
     is_of_time: bool = False
     """The log's time depends on it."""
+    alternatives: tuple[tuple[str, ...], ...] = ()
+    """Other lines, any one group of which may stand in place of this line."""
 
     @property
     def is_generic(self) -> bool:
@@ -206,22 +212,53 @@ class _Search:
         if len(self._seen) >= self._trials or repr(trial) in self._seen:
             return None
         self._seen.add(repr(trial))
+        error = self._refusal(trial)
+        if error is None:
+            return self._opened(trial, asked)
+        self.first_error = self.first_error or error
+        proposals = self._own_proposals() if trial is self._stated else []
+        fitting = next((one for one in proposals if self._refusal(one) is None), None)
+        if fitting is not None:
+            return self._opened(fitting, asked)
+        own: Iterator[tuple[Dimension, Stated]] = (("proposal", one) for one in proposals)
+        for dimension, changed in itertools.chain(own, self._changes(trial, error)):
+            found = self.run(changed, {dimension: error} | asked)
+            if found is not None:
+                return found
+        return None
+
+    def _look(self, trial: Stated) -> tuple[LogSource, LogHeader]:
+        """What the reader makes of the log, its first rows included. Raises the reader's refusal."""
+        source = trial.source(self._path, self._format)
+        header = self._format.header(source)
+        _taste(self._format.read(source, header))
+        return source, header
+
+    def _refusal(self, trial: Stated) -> RoadscanError | None:
         try:
-            source = trial.source(self._path, self._format)
-            header = self._format.header(source)
-            _taste(self._format.read(source, header))
+            self._look(trial)
         except RoadscanError as error:
-            self.first_error = self.first_error or error
-            for dimension, changed in self._changes(trial, error):
-                found = self.run(changed, {dimension: error} | asked)
-                if found is not None:
-                    return found
-            return None
-        return OpenedLog(self._format, source, header, tuple(self._needs(trial, asked)))
+            return error
+        return None
+
+    def _opened(self, trial: Stated, asked: dict[Dimension, RoadscanError]) -> OpenedLog:
+        least, reasons = self._least(trial)
+        source, header = self._look(least)
+        return OpenedLog(self._format, source, header, tuple(self._needs(least, asked, reasons)))
+
+    def _least(self, trial: Stated) -> tuple[Stated, dict[str, RoadscanError]]:
+        """A fitting trial with those of its settings alone that the reader asks for, and its refusal for each."""
+        own = [name for name in trial.options if name not in self._stated.options]
+        least = dataclasses.replace(trial, options=dict(self._stated.options))
+        reasons: dict[str, RoadscanError] = {}
+        while len(reasons) < len(own) and (error := self._refusal(least)) is not None:
+            left = [name for name in own if name not in reasons]
+            named = [name for name in left if name in _options_in(error)] or left[:1]
+            reasons |= dict.fromkeys(named, error)
+            least = dataclasses.replace(trial, options=least.options | {name: trial.options[name] for name in named})
+        return least, reasons
 
     def _changes(self, trial: Stated, error: RoadscanError) -> Iterator[tuple[Dimension, Stated]]:
-        if trial is self._stated:
-            yield from self._own_proposals()
         parts = {
             "clock": self._clocks,
             "crs": self._frames,
@@ -235,17 +272,16 @@ class _Search:
         for dimension in order:
             yield from ((dimension, changed) for changed in parts[dimension](trial, error))
 
-    def _own_proposals(self) -> Iterator[tuple[Dimension, Stated]]:
-        for one in self._format.provisional:
-            yield (
-                "clock",
-                dataclasses.replace(
-                    self._stated,
-                    clock=self._stated.clock or one.clock,
-                    crs=self._stated.crs or one.crs,
-                    options=one.options | self._stated.options,
-                ),
+    def _own_proposals(self) -> list[Stated]:
+        return [
+            dataclasses.replace(
+                self._stated,
+                clock=self._stated.clock or one.clock,
+                crs=self._stated.crs or one.crs,
+                options=one.options | self._stated.options,
             )
+            for one in self._format.provisional
+        ]
 
     def _clocks(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
         if self._stated.clock is not None:
@@ -282,26 +318,46 @@ class _Search:
                 for value in [*option_choices(self._format, name), *_proposed(error, name)]:
                     yield dataclasses.replace(trial, options=trial.options | {name: value})
 
-    def _needs(self, trial: Stated, asked: dict[Dimension, RoadscanError]) -> Iterator[Need]:
+    def _needs(
+        self, trial: Stated, asked: dict[Dimension, RoadscanError], reasons: dict[str, RoadscanError]
+    ) -> Iterator[Need]:
+        """What `trial` assumes: the refusals that asked for it, those for settings by the setting's name."""
         fallback = self.first_error or FormatError("not stated")
         if trial.clock != self._stated.clock:
-            error = asked.get("clock", fallback)
+            without = dataclasses.replace(trial, clock=self._stated.clock)
+            error = asked.get("clock") or self._refusal(without) or fallback
             yield Need("clock", f"clock = {_clock_line(error, trial.clock)}", _reason(error), is_of_time=True)
             for name in _options_in(error):
                 if name in self._format.options.model_fields and name not in trial.options:
                     yield Need(f"options.{name}", f'options.{name} = "????"', _reason(error), is_of_time=True)
         if trial.crs != self._stated.crs:
-            yield Need("crs", 'crs = "????"', _reason(asked.get("crs", fallback)))
+            without = dataclasses.replace(trial, crs=self._stated.crs)
+            yield Need("crs", 'crs = "????"', _reason(asked.get("crs") or self._refusal(without) or fallback))
         if trial.sensor != self._stated.sensor:
             yield Need("sensor", 'sensor = "????"', _reason(asked.get("sensor", fallback)))
         if trial.height != self._stated.height:
             yield Need("height", f'height = "{trial.height}"', _reason(asked.get("height", fallback)))
-        for name in trial.options:
-            if name not in self._stated.options:
-                error = asked.get("options", fallback)
-                choices = " or ".join(_toml(value) for value in option_choices(self._format, name))
-                reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
-                yield Need(f"options.{name}", f'options.{name} = "????"', reason, isinstance(error, TimeSystemError))
+        answered: set[str] = set()
+        for name, error in reasons.items():
+            if name not in answered:
+                need, names = self._option_need(name, error, trial)
+                answered |= names
+                yield need
+
+    def _option_need(self, name: str, error: RoadscanError, trial: Stated) -> tuple[Need, set[str]]:
+        """The line for a setting, and all settings that it answers for: those that exclude each other are one need."""
+        is_of_time = isinstance(error, TimeSystemError)
+        groups = _alternatives(error)
+        single = [group for group in groups if len(group) == 1]
+        names = {key for group in groups for key in group}
+        if name in names and single:
+            first = min(single, key=lambda group: not group.keys() <= trial.options.keys())
+            (line,) = _lines_of(first)
+            others = tuple(_lines_of(group) for group in groups if group is not first)
+            return Need(line.partition(" = ")[0], line, _reason(error), is_of_time, others), names
+        choices = " or ".join(_toml(value) for value in option_choices(self._format, name))
+        reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
+        return Need(f"options.{name}", f'options.{name} = "????"', reason, is_of_time), {name}
 
 
 def sensor_kind(log_format: LogFormat) -> SensorKind | None:
@@ -364,6 +420,17 @@ def _map_for(crs: str | None) -> MapFrame:
 def _options_in(error: RoadscanError) -> list[str]:
     text = f"{error.arrived} {error.expected} {error.change}"
     return list(dict.fromkeys(_OPTION_IN_TEXT.findall(text)))
+
+
+def _alternatives(error: RoadscanError) -> list[dict[str, str]]:
+    """Groups of settings of which a refusal asks for one, with the values that it names."""
+    match = _ONE_OF_IN_TEXT.search(error.expected)
+    parts = re.split(r", (?:or )?| or ", match.group(1)) if match else []
+    return [group for part in parts if (group := dict(_STATED_IN_TEXT.findall(part)))]
+
+
+def _lines_of(group: dict[str, str]) -> tuple[str, ...]:
+    return tuple(f"options.{name} = {value or _UNKNOWN}" for name, value in group.items())
 
 
 def _clock_line(error: RoadscanError, fitting: Clock | None) -> str:

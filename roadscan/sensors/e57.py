@@ -72,6 +72,7 @@ class E57Scans(LogFormat):
     options: ClassVar[type[E57Options]] = E57Options
     provisional: ClassVar[tuple[Provisional, ...]] = (
         Provisional(crs=LOCAL_WORLD),
+        Provisional(crs=LOCAL_WORLD, options={"epoch": "1980-01-06T00:00:00Z"}),
         Provisional(crs=LOCAL_WORLD, options={"epoch": "1980-01-06T00:00:00Z", "intensity": False}),
     )
 

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import ConfigError, FormatError
+from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
 from roadscan.sensors.las_crs import UNIT_M, LengthUnit
 from roadscan.sensors.ply_file import TYPE_NAMES, Element, PlyHeader, Vertices, read_header, vertices
@@ -77,7 +78,7 @@ class Ply(LogFormat):
     )
     options: ClassVar[type[PlyOptions]] = PlyOptions
     provisional: ClassVar[tuple[Provisional, ...]] = (
-        Provisional(crs=LOCAL_WORLD, options={"unit": "metre"}),
+        Provisional(Clock(TimeSystem.FREE), LOCAL_WORLD, {"unit": "metre"}),
         Provisional(crs=LOCAL_WORLD, options={"unit": "metre", "epoch": "1980-01-06T00:00:00Z"}),
         Provisional(crs=LOCAL_WORLD, options={"unit": "metre", "epoch": "1980-01-06T00:00:00Z", "intensity": False}),
     )

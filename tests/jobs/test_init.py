@@ -19,6 +19,7 @@ from roadscan.jobs.first_survey_text import FirstSurvey, write_first_survey
 from roadscan.model.errors import ConfigError
 from roadscan.model.strict import OPEN_QUESTION
 from roadscan.model.survey import Survey
+from roadscan.sensors.sick_telegrams import encode_scans, write_telegrams
 
 from .conftest import Simulated, outputs
 from .test_inspect import sbet, written
@@ -72,6 +73,9 @@ def answers_of(original: Survey, first: FirstSurvey) -> dict[str, dict[str, str]
             keys = ("axes", "lever_arm_body_m", "boresight", "range_min_m", "range_max_m")
             mounted = sensor.model_dump(include=set(keys))
             said[f"sensors.{names[log['path']]}"] = {key: toml(mounted[key]) for key in keys}
+        if log.get("options", {}).get("accuracy"):  # found as a log of its own too, in the trajectory's clock
+            beside = Path(log["path"]).with_name(log["options"]["accuracy"])
+            said[f"logs/{beside}"] = {"clock": toml(log["clock"])}
     return said
 
 
@@ -223,6 +227,24 @@ def test_a_log_whose_file_states_its_crs_fills_the_map_in(tmp_path: Path) -> Non
     assert made.questions == 0
     assert survey.config.map.crs == "EPSG:25832"
     assert [log.format for log in survey.config.runs[0].logs] == ["las"]
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_settings_that_exclude_each_other_are_one_question(tmp_path: Path, stamped: bool) -> None:
+    ranges = np.random.default_rng(1).integers(1, 8000, (40, 181), dtype=np.uint16)
+    stamps = 10**18 + np.arange(40) * 13_333_333
+    (tmp_path / "logs").mkdir()
+    write_telegrams(tmp_path / "logs/a.lms", encode_scans(ranges, "mm"), stamps if stamped else None)
+    first = write_first_survey(find_logs(tmp_path / "logs"), tmp_path / "SURVEY.toml")
+    lines = first.survey_file.read_text().splitlines()
+    about = [line for line in lines if re.match(r"#\?? options\.", line)]
+    by_rate = ['# options.first_stamp_s = "????"', '# options.scans_per_s = "????"']
+    if stamped:
+        assert about == ["#? options.stamped = true", '# options.stamps = "????"', *by_rate]
+    else:
+        assert about == ['#? options.stamps = "????"', *by_rate, "# options.stamped = true"]
+    assert lines.count("# or, in its place:") == 2
+    assert sum(line.startswith("#? clock = ") for line in lines) == 1
 
 
 def test_odd_names_stay_valid(tmp_path: Path) -> None:

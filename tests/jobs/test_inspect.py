@@ -252,6 +252,61 @@ def test_control_points_need_their_crs_and_role(tmp_path: Path) -> None:
     assert extent.degrees_low == pytest.approx([9.0, 48.752], abs=2e-3)
 
 
+def ply(path: Path, *properties: str, value: int = 7) -> Path:
+    """Ten points with x, y and z, and `value` for each further property."""
+    top = ["ply", "format ascii 1.0", "element vertex 10", *(f"property float {a}" for a in "xyz")]
+    rows = [" ".join([f"{k} 0 0", *[str(value)] * len(properties)]) for k in range(10)]
+    path.write_text("\n".join([*top, *(f"property {p}" for p in properties), "end_header", *rows, ""]))
+    return path
+
+
+def needs_of(found: Inspection) -> dict[str, str]:
+    assert found.log is not None
+    return {need.key: need.reason for need in found.log.opened.needs}
+
+
+def test_what_is_assumed_of_a_scan_is_not_shown_as_known(tmp_path: Path) -> None:
+    found = inspect(ply(tmp_path / "a.ply", "uchar intensity"))
+    needs = needs_of(found)
+    assert list(needs) == ["crs", "options.unit", "options.epoch"]
+    assert needs["crs"].startswith("the CRS of the log's positions is not stated")
+    assert "PLY does not say the unit" in needs["options.unit"]
+    assert "the file says no time" in needs["options.epoch"]
+    assert found.log is not None
+    assert found.log.is_time_assumed
+    assert found.log.time is None
+    assert "unit_m" not in found.log.header
+    shown = text_of(found)
+    assert "not known, and the log holds no stamps of its own" in shown
+    assert "1980" not in shown
+    assert "intensity 1,799" in shown
+    assert "0.000 in a unit that is not stated, as written" in shown
+
+
+def test_a_setting_is_asked_for_only_where_the_reader_does(tmp_path: Path) -> None:
+    scaleless = needs_of(inspect(ply(tmp_path / "a.ply", "float intensity")))
+    assert list(scaleless) == ["crs", "options.unit", "options.epoch", "options.intensity"]
+    assert "whose scale the file does not say" in scaleless["options.intensity"]
+    timed = inspect(ply(tmp_path / "b.ply", "double gps_time", value=300_000_007))
+    assert list(needs_of(timed)) == ["clock", "crs", "options.unit"]
+    assert timed.log is not None
+    assert timed.log.time is not None
+    assert timed.log.time.raw == (300_000_007, 300_000_007)
+
+
+@pytest.mark.parametrize("name", ["x.bin", "x.sbet"])
+def test_a_large_unknown_file_is_not_read_to_its_end(tmp_path: Path, name: str) -> None:
+    counts = Path("/proc/self/io")
+    if not counts.exists():
+        pytest.skip("this system does not count bytes read")
+    path = tmp_path / name
+    with path.open("wb") as stream:
+        stream.truncate(2 << 30)  # sparse
+    before = int(counts.read_text().split()[1])
+    assert "no known raw format" in inspect(path, quick=True).error
+    assert int(counts.read_text().split()[1]) - before < 1 << 30
+
+
 def test_a_quick_look_reads_a_prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inspect_module, "QUICK_VALUES", 1_000)
     path = written(tmp_path / "drive.sbet", sbet(200_000 + np.arange(40_000) / 200))

@@ -22,7 +22,7 @@ import types
 from collections.abc import Callable, Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -149,6 +149,11 @@ def _type(annotation: Any) -> str:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return _choice(arguments)
+    if origin is Annotated:
+        limits = [
+            words for one in arguments[1:] for limit in getattr(one, "metadata", [one]) for words in _limit_words(limit)
+        ]
+        return ", ".join([_type(arguments[0]), *limits])
     if origin in {Union, types.UnionType}:
         return " or ".join(_type(a) for a in arguments if a is not types.NoneType)
     if origin is dict:

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
@@ -106,11 +107,13 @@ class Survey:
 
     def objects(self) -> list[dict[str, Any]]:
         """What stands and moves beside the road."""
-        return pq.read_table(self.known.objects_file).to_pylist()
+        rows: list[dict[str, Any]] = pq.read_table(self.known.objects_file).to_pylist()
+        return rows
 
     def picture(self) -> npt.NDArray[np.uint8]:
         """The first picture of the camera."""
-        return cv2.imread(str(self.folder / "raw/run-1/camera/000000.jpg"), cv2.IMREAD_GRAYSCALE)
+        file = self.folder / "raw/run-1/camera/000000.jpg"
+        return np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
 def main(names: list[str]) -> None:
@@ -160,8 +163,9 @@ def path_of(name: str) -> Path:
 
 def save(figure: Figure, name: str) -> None:
     """Write a figure as a small JPEG."""
-    figure.canvas.draw()
-    rgb = np.asarray(figure.canvas.buffer_rgba())[:, :, :3]
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    rgb = np.asarray(canvas.buffer_rgba())[:, :, :3]
     cv2.imwrite(str(path_of(name)), rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
     plt.close(figure)
 
@@ -193,7 +197,8 @@ def draw_whole(axes: Axes, survey: Survey) -> None:
     origin = np.array([scene.map.easting_m, scene.map.northing_m])
 
     def turned(points: Float64) -> Float64:
-        return (np.asarray(points)[..., :2] - origin) @ turn.T
+        out: Float64 = (np.asarray(points)[..., :2] - origin) @ turn.T
+        return out
 
     reach = scene.road.edge_m + 1.0
     margin = np.array([0.0, reach])
@@ -314,7 +319,7 @@ def draw_profile(shape: Axes, error: Axes, survey: Survey, share: float) -> None
         error.plot(offset, 1e3 * (at[:, 2] - true), ".", ms=1.2, color=colour)
     shape.set(ylabel="height above the reference line (mm)")
     shape.set_title("one profile, left and right head, over the truth of the road (grey)", loc="left", fontsize=8)
-    top = np.nanmax([line.get_ydata().max() for line in error.lines])
+    top = np.nanmax([np.max(np.asarray(line.get_ydata())) for line in error.lines])
     error.set(xlabel="offset (m)", ylabel="measured − truth (mm)", ylim=(-4, max(4, 1.1 * top)))
 
 

@@ -10,6 +10,7 @@ logs, the pictures of the camera.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import sys
 import tempfile
@@ -24,7 +25,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
@@ -163,10 +163,11 @@ def path_of(name: str) -> Path:
 
 def save(figure: Figure, name: str) -> None:
     """Write a figure as a small JPEG."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    rgb = np.asarray(canvas.buffer_rgba())[:, :, :3]
-    cv2.imwrite(str(path_of(name)), rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="rgba", dpi=figure.dpi)
+    width, height = figure.canvas.get_width_height()
+    rgba = np.frombuffer(drawn.getvalue(), np.uint8).reshape(height, width, 4)
+    cv2.imwrite(str(path_of(name)), np.ascontiguousarray(rgba[:, :, 2::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
     plt.close(figure)
 
 

@@ -41,6 +41,7 @@ from roadscan.sensors.records import Sieve, options_of
 from roadscan.sensors.vector_layer import (
     LINE_KINDS,
     attribute_values,
+    check_archive,
     chosen_layer,
     feature_batches,
     flat_crs,
@@ -262,6 +263,7 @@ class LineLayer:
             )
         if not path.exists():
             raise FormatError("the layer does not exist", change="check its path in the survey file", file=path)
+        check_archive(path)
         with gdal_faults(path, _EXPECTED):
             name = chosen_layer(layer_names(path), options.layer, path)
             info: dict[str, Any] = pyogrio.read_info(gdal_name(path), layer=name)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import sqlite3
 import warnings
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -121,22 +123,58 @@ def shapes_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
     return np.asarray(shapes, dtype=object)
 
 
-def unread_features(path: Path, read: int) -> Iterator[Reject]:
-    """A reject for members of a GeoJSON file's list of features that GDAL passed over; larger files are not looked at.
+def check_archive(path: Path) -> None:
+    """Refuse a ZIP archive with a member whose checksum is wrong: GDAL does not look at it.
 
-    GDAL reads members whose type is "Feature", and leaves out others without a word.
+    Raises
+    ------
+    FormatError
+        if it is damaged.
     """
-    if path.suffix.lower() == ".zip" or path.stat().st_size > _LARGEST_JSON:
-        return
-    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
-    if not data.lstrip().startswith(b"{"):
+    if path.suffix.lower() != ".zip":
         return
     try:
-        listed = json.loads(data).get("features")
-    except (ValueError, AttributeError, RecursionError):
-        return
-    if isinstance(listed, list) and len(listed) > read:
-        yield Reject("the list of features holds something that is no feature", records=len(listed) - read)
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError, ValueError) as error:
+        raise FormatError(f"the archive is damaged: {error}", change="fetch it again", file=path) from error
+    if damaged is not None:
+        raise FormatError(f"the archive's member '{damaged}' is damaged", change="fetch it again", file=path)
+
+
+def unread_features(path: Path, read: int) -> Iterator[Reject]:
+    """A reject for features that a file lists and GDAL passed over without a word.
+
+    GDAL leaves out members of a GeoJSON file whose type is not "Feature" (only files up to 16 MB are looked at), and
+    features of a shapefile that its attribute table does not count or marks as deleted.
+    """
+    listed = _listed_features(path)
+    if listed > read:
+        yield Reject("the file lists features that cannot be read", records=listed - read)
+
+
+def _listed_features(path: Path) -> int:
+    try:
+        if path.suffix.lower() == ".zip":
+            with zipfile.ZipFile(path) as archive:
+                sizes = [m.file_size for m in archive.infolist() if m.filename.lower().endswith(".shx")]
+            return _shx_features(sizes[0]) if len(sizes) == 1 else 0
+        if path.suffix.lower() == ".shp":
+            return _shx_features(path.with_suffix(".shx").stat().st_size)
+        if path.stat().st_size > _LARGEST_JSON:
+            return 0
+        data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+        if not data.lstrip().startswith(b"{"):
+            return 0
+        features = json.loads(data.decode("utf-8", errors="replace"), strict=False).get("features")
+    except (OSError, ValueError, AttributeError, RecursionError, zipfile.BadZipFile):
+        return 0
+    return len(features) if isinstance(features, list) else 0
+
+
+def _shx_features(size: int) -> int:
+    """Features in a shapefile's index: 8 bytes each behind 100."""
+    return max(0, size - 100) // 8
 
 
 def flat_crs(crs: pyproj.CRS) -> pyproj.CRS:

@@ -166,9 +166,7 @@ def test_a_member_that_is_no_feature_is_told(tmp_path: Path) -> None:
     path.write_text(text[:at] + '"Peature",' + text[at + 10 :])
     log = read_log("control_vector", path, crs="EPSG:4979", map=MapFrame(crs="EPSG:32632"))
     assert log.table.num_rows == 2
-    assert [(r.reason, r.records) for r in log.rejects] == [
-        ("the list of features holds something that is no feature", 1)
-    ]
+    assert [(r.reason, r.records) for r in log.rejects] == [("the file lists features that cannot be read", 1)]
 
 
 def test_an_attribute_without_a_name_is_not_taken_for_the_geometry(tmp_path: Path) -> None:

@@ -270,3 +270,28 @@ def test_vertices_that_are_no_numbers_and_doubled_attributes(tmp_path: Path) -> 
     (tmp_path / "c.geojson").write_text(text.replace('"FULLNAME": "Riverwalk"', '"FULlNAME": "Riverwalk"'))
     with pytest.raises(FormatError, match="attribute 'FULLNAME' cannot be read"):
         read_log("road_lines", tmp_path / "c.geojson", map=UTM17)
+
+
+def test_damage_in_an_archive_is_seen_by_its_checksum(tmp_path: Path) -> None:
+    path = zipped(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        member = next(m for m in archive.infolist() if m.filename.endswith(".shp"))
+    data = bytearray(path.read_bytes())
+    at = member.header_offset + 30 + len(member.filename) + member.compress_size // 2
+    data[at] ^= 0x10
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"archive.*damaged"):
+        read_log("road_lines", path, map=UTM17)
+    path.write_bytes(data[: len(data) - 30])
+    with pytest.raises(FormatError, match="archive is damaged"):
+        read_log("road_lines", path, map=UTM17)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3])
+def test_features_that_the_attribute_table_does_not_count_are_told(tmp_path: Path, rows: int) -> None:
+    path = write(tmp_path / "a.shp", tiger())
+    table = bytearray(path.with_suffix(".dbf").read_bytes())
+    table[4:8] = rows.to_bytes(4, "little")
+    path.with_suffix(".dbf").write_bytes(table)
+    log = read_log("road_lines", path, map=UTM17)
+    assert [(r.reason, r.records) for r in log.rejects] == [("the file lists features that cannot be read", 4 - rows)]

@@ -171,6 +171,10 @@ def _first_line(path: Path, options: TextOptions) -> tuple[str, int, int]:
         line = raw.strip()
         comment = bool(options.comment) and line.startswith(options.comment.encode())
         if skip <= 0 and line and not comment:
+            if offset + len(raw) >= HEAD_BYTES and not raw.endswith((b"\n", b"\r")):
+                raise FormatError(
+                    f"the line of column names does not end within {HEAD_BYTES:,} bytes", expected="names", file=path
+                )
             try:
                 return line.decode("utf-8"), offset, offset + len(raw)
             except UnicodeDecodeError as error:

@@ -181,6 +181,12 @@ def test_a_first_stamp_that_lost_its_fraction_costs_no_other(tmp_path: Path) -> 
     assert log.epochs[1:].tolist() == [(1_400_000_000 + i) * 10**9 + 500_000_000 for i in range(1, 5)]
 
 
+def test_a_line_of_names_without_end(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", [line(0)], NAMES + "," + "x" * 70_000)
+    with pytest.raises(FormatError, match="does not end within 65,536 bytes"):
+        read_log("trajectory_csv", path, **STATED)
+
+
 def test_a_block_of_zeros_costs_its_lines(tmp_path: Path) -> None:
     """What a file system leaves of blocks that were never written."""
     lines = [line(i) for i in range(40)]

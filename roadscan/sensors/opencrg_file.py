@@ -471,8 +471,16 @@ def _number(value: float, width: int) -> str:
     """A number in `width` characters, as precise as they allow."""
     if math.isnan(value):
         return "*missing*".rjust(width)
-    for digits in range(width, 0, -1):
-        text = f"{value:.{digits}g}" if abs(value) >= 1e-3 or value == 0 else f"{value:.{digits - 1}e}"
-        if len(text) < width:
-            return text.rjust(width)
+    best = ""
+    for form in "gef":
+        for digits in range(width, -1, -1):
+            text = f"{value:.{digits}{form}}"
+            if text.startswith(("0.", "-0.")):
+                text = text.replace("0.", ".", 1)  # one more digit
+            if len(text) < width and text not in {".", "-."}:
+                if not best or abs(float(text) - value) < abs(float(best) - value):
+                    best = text
+                break
+    if best:
+        return best.rjust(width)
     raise FormatError(f"the value {value:g} does not fit {width} characters")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -191,6 +191,7 @@ heights = hnp.arrays(
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(z=np.full((2, 13), -0.0078125), encoding="LRFI", curved=False, uneven=False, start=(0.0, 0.0, 0.0), seed=0)
 @given(
     z=heights,
     encoding=st.sampled_from(["KRBI", "KDBI", "LRFI", "LDFI"]),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import selectors
 import subprocess
 import sys
@@ -127,14 +128,14 @@ def _lines(process: subprocess.Popen[str], start_s: float) -> Iterator[str]:
     """Lines as they come, until the process ends or says nothing for too long."""
     assert process.stdout is not None
     patience = start_s
+    rest = b""
     with selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
-        while selector.select(patience):
-            line = process.stdout.readline()
-            if not line:
-                return
-            patience = 3 * SLOWEST_S
-            yield line
+        while selector.select(patience) and (part := os.read(process.stdout.fileno(), 1 << 16)):
+            *lines, rest = (rest + part).split(b"\n")
+            for line in lines:
+                yield line.decode() + "\n"
+                patience = 3 * SLOWEST_S
 
 
 def _typed(values: dict[str, Any]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ MEMORY_FACTOR = 8.0
 ADDRESS_SPACE = 3 << 30
 """Fence: what a process may claim in all while a damaged file is read."""
 SLOWEST_S = 20.0
+FIRST_REJECTS = 1000
 LARGEST_CHUNK_ROWS = 1 << 18
 LARGEST_CHUNK_BYTES = 12 << 20
 
@@ -51,14 +52,18 @@ class Read:
 
     tables: dict[str, pa.Table] = field(default_factory=dict)
     rejects: list[Reject] = field(default_factory=list)
+    """The first of them."""
+    rejected: int = 0
+    """Records in all of them."""
 
     @property
     def rows(self) -> int:
         return sum(t.num_rows for t in self.tables.values())
 
-    @property
-    def rejected(self) -> int:
-        return sum(r.records for r in self.rejects)
+    def reject(self, reject: Reject) -> None:
+        self.rejected += reject.records
+        if len(self.rejects) < FIRST_REJECTS:
+            self.rejects.append(reject)
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,7 @@ def read(log_format: LogFormat, source: LogSource) -> Read:
     for item in log_format.read(source, header):
         if isinstance(item, Reject):
             _check_reject(item)
-            out.rejects.append(item)
+            out.reject(item)
             continue
         batches.setdefault(item.table, []).append(_checked(log_format, item, header.list_size))
     for name, parts in batches.items():

@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from tests.fuzz.harness import Fuzzer
+from tests.fuzz.harness import SLOWEST_S, Fuzzer
 from tests.fuzz.samples import all_samples
 
 
@@ -22,6 +22,7 @@ def main(name: str, seed: str, first: str, end: str, folder: str) -> None:
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     for number in range(int(first), int(end)):
+        faulthandler.dump_traceback_later(2 * SLOWEST_S, exit=True)  # where a library hangs, no alarm is heard
         sys.stdout.write(json.dumps(dataclasses.asdict(fuzzer.run(number))) + "\n")
         sys.stdout.flush()
 

@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from roadscan.model.camera import Interior
 from roadscan.model.frames import BODY_FROM_AXES, body_from_axes, rotation_from_rph
+from roadscan.model.imu import IMU_GRADES, ImuErrors, ImuGrade
 from roadscan.model.strict import Strict, load_toml
 
 Float64 = npt.NDArray[np.float64]
@@ -65,6 +67,14 @@ class Sensor(Strict):
     """Returns and readings of profiles farther than this are left out."""
     metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
+    lever_arm_sigma_m: tuple[float, float, float] | None = None
+    """1 σ of `lever_arm_body_m`, as good as it was measured (forward, right, down; m); a calibration starts from it."""
+    boresight_sigma_deg: tuple[float, float, float] | None = None
+    """1 σ of the boresight's roll, pitch, heading (degrees); a calibration starts from it."""
+    imu: ImuErrors | ImuGrade | None = None
+    """Errors of an IMU: a grade ("navigation", "tactical", "industrial", "mems"), or a table from its data sheet."""
+    interior: Interior | None = None
+    """Interior orientation of a camera, as `roadscan camera` finds it."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,6 +89,10 @@ class Sensor(Strict):
             if np.linalg.det(matrix) < 0:
                 raise ValueError("body_from_sensor mirrors (determinant −1): an axis points the wrong way")
         return self
+
+    def imu_errors(self) -> ImuErrors | None:
+        """Errors of an IMU, None where the rig file states none."""
+        return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
 
     def mounting(self) -> Mounting:
         """Mounting as stated in the rig file."""

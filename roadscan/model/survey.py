@@ -8,11 +8,13 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.clock_evidence import MotionEvidence
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Rig, Sensor
+from roadscan.model.smoothing import SmootherConfig
 from roadscan.model.strict import Strict, load_toml
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
@@ -178,7 +180,12 @@ class ControlConfig(Strict):
 
 
 class NavigationConfig(Strict):
-    """How poses are interpolated."""
+    """Where poses come from, and how they are interpolated."""
+
+    solve: Literal["missing", "always", "never"] = "missing"
+    """Runs whose trajectory is computed from GNSS and IMU: those without a trajectory log, all that have both, none."""
+    smoother: SmootherConfig = SmootherConfig()
+    """How it is computed."""
 
     max_gap_s: float = Field(default=1.0, gt=0)
     """Between two poses farther apart than this there is no pose: readings there are counted, not placed."""
@@ -276,8 +283,10 @@ class SurveyConfig(Strict):
     """Traverses of lanes."""
     control: list[ControlConfig] = []
     """Ground control and check points."""
+    clocks: list[MotionEvidence] = []
+    """Clocks of sensors that are found from shared motion."""
     navigation: NavigationConfig = NavigationConfig()
-    """Interpolation of poses."""
+    """Poses."""
     filters: FilterConfig = FilterConfig()
     """Filters of points."""
     tiles: TileConfig = TileConfig()

@@ -17,7 +17,8 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
-from roadscan.simulate.scene import IMU_GRADES, ImuErrors, Mount, Scene
+from roadscan.model.imu import IMU_GRADES, ImuErrors
+from roadscan.simulate.scene import Mount, Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

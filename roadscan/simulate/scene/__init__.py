@@ -17,15 +17,12 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.strict import Strict, load_toml
 from roadscan.simulate.scene.rig import (
-    IMU_GRADES,
     Camera,
     ClockError,
     Control,
     Encoder,
     Gnss,
     Imu,
-    ImuErrors,
-    ImuGrade,
     Lidar,
     Mount,
     MountError,
@@ -39,7 +36,6 @@ from roadscan.simulate.scene.roadside import Barrier, Roadside
 from roadscan.simulate.scene.vehicle import PassScene, Route, Vehicle
 
 __all__ = [
-    "IMU_GRADES",
     "Camera",
     "ClockError",
     "Control",
@@ -47,8 +43,6 @@ __all__ = [
     "Encoder",
     "Gnss",
     "Imu",
-    "ImuErrors",
-    "ImuGrade",
     "Lidar",
     "MapScene",
     "Mount",

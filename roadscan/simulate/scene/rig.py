@@ -7,6 +7,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.gpstime import TimeSystem
+from roadscan.model.imu import ImuErrors, ImuGrade
 from roadscan.model.strict import Strict
 
 
@@ -65,10 +66,6 @@ class Mount(Strict):
             pitch_deg=self.pitch_deg + e.pitch_deg,
             heading_deg=self.heading_deg + e.heading_deg,
         )
-
-
-ImuGrade = Literal["perfect", "navigation", "tactical", "industrial", "mems"]
-"""How good an inertial measurement unit is."""
 
 
 class Profilers(Strict):
@@ -152,71 +149,6 @@ class Sick(Strict):
         if self.interlaced and (self.scans_per_s > 37.5 or self.resolution_deg != 0.5):
             raise ValueError("interlaced scans are scans of 0.5 degrees, and at most 37.5 a second")
         return self
-
-
-class ImuErrors(Strict):
-    """Errors of an inertial measurement unit, 1 σ; biases change as Gauss–Markov processes."""
-
-    gyro_noise_deg_per_sqrt_h: float = Field(ge=0.0)
-    """Angle random walk."""
-    gyro_bias_deg_per_h: float = Field(ge=0.0)
-    """Bias of each gyroscope."""
-    gyro_scale_ppm: float = Field(ge=0.0)
-    """Scale error of each gyroscope."""
-    accel_noise_ug_per_sqrt_hz: float = Field(ge=0.0)
-    """Velocity random walk, as noise density of the accelerometers (µg/√Hz)."""
-    accel_bias_mg: float = Field(ge=0.0)
-    """Bias of each accelerometer (mg)."""
-    accel_scale_ppm: float = Field(ge=0.0)
-    """Scale error of each accelerometer."""
-    bias_time_constant_s: float = Field(default=600.0, gt=0.0)
-    """Time constant of the biases (s)."""
-
-
-IMU_GRADES: dict[ImuGrade, ImuErrors] = {
-    "perfect": ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.0,
-        gyro_bias_deg_per_h=0.0,
-        gyro_scale_ppm=0.0,
-        accel_noise_ug_per_sqrt_hz=0.0,
-        accel_bias_mg=0.0,
-        accel_scale_ppm=0.0,
-    ),
-    "navigation": ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.002,
-        gyro_bias_deg_per_h=0.005,
-        gyro_scale_ppm=5.0,
-        accel_noise_ug_per_sqrt_hz=10.0,
-        accel_bias_mg=0.03,
-        accel_scale_ppm=50.0,
-        bias_time_constant_s=3600.0,
-    ),
-    "tactical": ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.07,
-        gyro_bias_deg_per_h=1.0,
-        gyro_scale_ppm=150.0,
-        accel_noise_ug_per_sqrt_hz=50.0,
-        accel_bias_mg=1.0,
-        accel_scale_ppm=300.0,
-    ),
-    "industrial": ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.2,
-        gyro_bias_deg_per_h=10.0,
-        gyro_scale_ppm=500.0,
-        accel_noise_ug_per_sqrt_hz=60.0,
-        accel_bias_mg=3.0,
-        accel_scale_ppm=1000.0,
-    ),
-    "mems": ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.4,
-        gyro_bias_deg_per_h=100.0,
-        gyro_scale_ppm=3000.0,
-        accel_noise_ug_per_sqrt_hz=150.0,
-        accel_bias_mg=10.0,
-        accel_scale_ppm=3000.0,
-    ),
-}
-"""Errors by grade, the orders of magnitude of Groves (2013), table 4.1 and 4.2."""
 
 
 class Imu(Strict):

@@ -1,0 +1,1 @@
+"""Mountings from evidence: one estimator, several kinds of observations."""

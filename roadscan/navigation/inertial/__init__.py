@@ -1,0 +1,1 @@
+"""A trajectory from GNSS solutions, an IMU and an odometer."""

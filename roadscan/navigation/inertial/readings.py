@@ -1,0 +1,117 @@
+"""What the smoother takes and gives: readings, how their sensors sit on the vehicle, and the solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.imu import ImuErrors
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ImuReadings:
+    """Samples of an IMU in its own axes, as the table ``imu`` holds them."""
+
+    epochs_gps_ns: Int64
+    """(n,) strictly ascending; a sample is the mean over the interval that ends there."""
+    angular_rate_rad_per_s: Float64
+    """(n, 3) against inertial space, sensor axes."""
+    specific_force_m_per_s2: Float64
+    """(n, 3) acceleration less gravity, sensor axes; at rest an axis that points up reads +g."""
+
+
+@dataclass(frozen=True)
+class GnssSolutions:
+    """Positions and velocities of an antenna, as the table ``gnss`` holds them."""
+
+    world: str
+    """Geocentric frame of the positions (as in the log record)."""
+    epochs_gps_ns: Int64
+    """(m,) strictly ascending."""
+    position_world_m: Float64
+    """(m, 3); NaN where there is none."""
+    covariance_ned_m2: Float64
+    """(m, 3, 3) of the positions, local level; NaN where the log states none."""
+    quality: npt.NDArray[np.str_]
+    """(m,) 'fixed', 'float', 'dgps', 'single' … (``schemas/gnss.toml``)."""
+    velocity_ned_m_per_s: Float64
+    """(m, 3), local level; NaN where there is none."""
+    sigma_velocity_ned_m_per_s: Float64
+    """(m, 3); NaN where the log states none."""
+
+
+@dataclass(frozen=True)
+class OdometerReadings:
+    """Distance driven, growing forwards, as a wheel's counter states it (nominal metres)."""
+
+    epochs_gps_ns: Int64
+    """(k,) strictly ascending."""
+    distance_m: Float64
+    """(k,) running total; NaN where only the speed is known."""
+    speed_m_per_s: Float64
+    """(k,) speed, forwards positive; NaN where only the distance is known."""
+
+
+@dataclass(frozen=True)
+class VehicleSensors:
+    """How the sensors sit on the vehicle, body axes forward, right, down from the IMU reference point (m)."""
+
+    body_from_imu: Float64
+    """(3, 3) rotation from the IMU's axes to the body's."""
+    imu_lever_arm_body_m: Float64
+    """(3,) IMU reference point to the IMU itself (zero where the rig's origin is the IMU)."""
+    imu_errors: ImuErrors
+    antenna_lever_arm_body_m: Float64
+    """(3,)."""
+    antenna_sigma_body_m: Float64
+    """(3,) 1 σ of it."""
+    wheel_lever_arm_body_m: Float64 | None = None
+    """(3,) where the odometer's wheel meets the road."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A smoothed trajectory of the IMU reference point, with what was estimated beside it."""
+
+    world: str
+    epochs_gps_ns: Int64
+    """(n,)."""
+    position_world_m: Float64
+    """(n, 3)."""
+    quaternion_world_from_body: Float64
+    """(n, 4) scalar first."""
+    velocity_ned_m_per_s: Float64
+    """(n, 3)."""
+    covariance_position_ned_m2: Float64
+    """(n, 3, 3)."""
+    covariance_attitude_rad2: Float64
+    """(n, 3, 3) of a small rotation about north, east, down."""
+    covariance_velocity_ned: Float64
+    """(n, 3, 3), m²/s²."""
+    sigma_rph_rad: Float64
+    """(n, 3) 1 σ of roll, pitch, heading."""
+    states: dict[str, tuple[Float64, Float64]] = field(default_factory=dict)
+    """What else was estimated, by name with unit: value (n,) or (n, 3) and its 1 σ, at `state_epochs_gps_ns`."""
+    state_epochs_gps_ns: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    innovations: Innovations | None = None
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Every update that the filter was offered: what was measured against what was predicted."""
+
+    epochs_gps_ns: Int64
+    """(u,)."""
+    kind: npt.NDArray[np.str_]
+    """(u,) 'gnss position', 'gnss velocity', 'odometer', 'non-holonomic', 'zero velocity', 'zero rotation' …"""
+    residual: Float64
+    """(u, 3) observed − predicted, in the update's own unit and axes; NaN where it has fewer components."""
+    normalised: Float64
+    """(u,) squared, normalised by the predicted covariance, and divided by the components."""
+    weight: Float64
+    """(u,) 1 as stated, below 1 down-weighted as an outlier, 0 refused."""

@@ -12,7 +12,6 @@ from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES, survey_records
 from roadscan.jobs.readings import (
     CORRECTIONS,
-    MOUNTINGS,
     Ground,
     RawSlice,
     ReadingSource,
@@ -22,7 +21,7 @@ from roadscan.jobs.readings import (
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, RunId
-from roadscan.model.rig import Mounting
+from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.survey import Survey
 from roadscan.points.place import HeightLimits
 from roadscan.tables.logs import DataFile, LogRecord
@@ -107,7 +106,7 @@ def _sources(
     survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground
 ) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
     calibrated = load_mountings(store)
-    adjusted = key_of(*(store.read_bytes(t).hex() if store.exists(t) else None for t in (CORRECTIONS, MOUNTINGS)))
+    adjusted = store.read_bytes(CORRECTIONS).hex() if store.exists(CORRECTIONS) else None
     found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
     for record in records:
         for table in DATA_TABLES:
@@ -116,13 +115,14 @@ def _sources(
                 continue
             trajectory = None if table == "cloud" else _trajectory(record.run, records)
             sensor = survey.rig.sensors.get(record.sensor)
-            mounting = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor))
-            mounting = mounting or (sensor.mounting() if sensor else _UNMOUNTED)
+            nominal = sensor.mounting() if sensor else _UNMOUNTED
+            dated = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor)) or []
+            mountings = _mountings(nominal, dated)
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
                 code_version(),
                 adjusted,
-                mounting,
+                asdict(mountings),
                 limits,
                 None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
                 record.attributes,
@@ -136,11 +136,19 @@ def _sources(
                 record.sensor,
             )
             source = ReadingSource(
-                record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mounting,
+                record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
                 *limits, key,
             )  # fmt: skip
             found.append((source, files))
     return found
+
+
+def _mountings(nominal: Mounting, calibrated: Sequence[tuple[int, Mounting]]) -> Mountings:
+    """The rig file's mounting, until the first calibrated one, and so on."""
+    dated = [(since, mounting) for since, mounting in calibrated]
+    if not dated or dated[0][0] > 0:
+        dated = [(0, nominal), *dated]
+    return Mountings(tuple(since for since, _ in dated), tuple(mounting for _, mounting in dated))
 
 
 def _trajectory(run: str, records: Sequence[LogRecord]) -> TrajectorySource:

@@ -16,7 +16,7 @@ from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.rig import Mounting
+from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
 from roadscan.points.place import (
@@ -62,7 +62,7 @@ class ReadingSource:
     """What the readings need to be understood: scan geometry, or the cloud's CRS."""
     trajectory: TrajectorySource | None
     """None for clouds, which are placed already."""
-    mounting: Mounting
+    mountings: Mountings
     range_min_m: float
     range_max_m: float
     key: str
@@ -180,7 +180,7 @@ class Placer:
         return Placement(
             trajectory=trajectory,
             charts=_charts(self._ground.map, trajectory),
-            mounting=source.mounting,
+            mountings=source.mountings,
             range_min_m=source.range_min_m,
             range_max_m=source.range_max_m,
             heights=self._ground.heights,
@@ -232,16 +232,16 @@ def load_corrections(store: Store, run: str) -> Corrections | None:
     )
 
 
-def load_mountings(store: Store) -> dict[tuple[str, str], Mounting]:
-    """Calibrated mountings by run ('*' for all) and sensor."""
+def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:
+    """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
     if not store.exists(MOUNTINGS):
         return {}
-    found: dict[tuple[str, str], Mounting] = {}
-    for row in _small_table(store, MOUNTINGS).to_pylist():
+    found: dict[tuple[str, str], list[tuple[int, Mounting]]] = {}
+    for row in _small_table(store, MOUNTINGS).sort_by("valid_from_gps_ns").to_pylist():
         rotation = rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
         rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
         lever = (row["lever_forward_m"], row["lever_right_m"], row["lever_down_m"])
-        found[(row["run"], row["sensor"])] = Mounting(lever, rows)
+        found.setdefault((row["run"], row["sensor"]), []).append((row["valid_from_gps_ns"], Mounting(lever, rows)))
     return found
 
 

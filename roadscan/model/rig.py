@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
@@ -32,6 +33,33 @@ class Mounting:
     def arrays(self) -> tuple[Float64, Float64]:
         """Rotation (3, 3) and lever arm (3,)."""
         return np.array(self.body_from_sensor), np.array(self.lever_arm_body_m)
+
+
+@dataclass(frozen=True)
+class Mountings:
+    """Mountings of one sensor, each from an epoch on: a head was taken off and put back, a calibration repeated."""
+
+    since_gps_ns: tuple[int, ...]
+    """Ascending; before the first the first holds."""
+    mountings: tuple[Mounting, ...]
+
+    @classmethod
+    def one(cls, mounting: Mounting) -> Self:
+        """The same mounting at all times."""
+        return cls((0,), (mounting,))
+
+    def pieces(self, epochs_gps_ns: npt.NDArray[np.int64]) -> Iterator[tuple[slice, Mounting]]:
+        """Runs of readings under one mounting, in their order, for epochs (n,) in any order."""
+        if len(self.mountings) == 1:
+            yield slice(0, epochs_gps_ns.size), self.mountings[0]
+            return
+        index = np.searchsorted(np.array(self.since_gps_ns[1:]), epochs_gps_ns, side="right")
+        ends = [*(np.flatnonzero(np.diff(index)) + 1).tolist(), index.size]
+        start = 0
+        for end in ends:
+            if end > start:
+                yield slice(start, end), self.mountings[int(index[start])]
+            start = end
 
 
 class Boresight(Strict):

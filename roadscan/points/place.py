@@ -14,7 +14,7 @@ from roadscan.kernels.georeference import FATES, georeference_profiles, georefer
 from roadscan.model.crs import Geoid, MapFrame, world_frame_of
 from roadscan.model.errors import CrsError
 from roadscan.model.ids import LanePass
-from roadscan.model.rig import Mounting
+from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
 from roadscan.points.classes import KEPT, TOO_HIGH, TOO_LOW
@@ -99,14 +99,14 @@ class Placement:
 
     trajectory: Trajectory
     charts: Charts
-    mounting: Mounting
+    mountings: Mountings
     range_min_m: float
     range_max_m: float
     heights: HeightLimits
     tile_quanta: int
 
-    def _common(self, limits: tuple[float, ...]) -> tuple[Any, ...]:
-        rotation, lever = self.mounting.arrays()
+    def _common(self, mounting: Mounting, limits: tuple[float, ...]) -> tuple[Any, ...]:
+        rotation, lever = mounting.arrays()
         coefficients, valid = self.trajectory.intervals
         return (
             (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
@@ -191,20 +191,29 @@ class Placement:
         classes: UInt8 | None = None,
     ) -> _Work:
         work = _Work.of(_readings(batch, geometry))
-        if geometry is None:
-            xyz = np.stack([_numpy(batch, f"{a}_sensor_m") for a in "xyz"], axis=-1)
-            made = georeference_returns(
-                _numpy(batch, "pose_epoch_gps_ns"), xyz, *self._common(limits), astuple(window),
-                work.rows, work.tiles, work.quanta, work.fates, classes,
-            )  # fmt: skip
-        else:
-            origins, directions = geometry.rays()
-            made = georeference_profiles(
-                _numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), origins, directions,
-                (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns,
-                *self._common(limits), astuple(window),
-                work.rows, work.readings, work.tiles, work.quanta, work.fates, classes,
-            )  # fmt: skip
+        epochs = _numpy(batch, "pose_epoch_gps_ns" if geometry is None else "epoch_gps_ns")
+        made = 0
+        for rows, mounting in self.mountings.pieces(epochs):
+            common = (*self._common(mounting, limits), astuple(window))
+            own = work.after(made)
+            piece = batch.slice(rows.start, rows.stop - rows.start)
+            if geometry is None:
+                xyz = np.stack([_numpy(piece, f"{a}_sensor_m") for a in "xyz"], axis=-1)
+                count = georeference_returns(
+                    epochs[rows], xyz, *common, own.rows, own.tiles, own.quanta, work.fates,
+                    None if classes is None else classes[rows],
+                )  # fmt: skip
+            else:
+                origins, directions = geometry.rays()
+                readings = slice(rows.start * geometry.readings, rows.stop * geometry.readings)
+                count = georeference_profiles(
+                    epochs[rows], _lists(piece, "range", geometry.readings), origins, directions,
+                    (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns, *common,
+                    own.rows, own.readings, own.tiles, own.quanta, work.fates,
+                    None if classes is None else classes[readings],
+                )  # fmt: skip
+            own.rows[:count] += rows.start
+            made += count
         return work.first(made)
 
 
@@ -226,6 +235,9 @@ class _Work:
             np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 3), np.int32),
             np.zeros(FATES, np.int64),
         )  # fmt: skip
+
+    def after(self, n: int) -> _Work:
+        return _Work(self.rows[n:], self.readings[n:], self.tiles[n:], self.quanta[n:], self.fates)
 
     def first(self, n: int) -> _Work:
         return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates)

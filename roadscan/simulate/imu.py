@@ -14,10 +14,10 @@ import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.imu import IMU_GRADES, ImuErrors
 from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
-from roadscan.model.imu import IMU_GRADES, ImuErrors
 from roadscan.simulate.scene import Mount, Scene
 
 Float64 = npt.NDArray[np.float64]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -10,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import Anchor, MapFrame, world_frame_of
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.rig import Sensor
+from roadscan.model.rig import Mountings, Sensor
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import charts_along
 from roadscan.points.place import EVERYWHERE, HeightLimits, Placement, Window, passes_of
@@ -82,7 +84,7 @@ def placement(path: Trajectory, frame: MapFrame, **limits: float) -> Placement:
     return Placement(
         trajectory=path,
         charts=charts_along(frame, path.world, path.position_world_m),
-        mounting=SENSOR.mounting(),
+        mountings=Mountings.one(SENSOR.mounting()),
         range_min_m=limits.pop("range_min_m", 0.0),
         range_max_m=limits.pop("range_max_m", np.inf),
         heights=HeightLimits(**limits),
@@ -191,3 +193,61 @@ def test_passes_are_half_open_spans() -> None:
 
     passes = [LanePass(PassId(7), RunId("r"), 10, 20), LanePass(PassId(9), RunId("r"), 20, 30)]
     assert passes_of(np.array([9, 10, 19, 20, 29, 30]), passes).tolist() == [0, 7, 7, 9, 9, 0]
+
+
+def test_each_reading_is_placed_by_the_mounting_of_its_epoch() -> None:
+    path, frame, _ = scene("utm north", 91.0, 3.0, 2.0)
+    rng = np.random.default_rng(8)
+    times = np.round(rng.uniform(0.1, 3.7, 300), 9)
+    xyz = rng.uniform(-30, 30, (300, 3)).astype(np.float32)
+    xyz[5] = 0.0  # nearer than the limit, in the second mounting's time or the first's
+    later = Sensor(kind="lidar", axes="flu", lever_arm_body_m=(1.0, 0.2, -2.0), boresight={"heading_deg": 40.0})
+    since = 10**18 + 2 * NS_PER_S
+    both = Mountings((0, since), (SENSOR.mounting(), later.mounting()))
+    base = placement(path, frame, range_min_m=1.0)
+
+    def placed(mountings: Mountings):
+        return dataclasses.replace(base, mountings=mountings).returns(returns(times, xyz), EVERYWHERE, marked=True)
+
+    mixed, first, second = (
+        placed(both),
+        placed(Mountings.one(SENSOR.mounting())),
+        placed(Mountings.one(later.mounting())),
+    )
+    before = times < 2.0
+    assert mixed.tiles.shape == (300, 2)
+    np.testing.assert_array_equal(mixed.quanta, np.where(before[:, None], first.quanta, second.quanta))
+    np.testing.assert_array_equal(mixed.tiles, np.where(before[:, None], first.tiles, second.tiles))
+    np.testing.assert_array_equal(mixed.intensity, np.arange(300))
+    np.testing.assert_array_equal(mixed.classes, first.classes)
+    assert mixed.classes[5] != 0 and (mixed.fates == first.fates).all()
+    assert not np.array_equal(first.quanta, second.quanta)
+
+
+def test_profiles_too_are_placed_by_the_mounting_of_their_epoch() -> None:
+    path, frame, _ = scene("local", 91.0, 3.0, 2.0)
+    geometry = ScanGeometry(kind="polar", readings=40, first=-0.5, step=0.025, range_offset_m=0.5, range_step_m=0.001)
+    times = np.array([0.5, 2.5, 1.0, 3.0])  # out of order on purpose
+    raw = np.arange(160).reshape(4, 40).astype(np.uint16) * 100
+    batch = pa.RecordBatch.from_pydict(
+        {
+            "epoch_gps_ns": np.round(times * NS_PER_S).astype(np.int64) + 10**18,
+            "range": pa.FixedSizeListArray.from_arrays(pa.array(raw.ravel()), 40),
+            "intensity": pa.nulls(4, pa.list_(pa.uint8(), 40)),
+        }
+    )
+    later = Sensor(kind="lidar", axes="flu", lever_arm_body_m=(1.0, 0.2, -2.0))
+    base = placement(path, frame)
+    both = Mountings((0, 10**18 + 2 * NS_PER_S), (SENSOR.mounting(), later.mounting()))
+
+    def placed(mountings: Mountings):
+        return dataclasses.replace(base, mountings=mountings).profiles(batch, geometry, EVERYWHERE)
+
+    mixed, first, second = (
+        placed(both),
+        placed(Mountings.one(SENSOR.mounting())),
+        placed(Mountings.one(later.mounting())),
+    )
+    before = np.repeat(times < 2.0, 40)[raw.ravel() > 0]
+    np.testing.assert_array_equal(mixed.quanta, np.where(before[:, None], first.quanta, second.quanta))
+    np.testing.assert_array_equal(mixed.epoch_gps_ns, first.epoch_gps_ns)

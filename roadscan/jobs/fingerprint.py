@@ -14,6 +14,8 @@ from roadscan.tables.store import file_digest
 
 _SHAPING = ("model", "kernels", "navigation", "points", "tiles", "jobs")
 """Layers whose code shapes points and cells; a change in them makes every output stale."""
+_SOLVING = ("model", "kernels", "navigation")
+"""Layers whose code computes trajectories, clocks and mountings."""
 
 
 def key_of(*parts: Any) -> str:
@@ -33,10 +35,20 @@ def grid_digest(name: str | None) -> list[str] | None:
 @functools.cache
 def code_version() -> str:
     """Version of the code that shapes points and cells: release and hash of its sources."""
+    return _version(_SHAPING)
+
+
+@functools.cache
+def solver_version() -> str:
+    """Version of the code that computes trajectories, clocks and mountings."""
+    return _version(_SOLVING)
+
+
+def _version(layers: tuple[str, ...]) -> str:
     root = Path(roadscan.__file__).parent
     digest = hashlib.blake2b(roadscan.__version__.encode(), digest_size=8)
-    for layer in _SHAPING:
-        for file in sorted((root / layer).glob("*.py")):
-            digest.update(file.name.encode())
+    for layer in layers:
+        for file in sorted((root / layer).rglob("*.py")):
+            digest.update(file.relative_to(root).as_posix().encode())
             digest.update(file.read_bytes())
     return digest.hexdigest()

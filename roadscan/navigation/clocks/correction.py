@@ -1,0 +1,78 @@
+"""What an estimate says of a sensor's clock, and how epochs are corrected by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.gpstime import NS_PER_S
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ClockCorrection:
+    """epoch' = epoch + offset_s + drift · (epoch − reference_gps_ns): a correction of ingested epochs."""
+
+    offset_s: float
+    """Added at the reference (s)."""
+    drift: float
+    """Added a second from there on (s/s)."""
+    reference_gps_ns: int
+    """Epoch of the sensor's own, uncorrected clock at which the offset holds."""
+    sigma_offset_s: float = 0.0
+    """1 σ of the offset (s)."""
+    sigma_drift: float = 0.0
+    """1 σ of the drift (s/s)."""
+    correlation: float = 0.0
+    """Between the two."""
+    first_gps_ns: int = 0
+    """First epoch (uncorrected) of the span that it was found from; it is applied outside, too."""
+    last_gps_ns: int = 0
+    """Last epoch of that span."""
+
+    def applied(self, epochs_gps_ns: Int64) -> Int64:
+        """Corrected epochs (n,) of epochs (n,), GPS ns."""
+        if self.drift == 0.0:
+            return epochs_gps_ns + round(self.offset_s * NS_PER_S)
+        elapsed_ns = (epochs_gps_ns - self.reference_gps_ns).astype(np.float64)
+        corrected: Int64 = epochs_gps_ns + np.rint(self.offset_s * NS_PER_S + self.drift * elapsed_ns).astype(np.int64)
+        return corrected
+
+    def sigma_s(self, epochs_gps_ns: Int64) -> Float64:
+        """1 σ (n,) of the corrected epochs (s): it grows away from the reference."""
+        elapsed_s = (epochs_gps_ns - self.reference_gps_ns).astype(np.float64) / NS_PER_S
+        covariance = self.correlation * self.sigma_offset_s * self.sigma_drift
+        variance = self.sigma_offset_s**2 + 2 * covariance * elapsed_s + (self.sigma_drift * elapsed_s) ** 2
+        sigma: Float64 = np.sqrt(np.maximum(variance, 0.0))
+        return sigma
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What an estimate leaves: one a pair of stamps, or a window of motion."""
+
+    epochs_gps_ns: Int64
+    """(m,) epoch of the pair, or the middle of the window, by the sensor's own, uncorrected clock."""
+    residual_s: Float64
+    """(m,) observed − fitted correction (s)."""
+    sigma_s: Float64
+    """(m,) 1 σ of it, as the noise of the pair or window says (s)."""
+    used: Bool
+    """(m,) False for outliers, and for windows without motion."""
+
+    @property
+    def weights(self) -> Float64:
+        """(m,) share in the estimate: information 1/σ² over that of all that are used; 0 where not used."""
+        information = np.where(self.used, 1.0 / np.square(self.sigma_s), 0.0)
+        total = information.sum()
+        return information / total if total > 0.0 else information
+
+    @property
+    def rms_s(self) -> float:
+        """Weighted RMS of the residuals that are used (s)."""
+        return float(np.sqrt(np.sum(self.weights * np.square(np.where(self.used, self.residual_s, 0.0)))))

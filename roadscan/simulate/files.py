@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.gpstime import gps_ns_from_utc
+from roadscan.model.imu import ImuErrors, ImuGrade
 from roadscan.simulate import sick
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.imu import AT_BODY, head_imus
@@ -75,9 +76,12 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         )
         lines += _interior(scene.camera)
     if scene.imu.on:
-        lines += _sensor("imu", "imu", f"IMU, {scene.imu.grade} grade", "frd", mounted(AT_BODY))
+        own = scene.imu.errors is not None
+        lines += _sensor("imu", "imu", f"IMU, {'own' if own else scene.imu.grade} grade", "frd", mounted(AT_BODY))
+        lines.append(_imu_errors(scene.imu.errors or scene.imu.grade))
     for imu in head_imus(scene):
         lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", mounted(imu.mount))
+        lines.append(_imu_errors(scene.profilers.head_imus or "perfect"))
     if scene.gnss.on:
         error = MountError(lever_arm_body_m=scene.gnss.lever_arm_error_m)
         mount = Mount(lever_arm_body_m=scene.gnss.lever_arm_body_m, error=error)
@@ -179,6 +183,13 @@ def _interior(camera: Camera) -> list[str]:
         f"# focal length {lens.focal_px!r} px, principal point {list(lens.principal_px)} px,",
         f"# distortion k1, k2, p1, p2, k3 = {list(lens.distortion)}; x of the sensor is the optical axis",
     ]
+
+
+def _imu_errors(errors: ImuErrors | ImuGrade) -> str:
+    """Line of an IMU's errors: its grade, or the values of a data sheet."""
+    if isinstance(errors, str):
+        return f"imu = {_text(errors)}"
+    return "imu = { " + ", ".join(f"{name} = {value!r}" for name, value in errors.model_dump().items()) + " }"
 
 
 def _profiler_limits(head: Head) -> tuple[float, float]:

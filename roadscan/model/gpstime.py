@@ -20,6 +20,7 @@ Int64 = npt.NDArray[np.int64]
 
 NS_PER_S: Final = 1_000_000_000
 WEEK_S: Final = 604_800
+WEEKS_A_ROLLOVER: Final = 1024
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """Unix seconds of 1980-01-06T00:00:00 UTC, the origin of GPS time."""
 ADJUSTED_OFFSET_S: Final = 1_000_000_000
@@ -104,6 +105,23 @@ def gps_week_of_date(date: dt.date) -> int:
     return (date - dt.date(1980, 1, 6)).days // 7
 
 
+def check_week(week: int) -> None:
+    """Refuse a GPS week as the ten bits of the signal show it: they start again every 1024 weeks (IS-GPS-200, 20.3.3).
+
+    Raises
+    ------
+    ValueError
+        if the week lies before 22 August 1999, when the first rollover was.
+    """
+    if week < WEEKS_A_ROLLOVER:
+        days = [dt.date(1980, 1, 6) + dt.timedelta(weeks=week + k * WEEKS_A_ROLLOVER) for k in range(3)]
+        later = " or ".join(f"{week + k * WEEKS_A_ROLLOVER} (from {days[k]})" for k in (1, 2))
+        raise ValueError(
+            f"week {week} began on {days[0]}; a receiver that counts weeks modulo 1024 means {later}: "
+            "state the full week, or the date of the log in its place"
+        )
+
+
 @dataclass(frozen=True)
 class Clock:
     """How a log's stamps become GPS time.
@@ -154,21 +172,7 @@ class Clock:
             when the result lies outside 1980–2080: the unit or the system is wrong.
         """
         scale_ns = UNIT_NS[self.unit]
-        if np.issubdtype(stamps.dtype, np.integer):
-            integral = stamps.astype(np.int64)
-            limit = np.iinfo(np.int64).max // scale_ns
-            if integral.size and (integral.max() > limit or integral.min() < -limit):
-                self._refuse(int(integral[np.argmax(np.abs(integral))]))
-            ns = integral * scale_ns
-        else:
-            floating = stamps.astype(np.float64)
-            if floating.size and not np.all(np.isfinite(floating)):
-                raise TimeSystemError("a time stamp is not a number", expected="finite stamps")
-            whole = np.floor(floating)
-            worst = float(np.max(np.abs(whole))) if floating.size else 0.0
-            if worst * scale_ns > 9e18:
-                self._refuse(worst)
-            ns = whole.astype(np.int64) * scale_ns + np.rint((floating - whole) * scale_ns).astype(np.int64)
+        ns = self._nanoseconds(stamps)
         if self.drift_ppm:
             elapsed_ns = (ns - round(self.reference_s * NS_PER_S)).astype(np.float64)
             drift_ns = np.rint(elapsed_ns * (self.drift_ppm * 1e-6)).astype(np.int64)
@@ -180,6 +184,32 @@ class Clock:
             at = int(np.flatnonzero(epochs == bad[0])[0])
             self._refuse(int(ns[at]) // scale_ns if np.issubdtype(stamps.dtype, np.integer) else float(stamps[at]))
         return epochs
+
+    def counted_ns(self, stamps: npt.NDArray[np.generic]) -> tuple[Int64, Int64]:
+        """Stamps (n,) in nanoseconds of their own count, and what the time system alone makes of them (GPS ns).
+
+        Neither offset nor drift is applied, and a free-running clock may show any time.
+        """
+        ns = self._nanoseconds(stamps)
+        return ns, self._scale(ns)
+
+    def _nanoseconds(self, stamps: npt.NDArray[np.generic]) -> Int64:
+        scale_ns = UNIT_NS[self.unit]
+        if np.issubdtype(stamps.dtype, np.integer):
+            integral = stamps.astype(np.int64)
+            limit = np.iinfo(np.int64).max // scale_ns
+            if integral.size and (integral.max() > limit or integral.min() < -limit):
+                self._refuse(int(integral[np.argmax(np.abs(integral))]))
+            return integral * scale_ns
+        floating = stamps.astype(np.float64)
+        if floating.size and not np.all(np.isfinite(floating)):
+            raise TimeSystemError("a time stamp is not a number", expected="finite stamps")
+        whole = np.floor(floating)
+        worst = float(np.max(np.abs(whole))) if floating.size else 0.0
+        if worst * scale_ns > 9e18:
+            self._refuse(worst)
+        fraction: Int64 = np.rint((floating - whole) * scale_ns).astype(np.int64)
+        return whole.astype(np.int64) * scale_ns + fraction
 
     def _scale(self, ns: Int64) -> Int64:
         match self.system:

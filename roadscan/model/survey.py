@@ -8,10 +8,10 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.clock_evidence import MotionEvidence
+from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
-from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Rig, Sensor
 from roadscan.model.smoothing import SmootherConfig
@@ -92,7 +92,7 @@ class ClockConfig(Strict):
     unit: Literal["s", "ms", "us", "ns"] = "s"
     """Unit of numeric stamps."""
     week: int | None = Field(default=None, ge=0, le=5000)
-    """GPS week of the log's first stamp."""
+    """GPS week of the log's first stamp, in full: a receiver that counts modulo 1024 shows too small a one."""
     date: dt.date | None = None
     """UTC date of the log's first stamp; stands for the week, and resolves the hour of `utc_hour`."""
     offset_s: float = 0.0
@@ -101,18 +101,27 @@ class ClockConfig(Strict):
     """Measured rate error (parts per million) from `reference_s` on."""
     reference_s: float = 0.0
     """Stamp at which `offset_s` was measured (s of the log's own count)."""
+    pairs: PairEvidence | None = None
+    """Pairs of (stamp, GPS time) that offset and drift are computed from, in place of stating them."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.week is not None and self.date is not None:
             raise ValueError("give week or date, not both")
-        if self.system is TimeSystem.FREE and self.offset_s == 0.0:
-            raise ValueError("a free-running clock needs offset_s, measured against GPS time")
+        if self.week is not None:
+            check_week(self.week)
+        if self.pairs is None and self.system is TimeSystem.FREE and self.offset_s == 0.0:
+            raise ValueError("a free-running clock needs offset_s, measured against GPS time, or pairs of stamps")
+        if self.pairs is not None:
+            if {"offset_s", "drift_ppm", "reference_s"} & self.model_fields_set:
+                raise ValueError("give pairs, or offset_s and drift_ppm, not both")
+            if self.system is TimeSystem.UTC_HOUR:
+                raise ValueError("stamps past the hour cannot be paired: state the measured offset_s")
         return self
 
     def clock(self) -> Clock:
-        """The clock these settings describe."""
-        return Clock(**self.model_dump())
+        """The clock these settings describe; what pairs say of it is added by whoever reads them."""
+        return Clock(**self.model_dump(exclude={"pairs"}))
 
 
 class LogConfig(Strict):

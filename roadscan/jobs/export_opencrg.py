@@ -143,9 +143,10 @@ def _placed(
     first, end = lane_pass.start_gps_ns, lane_pass.end_gps_ns
     slices = []
     for file in files:
-        groups = tuple(k for k, span in enumerate(file.group_spans) if span[0] < end and span[1] >= first)
+        spans = source.spans(file.group_spans)
+        groups = tuple(k for k, span in enumerate(spans) if span[0] < end and span[1] >= first)
         if groups:
-            slices.append(RawSlice(source, file.path, groups, tuple(file.group_spans[k] for k in groups), file.bytes))
+            slices.append(RawSlice(source, file.path, groups, tuple(spans[k] for k in groups), file.bytes))
     placer = Placer(plan.store, plan.ground, slices)
     tile_quanta = plan.ground.grid.size_quanta
     for one in slices:

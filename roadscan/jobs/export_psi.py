@@ -14,7 +14,7 @@ import pyarrow as pa
 from roadscan import __version__
 from roadscan.jobs.export import Exported, published, source_in
 from roadscan.jobs.plan import SurveyPlan, plan_survey
-from roadscan.jobs.readings import ReadingSource, load_trajectory, read_groups
+from roadscan.jobs.readings import ReadingSource, load_trajectory, read_rows
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.gpstime import NS_PER_S, utc_from_gps_ns
 from roadscan.model.survey import Survey
@@ -61,11 +61,11 @@ def export_psi(
     geometry = _cartesian(source)
     if source.trajectory is None or not files:
         raise RunError(f"run '{run}' has no profiles of '{sensor}' with a trajectory")
-    spans = [span for f in files for span in f.group_spans]
+    spans = [span for f in files for span in source.spans(f.group_spans)]
     travel = Travel(load_trajectory(store, source.trajectory, spans, plan.ground.max_gap_s))
     with published(out) as folder:
         writer = _PsiWriter(folder, plan, source, geometry, travel, settings)
-        for batch in _batches(store, files):
+        for batch in _batches(store, source, files):
             writer.add(batch)
         writer.flush()
         if not writer.names:
@@ -94,11 +94,11 @@ def _cartesian(source: ReadingSource) -> ScanGeometry:
     return geometry
 
 
-def _batches(store: Store, files: list[DataFile]) -> Iterator[pa.RecordBatch]:
+def _batches(store: Store, source: ReadingSource, files: list[DataFile]) -> Iterator[pa.RecordBatch]:
     """Row groups of data files."""
     for file in files:
         for group in range(len(file.group_rows)):
-            yield from read_groups(store, file.path, [group]).combine_chunks().to_batches()
+            yield from read_rows(store, source, file.path, [group]).combine_chunks().to_batches()
 
 
 @dataclass

@@ -172,10 +172,8 @@ def _sensor(rig: Rig, record: LogRecord, kind: str) -> Sensor:
 
 def _rows(store: Store, records: Sequence[LogRecord], table: str) -> dict[str, npt.NDArray[Any]]:
     """Columns of all rows, in order of time; nulls of numbers become NaN."""
-    parts: list[pa.Table] = []
-    for record in records:
-        for file in record.tables.get(table, ()):
-            parts.append(read_groups(store, file.path, range(len(file.group_rows))))
+    files = [f for record in records for f in record.tables.get(table, ())]
+    parts = [read_groups(store, f.path, range(len(f.group_rows))) for f in files]
     rows = pa.concat_tables(parts).sort_by("epoch_gps_ns") if parts else None
     if rows is None or rows.num_rows == 0:
         raise NavigationError(f"the table {table} has no rows", file=records[0].path if records else None)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from roadscan.jobs.centre_line import CentreLines
+from roadscan.jobs.clocks import load_clocks
 from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES, survey_records
 from roadscan.jobs.readings import (
@@ -65,7 +66,7 @@ class SurveyPlan:
     def slices(self) -> list[RawSlice]:
         """All data files, whole."""
         return [
-            RawSlice(source, f.path, tuple(range(len(f.group_rows))), f.group_spans, f.bytes)
+            RawSlice(source, f.path, tuple(range(len(f.group_rows))), source.spans(f.group_spans), f.bytes)
             for source, files in self.sources
             for f in files
         ]
@@ -106,6 +107,7 @@ def _sources(
     survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground
 ) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
     calibrated = load_mountings(store)
+    clocks = load_clocks(store)
     adjusted = store.read_bytes(CORRECTIONS).hex() if store.exists(CORRECTIONS) else None
     found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
     for record in records:
@@ -118,11 +120,13 @@ def _sources(
             nominal = sensor.mounting() if sensor else _UNMOUNTED
             dated = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor)) or []
             mountings = _mountings(nominal, dated)
+            clock = clocks.get((record.run, record.sensor)) or clocks.get(("*", record.sensor))
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
                 code_version(),
                 adjusted,
                 asdict(mountings),
+                None if clock is None else (clock.offset_s, clock.drift, clock.reference_gps_ns),
                 limits,
                 None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
                 record.attributes,
@@ -137,7 +141,7 @@ def _sources(
             )
             source = ReadingSource(
                 record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
-                *limits, key,
+                *limits, key, clock,
             )  # fmt: skip
             found.append((source, files))
     return found
@@ -171,8 +175,9 @@ def _passes(
         run = RunId(source.run)
         for span in (f.span for f in files):
             if span is not None:
-                before = spans.get(run, span)
-                spans[run] = (min(before[0], span[0]), max(before[1], span[1] + _profile_ns(source)))
+                ((first, last),) = source.spans([span])
+                before = spans.get(run, (first, last))
+                spans[run] = (min(before[0], first), max(before[1], last + _profile_ns(source)))
     return survey.passes(spans)
 
 

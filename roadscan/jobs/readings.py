@@ -17,6 +17,7 @@ from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting, Mountings
+from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
 from roadscan.points.place import (
@@ -39,6 +40,7 @@ CORRECTIONS: str = "tables/corrections/part-00000.parquet"
 MOUNTINGS: str = "tables/mountings/part-00000.parquet"
 
 _CHUNK_READINGS = 1 << 20
+_EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
 _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz"]
 
 
@@ -66,7 +68,16 @@ class ReadingSource:
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: poses, corrections, mounting, range limits, map, grid, code."""
+    """Hash of all that places the readings: poses, corrections, mounting, clock, range limits, map, grid, code."""
+    clock: ClockCorrection | None = None
+    """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
+
+    def spans(self, ingested: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+        """First and last epochs (GPS ns) on time, of spans of ingested epochs."""
+        if self.clock is None:
+            return tuple(ingested)
+        ends = self.clock.applied(np.array(ingested, dtype=np.int64).ravel()).reshape(-1, 2)
+        return tuple((int(a), int(b)) for a, b in ends)
 
     @property
     def attribute(self) -> dict[str, Any]:
@@ -115,6 +126,19 @@ def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[st
         ) from error
 
 
+def read_rows(store: Store, source: ReadingSource, file: str, groups: Sequence[int]) -> pa.Table:
+    """Row groups of a source's data file, their epochs on time."""
+    rows = read_groups(store, file, groups)
+    if source.clock is None:
+        return rows
+    for name in _EPOCH_COLUMNS:
+        if name in rows.column_names:
+            index = rows.column_names.index(name)
+            corrected = source.clock.applied(rows.column(name).to_numpy())
+            rows = rows.set_column(index, rows.schema.field(name), pa.array(corrected))
+    return rows
+
+
 class Placer:
     """Places the readings of slices: loads the poses they need, once for each source."""
 
@@ -136,13 +160,13 @@ class Placer:
     def place(self, one: RawSlice, window: Window) -> Iterator[tuple[int, Placed]]:
         """Points of a slice, chunk by chunk, with the row group each chunk starts with."""
         for groups in _chunks(one):
-            rows = read_groups(self._store, one.file, groups).combine_chunks()
+            rows = read_rows(self._store, one.source, one.file, groups).combine_chunks()
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
 
     def touched(self, one: RawSlice, group: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
         """Tiles (n, 2) of the points of one row group, and the fates of its readings."""
-        batch = read_groups(self._store, one.file, [group]).combine_chunks().to_batches()[0]
+        batch = read_rows(self._store, one.source, one.file, [group]).combine_chunks().to_batches()[0]
         if one.source.table == "cloud":
             placed = self._place_batch(one.source, batch, EVERYWHERE, self._ground.marks)
             return placed.tiles, placed.fates
@@ -154,7 +178,7 @@ class Placer:
         Passes and centre lines are not looked at.
         """
         for groups in _chunks(one):
-            for batch in read_groups(self._store, one.file, groups).combine_chunks().to_batches():
+            for batch in read_rows(self._store, one.source, one.file, groups).combine_chunks().to_batches():
                 kept = self._place_batch(one.source, batch, EVERYWHERE, marked=False)
                 yield batch, self._classes(one.source, batch), kept
 

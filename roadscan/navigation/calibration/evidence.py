@@ -1,11 +1,15 @@
 """What observations of mountings look like, whatever they come from.
 
-Every kind of evidence ends as one of two observations:
+Every kind of evidence ends as one of three observations:
 
 - **Ties**: two readings saw the same place. With p = t + R_world←body (R_body←sensor p_sensor + l), the whitened
   difference W (p_first − p_second) has unit variance. Rows of W say what is known: one row nᵀ/σ for two readings of
   one plane with normal n, three for a place known in all directions.
-- **Directions**: the same vector seen by the sensor and by the body (gravity, acceleration, the Earth's field).
+- **Directions**: the same vector seen by the sensor and by the body (gravity, acceleration, the Earth's field), each
+  with an error of its own.
+- **Orientation**: the whole rotation of a sensor with its covariance, from a solution whose errors are not independent.
+
+Poses have errors too. A **Traverse** is a piece of a drive within which they are one shift and one small rotation.
 
 World frame: any right-handed Cartesian frame in metres (ECEF or the local frame).
 """
@@ -72,4 +76,33 @@ class Directions:
     """(n,) 1 σ of the angle between them."""
 
 
-Evidence = Ties | Directions
+@dataclass(frozen=True)
+class Orientation:
+    """The rotation of a sensor, found by itself."""
+
+    kind: str
+    sensor: str
+    body_from_sensor: Float64
+    """(3, 3)."""
+    covariance_rad2: Float64
+    """(3, 3) of a small rotation about the body's axes that follows `body_from_sensor`."""
+
+
+Evidence = Ties | Directions | Orientation
+
+
+@dataclass(frozen=True)
+class Traverse:
+    """A piece of a drive whose poses share one error; pieces of one run are correlated by the time between them."""
+
+    run: str
+    epoch_gps_ns: int
+    """Its middle."""
+    sigma_north_east_down_m: tuple[float, float, float]
+    """1 σ of the poses' position."""
+    sigma_roll_pitch_heading_rad: tuple[float, float, float]
+    """1 σ of the poses' attitude, about the body's axes."""
+    world_from_ned: Float64
+    """(3, 3) local level axes at the place."""
+    time_constant_s: float = 60.0
+    """Errors of two pieces of the run are correlated by exp(−|Δt| / time constant)."""

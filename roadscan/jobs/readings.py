@@ -41,7 +41,8 @@ MOUNTINGS: str = "tables/mountings/part-00000.parquet"
 
 _CHUNK_READINGS = 1 << 20
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
-_POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz"]
+_SIGMA_COLUMNS = ["sigma_north_m", "sigma_east_m", "sigma_down_m"]
+_POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz", *_SIGMA_COLUMNS]
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,11 @@ class Placer:
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
 
+    def trajectory(self, source: ReadingSource) -> Trajectory | None:
+        """Poses around the slices of a source; None for clouds."""
+        placement = self._placements.get(source.key)
+        return None if placement is None else placement.trajectory
+
     def touched(self, one: RawSlice, group: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
         """Tiles (n, 2) of the points of one row group, and the fates of its readings."""
         batch = read_rows(self._store, one.source, one.file, [group]).combine_chunks().to_batches()[0]
@@ -237,6 +243,7 @@ def load_trajectory(
         np.stack([column[f"{a}_world_m"] for a in "xyz"], axis=-1),
         np.stack([column[a] for a in ("qw", "qx", "qy", "qz")], axis=-1),
         max_gap_s,
+        np.stack([column[a] for a in _SIGMA_COLUMNS], axis=-1).astype(np.float64),
     )
     return trajectory.corrected(load_corrections(store, source.run))
 

@@ -25,6 +25,7 @@ from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
+from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.centre_line import CentreLineBuffer
 from roadscan.points.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
 from roadscan.points.cloud import QUANTUM_M, TilePoints, fill_of
@@ -41,6 +42,8 @@ from roadscan.tiles.statistics import cells_of
 
 TILE = "tile"
 """Manifest name of a tile as a whole; its file holds the cells."""
+
+_MOMENT_NS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ def compute_block(task: BlockTask) -> BlockResult:
             continue  # a tile of the halo, or one without points
         key = waiting.pop(tile)
         try:
-            records += _write_tile(task, key, loaded.points, loaded.marked)
+            records += _write_tile(task, key, loaded.points, loaded.marked, loaded.sigma)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), _reason(error)))
     for tile, key in waiting.items():
@@ -209,6 +212,16 @@ class LoadedTile:
     """Points that passed all filters; None without any."""
     marked: TilePoints | None
     """Points that a filter leaves out; None without any, or where the survey does not keep them."""
+    sigma: PositionSigma
+    """Of the poses that placed the points."""
+
+
+@dataclass(frozen=True)
+class PositionSigma:
+    """Largest 1 σ of the positions that placed a tile's points (m); None where a trajectory does not state it."""
+
+    horizontal_m: float | None
+    down_m: float | None
 
 
 def load_points(task: BlockTask) -> Iterator[tuple[TileId, TilePoints]]:
@@ -228,7 +241,7 @@ def load_tiles(task: BlockTask) -> Iterator[LoadedTile]:
         own = [p for p in task.passes if p.run == one.source.run]
         for _, placed in placer.place(one, Window(*box)):
             if placed.epoch_gps_ns.size:
-                parts.add(one.source, placed, passes_of(placed.epoch_gps_ns, own))
+                parts.add(one.source, placed, passes_of(placed.epoch_gps_ns, own), placer.trajectory(one.source))
     if not parts.placed:
         return
     joined = parts.join()
@@ -256,13 +269,13 @@ def _loaded(
     near = None if buffer is None else near_lines(tile, joined.quanta[rows], buffer, ground)
     if joined.classes is None:
         rows = rows if near is None else rows[near]
-        return LoadedTile(tile, joined.tile(tile, rows) if rows.size else None, None)
+        return LoadedTile(tile, joined.tile(tile, rows) if rows.size else None, None, joined.sigma(rows))
     classes = joined.classes[rows]
     if near is not None:
         classes[(classes == KEPT) & ~near] = OFF_CENTRE_LINE
     kept, left = rows[classes == KEPT], rows[classes != KEPT]
     marked = joined.tile(tile, left, LAS_CLASSES[classes[classes != KEPT]]) if left.size else None
-    return LoadedTile(tile, joined.tile(tile, kept) if kept.size else None, marked)
+    return LoadedTile(tile, joined.tile(tile, kept) if kept.size else None, marked, joined.sigma(kept))
 
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
@@ -330,12 +343,20 @@ class _Parts:
         self._sources: list[npt.NDArray[np.uint16]] = []
         self._numbers: dict[str, int] = {}
         self._profiles: list[bool] = []
+        self.trajectories: list[Trajectory | None] = []
 
-    def add(self, source: ReadingSource, placed: Placed, passes: npt.NDArray[np.uint16]) -> None:
+    def add(
+        self,
+        source: ReadingSource,
+        placed: Placed,
+        passes: npt.NDArray[np.uint16],
+        trajectory: Trajectory | None,
+    ) -> None:
         """Take a chunk of one source; sources are numbered as they come."""
         number = self._numbers.setdefault(source.key, len(self._numbers))
         if number == len(self._profiles):
             self._profiles.append(source.table == "scans")
+            self.trajectories.append(trajectory)
         self.placed.append(placed)
         self._passes.append(passes)
         self._sources.append(np.full(passes.size, number, np.uint16))
@@ -355,6 +376,7 @@ class _Parts:
             passes=np.concatenate(self._passes),
             sources=np.concatenate(self._sources),
             profiles=np.array(self._profiles),
+            trajectories=self.trajectories,
             extra=extra,
             lacking=lacking,
             classes=classes,
@@ -375,11 +397,27 @@ class _Joined:
     sources: npt.NDArray[np.uint16]
     profiles: npt.NDArray[np.bool_]
     """(sources,) True for scans."""
+    trajectories: Sequence[Trajectory | None]
+    """Of each source; None for clouds."""
     extra: dict[str, npt.NDArray[Any]]
     lacking: dict[str, npt.NDArray[np.bool_]]
     """(n,) True for points without a recorded value, for columns that some points lack."""
     classes: npt.NDArray[np.uint8] | None
     """(n,) class of each reading, where those that a filter leaves out were placed too."""
+
+    def sigma(self, rows: npt.NDArray[np.integer[Any]]) -> PositionSigma:
+        """Largest σ of the poses that placed the points at `rows`."""
+        sources, epochs = self.sources[rows], self.epoch_gps_ns[rows]
+        found = [np.full((1, 3), np.nan)]
+        for number in np.unique(sources).tolist():
+            trajectory = self.trajectories[number]
+            if trajectory is None:
+                return PositionSigma(None, None)
+            found.append(trajectory.position_sigma_m(_moments(epochs[sources == number])))
+        sigma = np.concatenate(found[1:] or found)
+        if np.isnan(sigma).any():
+            return PositionSigma(None, None)
+        return PositionSigma(float(np.hypot(sigma[:, 0], sigma[:, 1]).max()), float(sigma[:, 2].max()))
 
     def tile(
         self,
@@ -415,6 +453,16 @@ class _Joined:
         )
 
 
+def _moments(epochs_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Middle of each twentieth of a second that holds an epoch, not beyond the first and last of them."""
+    if epochs_gps_ns.size == 0:
+        return epochs_gps_ns
+    first, last = int(epochs_gps_ns.min()), int(epochs_gps_ns.max())
+    number = first // _MOMENT_NS
+    held = np.flatnonzero(np.bincount(epochs_gps_ns // _MOMENT_NS - number))
+    return np.clip((number + held) * _MOMENT_NS + _MOMENT_NS // 2, first, last)
+
+
 def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
     known = [p.extra[column] for p in parts if column in p.extra]
     if not known:
@@ -437,7 +485,9 @@ def near_lines(
     return buffer.keeps(easting, northing, (b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m))
 
 
-def _write_tile(task: BlockTask, key: str, points: TilePoints, marked: TilePoints | None) -> list[OutputRecord]:
+def _write_tile(
+    task: BlockTask, key: str, points: TilePoints, marked: TilePoints | None, sigma: PositionSigma
+) -> list[OutputRecord]:
     tile = points.tile
     cells = cells_of(points, task.ground.grid)
     context = dataclasses.replace(task.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
@@ -452,7 +502,7 @@ def _write_tile(task: BlockTask, key: str, points: TilePoints, marked: TilePoint
             records.append(_publish(task.store, path, target, wanted.product.name, str(tile), own_key))
         path = folder / "cells.parquet"
         write_parquet(path, cells_table(cells), table_schema("cells"))
-        detail = json.dumps(_figures(points, cells))
+        detail = json.dumps(_figures(points, cells, sigma))
         records.append(
             _publish(task.store, path, f"tiles/cells/{tile}.parquet", TILE, str(tile), key, detail)
         )  # last: a tile is current only with all its files
@@ -466,7 +516,7 @@ def cells_table(cells: TileCells) -> pa.Table:
     return pa.table([passes if n == "passes" else getattr(cells, n) for n in schema.names], schema=schema)
 
 
-def _figures(points: TilePoints, cells: TileCells) -> dict[str, Any]:
+def _figures(points: TilePoints, cells: TileCells, sigma: PositionSigma) -> dict[str, Any]:
     return {
         "points": len(points),
         "cells": len(cells),
@@ -478,6 +528,8 @@ def _figures(points: TilePoints, cells: TileCells) -> dict[str, Any]:
         "passes": np.unique(points.pass_id).tolist(),
         "first_epoch_gps_ns": int(points.epoch_gps_ns.min()),
         "last_epoch_gps_ns": int(points.epoch_gps_ns.max()),
+        "sigma_horizontal_m": sigma.horizontal_m,
+        "sigma_down_m": sigma.down_m,
     }
 
 

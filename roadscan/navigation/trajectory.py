@@ -74,10 +74,18 @@ class Trajectory:
     """(n, 4), unit, scalar first."""
     max_gap_s: float = 1.0
     """Between knots farther apart there is no pose."""
+    sigma_ned_m: Float64 | None = None
+    """(n, 3) 1 σ of the positions, local level (local frame: y, x, −z), as the log states it; NaN where it does not."""
 
     @classmethod
     def of(
-        cls, world: str, epochs_gps_ns: Int64, position_world_m: Float64, quaternion: Float64, max_gap_s: float = 1.0
+        cls,
+        world: str,
+        epochs_gps_ns: Int64,
+        position_world_m: Float64,
+        quaternion: Float64,
+        max_gap_s: float = 1.0,
+        sigma_ned_m: Float64 | None = None,
     ) -> Trajectory:
         """Sort, drop repeated epochs (the first stays) and normalise the quaternions."""
         order = np.argsort(epochs_gps_ns, kind="stable")
@@ -85,7 +93,8 @@ class Trajectory:
         keep = np.concatenate([[True], np.diff(epochs) > 0]) if epochs.size else np.zeros(0, dtype=bool)
         unit = quaternion[order][keep]
         unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-        return cls(world, epochs[keep], np.ascontiguousarray(position_world_m[order][keep]), unit, max_gap_s)
+        sigma = None if sigma_ned_m is None else sigma_ned_m[order][keep]
+        return cls(world, epochs[keep], np.ascontiguousarray(position_world_m[order][keep]), unit, max_gap_s, sigma)
 
     @property
     def span_gps_ns(self) -> tuple[int, int]:
@@ -111,7 +120,17 @@ class Trajectory:
             position,
             _turned(self.quaternion_world_from_body, turn),
             self.max_gap_s,
+            self.sigma_ned_m,
         )
+
+    def position_sigma_m(self, epochs_gps_ns: Int64) -> Float64:
+        """1 σ (n, 3) of positions at epochs (n,), north, east, down: linear between knots, NaN where not known."""
+        if self.sigma_ned_m is None or self.epochs_gps_ns.size == 0:
+            return np.full((epochs_gps_ns.size, 3), np.nan)
+        knots = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
+        since = (epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
+        columns = [np.interp(since, knots, self.sigma_ned_m[:, a], left=np.nan, right=np.nan) for a in range(3)]
+        return np.stack(columns, axis=-1)
 
     def poses(self, epochs_gps_ns: Int64, *, strict: bool = False) -> Poses:
         """Interpolate.

@@ -74,6 +74,8 @@ class TileSummary:
     passes: tuple[int, ...]
     first_epoch_gps_ns: int
     last_epoch_gps_ns: int
+    sigma_horizontal_m: float | None = None
+    sigma_down_m: float | None = None
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ _COLUMNS: Final = pa.schema(
         pa.field("passes", pa.list_(pa.field("element", pa.uint16(), nullable=False)), nullable=False),
         pa.field("first_epoch_gps_ns", pa.int64(), nullable=False),
         pa.field("last_epoch_gps_ns", pa.int64(), nullable=False),
+        pa.field("sigma_horizontal_m", pa.float64(), nullable=True),
+        pa.field("sigma_down_m", pa.float64(), nullable=True),
     ]
 )
 """Types of ``schemas/tiles.toml``; a test compares them."""
@@ -114,6 +116,8 @@ def _row(one: TileSummary, context: ProductContext) -> dict[str, Any]:
         "passes": list(one.passes),
         "first_epoch_gps_ns": one.first_epoch_gps_ns,
         "last_epoch_gps_ns": one.last_epoch_gps_ns,
+        "sigma_horizontal_m": one.sigma_horizontal_m,
+        "sigma_down_m": one.sigma_down_m,
     }
 
 

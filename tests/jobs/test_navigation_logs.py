@@ -12,6 +12,7 @@ from roadscan.jobs.ingest import ingest, plan_logs
 from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.survey import Survey
 from roadscan.sensors.nmea_writer import Fix, write_nmea
+from roadscan.simulate import Scene
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
@@ -121,3 +122,12 @@ def test_a_changed_accuracy_file_makes_the_trajectory_new(tmp_path: Path) -> Non
     assert keys[0] != keys[1]
     assert query(store, "SELECT file, record FROM rejects").to_pylist() == [{"file": "accuracy.out", "record": 4}]
     assert len(plan_logs(survey, store)[0]) == 1
+
+
+def test_stated_errors_of_poses_reach_the_tiles(finished: Simulated) -> None:
+    sigma = Scene.load("demo").noise.position_m
+    rows = query(finished.store(), "SELECT sigma_horizontal_m, sigma_down_m FROM tiles").to_pylist()
+    assert rows
+    for row in rows:
+        assert row["sigma_horizontal_m"] == pytest.approx(sigma * 2**0.5, rel=0.02)
+        assert row["sigma_down_m"] == pytest.approx(sigma, rel=0.02)

@@ -1,0 +1,431 @@
+"""Mountings by least squares over all evidence at once.
+
+Weighted, robust Gauss–Newton over mountings, errors of poses and poses of calibration objects, each with its prior
+(Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment – a modern synthesis", sections 3 and 4). Poses and
+objects are eliminated; what remains tells which directions of the mountings the evidence determines
+(:mod:`roadscan.navigation.calibration.observability`). Directions that it does not determine keep their prior value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from roadscan.model.calibration import CalibrationSettings
+from roadscan.model.errors import ConfigError
+from roadscan.model.rig import Mounting
+from roadscan.navigation.calibration.evidence import Evidence, Traverse
+from roadscan.navigation.calibration.observability import Observability, observe
+from roadscan.navigation.calibration.observations import Observations, observations
+from roadscan.navigation.calibration.robust import (
+    Scales,
+    Weighed,
+    independent_share,
+    loss,
+    scales_of,
+    variance_factor,
+    weigh,
+)
+from roadscan.navigation.calibration.unknowns import (
+    MOUNTING,
+    Correction,
+    Estimate,
+    Geometry,
+    ObjectPose,
+    Prior,
+    Unknowns,
+)
+
+__all__ = [
+    "Calibrated",
+    "Calibration",
+    "Correction",
+    "Estimate",
+    "Figures",
+    "KindFigures",
+    "ObjectPose",
+    "Prior",
+    "calibrate",
+]
+
+Float64 = npt.NDArray[np.float64]
+
+Finder = Callable[[Estimate], Sequence[Evidence]]
+"""Finds the evidence anew with better mountings: correspondences change."""
+
+_CONVERGED: Final = 0.01
+"""A step below this share of every mounting's σ ends the iteration."""
+_HALVINGS: Final = 6
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """The mounting of one sensor."""
+
+    before: Mounting
+    mounting: Mounting
+    covariance: Float64
+    """(6, 6) lever arm forward, right, down (m), then a small rotation about body x, y, z (rad) that follows the
+    boresight."""
+    prior_sigma: Float64
+    """(6,) m and rad."""
+    range_offset_m: float
+    range_offset_sigma_m: float
+    not_determined: tuple[str, ...]
+    """Directions in words; they kept their prior value. Empty where the evidence determines all."""
+
+    @property
+    def sigma(self) -> Float64:
+        """(6,) m and rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Residuals of one kind between one pair of sensors."""
+
+    kind: str
+    sensors: str
+    count: int
+    rejected: int
+    """Beyond the reject limit with the final mountings: they count for nothing."""
+    unusable: int
+    """Not finite."""
+    rms_before: float
+    """Of unit variance where residuals are as large as their σ says; with the mountings of the rig file."""
+    rms_after: float
+    rms_before_m: float | None
+    """None for angles."""
+    rms_after_m: float | None
+
+
+@dataclass(frozen=True)
+class KindFigures:
+    """What all observations of one kind tell of their stated σ."""
+
+    kind: str
+    count: int
+    rejected: int
+    down_weighted: int
+    """Beyond the robust limit, within the reject limit."""
+    variance_factor: float
+    """1: residuals are as their σ says; else the variances of this kind were multiplied by it."""
+    counted_as: float
+    """Independent observations it was counted as."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Mountings, their covariance, and what the evidence says of itself."""
+
+    sensors: dict[str, Calibrated]
+    covariance: Float64
+    """(6 S, 6 S) of all sensors in their order, as in :class:`Calibrated`."""
+    observability: Observability
+    kinds: tuple[KindFigures, ...]
+    figures: tuple[Figures, ...]
+    corrections: dict[int, Correction]
+    """Errors of the poses, by traverse."""
+    correction_sigma: dict[int, Float64]
+    """(6,) 1 σ of them, m and rad."""
+    objects: dict[str, ObjectPose]
+    rounds: int
+    """How often the evidence was found."""
+    iterations: int
+    """Linearisations in all."""
+    converged: bool
+
+    @property
+    def mountings(self) -> dict[str, Mounting]:
+        """Mountings by sensor."""
+        return {name: one.mounting for name, one in self.sensors.items()}
+
+
+def calibrate(
+    sensors: Mapping[str, Prior],
+    evidence: Sequence[Evidence] | Finder,
+    traverses: Mapping[int, Traverse],
+    settings: CalibrationSettings | None = None,
+    objects: Mapping[str, ObjectPose] | None = None,
+) -> Calibration:
+    """Estimate mountings.
+
+    Parameters
+    ----------
+    sensors : those that are calibrated, with what is known of their mountings.
+    evidence : observations, or a function that finds them with the mountings of an estimate; it is called until the
+        mountings stay where they are.
+    traverses : errors of poses by the numbers that the evidence names.
+    settings : limits; their defaults where left out.
+    objects : about where the calibration objects lie that the evidence names.
+
+    Raises
+    ------
+    ConfigError
+        where there is no sensor, or evidence names a sensor, traverse or object that is not given.
+    NavigationError
+        where the shapes of evidence do not fit.
+    """
+    if not sensors:
+        raise ConfigError("a calibration without sensors", expected="at least one sensor whose mounting is estimated")
+    unknowns = Unknowns(dict(sensors), dict(traverses), dict(objects or {}))
+    return _Adjustment(unknowns, evidence, settings or CalibrationSettings()).run()
+
+
+@dataclass
+class _Adjustment:
+    """The state of one calibration."""
+
+    unknowns: Unknowns
+    evidence: Sequence[Evidence] | Finder
+    settings: CalibrationSettings
+    rounds: int = 0
+    iterations: int = 0
+    found: list[Observations] = field(default_factory=list)
+
+    def run(self) -> Calibration:
+        """All stages: with all directions free, then with those held that the evidence does not determine."""
+        start = np.zeros(self.unknowns.size)
+        z, _ = self._rounds(start, None, reject=False)
+        z, _ = self._rounds(z, None, reject=True)
+        system = self._linearised(z, reject=True)
+        seen = self._observe(system)
+        z, converged = self._rounds(z, seen.free, reject=True)
+        return self._result(z, seen, converged=converged)
+
+    def _rounds(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:
+        """Find the evidence and solve, until the mountings stay where they are."""
+        if not callable(self.evidence):
+            if not self.found:
+                self._find(z)
+            return self._solve(z, free, reject=reject)
+        for _ in range(self.settings.rounds_max):
+            self._find(z)
+            before = z
+            z, settled = self._solve(z, free, reject=reject)
+            system = self._linearised(z, reject=reject)
+            if settled and self._small(z - before, system, share=0.1):
+                return z, True
+        return z, False
+
+    def _find(self, z: Float64) -> None:
+        found = self.evidence(self.unknowns.estimate(z)) if callable(self.evidence) else self.evidence
+        self.found = observations(found, self.unknowns)
+        self.rounds += 1
+
+    def _solve(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:
+        """Gauss–Newton with the evidence at hand; a step that makes things worse is halved."""
+        system = self._linearised(z, reject=reject)
+        for _ in range(self.settings.iterations_max):
+            step = system.solution(free) - z
+            system, z, accepted = self._stepped(system, z, step, reject=reject)
+            if self._small(step, system) or not accepted:
+                return z, accepted or self._small(step, system, share=1.0)
+        return z, False
+
+    def _stepped(self, system: _System, z: Float64, step: Float64, *, reject: bool) -> tuple[_System, Float64, bool]:
+        for _ in range(_HALVINGS):
+            tried = self._linearised(z + step, reject=reject)
+            if tried.cost(system.scales) <= system.cost(system.scales) * (1 + 1e-9):
+                return tried, z + step, True
+            if self._small(step, tried):
+                return tried, z + step, True
+            step = 0.5 * step
+        return system, z, False
+
+    def _small(self, step: Float64, system: _System, share: float = _CONVERGED) -> bool:
+        size = self.unknowns.mounting_size
+        return bool((np.abs(step[:size]) <= share * np.sqrt(np.diag(system.covariance)[:size])).all())
+
+    def _linearised(self, z: Float64, *, reject: bool) -> _System:
+        self.iterations += 1
+        return _System.at(z, self.unknowns, self.found, self.settings, reject=reject)
+
+    def _observe(self, system: _System) -> Observability:
+        return observe(system.information, self.unknowns, self.settings.determined_below)
+
+    def _result(self, z: Float64, seen: Observability, *, converged: bool) -> Calibration:
+        system = self._linearised(z, reject=True)
+        # The split into directions stays that of the solution; their σ are those at the end.
+        seen = seen.updated(system.information, self.unknowns)
+        estimate = self.unknowns.estimate(z)
+        before = self.unknowns.geometry(np.zeros_like(z))
+        root = self.unknowns.root[: self.unknowns.mounting_size, : self.unknowns.mounting_size]
+        covariance = root @ seen.covariance @ root.T
+        keep = np.concatenate([MOUNTING * i + np.arange(6) for i in range(len(self.unknowns.priors))])
+        spread = np.sqrt(np.diag(self.unknowns.root @ system.covariance @ self.unknowns.root.T))
+        return Calibration(
+            sensors={name: self._calibrated(name, estimate, covariance, seen) for name in self.unknowns.priors},
+            covariance=covariance[np.ix_(keep, keep)],
+            observability=seen,
+            kinds=system.kind_figures(),
+            figures=tuple(self._figures(one, system, before) for one in system.weighed),
+            corrections=estimate.corrections,
+            correction_sigma={
+                int(key): spread[self.unknowns.body_slice(body)] for body, key in enumerate(self.unknowns.traverse_keys)
+            },
+            objects=estimate.objects,
+            rounds=self.rounds,
+            iterations=self.iterations,
+            converged=converged,
+        )
+
+    def _calibrated(self, name: str, estimate: Estimate, covariance: Float64, seen: Observability) -> Calibrated:
+        prior = self.unknowns.priors[name]
+        place = self.unknowns.mounting_slice(name)
+        own = covariance[place, place]
+        return Calibrated(
+            before=prior.mounting,
+            mounting=estimate.mountings[name],
+            covariance=own[:6, :6],
+            prior_sigma=np.array([*prior.lever_arm_sigma_m, *prior.boresight_sigma_rad]),
+            range_offset_m=estimate.range_offsets_m[name],
+            range_offset_sigma_m=float(np.sqrt(own[6, 6])),
+            not_determined=seen.not_determined(name),
+        )
+
+    @staticmethod
+    def _figures(one: Weighed, system: _System, before: Geometry) -> Figures:
+        at_start = one.observations.residuals(before)
+        used = one.weight > 0
+        lengths_before = one.observations.metres(at_start)
+        lengths_after = one.observations.metres(one.residuals)
+        return Figures(
+            kind=one.observations.kind,
+            sensors=one.observations.label,
+            count=one.observations.count,
+            rejected=int((~used).sum()),
+            unusable=one.observations.unusable,
+            rms_before=_rms(at_start[used]),
+            rms_after=_rms(one.residuals[used]),
+            rms_before_m=None if lengths_before is None else _rms(lengths_before[used]),
+            rms_after_m=None if lengths_after is None else _rms(lengths_after[used]),
+        )
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations at one place, whitened by the prior."""
+
+    z: Float64
+    weighed: tuple[Weighed, ...]
+    scales: Scales
+    information: Float64
+    """(P, P) of the evidence alone, in units of the prior's."""
+    slope: Float64
+    """(P,)"""
+    reject: bool
+
+    @classmethod
+    def at(
+        cls,
+        z: Float64,
+        unknowns: Unknowns,
+        found: Sequence[Observations],
+        settings: CalibrationSettings,
+        *,
+        reject: bool,
+    ) -> _System:
+        """Linearise."""
+        now = unknowns.geometry(z)
+        residuals = [one.residuals(now) for one in found]
+        scales = scales_of(found, residuals, settings)
+        weighed = tuple(
+            weigh(one, residual, scales, reject=reject) for one, residual in zip(found, residuals, strict=True)
+        )
+        by_kind = _normal_equations(weighed, now)
+        scales = _settled(scales, weighed, by_kind, settings)
+        information, slope = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
+        for kind, (own_information, own_slope) in by_kind.items():
+            information += scales.gain(kind) * own_information
+            slope += scales.gain(kind) * own_slope
+        return cls(z, weighed, scales, information, slope, reject)
+
+    @cached_property
+    def covariance(self) -> Float64:
+        """(P, P) in units of prior σ, with all directions free."""
+        return _inverse(self.information + np.eye(self.z.size))
+
+    def cost(self, scales: Scales) -> float:
+        """What is minimised, with the weights of another place."""
+        of_evidence = sum(scales.gain(one.kind) * loss(one, scales, reject=self.reject) for one in self.weighed)
+        return float(of_evidence + self.z @ self.z)
+
+    def solution(self, free: Float64 | None) -> Float64:
+        """Solution z (P,) of the normal equations, with the mountings in the space of `free` (M, d)."""
+        right = self.information @ self.z - self.slope
+        if free is None:
+            return self.covariance @ right
+        rest = self.z.size - len(free)
+        basis = block_diag(free, np.eye(rest))
+        inner = cho_factor(basis.T @ self.information @ basis + np.eye(basis.shape[1]))
+        return np.asarray(basis @ cho_solve(inner, basis.T @ right))
+
+    def kind_figures(self) -> tuple[KindFigures, ...]:
+        """What each kind says of its σ."""
+        return tuple(
+            KindFigures(
+                kind=kind,
+                count=sum(one.observations.count for one in members),
+                rejected=sum(int((one.weight == 0).sum()) for one in members),
+                down_weighted=sum(int(((one.weight > 0) & (one.weight < 1)).sum()) for one in members),
+                variance_factor=self.scales.variance_factor[kind],
+                counted_as=self.scales.share[kind] * sum(float(one.weight.sum()) for one in members),
+            )
+            for kind, members in _by_kind(self.weighed).items()
+        )
+
+
+def _by_kind(weighed: Sequence[Weighed]) -> dict[str, list[Weighed]]:
+    found: dict[str, list[Weighed]] = {}
+    for one in weighed:
+        found.setdefault(one.kind, []).append(one)
+    return found
+
+
+def _normal_equations(weighed: Sequence[Weighed], now: Geometry) -> dict[str, tuple[Float64, Float64]]:
+    """Information and slope of each kind, in units of prior σ."""
+    size = len(now.derivative)
+    found = {}
+    for kind, members in _by_kind(weighed).items():
+        information, slope = np.zeros((size, size)), np.zeros(size)
+        for one in members:
+            one.observations.add(now, one.weight, information, slope)
+        found[kind] = (now.derivative.T @ information @ now.derivative, now.derivative.T @ slope)
+    return found
+
+
+def _settled(
+    scales: Scales,
+    weighed: Sequence[Weighed],
+    by_kind: Mapping[str, tuple[Float64, Float64]],
+    settings: CalibrationSettings,
+) -> Scales:
+    """Weights of the kinds: their variance factors, with the unknowns that each determines, and their limit."""
+    if not by_kind:
+        return scales
+    share = independent_share(weighed, settings.independent_ties)
+    scales = scales.with_factors(scales.variance_factor, share)
+    gained = {kind: scales.gain(kind) * information for kind, (information, _) in by_kind.items()}
+    total = sum(gained.values(), np.zeros_like(next(iter(gained.values()))))
+    covariance = _inverse(total + np.eye(len(total)))
+    factors = {
+        kind: variance_factor(members, scales, float((gained[kind] * covariance).sum()))
+        for kind, members in _by_kind(weighed).items()
+    }
+    return scales.with_factors(factors, share)
+
+
+def _inverse(matrix: Float64) -> Float64:
+    """Of a positive definite matrix."""
+    return np.asarray(cho_solve(cho_factor(0.5 * (matrix + matrix.T)), np.eye(len(matrix))))

@@ -1,0 +1,437 @@
+"""Residuals and normal equations of the evidence: what each observation says of the unknowns.
+
+A reading's place is p = t + s + R E (B (p_sensor + o u) + l): lever arm l and rotation B of the mounting, range offset
+o along the beam u, shift s and small rotation E of the traverse. A row w of a tie's weight gives, with c = Eᵀ Rᵀ w,
+
+    ∂/∂l = c,  ∂/∂β = (B p) × c,  ∂/∂o = c · B u,  ∂/∂s = w,  ∂/∂ε = (B p + l) × c
+
+for small rotations β that follows B and ε that follows E; Glennie (2007), "Rigorous 3D error analysis of kinematic
+scanning LIDAR systems", writes the same terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import NavigationError
+from roadscan.navigation.calibration.evidence import Directions, Evidence, Known, Orientation, Seen, Ties
+from roadscan.navigation.calibration.rotations import left_jacobian, logarithm
+from roadscan.navigation.calibration.unknowns import BODY, MOUNTING, Geometry, Unknowns
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_CHUNK: Final = 65_536
+"""Ties linearised at once: 26 derivatives a row stay within the cache's reach."""
+_ABSENT: Final = -1
+
+
+class Observations(Protocol):
+    """Observations of one kind and one pair of sensors."""
+
+    kind: str
+    label: str
+    """Sensors concerned, for the report."""
+
+    @property
+    def count(self) -> int:
+        """Observations."""
+
+    @property
+    def rows(self) -> int:
+        """Numbers that one observation gives."""
+
+    @property
+    def unusable(self) -> int:
+        """Observations that are not finite; they are left out."""
+
+    def residuals(self, now: Geometry) -> Float64:
+        """(count, rows), unit variance."""
+
+    def metres(self, residuals: Float64) -> Float64 | None:
+        """Lengths (count,) of residuals in metres; None where they are angles."""
+
+    def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
+        """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
+
+
+def observations(evidence: Iterable[Evidence], unknowns: Unknowns) -> list[Observations]:
+    """Prepare evidence for an adjustment.
+
+    Raises
+    ------
+    ConfigError
+        where it names a sensor, traverse or object that is not among the unknowns.
+    NavigationError
+        where shapes do not fit.
+    """
+    return [_prepared(one, unknowns) for one in evidence]
+
+
+def _prepared(one: Evidence, unknowns: Unknowns) -> Observations:
+    if isinstance(one, Ties):
+        return TieObservations(one, unknowns)
+    if isinstance(one, Directions):
+        return DirectionObservations(one, unknowns)
+    return OrientationObservation(one, unknowns)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One end of n ties."""
+
+    sensor: int
+    """−1: no sensor."""
+    body: Int64
+    """(n,) traverse or object; −1: none."""
+    point_m: Float64
+    """(n, 3) sensor's, object's or world axes."""
+    position_m: Float64
+    """(n, 3), or (1, 3) where all share it."""
+    rotation: Float64
+    """(n, 3, 3), or (1, 3, 3)."""
+
+    def taken(self, index: Int64 | slice) -> _Side:
+        """Some of them."""
+        return _Side(
+            self.sensor,
+            self.body[index],
+            self.point_m[index],
+            self.position_m[index] if len(self.position_m) > 1 else self.position_m,
+            self.rotation[index] if len(self.rotation) > 1 else self.rotation,
+        )
+
+    def finite(self) -> npt.NDArray[np.bool_]:
+        """(n,) whether all numbers are."""
+        good = (
+            np.isfinite(self.point_m).all(1)
+            & np.isfinite(self.position_m).all(1)
+            & np.isfinite(self.rotation).all((1, 2))
+        )
+        return np.asarray(good)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Places of one end, with what their derivatives need."""
+
+    world_m: Float64
+    """(n, 3)"""
+    turned: Float64
+    """(n, 3, 3) world from body, with the traverse's error."""
+    body_m: Float64
+    """(n, 3) body axes, from the IMU reference point."""
+    from_sensor_m: Float64
+    """(n, 3) body axes, from the sensor's origin."""
+    beam: Float64
+    """(n, 3) body axes."""
+
+
+class TieObservations:
+    """Ties of one pair of sensors, sorted by their pair of traverses."""
+
+    def __init__(self, ties: Ties, unknowns: Unknowns) -> None:
+        self.kind = ties.kind
+        self._on_object = isinstance(ties.second, Known) and ties.second.object is not None
+        first, second = _seen(ties.first, unknowns), _other(ties.second, unknowns)
+        self.label = _label(ties)
+        _check_shapes(ties)
+        good = first.finite() & second.finite() & np.isfinite(ties.weight).all((1, 2))
+        order = np.lexsort((second.body, first.body))
+        order = order[good[order]]
+        self._first, self._second = first.taken(order), second.taken(order)
+        self._weight = np.ascontiguousarray(ties.weight[order])
+        self._unusable = int(good.size - order.size)
+        self._size = unknowns.mounting_size
+        self._axes = [prior.beam_axis_sensor for prior in unknowns.priors.values()]
+
+    @property
+    def count(self) -> int:
+        """Observations."""
+        return len(self._weight)
+
+    @property
+    def rows(self) -> int:
+        """Numbers that one observation gives."""
+        return int(self._weight.shape[1])
+
+    @property
+    def unusable(self) -> int:
+        """Observations that are not finite; they are left out."""
+        return self._unusable
+
+    def residuals(self, now: Geometry) -> Float64:
+        """(count, rows), unit variance."""
+        parts = [self._difference(part, now)[0] for part in self._chunks()]
+        return np.concatenate(parts) if parts else np.zeros((0, self.rows))
+
+    def metres(self, residuals: Float64) -> Float64 | None:
+        """(count,) root mean square over a tie's rows, each divided by its weight."""
+        scale = np.maximum(np.linalg.norm(self._weight, axis=2), 1e-300)
+        length: Float64 = np.sqrt(np.mean((residuals / scale) ** 2, axis=1))
+        return length
+
+    def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
+        """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
+        for part in self._chunks():
+            residual, first, second = self._difference(part, now)
+            jacobian = self._jacobian(part, first, second)
+            root = np.sqrt(weight[part])
+            jacobian *= root[:, None, None]
+            residual = residual * root[:, None]
+            pairs = np.stack([self._first.body[part], self._second.body[part]], axis=1)
+            starts = np.flatnonzero(np.r_[True, (np.diff(pairs, axis=0) != 0).any(1)])
+            for start, end in zip(starts, [*starts[1:], len(pairs)], strict=True):
+                rows = jacobian[start:end].reshape(-1, jacobian.shape[2])
+                where = self._places(int(pairs[start, 0]), int(pairs[start, 1]))
+                used = where >= 0
+                local = rows.T @ rows
+                slope = rows.T @ residual[start:end].ravel()
+                # Both ends may share a sensor or traverse: places repeat, and add.at sums them.
+                np.add.at(information, np.ix_(where[used], where[used]), local[np.ix_(used, used)])
+                np.add.at(gradient, where[used], slope[used])
+
+    def _chunks(self) -> Iterator[slice]:
+        return (slice(begin, min(begin + _CHUNK, self.count)) for begin in range(0, self.count, _CHUNK))
+
+    def _difference(self, part: slice, now: Geometry) -> tuple[Float64, _Placed, _Placed]:
+        first = self._placed(self._first.taken(part), now)
+        second = self._placed(self._second.taken(part), now)
+        difference = first.world_m - second.world_m
+        if self._on_object:
+            difference = np.einsum("nji,nj->ni", second.turned, difference)
+        return np.einsum("nki,ni->nk", self._weight[part], difference), first, second
+
+    def _placed(self, side: _Side, now: Geometry) -> _Placed:
+        if side.sensor == _ABSENT:
+            body = from_sensor = side.point_m
+            beam = np.zeros((1, 3))
+        else:
+            along = self._beam(side)
+            mounted = now.body_from_sensor[side.sensor].T
+            from_sensor = (side.point_m + now.range_offset_m[side.sensor] * along) @ mounted
+            beam = along @ mounted
+            body = from_sensor + now.lever_arm_m[side.sensor]
+        turned, world = side.rotation, side.position_m
+        if (side.body >= 0).all():
+            turned = turned @ now.turn[side.body]
+            world = world + now.shift_world_m[side.body]
+        turned = np.broadcast_to(turned, (len(body), 3, 3))
+        return _Placed(world + np.einsum("nij,nj->ni", turned, body), turned, body, from_sensor, beam)
+
+    def _beam(self, side: _Side) -> Float64:
+        """(n, 3) or (1, 3), sensor axes."""
+        axis = self._axes[side.sensor]
+        if axis is not None:
+            return np.array([axis])
+        away: Float64 = side.point_m / np.maximum(np.linalg.norm(side.point_m, axis=1), 1e-9)[:, None]
+        return away
+
+    def _jacobian(self, part: slice, first: _Placed, second: _Placed) -> Float64:
+        """(n, k, 2 (7 + 6)): mounting and body of the first end, then of the second."""
+        weight = self._weight[part]
+        lever = second.body_m
+        if self._on_object:
+            # Rows stand in the object's axes: they turn with it, and so does what it sees of the first place.
+            lever = np.einsum("nji,nj->ni", second.turned, first.world_m - second.world_m) + second.body_m
+            weight = np.einsum("nki,nji->nkj", weight, second.turned)
+        half = MOUNTING + BODY
+        jacobian = np.zeros((*weight.shape[:2], 2 * half))
+        _derivatives(jacobian[..., :half], weight, first, first.body_m, with_sensor=True)
+        if self._second.sensor != _ABSENT or (self._second.body >= 0).any():
+            with_sensor = self._second.sensor != _ABSENT
+            _derivatives(jacobian[..., half:], -weight, second, lever, with_sensor=with_sensor)
+        return jacobian
+
+    def _places(self, first_body: int, second_body: int) -> Int64:
+        """(26,) among all unknowns; −1: none."""
+        where = np.full(2 * (MOUNTING + BODY), _ABSENT, dtype=np.int64)
+        for half, sensor, body in ((0, self._first.sensor, first_body), (1, self._second.sensor, second_body)):
+            begin = half * (MOUNTING + BODY)
+            if sensor != _ABSENT:
+                where[begin : begin + MOUNTING] = MOUNTING * sensor + np.arange(MOUNTING)
+            if body != _ABSENT:
+                where[begin + MOUNTING : begin + MOUNTING + BODY] = self._size + BODY * body + np.arange(BODY)
+        return where
+
+
+def _derivatives(out: Float64, weight: Float64, placed: _Placed, lever_m: Float64, *, with_sensor: bool) -> None:
+    """Fill (n, k, 13) with the derivatives of weight @ place."""
+    by_body = weight @ placed.turned
+    if with_sensor:
+        out[..., 0:3] = by_body
+        out[..., 3:6] = _cross(placed.from_sensor_m, by_body)
+        out[..., 6] = np.einsum("nkj,nj->nk", by_body, np.broadcast_to(placed.beam, placed.body_m.shape))
+    out[..., 7:10] = weight
+    out[..., 10:13] = _cross(lever_m, by_body)
+
+
+def _cross(a: Float64, b: Float64) -> Float64:
+    """(n, k, 3) of vectors a (n, 3) and b (n, k, 3)."""
+    x, y, z = (a[:, None, i] for i in range(3))
+    return np.stack(
+        [y * b[..., 2] - z * b[..., 1], z * b[..., 0] - x * b[..., 2], x * b[..., 1] - y * b[..., 0]], axis=-1
+    )
+
+
+def _seen(seen: Seen, unknowns: Unknowns) -> _Side:
+    return _Side(
+        unknowns.find_sensor(seen.sensor),
+        unknowns.find_traverses(seen.traverse),
+        seen.point_sensor_m,
+        seen.position_world_m,
+        seen.world_from_body,
+    )
+
+
+def _other(second: Seen | Known, unknowns: Unknowns) -> _Side:
+    if isinstance(second, Seen):
+        return _seen(second, unknowns)
+    count = len(second.point_m)
+    if second.object is None:
+        nowhere = np.full(count, _ABSENT, dtype=np.int64)
+        return _Side(_ABSENT, nowhere, second.point_m, np.zeros((1, 3)), np.eye(3)[None])
+    body = np.full(count, unknowns.find_object(second.object), dtype=np.int64)
+    pose = unknowns.objects[second.object]
+    return _Side(_ABSENT, body, second.point_m, pose.position_world_m[None], pose.world_from_object[None])
+
+
+def _label(ties: Ties) -> str:
+    if isinstance(ties.second, Seen):
+        names = sorted({ties.first.sensor, ties.second.sensor})
+        return " and ".join(names)
+    return f"{ties.first.sensor} and {ties.second.object or 'the world'}"
+
+
+def _check_shapes(ties: Ties) -> None:
+    count = len(ties.first.point_sensor_m)
+    expected = f"{count} of each"
+    sizes = {"first.traverse": len(ties.first.traverse), "weight": len(ties.weight)}
+    if isinstance(ties.second, Seen):
+        sizes |= {
+            "second.point_sensor_m": len(ties.second.point_sensor_m),
+            "second.traverse": len(ties.second.traverse),
+        }
+    else:
+        sizes["second.point_m"] = len(ties.second.point_m)
+    for name, size in sizes.items():
+        if size != count:
+            raise NavigationError(f"ties of kind '{ties.kind}': {size} of {name}", expected=expected)
+    if ties.weight.ndim != 3 or ties.weight.shape[2] != 3:
+        raise NavigationError(f"ties of kind '{ties.kind}': weights of shape {ties.weight.shape}", expected="(n, k, 3)")
+
+
+class DirectionObservations:
+    """Directions: two numbers each, the angle across the direction in the body."""
+
+    def __init__(self, one: Directions, unknowns: Unknowns) -> None:
+        self.kind, self.label = one.kind, one.sensor
+        self._sensor = unknowns.find_sensor(one.sensor)
+        good = (
+            np.isfinite(one.direction_sensor).all(1)
+            & np.isfinite(one.direction_body).all(1)
+            & np.isfinite(one.sigma_rad)
+            & (one.sigma_rad > 0)
+        )
+        self._unusable = int((~good).sum())
+        self._sensor_axes = one.direction_sensor[good]
+        self._across = _across(one.direction_body[good]) / one.sigma_rad[good][:, None, None]
+
+    @property
+    def count(self) -> int:
+        """Observations."""
+        return len(self._across)
+
+    @property
+    def rows(self) -> int:
+        """Numbers that one observation gives."""
+        return 2
+
+    @property
+    def unusable(self) -> int:
+        """Observations that are not finite; they are left out."""
+        return self._unusable
+
+    def residuals(self, now: Geometry) -> Float64:
+        """(count, rows), unit variance."""
+        return np.asarray(np.einsum("nki,ni->nk", self._across, self._turned(now)))
+
+    def metres(self, residuals: Float64) -> Float64 | None:
+        """Angles have no length."""
+        return None
+
+    def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
+        """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
+        jacobian = _cross(self._turned(now), self._across)
+        rows = jacobian * weight[:, None, None]
+        begin = MOUNTING * self._sensor + 3
+        place = slice(begin, begin + 3)
+        information[place, place] += np.einsum("nki,nkj->ij", rows, jacobian)
+        gradient[place] += np.einsum("nki,nk->i", rows, self.residuals(now))
+
+    def _turned(self, now: Geometry) -> Float64:
+        return np.asarray(self._sensor_axes @ now.body_from_sensor[self._sensor].T)
+
+
+def _across(direction: Float64) -> Float64:
+    """(n, 2, 3) unit vectors at right angles to unit vectors (n, 3) and to each other."""
+    least = np.argmin(np.abs(direction), axis=1)
+    first = np.cross(direction, np.eye(3)[least])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(direction, first)], axis=1)
+
+
+class OrientationObservation:
+    """A rotation with its covariance."""
+
+    def __init__(self, one: Orientation, unknowns: Unknowns) -> None:
+        self.kind, self.label = one.kind, one.sensor
+        self._sensor = unknowns.find_sensor(one.sensor)
+        try:
+            self._whitening = np.linalg.inv(np.linalg.cholesky(one.covariance_rad2))
+        except np.linalg.LinAlgError as error:
+            raise NavigationError(
+                f"orientation of '{one.sensor}' ({one.kind}): its covariance is not positive definite",
+                expected="a 3 × 3 covariance in rad²",
+            ) from error
+        self._observed = one.body_from_sensor
+
+    @property
+    def count(self) -> int:
+        """Observations."""
+        return 1
+
+    @property
+    def rows(self) -> int:
+        """Numbers that one observation gives."""
+        return 3
+
+    @property
+    def unusable(self) -> int:
+        """Observations that are not finite; they are left out."""
+        return 0
+
+    def residuals(self, now: Geometry) -> Float64:
+        """(count, rows), unit variance."""
+        return (self._whitening @ self._away(now))[None]
+
+    def metres(self, residuals: Float64) -> Float64 | None:
+        """Angles have no length."""
+        return None
+
+    def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
+        """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
+        away = self._away(now)
+        jacobian = self._whitening @ np.linalg.inv(left_jacobian(away))
+        begin = MOUNTING * self._sensor + 3
+        place = slice(begin, begin + 3)
+        information[place, place] += weight[0] * jacobian.T @ jacobian
+        gradient[place] += weight[0] * jacobian.T @ self._whitening @ away
+
+    def _away(self, now: Geometry) -> Float64:
+        return logarithm(now.body_from_sensor[self._sensor] @ self._observed.T)

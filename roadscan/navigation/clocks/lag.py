@@ -1,0 +1,169 @@
+"""The coarse lag between two recordings of one motion: how well each shift explains what was felt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft
+
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.clocks.signals import Felt, Motion
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+STEP_S: Final = 0.05
+"""Bins of the coarse search."""
+_CLEAR: Final = 1.5
+"""The best shift is clear where it leaves so many times less than the next one, or explains so many times more."""
+_LEAST_SHARE: Final = 0.5
+"""Shifts that leave a smaller share of the bins in common than this of the best are not looked at."""
+_LEAST_BINS: Final = 40
+_LOBE: Final = 0.5
+"""The main peak reaches to where half of what it explains is left."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """The best shift of a recording, and the best one beside its peak."""
+
+    since_s: float
+    """Middle of the recording, since the motion's origin by the sensor's clock."""
+    lag_s: float
+    """Added to the sensor's epochs, it explains best what was felt."""
+    explained: float
+    """Share of the variance that it explains, 0–1."""
+    next_lag_s: float
+    next_explained: float
+    """Of the best shift outside the main peak; 0 where there is none."""
+    at_edge: bool
+    """The best shift is the largest one looked at."""
+
+    @property
+    def is_clear(self) -> bool:
+        """True where no other shift comes near."""
+        if self.at_edge or self.explained <= 0.0:
+            return False
+        left, next_left = 1.0 - self.explained, 1.0 - self.next_explained
+        return next_left >= _CLEAR * left or self.explained >= _CLEAR * self.next_explained
+
+
+def coarse_lag(felt: Felt, motion: Motion, search_s: float, about_s: float = 0.0) -> Lag | None:
+    """Shift within `about_s` ± `search_s` that explains a recording best; None where too little of it is known.
+
+    All channels are explained at once by all rates of the motion, so the sensor's orientation need not be known: for
+    each shift the share of variance that a linear regression explains, by Fourier transforms over the bins that both
+    have (masked correlation, Padfield, IEEE Trans. Image Process. 2012, 21).
+    """
+    origin = motion.origin_gps_ns
+    since = (felt.epochs_gps_ns - origin).astype(np.float64) / NS_PER_S
+    reach = round(search_s / STEP_S)
+    shift = round(about_s / STEP_S)
+    first = int(np.floor(since[0] / STEP_S))
+    last = int(np.floor(since[-1] / STEP_S)) + 1
+    values, has_values = _binned(felt, since, np.arange(first, last + 1))
+    edges = np.arange(first + shift - reach, last + shift + reach + 1)
+    rates, has_rates = _rates(motion, edges.astype(np.float64) * STEP_S)
+    explained = _explained(values, has_values, rates, has_rates, 2 * reach + 1, same_sign=motion.leads)
+    if not np.isfinite(explained).any():
+        return None
+    lags = np.arange(shift - reach, shift + reach + 1).astype(np.float64) * STEP_S
+    return _best(lags, explained, float(since[since.size // 2]))
+
+
+def _best(lags: Float64, explained: Float64, middle_s: float) -> Lag:
+    filled = np.where(np.isfinite(explained), explained, 0.0)
+    best = int(np.argmax(filled))
+    left, right = _lobe(filled, best)
+    outside = filled.copy()
+    outside[left : right + 1] = 0.0
+    second = int(np.argmax(outside))
+    at_edge = best in (0, lags.size - 1)
+    fine = 0.0
+    if not at_edge:
+        before, here, after = filled[best - 1 : best + 2]
+        bend = before - 2 * here + after
+        fine = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return Lag(
+        middle_s, float(lags[best]) + fine * STEP_S, float(filled[best]), float(lags[second]), float(outside[second]),
+        at_edge,
+    )  # fmt: skip
+
+
+def _lobe(explained: Float64, best: int) -> tuple[int, int]:
+    """First and last shift of the main peak: down to half of it, and on to the next valley."""
+    edges = []
+    for step in (-1, 1):
+        at = best
+        while 0 <= at + step < explained.size and explained[at + step] > _LOBE * explained[best]:
+            at += step
+        while 0 <= at + step < explained.size and explained[at + step] < explained[at]:
+            at += step
+        edges.append(at)
+    return edges[0], edges[1]
+
+
+def _binned(felt: Felt, since_s: Float64, edges: Int64) -> tuple[Float64, Bool]:
+    """Mean rates (b, c) in the bins between `edges` (b + 1,), and where a bin has samples around it (b,)."""
+    if felt.is_total:
+        totals = felt.values
+    else:
+        steps = 0.5 * (felt.values[1:] + felt.values[:-1]) * np.diff(since_s)[:, None]
+        totals = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+    at = edges * STEP_S
+    columns = [np.interp(at, since_s, totals[:, c]) for c in range(totals.shape[1])]
+    interval = np.clip(np.searchsorted(since_s, at, side="right") - 1, 0, since_s.size - 2)
+    near = np.diff(since_s)[interval] <= max(5.0 * felt.interval_s, STEP_S)
+    known = near & (at >= since_s[0]) & (at <= since_s[-1])
+    return np.diff(np.stack(columns, axis=-1), axis=0) / STEP_S, known[1:] & known[:-1]
+
+
+def _rates(motion: Motion, edges_s: Float64) -> tuple[Float64, Bool]:
+    known = motion.known(edges_s)
+    totals = np.where(known[:, None], motion.at(edges_s, total=True), 0.0)
+    totals = totals[:, :1] if motion.leads else totals
+    return np.diff(totals, axis=0) / STEP_S, known[1:] & known[:-1]
+
+
+def _explained(
+    values: Float64, has_values: Bool, rates: Float64, has_rates: Bool, shifts: int, *, same_sign: bool
+) -> Float64:
+    """Share of variance (shifts,) that rates explain, when values begin 0, 1 … bins after them; NaN: not known.
+
+    same_sign : values and rates grow together; what explains values with the other sign explains nothing.
+    """
+    size = next_fast_len(rates.shape[0] + values.shape[0])
+
+    def together(a: Float64, b: Float64) -> Float64:
+        """Σ a[k] · b[k + shift] for each shift."""
+        product: Float64 = irfft(np.conj(rfft(a, size)) * rfft(b, size), size)[:shifts]
+        return product
+
+    of_y, of_x = has_values.astype(np.float64), has_rates.astype(np.float64)
+    y = (values - values[has_values].mean(axis=0) if has_values.any() else values) * of_y[:, None]
+    x = (rates - rates[has_rates].mean(axis=0) if has_rates.any() else rates) * of_x[:, None]
+    channels, regressors = range(y.shape[1]), range(x.shape[1])
+    count = np.rint(together(of_y, of_x))
+    enough = count >= max(_LEAST_BINS, _LEAST_SHARE * count.max())
+    n = np.maximum(count, 1.0)
+    sum_x = [together(of_y, x[:, i]) / n for i in regressors]
+    xx = np.empty((shifts, x.shape[1], x.shape[1]))
+    for i in regressors:
+        for j in regressors:
+            xx[:, i, j] = together(of_y, x[:, i] * x[:, j]) / n - sum_x[i] * sum_x[j]
+    trace = np.einsum("sii->s", xx)
+    xx += (1e-9 * np.maximum(trace, 1e-300))[:, None, None] * np.eye(x.shape[1])
+    all_variance, all_explained = np.zeros(shifts), np.zeros(shifts)
+    for c in channels:
+        sum_y = together(y[:, c], of_x) / n
+        xy = np.stack([together(y[:, c], x[:, i]) / n - sum_x[i] * sum_y for i in regressors], axis=-1)
+        all_variance += together(np.square(y[:, c]), of_x) / n - np.square(sum_y)
+        xy = np.maximum(xy, 0.0) if same_sign else xy
+        all_explained += np.einsum("si,si->s", xy, np.linalg.solve(xx, xy[:, :, None])[:, :, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip(all_explained / all_variance, 0.0, 1.0)
+    return np.where(enough & (all_variance > 0.0), share, np.nan)

@@ -1,0 +1,108 @@
+"""Straight lines through differences of two clocks: robust, with honest σ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.clock_evidence import USUAL_DRIFT, Drift
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+
+_OUTLIER: Final = 4.0
+"""Beyond so many σ a difference is an outlier."""
+_FEW: Final = 4
+"""Of fewer differences none can be told to be an outlier."""
+_SLOPES_OF: Final = 400
+"""Differences that the first guess of the rate is made from: it looks at all pairs of them."""
+_ROUNDS: Final = 30
+
+
+@dataclass(frozen=True)
+class Line:
+    """y = offset_s + drift · (x − reference_s); offset and drift are not correlated at the reference."""
+
+    offset_s: float
+    drift: float
+    reference_s: float
+    sigma_offset_s: float
+    sigma_drift: float
+    used: Bool
+    """(m,) False for outliers."""
+    scale: float
+    """Factor that the stated σ were multiplied by, 1 or more: the scatter about the line asked for it."""
+
+    def at(self, x_s: Float64) -> Float64:
+        """Difference (n,) that the line gives at times (n,)."""
+        return self.offset_s + self.drift * (x_s - self.reference_s)
+
+
+def robust_line(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> Line:
+    """Weighted least squares without outliers.
+
+    Parameters
+    ----------
+    x_s, y_s, sigma_s : (m,) m ≥ 1, time, difference of two clocks, and its 1 σ (s).
+    drift : "none": the line is level; "estimate": free; "auto": free within a prior of 100 ppm (1 σ).
+
+    The start is Siegel's repeated median of slopes (Biometrika 1982, 69), which half of the differences cannot
+    spoil; then differences beyond 4 σ of the line are left out, and σ is raised where those that stay scatter by more
+    than they should.
+    """
+    level = drift == "none"
+    slope = 0.0 if level else _first_slope(x_s, y_s, sigma_s, drift)
+    used = _near(y_s - slope * x_s, sigma_s) if x_s.size >= _FEW else np.ones(x_s.size, dtype=bool)
+    for _ in range(_ROUNDS):
+        line = _fitted(x_s, y_s, sigma_s, used, drift)
+        if x_s.size < _FEW:
+            break
+        normalised = np.abs(y_s - line.at(x_s)) / sigma_s
+        again = normalised <= _OUTLIER * max(1.0, 1.4826 * float(np.median(normalised[used])))
+        if np.array_equal(again, used) or np.count_nonzero(again) < _FEW - 1:
+            break
+        used = again
+    return line
+
+
+def _first_slope(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> float:
+    """Repeated median of the slopes between the better differences."""
+    better = np.flatnonzero(sigma_s <= 3.0 * np.median(sigma_s))
+    chosen = better[np.linspace(0, better.size - 1, min(better.size, _SLOPES_OF)).astype(np.int64)]
+    x, y = x_s[chosen], y_s[chosen]
+    if x.size < _FEW or np.ptp(x) == 0.0:
+        return 0.0
+    apart = x[:, None] - x[None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.where(apart != 0.0, (y[:, None] - y[None, :]) / apart, np.nan)
+    slope = float(np.median(np.nanmedian(slopes[np.isfinite(slopes).any(axis=1)], axis=1)))
+    return float(np.clip(slope, -5 * USUAL_DRIFT, 5 * USUAL_DRIFT)) if drift == "auto" else slope
+
+
+def _near(level_s: Float64, sigma_s: Float64) -> Bool:
+    """(m,) differences that lie near the median of all."""
+    away = np.abs(level_s - np.median(level_s))
+    spread = 1.4826 * float(np.median(away))
+    return np.asarray(away <= np.maximum(_OUTLIER * sigma_s, _OUTLIER * spread))
+
+
+def _fitted(x_s: Float64, y_s: Float64, sigma_s: Float64, used: Bool, drift: Drift) -> Line:
+    weight = np.where(used, 1.0 / np.square(sigma_s), 0.0)
+    total = weight.sum()
+    reference = float(weight @ x_s / total)
+    offset = float(weight @ y_s / total)
+    information = float(weight @ np.square(x_s - reference))
+    prior = 1.0 / USUAL_DRIFT**2 if drift == "auto" else 0.0
+    free = drift != "none" and information + prior > 0.0
+    scale, slope = 1.0, 0.0
+    for _ in range(2):  # the scatter says how far the data count against the prior
+        held = information / scale**2 + prior
+        slope = float(weight @ ((x_s - reference) * (y_s - offset)) / scale**2 / held) if free else 0.0
+        left = y_s - offset - slope * (x_s - reference)
+        over = np.count_nonzero(used) - (2 if free else 1)
+        scale = max(1.0, float(np.sqrt(weight @ np.square(left) / over))) if over > 0 else 1.0
+    sigma_drift = float(1.0 / np.sqrt(information / scale**2 + prior)) if free else 0.0
+    return Line(offset, slope, reference, scale / float(np.sqrt(total)), sigma_drift, used, scale)

@@ -1,0 +1,224 @@
+"""Motion as signals of time: what a sensor felt, and what the poses say it should have felt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from roadscan.model.crs import LOCAL_WORLD
+from roadscan.model.errors import NavigationError
+from roadscan.model.frames import rotation_from_quaternion
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
+from roadscan.navigation.trajectory import Trajectory
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+EARTH_RATE_RAD_PER_S: Final = 7.292115e-5
+"""WGS 84."""
+_GAP: Final = 5.0
+"""Samples farther apart than so many usual intervals leave a gap between them."""
+_BESIDE_GAPS: Final = 8
+"""Knots beside a gap where splines are not trusted."""
+_SMOOTH_KNOTS: Final = 2.0
+_SMOOTH_S: Final = 0.01
+"""Width (1 σ) of the filter that derivatives are taken behind."""
+_FINEST_S: Final = 0.01
+"""Samples that are closer are averaged: vehicles do not move faster."""
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What a sensor felt, by its own clock."""
+
+    epochs_gps_ns: Int64
+    """(n,) strictly ascending."""
+    values: Float64
+    """(n, c): angular rates (rad/s), speed (m/s), or distance (m)."""
+    is_total: bool
+    """True for a running total (distance), False for a rate."""
+
+    @cached_property
+    def interval_s(self) -> float:
+        """Usual time from sample to sample."""
+        return float(np.median(np.diff(self.epochs_gps_ns))) / NS_PER_S
+
+    def averaged(self, interval_s: float) -> Felt:
+        """Means of neighbouring samples, about `interval_s` apart; totals stay as they are."""
+        count = round(interval_s / self.interval_s)
+        if self.is_total or count < 2:
+            return self
+        size = self.epochs_gps_ns.size // count * count
+        origin = self.epochs_gps_ns[0]
+        since = (self.epochs_gps_ns[:size] - origin).reshape(-1, count)
+        whole = since[:, -1] - since[:, 0] < _GAP * count * self.interval_s * NS_PER_S
+        values = self.values[:size].reshape(-1, count, self.values.shape[1]).mean(axis=1)
+        epochs = origin + np.rint(since.mean(axis=1)).astype(np.int64)
+        return Felt(epochs[whole], values[whole], is_total=False)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What sensors should feel, continuous in GPS time: totals between knots, cubic splines."""
+
+    epochs_gps_ns: Int64
+    """(k,) knots, strictly ascending."""
+    totals: Float64
+    """(k, p) integrals of the rates: angles (rad) and distance (m)."""
+    leads: bool = False
+    """The first of them is what the sensor counts, with the same sign; otherwise its axes are not known."""
+
+    @property
+    def origin_gps_ns(self) -> int:
+        """Epoch from which the splines count."""
+        return int(self.epochs_gps_ns[0])
+
+    @cached_property
+    def interval_s(self) -> float:
+        """Usual time from knot to knot."""
+        return float(np.median(np.diff(self.epochs_gps_ns))) / NS_PER_S
+
+    def at(self, since_s: Float64, *, total: bool) -> Float64:
+        """Rates or totals (n, p).
+
+        Parameters
+        ----------
+        since_s : (n,) time since `origin_gps_ns` (s).
+        """
+        return np.asarray(self._spline(since_s) if total else self._spline.derivative(1)(since_s))
+
+    def change(self, since_s: Float64, *, total: bool) -> Float64:
+        """Smooth change a second (n, p) of rates or totals: it shows where a shift in time would tell.
+
+        Unsmoothed, a derivative is mostly noise, and depends on how far a time lies from the next knot.
+        """
+        return np.asarray(self._smooth.derivative(1 if total else 2)(since_s))
+
+    def known(self, since_s: Float64) -> Bool:
+        """(n,) False outside the knots, in gaps and beside them."""
+        interval = np.searchsorted(self._knots_s, since_s, side="right") - 1
+        inside = (interval >= 0) & (interval < self._sound.size)
+        return inside & self._sound[np.clip(interval, 0, self._sound.size - 1)]
+
+    @cached_property
+    def _knots_s(self) -> Float64:
+        since: Float64 = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64) / NS_PER_S
+        return since
+
+    @cached_property
+    def _sound(self) -> Bool:
+        """(k − 1,) intervals whose splines are trusted."""
+        sound = np.diff(self._knots_s) <= _GAP * self.interval_s
+        for at in np.flatnonzero(~sound):
+            sound[max(at - _BESIDE_GAPS, 0) : at + _BESIDE_GAPS + 1] = False
+        return sound
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(self._knots_s, self.totals)
+
+    @cached_property
+    def _smooth(self) -> CubicSpline:
+        knots = max(_SMOOTH_KNOTS, _SMOOTH_S / self.interval_s)
+        first, last = self.totals[0], self.totals[-1]
+        # About the line through its ends: there the filter repeats the last value.
+        along = np.linspace(0.0, 1.0, self.totals.shape[0])[:, None]
+        level = first + (last - first) * along
+        return CubicSpline(self._knots_s, level + gaussian_filter1d(self.totals - level, knots, axis=0, mode="nearest"))
+
+
+def felt_by_imu(imu: ImuReadings, finest_s: float) -> Felt:
+    """Angular rates of an IMU, averaged to no more than `finest_s` apart."""
+    felt = _felt(imu.epochs_gps_ns, imu.angular_rate_rad_per_s, is_total=False)
+    return felt.averaged(max(finest_s, _FINEST_S))
+
+
+def felt_by_encoder(odometer: OdometerReadings) -> Felt:
+    """Distance that an encoder counts; its speed where the log states no distance."""
+    if np.isfinite(odometer.distance_m).sum() >= 2:
+        return _felt(odometer.epochs_gps_ns, odometer.distance_m[:, None], is_total=True)
+    return _felt(odometer.epochs_gps_ns, odometer.speed_m_per_s[:, None], is_total=False)
+
+
+def turning(trajectory: Trajectory) -> Motion:
+    """Angles about body forward, right, down against inertial space, from a trajectory's attitudes.
+
+    The Earth's turn is added where the world turns with it.
+    """
+    increments = _turns(trajectory)
+    if trajectory.world != LOCAL_WORLD:
+        interval_s = np.diff(trajectory.epochs_gps_ns) / NS_PER_S
+        pole_body = rotation_from_quaternion(trajectory.quaternion_world_from_body)[:-1, 2]
+        increments = increments + EARTH_RATE_RAD_PER_S * interval_s[:, None] * pole_body
+    return Motion(trajectory.epochs_gps_ns, _summed(increments))
+
+
+def turning_of_imu(imu: ImuReadings) -> Motion:
+    """Angles about the axes of an IMU, whose stamps are right."""
+    felt = _felt(imu.epochs_gps_ns, imu.angular_rate_rad_per_s, is_total=False)
+    interval_s = np.diff(felt.epochs_gps_ns)[:, None] / NS_PER_S
+    return Motion(felt.epochs_gps_ns, _summed(0.5 * (felt.values[1:] + felt.values[:-1]) * interval_s))
+
+
+def driving(trajectory: Trajectory, *, backwards_counts_down: bool) -> Motion:
+    """Distance forward, and angles about right and down (what a wheel off the reference point drives beside it).
+
+    A wheel at l (body) drives forward at v + ω_right · l_down − ω_down · l_right.
+
+    Parameters
+    ----------
+    backwards_counts_down : the counter falls when the vehicle reverses; otherwise it grows both ways.
+    """
+    forward = rotation_from_quaternion(trajectory.quaternion_world_from_body)[:, :, 0]
+    steps = np.diff(trajectory.position_world_m, axis=0)
+    distance = np.einsum("ni,ni->n", steps, 0.5 * (forward[1:] + forward[:-1]))
+    increments = np.column_stack([distance, _turns(trajectory)[:, 1:]])
+    if not backwards_counts_down:
+        increments = increments * np.where(distance < 0.0, -1.0, 1.0)[:, None]
+    return Motion(trajectory.epochs_gps_ns, _summed(increments), leads=True)
+
+
+def _felt(epochs: Int64, values: Float64, *, is_total: bool) -> Felt:
+    order = np.argsort(epochs, kind="stable")
+    order = order[np.isfinite(values[order]).all(axis=1)]
+    fresh = np.concatenate([[True], np.diff(epochs[order]) > 0]) if order.size else np.zeros(0, dtype=bool)
+    kept = order[fresh]
+    if kept.size < 2:
+        raise NavigationError("the log holds fewer than two samples", expected="a recording of motion")
+    return Felt(epochs[kept], values[kept], is_total)
+
+
+def _summed(increments: Float64) -> Float64:
+    return np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
+
+
+def _turns(trajectory: Trajectory) -> Float64:
+    """(k − 1, 3) rotation vectors from knot to knot, body axes."""
+    if trajectory.epochs_gps_ns.size < 2:
+        raise NavigationError("the trajectory holds fewer than two poses", expected="poses of the whole run")
+    before, after = trajectory.quaternion_world_from_body[:-1], trajectory.quaternion_world_from_body[1:]
+    w1, x1, y1, z1 = before.T
+    w2, x2, y2, z2 = after.T
+    real = w1 * w2 + x1 * x2 + y1 * y2 + z1 * z2
+    imaginary = np.stack(
+        [
+            w1 * x2 - x1 * w2 - y1 * z2 + z1 * y2,
+            w1 * y2 + x1 * z2 - y1 * w2 - z1 * x2,
+            w1 * z2 - x1 * y2 + y1 * x2 - z1 * w2,
+        ],
+        axis=-1,
+    )
+    imaginary = imaginary * np.where(real < 0.0, -1.0, 1.0)[:, None]
+    sine = np.linalg.norm(imaginary, axis=1)
+    half = np.arctan2(sine, np.abs(real))
+    factor = np.where(sine > 1e-12, 2.0 * half / np.maximum(sine, 1e-300), 2.0)
+    turns: Float64 = imaginary * factor[:, None]
+    return turns

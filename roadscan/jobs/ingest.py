@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.jobs.clock_pairs import log_clock
 from roadscan.jobs.fingerprint import grid_digest, key_of
 from roadscan.model.crs import Geoid, add_grid_folder
 from roadscan.model.errors import FormatError, RoadscanError, RunError
@@ -210,7 +211,7 @@ def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known
     is_log = isinstance(config, LogConfig)
     in_map = format_.needs_map or not is_log
     sensor = config.sensor if isinstance(config, LogConfig) else None
-    clock = config.clock.clock() if isinstance(config, LogConfig) and config.clock else None
+    clock = log_clock(survey, config) if isinstance(config, LogConfig) else None
     needs_sensor = bool({"scans", "returns"} & set(format_.yields))
     if is_log and sensor is None and needs_sensor:
         raise RoadscanError(

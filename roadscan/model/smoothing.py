@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from roadscan.model.strict import Strict
@@ -21,3 +23,58 @@ class SmootherConfig(Strict):
     land_vehicle: bool = True
     """The body moves neither sideways nor up with respect to itself (non-holonomic constraint), and stands still
     now and then (zero-velocity and zero-rotation updates)."""
+
+    imu_samples: Literal["mean", "instant"] = "mean"
+    """What a sample of the IMU is: the mean over the interval that ends at its stamp (IMUs that integrate), or the
+    value at the stamp itself. The wrong one shifts the IMU by half a sample: 5 ms at 100 Hz."""
+    imu_clock_sigma_s: float = Field(default=0.0, ge=0.0, le=0.5)
+    """1 σ of what remains of the IMU's clock error after its clock's correction: a constant delay against GNSS is
+    estimated where this is above zero (s)."""
+    max_imu_gap_s: float = Field(default=1.0, gt=0.0, le=10.0)
+    """A longer silence of the IMU ends the trajectory; it begins anew behind it (s)."""
+
+    gnss_sigma_factor: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Multiplies all σ that receivers state; they are often optimistic."""
+    gnss_floor_horizontal_m: float = Field(default=0.005, ge=0.0)
+    """Least σ of a horizontal position component, whatever the log states (m)."""
+    gnss_floor_vertical_m: float = Field(default=0.008, ge=0.0)
+    """Least σ of a height (m)."""
+    gnss_floor_velocity_m_per_s: float = Field(default=0.01, ge=0.0)
+    """Least σ of a velocity component (m/s)."""
+    gnss_correlated_share: float = Field(default=0.5, ge=0.0, lt=1.0)
+    """Share of the variance of a fixed position that does not change from epoch to epoch but slowly (ionosphere,
+    multipath); of all other solutions it is nearly everything."""
+    gnss_correlation_s: float = Field(default=20.0, gt=0.0)
+    """Time constant of that part (s)."""
+
+    constraints_per_s: float = Field(default=5.0, ge=0.5, le=50.0)
+    """Updates by odometer, non-holonomic constraint and standstill a second; the σ below hold for one of them."""
+    odometer_sigma_m_per_s: float = Field(default=0.02, gt=0.0)
+    """1 σ of the odometer's speed (m/s)."""
+    odometer_slip: float = Field(default=0.003, ge=0.0, le=0.2)
+    """1 σ of the part that grows with speed: slip and unevenness (1)."""
+    odometer_scale_sigma: float = Field(default=0.02, ge=0.0, le=0.2)
+    """1 σ of the odometer's scale before it is estimated (1)."""
+    sideways_m_per_s: float = Field(default=0.05, gt=0.0)
+    """1 σ of the velocity to the side of the point that moves only forwards (m/s)."""
+    side_slip_deg_per_m_per_s2: float = Field(default=0.15, ge=0.0, le=5.0)
+    """1 σ of the side-slip angle of that point for each m/s² of acceleration to the side (degrees)."""
+    upwards_m_per_s: float = Field(default=0.10, gt=0.0)
+    """1 σ of the velocity upwards, by the springs (m/s)."""
+    axle_body_m: tuple[float, float, float] | None = None
+    """From the IMU reference point to the point that moves only forwards, on the ground under the middle of the
+    unsteered axle: forward, right, down (m). Where left out, the wheel of the odometer, if it has a lever arm."""
+    axle_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.1)
+    """1 σ of it (m); where nothing says where the axle is, 1.5, 0.5 and 1 m about the reference point."""
+    travel_sigma_deg: float = Field(default=2.0, ge=0.0, le=20.0)
+    """1 σ of the angles between the body's forward axis and the direction of travel: pitch, heading (degrees)."""
+    standing_m_per_s: float = Field(default=0.01, gt=0.0)
+    """1 σ of a standing vehicle's velocity (m/s)."""
+    standing_deg_per_s: float = Field(default=0.02, gt=0.0)
+    """1 σ of a standing vehicle's rotation (°/s)."""
+
+    outlier_probability: float = Field(default=0.001, gt=0.0, lt=0.5)
+    """Updates whose innovation would be exceeded with less than this probability count less."""
+    outlier_patience_s: float = Field(default=15.0, gt=0.0)
+    """After this long without a position that counts in full they all do again: then the filter is wrong, and not
+    the receiver (s)."""

@@ -18,7 +18,8 @@ class ImuReadings:
     """Samples of an IMU in its own axes, as the table ``imu`` holds them."""
 
     epochs_gps_ns: Int64
-    """(n,) strictly ascending; a sample is the mean over the interval that ends there."""
+    """(n,) strictly ascending; a sample is the mean over the interval that ends there, or the value at that instant
+    (`SmootherConfig.imu_samples`)."""
     angular_rate_rad_per_s: Float64
     """(n, 3) against inertial space, sensor axes."""
     specific_force_m_per_s2: Float64
@@ -96,9 +97,14 @@ class Solution:
     sigma_rph_rad: Float64
     """(n, 3) 1 σ of roll, pitch, heading."""
     states: dict[str, tuple[Float64, Float64]] = field(default_factory=dict)
-    """What else was estimated, by name with unit: value (n,) or (n, 3) and its 1 σ, at `state_epochs_gps_ns`."""
+    """What else was estimated, by name with frame and unit (``…_imu``: the IMU's axes, ``…_body``: the body's): value
+    (j,) or (j, k) and its 1 σ, at `state_epochs_gps_ns`."""
     state_epochs_gps_ns: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     innovations: Innovations | None = None
+    pieces: tuple[tuple[int, int], ...] = ()
+    """First and last epoch (GPS ns) of each unbroken piece; the IMU was silent for too long between them."""
+    notes: tuple[str, ...] = ()
+    """What the user should know: where the solution is divided, and which part could not be solved."""
 
 
 @dataclass(frozen=True)

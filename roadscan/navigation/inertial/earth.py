@@ -1,0 +1,30 @@
+"""The Earth as navigation needs it: level axes, normal gravity, rotation. WGS 84; other datums differ by far less
+than an accelerometer can tell."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.inertial import EARTH_RATE_RAD_PER_S, gravity_at, geodetic_of
+
+Float64 = npt.NDArray[np.float64]
+
+EARTH_RATE_ECEF_RAD_PER_S: Final[Float64] = np.array([0.0, 0.0, EARTH_RATE_RAD_PER_S])
+
+
+def ecef_from_level(position_ecef_m: Float64) -> Float64:
+    """Rotations (n, 3, 3) from north-east-down to ECEF at positions (n, 3). Groves (2013), eq. 2.150."""
+    found = np.empty((len(position_ecef_m), 5))
+    geodetic_of(np.ascontiguousarray(position_ecef_m), found)
+    sa, ca, so, co, _ = found.T
+    rows = [[-sa * co, -so, -ca * co], [-sa * so, co, -ca * so], [ca, np.zeros_like(ca), -sa]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def gravity_ecef(position_ecef_m: Float64) -> Float64:
+    """Normal gravity (3,) at a position (3,), ECEF axes (m/s²)."""
+    size, *up = gravity_at(*(float(x) for x in position_ecef_m))
+    return -size * np.array(up)

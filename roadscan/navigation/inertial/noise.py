@@ -1,0 +1,87 @@
+"""How far GNSS solutions are believed: by what the log states, and by their quality where it states nothing.
+
+A position's error has a part that is new at each epoch and a part that changes slowly. Taken as new at each epoch, the
+slow part would let a standing receiver know its place to a millimetre after a minute. It is a state of the filter
+instead: a Gauss–Markov process of the stated σ (Bar-Shalom, Li and Kirubarajan 2001, section 8.2, "coloured measurement
+noise"). It starts anew when the quality of the solution changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.kalman import Fixes
+from roadscan.model.smoothing import SmootherConfig
+from roadscan.navigation.inertial.readings import GnssSolutions
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Quality:
+    horizontal_m: float
+    vertical_m: float
+    velocity_m_per_s: float
+
+
+QUALITIES: Final[dict[str, _Quality]] = {
+    "fixed": _Quality(0.015, 0.025, 0.05),
+    "float": _Quality(0.4, 0.6, 0.08),
+    "ppp": _Quality(0.1, 0.2, 0.08),
+    "sbas": _Quality(1.0, 1.5, 0.15),
+    "dgps": _Quality(0.8, 1.5, 0.15),
+    "pps": _Quality(1.5, 3.0, 0.2),
+    "single": _Quality(2.0, 4.0, 0.2),
+    "simulated": _Quality(2.0, 4.0, 0.2),
+}
+"""1 σ where the log states none. Solutions of other qualities are not measured, and not used."""
+_SLOW_SHARE: Final = 0.9
+"""Share of the variance that changes slowly, of all solutions that are not fixed."""
+
+
+def usable(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
+    """True (m,) for measured solutions with a position."""
+    measured = np.isin(gnss.quality, list(QUALITIES))
+    return np.asarray(measured & np.isfinite(gnss.position_world_m).all(axis=1))
+
+
+def fixes_of(gnss: GnssSolutions, config: SmootherConfig) -> Fixes:
+    """Solutions with their noise as the filter takes it; all of them :func:`usable`."""
+    covariance = _covariance(gnss, config)
+    slow = np.where(gnss.quality == "fixed", config.gnss_correlated_share, _SLOW_SHARE)
+    default = np.array([QUALITIES[str(q)].velocity_m_per_s for q in gnss.quality])
+    sigma = gnss.sigma_velocity_ned_m_per_s * config.gnss_sigma_factor
+    sigma = np.maximum(np.where(np.isfinite(sigma), sigma, default[:, None]), config.gnss_floor_velocity_m_per_s)
+    return Fixes(
+        position=np.ascontiguousarray(gnss.position_world_m),
+        white=covariance * (1.0 - slow)[:, None, None],
+        coloured=np.sqrt(np.einsum("nii->ni", covariance) * slow[:, None]),
+        velocity=np.ascontiguousarray(gnss.velocity_ned_m_per_s),
+        velocity_variance=sigma**2,
+    )
+
+
+def _covariance(gnss: GnssSolutions, config: SmootherConfig) -> Float64:
+    """Covariances (m, 3, 3), north-east-down, of the positions: stated or by quality, not below the floor."""
+    found = np.array(gnss.covariance_ned_m2, dtype=np.float64) * config.gnss_sigma_factor**2
+    diagonal = np.einsum("nii->ni", found)
+    unknown = ~(np.isfinite(found).all(axis=(1, 2)) & (diagonal > 0.0).all(axis=1))
+    kinds = [QUALITIES[str(q)] for q in gnss.quality[unknown]]
+    default = np.array([(k.horizontal_m, k.horizontal_m, k.vertical_m) for k in kinds]).reshape(-1, 3)
+    found[unknown] = default[:, :, None] ** 2 * np.eye(3)
+    floor = np.array([config.gnss_floor_horizontal_m] * 2 + [config.gnss_floor_vertical_m])
+    raised = np.maximum(floor**2 - np.einsum("nii->ni", found), 0.0)
+    found += raised[:, :, None] * np.eye(3)
+    # A log that rounds its covariances may state a correlation of one: the least eigenvalue is kept off zero.
+    return found + 0.01 * np.einsum("nii->ni", found)[:, :, None] * np.eye(3)
+
+
+def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
+    """True (m,) where a solution is of another quality than the one before it."""
+    return np.append(False, gnss.quality[1:] != gnss.quality[:-1])
+
+

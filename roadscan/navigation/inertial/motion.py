@@ -1,0 +1,203 @@
+"""The motion of a vehicle as its GNSS receiver, its IMU and its odometer feel it, over the same short windows.
+
+All are means over a window of `window_s`, so that they can be compared without a model of any sensor:
+
+    turn    change of the course (from the velocity at the window's ends), against the mean angular rate
+    along   change of the speed, plus gravity's part along the slope that is driven, against the mean specific force
+    aside   speed × turn, towards the inside of a bend, against the mean specific force
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
+from roadscan.navigation.inertial.records import runs
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+STEP_S: Final = 0.1
+"""Distance of the windows' middles."""
+GRAVITY_M_PER_S2: Final = 9.80665
+SLOWEST_M_PER_S: Final = 2.0
+"""Below this speed (and below twenty times its noise) a course says little."""
+_SPIKE_M_PER_S: Final = 0.5
+_USUAL_M_PER_S2: Final = 4.0
+_LEAST_WINDOW_S: Final = 1.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """Velocity of the antenna, from the log or from its positions."""
+
+    epochs_gps_ns: Int64
+    """(k,)"""
+    velocity_ned_m_per_s: Float64
+    """(k, 3)"""
+    noise_m_per_s: float
+    """1 σ of a horizontal component, from its scatter."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The antenna's motion over windows."""
+
+    epochs_gps_ns: Int64
+    """(n,) the middles, `STEP_S` apart."""
+    window_s: float
+    covered: Flags
+    """(n,) GNSS solutions without a break over the whole window."""
+    driving: Flags
+    """(n,) covered, and fast enough for a course at both ends."""
+    speed: Float64
+    """(n,) m/s."""
+    turn: Float64
+    """(n,) rad/s, clockwise."""
+    surge: Float64
+    """(n,) m/s², change of the speed."""
+    along: Float64
+    """(n,) m/s², the same with gravity's part along the slope."""
+    turn_noise: Float64
+    """(n,) 1 σ of `turn`."""
+    along_noise: float
+    """1 σ of `along`."""
+
+    @property
+    def aside(self) -> Float64:
+        """(n,) m/s², to the right of the direction of travel."""
+        return self.speed * self.turn
+
+    @property
+    def stints(self) -> Int64:
+        """First and one past the last window (s, 2) of each drive without a stop or a break."""
+        return runs(self.driving)
+
+
+def ned_from_world(world: str, position_world_m: Float64) -> Float64:
+    """Rotation (3, 3) that turns vectors of the world frame to north-east-down at a position (3,)."""
+    if world == LOCAL_WORLD:
+        return ENU_FROM_NED.T
+    lon, lat, _ = geodetic_from_world(world, position_world_m[None])[0]
+    return ecef_from_ned(np.radians(lat), np.radians(lon)).T
+
+
+def track_of(gnss: GnssSolutions) -> Track:
+    """Velocities of the log where most positions have one, else those that the positions give."""
+    placed = np.isfinite(gnss.position_world_m[:, 0])
+    moving = np.isfinite(gnss.velocity_ned_m_per_s[:, 0])
+    if (placed & moving).sum() >= 0.5 * placed.sum():
+        epochs, velocity = gnss.epochs_gps_ns[moving], gnss.velocity_ned_m_per_s[moving]
+    else:
+        epochs, velocity = _without_spikes(*position_velocity(gnss))
+    return Track(epochs, velocity, _noise(velocity[:, :2]))
+
+
+def position_velocity(gnss: GnssSolutions) -> tuple[Int64, Float64]:
+    """Middles (k,) and velocities (k, 3), north-east-down, between one position and the next."""
+    placed = np.flatnonzero(np.isfinite(gnss.position_world_m[:, 0]))
+    epochs, position = gnss.epochs_gps_ns[placed], gnss.position_world_m[placed]
+    if placed.size < 2:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    steps = np.diff(epochs)
+    world = np.diff(position, axis=0) / (steps / NS_PER_S)[:, None]
+    return epochs[:-1] + steps // 2, world @ ned_from_world(gnss.world, position[len(position) // 2]).T
+
+
+def windows_of(track: Track, span_gps_ns: tuple[int, int]) -> Windows:
+    """Windows over the track inside a span, on whole tenths of a second."""
+    step = np.median(np.diff(track.epochs_gps_ns)) / NS_PER_S if track.epochs_gps_ns.size > 1 else 1.0
+    window = max(_LEAST_WINDOW_S, 2.0 * float(step))
+    grid_ns, half_ns = round(STEP_S * NS_PER_S), round(window * NS_PER_S / 2)
+    first = -(-max(span_gps_ns[0], int(track.epochs_gps_ns[0])) // grid_ns) * grid_ns
+    middles = np.arange(first + half_ns, min(span_gps_ns[1], int(track.epochs_gps_ns[-1])) - half_ns, grid_ns)
+    longest_ns = 2.5 * step * NS_PER_S
+    piece = np.concatenate([[0], np.cumsum(np.diff(track.epochs_gps_ns) > longest_ns)])
+    at = [np.searchsorted(track.epochs_gps_ns, middles + shift, side="right") - 1 for shift in (-half_ns, half_ns)]
+    covered = piece[at[0]] == piece[np.minimum(at[1] + 1, piece.size - 1)]
+    before, here, after = (
+        _at(track.epochs_gps_ns, track.velocity_ned_m_per_s, middles + s) for s in (-half_ns, 0, half_ns)
+    )
+    slow, fast, speed = (np.hypot(v[:, 0], v[:, 1]) for v in (before, after, here))
+    driving = covered & (np.minimum(slow, fast) > max(SLOWEST_M_PER_S, 20 * track.noise_m_per_s))
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.arctan2(cross, (before * after)[:, :2].sum(axis=1)) / window
+    surge = (fast - slow) / window
+    slope = -here[:, 2] / np.maximum(speed, 1.0)
+    noise = np.sqrt(2.0) * track.noise_m_per_s / window
+    return Windows(
+        middles,
+        window,
+        covered,
+        driving,
+        speed,
+        turn,
+        surge,
+        surge + GRAVITY_M_PER_S2 * slope,
+        noise / np.maximum(speed, 1.0),
+        noise,
+    )
+
+
+def imu_means(imu: ImuReadings, middles: Int64, window_s: float, body_from_imu: Float64) -> tuple[Float64, Float64]:
+    """Mean angular rate and specific force (n, 3) over windows, body axes; NaN where the log does not reach."""
+    half = round(window_s * NS_PER_S / 2)
+    out = []
+    for values in (imu.angular_rate_rad_per_s, imu.specific_force_m_per_s2):
+        seconds = np.diff(imu.epochs_gps_ns) / NS_PER_S
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(values[1:] * seconds[:, None], axis=0)])
+        mean = (
+            _at(imu.epochs_gps_ns, total, middles + half) - _at(imu.epochs_gps_ns, total, middles - half)
+        ) / window_s
+        beyond = (middles - half < imu.epochs_gps_ns[0]) | (middles + half > imu.epochs_gps_ns[-1])
+        out.append(np.where(beyond[:, None], np.nan, mean @ body_from_imu.T))
+    return out[0], out[1]
+
+
+def odometer_means(odometer: OdometerReadings, middles: Int64, window_s: float) -> Float64:
+    """Mean speed (n,) over windows; NaN where the log does not reach."""
+    half = round(window_s * NS_PER_S / 2)
+    known = ~np.isnan(odometer.distance_m)
+    if known.sum() >= 2:
+        epochs, total = odometer.epochs_gps_ns[known], odometer.distance_m[known]
+    else:
+        epochs, speed = odometer.epochs_gps_ns, odometer.speed_m_per_s
+        total = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(epochs) / NS_PER_S)])
+    ends = [_at(epochs, total[:, None], middles + shift)[:, 0] for shift in (-half, half)]
+    beyond = (middles - half < epochs[0]) | (middles + half > epochs[-1])
+    speeds: Float64 = np.where(beyond, np.nan, (ends[1] - ends[0]) / window_s)
+    return speeds
+
+
+def _at(epochs: Int64, values: Float64, wanted: Int64) -> Float64:
+    """Values (n, k) at wanted epochs (m,), linear between."""
+    since = (epochs - epochs[0]).astype(np.float64)
+    x = (wanted - epochs[0]).astype(np.float64)
+    return np.stack([np.interp(x, since, values[:, k]) for k in range(values.shape[1])], axis=1)
+
+
+def _without_spikes(epochs: Int64, velocity: Float64) -> tuple[Int64, Float64]:
+    """Velocities from positions, without those that a leap of a position has spoilt."""
+    if epochs.size < 5:
+        return epochs, velocity
+    padded = np.pad(velocity, ((2, 2), (0, 0)), mode="edge")
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1)
+    step_s = float(np.median(np.diff(epochs))) / NS_PER_S
+    good = np.linalg.norm(velocity - usual, axis=1) < _SPIKE_M_PER_S + 2 * _USUAL_M_PER_S2 * step_s
+    return epochs[good], velocity[good]
+
+
+def _noise(values: Float64) -> float:
+    """1 σ of the noise of values (n, k), from the median of their second differences."""
+    if len(values) < 3:
+        return 0.0
+    bends = values[2:] - 2 * values[1:-1] + values[:-2]
+    return float(1.4826 * np.median(np.abs(bends)) / np.sqrt(6.0))

@@ -1,0 +1,370 @@
+"""Records of the smoother's logs put in order: what cannot be used is left out and named, or the log is refused.
+
+A record is counted from 0 in the order in which it arrived.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import NavigationError, TimeSystemError
+from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+BRIDGED_S: Final = 0.25
+"""A gap between IMU samples up to this (and up to three samples) is filled by a straight line."""
+BRIDGED_SHARE: Final = 0.05
+"""Greatest share of an IMU log's time that may be filled."""
+DAMAGED_SHARE: Final = 0.05
+"""Greatest share of a log's records that may be left out for what they hold."""
+CONFLICT_SHARE: Final = 0.01
+"""Greatest share of records that may contradict another one of the same epoch."""
+FEWEST_SPOILT: Final = 5
+"""Up to so many spoilt records never spoil a log by their share."""
+FASTEST_M_PER_S: Final = 100.0
+"""No road vehicle drives faster."""
+CLIPPED_S: Final = 0.1
+"""A sensor may stand at the end of its scale this long at a time."""
+CLIPPED_SHARE: Final = 0.001
+"""Greatest share of samples at the end of the scale."""
+_CLIPPED_SAMPLES: Final = 3
+_LEAST_SCALE: Final = (1.0, 14.0)
+"""No gyroscope ends below this rate (rad/s), no accelerometer below this force (m/s²)."""
+_LISTED: Final = 3
+
+Log = TypeVar("Log")
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What was done to some records of a log, so that the rest can be used."""
+
+    sensor: str
+    """'IMU', 'GNSS' or 'odometer'."""
+    what: str
+    """What was wrong with them, and what was done."""
+    records: Int64
+    """(n,) the records, from 0 as they arrived; of a gap the record before it."""
+    epochs_gps_ns: Int64
+    """(n,) their epochs."""
+
+    def __str__(self) -> str:
+        return f"{self.sensor}: {self.what}: {listed(self.records, self.epochs_gps_ns)}"
+
+
+@dataclass(frozen=True)
+class Kept(Generic[Log]):
+    """A log in order."""
+
+    log: Log
+    records: Int64
+    """(n,) where each of its rows stood as they arrived; −1: filled in."""
+    repairs: list[Repair]
+
+
+def listed(records: Int64, epochs_gps_ns: Int64) -> str:
+    """``record 12 (2026-05-04T09:30:00.1Z), record 15 (…) and 4 more``."""
+    named = [f"record {r} ({iso_from_gps_ns(int(e))})" for r, e in zip(records[:_LISTED], epochs_gps_ns, strict=False)]
+    more = records.size - len(named)
+    return ", ".join(named) + (f" and {more} more" if more else "")
+
+
+def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
+    """Samples sorted, each epoch once, without gaps.
+
+    Raises
+    ------
+    NavigationError
+        where samples are missing or no numbers for longer than can be filled, or saturated.
+    TimeSystemError
+        where the clock stepped back.
+    """
+    values = np.column_stack([imu.angular_rate_rad_per_s, imu.specific_force_m_per_s2])
+    rows, repairs = _each_epoch_once("IMU", imu.epochs_gps_ns, values)
+    bad = ~np.isfinite(values[rows]).all(axis=1)
+    if bad.any():
+        repairs.append(_left_out("IMU", "no finite numbers", rows[bad], imu.epochs_gps_ns, rows.size))
+        rows = rows[~bad]
+    if rows.size < 2:
+        raise NavigationError(f"the IMU log has {rows.size} usable samples", expected="at least two")
+    epochs, values = imu.epochs_gps_ns[rows], values[rows]
+    repairs += _saturation(epochs, values, rows)
+    epochs, values, rows, bridges = _bridged(epochs, values, rows)
+    log = ImuReadings(epochs, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]))
+    return Kept(log, rows, repairs + bridges)
+
+
+def gnss_in_order(gnss: GnssSolutions) -> Kept[GnssSolutions]:
+    """Solutions sorted, each epoch once; half a position, and covariances that are none, are set to NaN.
+
+    Raises
+    ------
+    NavigationError
+        where hardly a solution is usable.
+    TimeSystemError
+        where the clock stepped back.
+    """
+    position, velocity = gnss.position_world_m, gnss.velocity_ned_m_per_s
+    rows, repairs = _each_epoch_once("GNSS", gnss.epochs_gps_ns, np.column_stack([position, velocity]))
+    position, halves = _whole(position[rows])
+    velocity, half_velocities = _whole(velocity[rows])
+    covariance, flawed = _covariances(gnss.covariance_ned_m2[rows])
+    epochs = gnss.epochs_gps_ns[rows]
+    for bad, what in (
+        (halves, "a position of which a part is no finite number was left out"),
+        (half_velocities, "a velocity of which a part is no finite number was left out"),
+        (flawed, "a covariance that is not positive definite counts as not stated"),
+    ):
+        if bad.any():
+            repairs.append(Repair("GNSS", what, rows[bad], epochs[bad]))
+    if not np.isfinite(position[:, 0]).any():
+        raise NavigationError(
+            f"none of {rows.size} GNSS solutions has a position",
+            expected="positions of the antenna",
+            change="check the log's columns, or name another receiver in navigation.smoother.gnss",
+        )
+    sigma = np.where(gnss.sigma_velocity_ned_m_per_s[rows] > 0.0, gnss.sigma_velocity_ned_m_per_s[rows], np.nan)
+    log = GnssSolutions(gnss.world, epochs, position, covariance, gnss.quality[rows], velocity, sigma)
+    return Kept(log, rows, repairs)
+
+
+def odometer_in_order(odometer: OdometerReadings) -> Kept[OdometerReadings]:
+    """Readings sorted, each epoch once; a counter that started anew goes on where it was.
+
+    Raises
+    ------
+    NavigationError
+        where the counter leaps all the time.
+    TimeSystemError
+        where the clock stepped back.
+    """
+    values = np.column_stack([odometer.distance_m, odometer.speed_m_per_s])
+    rows, repairs = _each_epoch_once("odometer", odometer.epochs_gps_ns, values)
+    values = np.where(np.isfinite(values), values, np.nan)
+    bad = np.isnan(values[rows]).all(axis=1)
+    if bad.any():
+        repairs.append(
+            _left_out("odometer", "neither distance nor speed", rows[bad], odometer.epochs_gps_ns, rows.size)
+        )
+        rows = rows[~bad]
+    epochs = odometer.epochs_gps_ns[rows]
+    distance, restarted = _going_on(epochs, values[rows, 0], rows)
+    return Kept(OdometerReadings(epochs, distance, values[rows, 1]), rows, repairs + restarted)
+
+
+def runs(flags: Flags) -> Int64:
+    """First and one past the last index (r, 2) of each run of true flags (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return edges.reshape(-1, 2).astype(np.int64)
+
+
+def _each_epoch_once(sensor: str, epochs: Int64, values: Float64) -> tuple[Int64, list[Repair]]:
+    """Rows in the order of their epochs, each epoch once, and what had to be done for it."""
+    if epochs.size == 0:
+        raise NavigationError(f"the {sensor} log is empty", expected="at least two records")
+    repairs = []
+    late = np.flatnonzero(epochs < np.maximum.accumulate(epochs))
+    order = np.argsort(epochs, kind="stable")
+    if late.size:
+        _check_not_interleaved(sensor, epochs, order, late)
+        repairs.append(Repair(sensor, "stood behind later records and were sorted", late, epochs[late]))
+    first = np.concatenate([[True], np.diff(epochs[order]) > 0])
+    group = np.cumsum(first) - 1
+    leader = order[first][group]
+    same = np.all((values[order] == values[leader]) | (np.isnan(values[order]) & np.isnan(values[leader])), axis=1)
+    contradicted = np.zeros(group[-1] + 1, dtype=bool)
+    contradicted[group[~same]] = True
+    repeated = order[~first & ~contradicted[group]]
+    if repeated.size:
+        what = "repeat the epoch and the values of another record and were dropped"
+        repairs.append(Repair(sensor, what, repeated, epochs[repeated]))
+    against = order[contradicted[group]]
+    if against.size:
+        _check_conflicts(sensor, epochs, against)
+        what = "share their epoch with records of other values; none of them can be trusted, all were dropped"
+        repairs.append(Repair(sensor, what, against, epochs[against]))
+    return order[first & ~contradicted[group]], repairs
+
+
+def _check_not_interleaved(sensor: str, epochs: Int64, order: Int64, late: Int64) -> None:
+    """Refuse records that, sorted, run in between others: the clock went back over a time that it had shown."""
+    steps = np.diff(epochs[order])
+    if not (steps > 0).any():
+        return
+    is_late = np.zeros(epochs.size, dtype=bool)
+    is_late[late] = True
+    beside = is_late[order][1:] | is_late[order][:-1]
+    crowded = int((beside & (steps < 0.6 * np.median(steps[steps > 0]))).sum())
+    step_back = int(np.argmin(np.diff(epochs)))
+    if crowded > max(FEWEST_SPOILT, 0.3 * late.size):
+        back_s = -np.diff(epochs)[step_back] / NS_PER_S
+        raise TimeSystemError(
+            f"the clock of the {sensor} log steps back by {back_s:.3f} s at record {step_back + 1} "
+            f"({iso_from_gps_ns(int(epochs[step_back + 1]))}), and what follows runs in between what was before",
+            expected="a clock that never shows the same time twice",
+            change="split the log at that record, and state the clock of each part",
+            record=step_back + 1,
+        )
+
+
+def _check_conflicts(sensor: str, epochs: Int64, against: Int64) -> None:
+    if against.size <= max(2 * FEWEST_SPOILT, CONFLICT_SHARE * epochs.size):
+        return
+    steps = np.diff(epochs)
+    step_back = int(np.argmin(steps))
+    back = steps[step_back] < 0
+    record = step_back + 1 if back else int(against.min())
+    cause = f"; the clock steps back by {-steps[step_back] / NS_PER_S:.3f} s at record {record}" if back else ""
+    raise TimeSystemError(
+        f"{against.size} of {epochs.size} {sensor} records share their epoch with a record of other values, first "
+        f"{listed(against[:1], epochs[against[:1]])}{cause}",
+        expected="one record an epoch",
+        change="check the clock of the log and the resolution of its stamps; split a log that holds two recordings",
+        record=record,
+    )
+
+
+def _left_out(sensor: str, what: str, rows: Int64, epochs: Int64, of: int) -> Repair:
+    if rows.size > max(FEWEST_SPOILT, DAMAGED_SHARE * of):
+        raise NavigationError(
+            f"{rows.size} of {of} {sensor} records hold {what}, first {listed(rows[:1], epochs[rows[:1]])}",
+            expected=f"at most {DAMAGED_SHARE:.0%} such records",
+            change="check the log's columns and what wrote it",
+            record=int(rows[0]),
+        )
+    return Repair(sensor, f"hold {what} and were left out", rows, epochs[rows])
+
+
+def _bridged(epochs: Int64, values: Float64, rows: Int64) -> tuple[Int64, Float64, Int64, list[Repair]]:
+    """Samples with straight lines over short gaps."""
+    steps = np.diff(epochs)
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > 1.5 * usual)
+    longest_ns = max(BRIDGED_S * NS_PER_S, 3.5 * usual)
+    long = gaps[steps[gaps] > longest_ns]
+    if long.size:
+        at, gap_s = long[0], steps[long] / NS_PER_S
+        raise NavigationError(
+            f"the IMU log has {long.size} gaps of more than {longest_ns / NS_PER_S:.2f} s, the longest "
+            f"{gap_s.max():.2f} s; the first, of {gap_s[0]:.2f} s, follows "
+            f"{listed(rows[at : at + 1], epochs[at : at + 1])}",
+            expected=f"a sample each {usual / 1e6:.2f} ms",
+            change="cut the run into parts at these gaps (roadscan.navigation.inertial.checks.parts)",
+            record=int(rows[at]),
+        )
+    if gaps.size == 0:
+        return epochs, values, rows, []
+    counts = np.rint(steps[gaps] / usual).astype(np.int64) - 1
+    _check_share(counts, epochs, rows, gaps)
+    missing = np.repeat(gaps, counts)
+    part = (np.arange(missing.size) - np.repeat(np.cumsum(counts) - counts, counts) + 1) / np.repeat(counts + 1, counts)
+    new_epochs = epochs[missing] + np.rint(part * steps[missing]).astype(np.int64)
+    new_values = values[missing] + part[:, None] * (values[missing + 1] - values[missing])
+    what = f"are followed by a gap; {missing.size} samples, {counts.max()} at most in one gap, were filled in"
+    return (
+        np.insert(epochs, missing + 1, new_epochs),
+        np.insert(values, missing + 1, new_values, axis=0),
+        np.insert(rows, missing + 1, -1),
+        [Repair("IMU", what, rows[gaps], epochs[gaps])],
+    )
+
+
+def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None:
+    if counts.sum() > max(FEWEST_SPOILT, BRIDGED_SHARE * epochs.size):
+        raise NavigationError(
+            f"{counts.sum()} samples are missing from an IMU log of {epochs.size}, in {gaps.size} gaps; the first "
+            f"follows {listed(rows[gaps[:1]], epochs[gaps[:1]])}",
+            expected=f"at most {BRIDGED_SHARE:.0%} missing samples",
+            change="check what recorded the log: it loses samples",
+            record=int(rows[gaps[0]]),
+        )
+
+
+def _saturation(epochs: Int64, values: Float64, rows: Int64) -> list[Repair]:
+    """Samples at the end of a sensor's scale: kept where they are few, refused where they are many."""
+    repairs = []
+    step_s = float(np.median(np.diff(epochs))) / NS_PER_S
+    for axis in range(6):
+        kind, name = axis // 3, f"{('gyroscope', 'accelerometer')[axis // 3]} {'xyz'[axis % 3]}"
+        column = values[:, axis]
+        for end in (column.max(), column.min()):
+            held = runs(column == end)
+            held = held[held[:, 1] - held[:, 0] >= _CLIPPED_SAMPLES]
+            if abs(end) < _LEAST_SCALE[kind] or held.size == 0 or _is_constant(column):
+                continue
+            clipped = np.concatenate([np.arange(a, b) for a, b in held])
+            longest = int((held[:, 1] - held[:, 0]).max())
+            if longest * step_s > max(CLIPPED_S, 4 * step_s) or clipped.size > max(
+                2 * FEWEST_SPOILT, CLIPPED_SHARE * column.size
+            ):
+                raise NavigationError(
+                    f"{name} stands at the end of its scale, {end:.6g} {('rad/s', 'm/s²')[kind]}, in {clipped.size} "
+                    f"samples, up to {longest} on end, first {listed(rows[clipped[:1]], epochs[clipped[:1]])}",
+                    expected=f"no more than {CLIPPED_S:g} s on end and {CLIPPED_SHARE:.1%} of the samples",
+                    change="record with a wider scale, or mount the IMU more softly",
+                    record=int(rows[clipped[0]]),
+                )
+            what = f"{name} stands at the end of its scale, {end:.6g}; the samples were kept as they are"
+            repairs.append(Repair("IMU", what, rows[clipped], epochs[clipped]))
+    return repairs
+
+
+def _is_constant(column: Float64) -> bool:
+    return bool(column.min() == column.max())
+
+
+def _whole(vectors: Float64) -> tuple[Float64, Flags]:
+    """Vectors (n, 3), all NaN where a part is not finite; flags where that was not so."""
+    finite = np.isfinite(vectors)
+    whole: Flags = np.asarray(finite.all(axis=1))
+    missing: Flags = np.asarray(np.isnan(vectors).all(axis=1))
+    return np.where(whole[:, None], vectors, np.nan), ~whole & ~missing
+
+
+def _covariances(covariance: Float64) -> tuple[Float64, Flags]:
+    """Covariances (n, 3, 3), NaN where they are none; flags where one was stated that is none."""
+    stated = ~np.isnan(covariance).all(axis=(1, 2))
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    smallest = np.full(len(covariance), -1.0)
+    smallest[finite] = np.linalg.eigvalsh(covariance[finite])[:, 0] if finite.any() else 0.0
+    good = finite & (smallest > 0.0)
+    flawed: Flags = stated & ~good
+    return np.where(good[:, None, None], covariance, np.nan), flawed
+
+
+def _going_on(epochs: Int64, distance: Float64, rows: Int64) -> tuple[Float64, list[Repair]]:
+    """Distances (n,) where a counter that leaps goes on as before its leap."""
+    known = np.flatnonzero(~np.isnan(distance))
+    steps, seconds = np.diff(distance[known]), np.diff(epochs[known]) / NS_PER_S
+    leaps = np.flatnonzero(np.abs(steps) > FASTEST_M_PER_S * seconds + 1.0)
+    if leaps.size == 0:
+        return distance, []
+    after = known[leaps + 1]
+    if leaps.size > max(FEWEST_SPOILT, CONFLICT_SHARE * known.size):
+        raise NavigationError(
+            f"the odometer's distance leaps {leaps.size} times faster than {FASTEST_M_PER_S:g} m/s, the first time at "
+            f"{listed(rows[after[:1]], epochs[after[:1]])}, by {steps[leaps[0]]:.6g} m",
+            expected="a running total in metres",
+            change="check the unit of the distance (metres_per_tick of the encoder in the rig file)",
+            record=int(rows[after[0]]),
+        )
+    good = np.ones(steps.size, dtype=bool)
+    good[leaps] = False
+    speeds = np.where(good, steps / np.maximum(seconds, 1e-9), 0.0)
+    instead = np.interp(leaps, np.flatnonzero(good), speeds[good]) * seconds[leaps]
+    steps = steps.copy()
+    steps[leaps] = instead
+    mended = distance.copy()
+    mended[known] = distance[known[0]] + np.concatenate([[0.0], np.cumsum(steps)])
+    what = (
+        f"the counter leaps (by {np.diff(distance[known])[leaps[0]]:.6g} m); it goes on as the speed before and after"
+    )
+    return mended, [Repair("odometer", what, rows[after], epochs[after])]

@@ -176,20 +176,16 @@ def _sensor(
 
 
 def _interior(camera: Camera) -> list[str]:
-    """Interior orientation as comments, for the reader of the file: the rig has no keys for it."""
+    """Interior orientation as it is in truth: no calibration of a simulated camera errs."""
     lens = Lens.of(camera)
     return [
-        f"# interior orientation, in OpenCV's model: {camera.width_px} x {camera.height_px} pixels,",
-        f"# focal length {lens.focal_px!r} px, principal point {list(lens.principal_px)} px,",
-        f"# distortion k1, k2, p1, p2, k3 = {list(lens.distortion)}; x of the sensor is the optical axis",
+        "[sensors.camera.interior]",
+        f"width_px = {camera.width_px}",
+        f"height_px = {camera.height_px}",
+        f"focal_px = {[lens.focal_px, lens.focal_px]}",
+        f"principal_px = {[float(c) for c in lens.principal_px]}",
+        f"distortion = {[float(k) for k in lens.distortion]}",
     ]
-
-
-def _imu_errors(errors: ImuErrors | ImuGrade) -> str:
-    """Line of an IMU's errors: its grade, or the values of a data sheet."""
-    if isinstance(errors, str):
-        return f"imu = {_text(errors)}"
-    return "imu = { " + ", ".join(f"{name} = {value!r}" for name, value in errors.model_dump().items()) + " }"
 
 
 def _profiler_limits(head: Head) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Sensor
+from roadscan.model.rig import Rig, Sensor
 from roadscan.model.survey import ClockConfig
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.lens import Lens
@@ -285,4 +285,9 @@ def test_the_rig_file_states_the_nominal_mounting(tmp_path: Path):
     assert sensor["kind"] == "camera"
     assert sensor["boresight"]["pitch_deg"] == pytest.approx(-10.0 + 0.7)
     assert sensor["lever_arm_body_m"] == pytest.approx([0.9, -0.23, -1.15])
-    assert "focal length 140.0 px" in made.rig_file.read_text()
+    interior = Rig.load(made.rig_file).sensors["camera"].interior
+    assert interior is not None
+    assert (interior.width_px, interior.height_px, interior.focal_px) == (160, 100, (140.0, 140.0))
+    assert interior.principal_px == (79.5, 49.5)
+    assert interior.distortion == BARREL
+    assert Rig.load(truth.load(made.folder).rig_file).sensors["camera"].interior == interior

@@ -30,6 +30,9 @@ class SmootherConfig(Strict):
     imu_clock_sigma_s: float = Field(default=0.0, ge=0.0, le=0.5)
     """1 σ of what remains of the IMU's clock error after its clock's correction: a constant delay against GNSS is
     estimated where this is above zero (s)."""
+    imu_clock_wander_ms_per_sqrt_s: float = Field(default=0.0, ge=0.0, le=100.0)
+    """How the IMU's clock wanders against GNSS where it is not disciplined: change of that delay over a second, 1 σ, as a
+    random walk (ms)."""
     max_imu_gap_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """A longer silence of the IMU ends the trajectory; it begins anew behind it (s)."""
 
@@ -78,3 +81,31 @@ class SmootherConfig(Strict):
     outlier_patience_s: float = Field(default=15.0, gt=0.0)
     """After this long without a position that counts in full they all do again: then the filter is wrong, and not
     the receiver (s)."""
+
+
+class SplineConfig(Strict):
+    """Spline smoothing of a trajectory where GNSS dropped out (``navigation/spline.py``)."""
+
+    on: bool = False
+    """Smooth the trajectory of the run; poses outside the rugged spans stay as they are, to the bit."""
+    outage_sigma_factor: float = Field(default=4.0, gt=1.0)
+    """GNSS dropped out where the stated horizontal σ exceeds its median this many times …"""
+    outage_sigma_m: float = Field(default=0.05, gt=0.0)
+    """… and this (m)."""
+    step_m: float = Field(default=0.03, gt=0.0)
+    """Smallest step between two poses that neighbouring motion does not explain (m): the end of an outage."""
+    step_reach_s: float = Field(default=15.0, gt=0.0)
+    """Drift before a step is taken back over this long, where nothing says when the outage began (s)."""
+    rugged_factor: float = Field(default=5.0, gt=1.0)
+    """A span is rugged where its increments scatter this many times more than the trajectory's usually do …"""
+    rugged_m: float = Field(default=0.005, gt=0.0)
+    """… and by more than this (m)."""
+    knot_s: float = Field(default=0.5, gt=0.0, le=60.0)
+    """Distance of the knots of the cubic B-spline that replaces a rugged span (s): faster motion is taken as noise."""
+    ease_s: float = Field(default=0.5, gt=0.0)
+    """At the ends of a rugged span the trajectory passes into the spline over this long (s)."""
+    longest_s: float = Field(default=180.0, gt=0.0)
+    """Longer spans are left as they are (s)."""
+    fill_gap_s: float = Field(default=0.0, ge=0.0, le=60.0)
+    """Gaps without poses up to this long are filled (s); their σ is what filling as long a gap elsewhere in the same
+    trajectory misses."""

@@ -12,12 +12,15 @@ scanning LIDAR systems", writes the same terms.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.kernels.calibration import tie_residuals, tie_rows
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.evidence import Directions, Evidence, Known, Orientation, Seen, Ties
 from roadscan.navigation.calibration.rotations import left_jacobian, logarithm
@@ -95,15 +98,36 @@ class _Side:
     """(n, 3), or (1, 3) where all share it."""
     rotation: Float64
     """(n, 3, 3), or (1, 3, 3)."""
+    beam_axis: Float64
+    """(3,), zero: away from the sensor."""
 
     def taken(self, index: Int64 | slice) -> _Side:
         """Some of them."""
-        return _Side(
-            self.sensor,
-            self.body[index],
-            self.point_m[index],
-            self.position_m[index] if len(self.position_m) > 1 else self.position_m,
-            self.rotation[index] if len(self.rotation) > 1 else self.rotation,
+        return replace(
+            self,
+            body=self.body[index],
+            point_m=np.ascontiguousarray(self.point_m[index]),
+            position_m=self.position_m if self._is_shared else np.ascontiguousarray(self.position_m[index]),
+            rotation=self.rotation if self._is_shared else np.ascontiguousarray(self.rotation[index]),
+        )
+
+    @property
+    def _is_shared(self) -> bool:
+        return self.sensor == _ABSENT
+
+    def arrays(self) -> tuple[Int64, Float64, Float64, Float64]:
+        """As the kernels take it."""
+        return self.body, self.point_m, self.position_m, self.rotation
+
+    def mounting(self, now: Geometry) -> tuple[tuple[float, ...], tuple[float, ...], float, tuple[float, ...]]:
+        """As the kernels take it; without a sensor, one that changes nothing."""
+        if self.sensor == _ABSENT:
+            return tuple(np.eye(3).ravel().tolist()), (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
+        return (
+            tuple(now.body_from_sensor[self.sensor].ravel().tolist()),
+            tuple(now.lever_arm_m[self.sensor].tolist()),
+            float(now.range_offset_m[self.sensor]),
+            tuple(self.beam_axis.tolist()),
         )
 
     def finite(self) -> npt.NDArray[np.bool_]:
@@ -114,22 +138,6 @@ class _Side:
             & np.isfinite(self.rotation).all((1, 2))
         )
         return np.asarray(good)
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """Places of one end, with what their derivatives need."""
-
-    world_m: Float64
-    """(n, 3)"""
-    turned: Float64
-    """(n, 3, 3) world from body, with the traverse's error."""
-    body_m: Float64
-    """(n, 3) body axes, from the IMU reference point."""
-    from_sensor_m: Float64
-    """(n, 3) body axes, from the sensor's origin."""
-    beam: Float64
-    """(n, 3) body axes."""
 
 
 class TieObservations:
@@ -148,7 +156,6 @@ class TieObservations:
         self._weight = np.ascontiguousarray(ties.weight[order])
         self._unusable = int(good.size - order.size)
         self._size = unknowns.mounting_size
-        self._axes = [prior.beam_axis_sensor for prior in unknowns.priors.values()]
 
     @property
     def count(self) -> int:
@@ -167,8 +174,9 @@ class TieObservations:
 
     def residuals(self, now: Geometry) -> Float64:
         """(count, rows), unit variance."""
-        parts = [self._difference(part, now)[0] for part in self._chunks()]
-        return np.concatenate(parts) if parts else np.zeros((0, self.rows))
+        residual = np.empty((self.count, self.rows))
+        tie_residuals(*self._ends(slice(None), now), self._weight, self._on_object, residual)
+        return residual
 
     def metres(self, residuals: Float64) -> Float64 | None:
         """(count,) root mean square over a tie's rows, each divided by its weight."""
@@ -179,19 +187,15 @@ class TieObservations:
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
         """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
         for part in self._chunks():
-            residual, first, second = self._difference(part, now)
-            jacobian = self._jacobian(part, first, second)
-            root = np.sqrt(weight[part])
-            jacobian *= root[:, None, None]
-            residual = residual * root[:, None]
-            pairs = np.stack([self._first.body[part], self._second.body[part]], axis=1)
-            starts = np.flatnonzero(np.r_[True, (np.diff(pairs, axis=0) != 0).any(1)])
-            for start, end in zip(starts, [*starts[1:], len(pairs)], strict=True):
-                rows = jacobian[start:end].reshape(-1, jacobian.shape[2])
-                where = self._places(int(pairs[start, 0]), int(pairs[start, 1]))
+            ties = self._weight[part]
+            residual, jacobian = np.empty(ties.shape[:2]), np.empty((*ties.shape[:2], 2 * (MOUNTING + BODY)))
+            tie_rows(*self._ends(part, now), ties, self._on_object, weight[part], residual, jacobian)
+            for start, end in self._pairs(part):
+                rows = jacobian[start - part.start : end - part.start].reshape(-1, jacobian.shape[2])
+                where = self._places(int(self._first.body[start]), int(self._second.body[start]))
                 used = where >= 0
                 local = rows.T @ rows
-                slope = rows.T @ residual[start:end].ravel()
+                slope = rows.T @ residual[start - part.start : end - part.start].ravel()
                 # Both ends may share a sensor or traverse: places repeat, and add.at sums them.
                 np.add.at(information, np.ix_(where[used], where[used]), local[np.ix_(used, used)])
                 np.add.at(gradient, where[used], slope[used])
@@ -199,54 +203,23 @@ class TieObservations:
     def _chunks(self) -> Iterator[slice]:
         return (slice(begin, min(begin + _CHUNK, self.count)) for begin in range(0, self.count, _CHUNK))
 
-    def _difference(self, part: slice, now: Geometry) -> tuple[Float64, _Placed, _Placed]:
-        first = self._placed(self._first.taken(part), now)
-        second = self._placed(self._second.taken(part), now)
-        difference = first.world_m - second.world_m
-        if self._on_object:
-            difference = np.einsum("nji,nj->ni", second.turned, difference)
-        return np.einsum("nki,ni->nk", self._weight[part], difference), first, second
+    def _pairs(self, part: slice) -> Iterator[tuple[int, int]]:
+        """Spans of ties in a chunk that share both traverses."""
+        inside = self._changes[(self._changes > part.start) & (self._changes < part.stop)].tolist()
+        return pairwise([part.start, *inside, part.stop])
 
-    def _placed(self, side: _Side, now: Geometry) -> _Placed:
-        if side.sensor == _ABSENT:
-            body = from_sensor = side.point_m
-            beam = np.zeros((1, 3))
-        else:
-            along = self._beam(side)
-            mounted = now.body_from_sensor[side.sensor].T
-            from_sensor = (side.point_m + now.range_offset_m[side.sensor] * along) @ mounted
-            beam = along @ mounted
-            body = from_sensor + now.lever_arm_m[side.sensor]
-        turned, world = side.rotation, side.position_m
-        if (side.body >= 0).all():
-            turned = turned @ now.turn[side.body]
-            world = world + now.shift_world_m[side.body]
-        turned = np.broadcast_to(turned, (len(body), 3, 3))
-        return _Placed(world + np.einsum("nij,nj->ni", turned, body), turned, body, from_sensor, beam)
+    @cached_property
+    def _changes(self) -> Int64:
+        """Ties whose traverses differ from those before."""
+        first, second = self._first.body, self._second.body
+        return np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
 
-    def _beam(self, side: _Side) -> Float64:
-        """(n, 3) or (1, 3), sensor axes."""
-        axis = self._axes[side.sensor]
-        if axis is not None:
-            return np.array([axis])
-        away: Float64 = side.point_m / np.maximum(np.linalg.norm(side.point_m, axis=1), 1e-9)[:, None]
-        return away
-
-    def _jacobian(self, part: slice, first: _Placed, second: _Placed) -> Float64:
-        """(n, k, 2 (7 + 6)): mounting and body of the first end, then of the second."""
-        weight = self._weight[part]
-        lever = second.body_m
-        if self._on_object:
-            # Rows stand in the object's axes: they turn with it, and so does what it sees of the first place.
-            lever = np.einsum("nji,nj->ni", second.turned, first.world_m - second.world_m) + second.body_m
-            weight = np.einsum("nki,nji->nkj", weight, second.turned)
-        half = MOUNTING + BODY
-        jacobian = np.zeros((*weight.shape[:2], 2 * half))
-        _derivatives(jacobian[..., :half], weight, first, first.body_m, with_sensor=True)
-        if self._second.sensor != _ABSENT or (self._second.body >= 0).any():
-            with_sensor = self._second.sensor != _ABSENT
-            _derivatives(jacobian[..., half:], -weight, second, lever, with_sensor=with_sensor)
-        return jacobian
+    def _ends(self, part: slice, now: Geometry) -> tuple[object, ...]:
+        """Both ends, and the errors of poses with an exact one at the end, as the kernels take them."""
+        first, second = self._first.taken(part), self._second.taken(part)
+        shift = np.concatenate([now.shift_world_m, np.zeros((1, 3))])
+        turn = np.concatenate([now.turn, np.eye(3)[None]])
+        return first.arrays(), first.mounting(now), second.arrays(), second.mounting(now), shift, turn
 
     def _places(self, first_body: int, second_body: int) -> Int64:
         """(26,) among all unknowns; −1: none."""
@@ -258,17 +231,6 @@ class TieObservations:
             if body != _ABSENT:
                 where[begin + MOUNTING : begin + MOUNTING + BODY] = self._size + BODY * body + np.arange(BODY)
         return where
-
-
-def _derivatives(out: Float64, weight: Float64, placed: _Placed, lever_m: Float64, *, with_sensor: bool) -> None:
-    """Fill (n, k, 13) with the derivatives of weight @ place."""
-    by_body = weight @ placed.turned
-    if with_sensor:
-        out[..., 0:3] = by_body
-        out[..., 3:6] = _cross(placed.from_sensor_m, by_body)
-        out[..., 6] = np.einsum("nkj,nj->nk", by_body, np.broadcast_to(placed.beam, placed.body_m.shape))
-    out[..., 7:10] = weight
-    out[..., 10:13] = _cross(lever_m, by_body)
 
 
 def _cross(a: Float64, b: Float64) -> Float64:
@@ -286,6 +248,7 @@ def _seen(seen: Seen, unknowns: Unknowns) -> _Side:
         seen.point_sensor_m,
         seen.position_world_m,
         seen.world_from_body,
+        np.array(unknowns.priors[seen.sensor].beam_axis_sensor or (0.0, 0.0, 0.0)),
     )
 
 
@@ -295,10 +258,10 @@ def _other(second: Seen | Known, unknowns: Unknowns) -> _Side:
     count = len(second.point_m)
     if second.object is None:
         nowhere = np.full(count, _ABSENT, dtype=np.int64)
-        return _Side(_ABSENT, nowhere, second.point_m, np.zeros((1, 3)), np.eye(3)[None])
+        return _Side(_ABSENT, nowhere, second.point_m, np.zeros((1, 3)), np.eye(3)[None], np.zeros(3))
     body = np.full(count, unknowns.find_object(second.object), dtype=np.int64)
     pose = unknowns.objects[second.object]
-    return _Side(_ABSENT, body, second.point_m, pose.position_world_m[None], pose.world_from_object[None])
+    return _Side(_ABSENT, body, second.point_m, pose.position_world_m[None], pose.world_from_object[None], np.zeros(3))
 
 
 def _label(ties: Ties) -> str:

@@ -188,6 +188,13 @@ def _interior(camera: Camera) -> list[str]:
     ]
 
 
+def _imu_errors(errors: ImuErrors | ImuGrade) -> str:
+    """Line of an IMU's errors: its grade, or the values of a data sheet."""
+    if isinstance(errors, str):
+        return f"imu = {_text(errors)}"
+    return "imu = { " + ", ".join(f"{name} = {value!r}" for name, value in errors.model_dump().items()) + " }"
+
+
 def _profiler_limits(head: Head) -> tuple[float, float]:
     settings = head.settings
     return settings.range_offset_m, round(settings.range_offset_m + _LONGEST_RAW * settings.range_step_m, 6)

@@ -124,7 +124,7 @@ def _binned(felt: Felt, since_s: Float64, edges: Int64) -> tuple[Float64, Bool]:
 
 def _rates(motion: Motion, edges_s: Float64) -> tuple[Float64, Bool]:
     known = motion.known(edges_s)
-    totals = np.where(known[:, None], motion.at(edges_s, total=True), 0.0)
+    totals = np.where(known[:, None], motion.at(edges_s, total=True)[0], 0.0)
     totals = totals[:, :1] if motion.leads else totals
     return np.diff(totals, axis=0) / STEP_S, known[1:] & known[:-1]
 

@@ -29,6 +29,8 @@ _WINDOW_OF_TOTALS_S: Final = (6.0, 30.0)
 """Shortest and longest window. Within one a bias of the gyroscopes and the zero of a counter do not change."""
 _GAP: Final = 5.0
 _APART_S: Final = 2.0
+_ANSWER: Final = 0.05
+"""A shift changes what is left by at least this share of what the smoothed motion lets expect."""
 _LEAST_SAMPLES: Final = 20
 _LEAST_WINDOWS: Final = 3
 _POOR: Final = 30.0
@@ -84,7 +86,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
     for round_ in range(_ROUNDS):
         lags = windows.lags(line, keep)
         if lags is None:
-            raise _too_little(what, "too few samples lie within the other sensor's recording")
+            raise _too_little(what, "too few samples lie within the other sensor's recording, or it is all noise")
         keep = lags.keep if round_ >= _LEARNING else None
         asked = robust_line(lags.middle_s[lags.moving], lags.lag_s[lags.moving], lags.sigma_s[lags.moving], drift)
         ends = lags.middle_s[[0, -1]]
@@ -176,27 +178,33 @@ class _Windows:
         if group[-1] + 1 < _LEAST_WINDOWS:
             return None
         since, y = self.since_s[rows], self.values[rows]
-        f = self.motion.at(shifted[rows], total=self.is_total)
-        df = self.motion.change(shifted[rows], total=self.is_total)
+        f, df = self.motion.at(shifted[rows], total=self.is_total)
+        z, dz, ddz = self.motion.smooth(shifted[rows], total=self.is_total)
         if keep is None:
-            _, left = _regressed(_centred(f, group), _centred(y, group), np.ones(rows.size))
-            keep = _keep(since, left, self.longest_s)
+            mixing = _mixing(_centred(z, group), _centred(f, group), _centred(y, group), np.ones(rows.size))
+            keep = _keep(since, _centred(y, group) - _centred(f, group) @ mixing, self.longest_s)
         white = _Whitening(keep, _starts(since))
-        f, df, y = (white.applied(v) for v in (f, df, y))
+        f, df, z, dz, ddz, y = (white.applied(v) for v in (f, df, z, dz, ddz, y))
         weight = np.ones(group[-1] + 1)
         for _ in range(3):  # windows in which something else was felt do not shape A
-            mixing, left = _regressed(f, y, weight[group])
+            mixing = _mixing(z, f, y, weight[group])
+            left = y - f @ mixing
             variance = _variance(left, group)
             usual = np.median(variance, axis=0)
             weight = np.min(usual / np.maximum(variance, usual), axis=1)
         noise = np.maximum(variance, usual) + 1e-300
-        lever = df @ mixing
-        lever = lever - f @ _regressed(f, lever, weight[group])[0]
+        shadow = _mixing(f, z, dz @ mixing, weight[group])
+        lever, turn = dz @ mixing - z @ shadow, ddz @ mixing - dz @ shadow  # a wrong A does not show in the lever
         precision = (lever**2 / noise[group]).sum(axis=1)
-        information = np.bincount(group, precision)
-        asked = np.bincount(group, (lever * left / noise[group]).sum(axis=1))
-        middle = np.bincount(group, precision * since) / np.maximum(information, 1e-300)
-        middle = np.where(information > 0.0, middle, _means(since[:, None], group)[:, 0])
+        change = (lever * (df @ mixing) - turn * left) / noise[group]
+        own, changes = (np.bincount(group, v).astype(np.float64) for v in (precision, change.sum(axis=1)))
+        answer = _answer(own, changes)
+        if answer is None:
+            return None
+        information = own * answer**2
+        asked = np.bincount(group, (lever * left / noise[group]).sum(axis=1)) * answer
+        middle = np.bincount(group, precision * since) / np.maximum(own, 1e-300)
+        middle = np.where(own > 0.0, middle, _means(since[:, None], group)[:, 0])
         with np.errstate(divide="ignore", invalid="ignore"):
             sigma = 1.0 / np.sqrt(information)
             lag = line.at(middle) + np.where(information > 0.0, asked / information, 0.0)
@@ -269,12 +277,30 @@ def _centred(values: Float64, group: Int64) -> Float64:
     return values - _means(values, group)[group]
 
 
-def _regressed(f: Float64, y: Float64, weight: Float64) -> tuple[Float64, Float64]:
-    """Mixing (p, c) that explains y by f best, and what it leaves (n, c)."""
-    root = np.sqrt(weight)[:, None]
+def _answer(precision: Float64, change: Float64) -> Float64 | None:
+    """How far what is left really changes with a shift, by what the smoothed motion lets expect, a window (w,).
+
+    Windows that say little take over what all say. None where all is noise.
+    """
+    mean = float(precision.mean())
+    usual = float(change.mean()) / max(mean, 1e-300)
+    if not usual > _ANSWER:
+        return None
+    own = (change + mean * usual) / (precision + mean)
+    return np.asarray(np.maximum(own, 0.3 * usual))
+
+
+def _mixing(instrument: Float64, f: Float64, y: Float64, weight: Float64) -> Float64:
+    """A (p, c) with which f @ A explains y: instrumental variables, so that noise in f does not make A too small.
+
+    instrument : (n, p) like f, without its noise.
+    """
+    weighted = instrument * weight[:, None]
     size = np.sqrt((f**2).mean(axis=0)) + 1e-300  # distances and angles are of different size
-    mixing = np.linalg.lstsq(root * f / size, root * y, rcond=1e-9)[0] / size[:, None]
-    return mixing, y - f @ mixing
+    normal = (weighted.T @ f) / np.outer(size, size)
+    right = (weighted.T @ y) / size[:, None]
+    mixing: Float64 = np.linalg.pinv(normal, rcond=1e-6) @ right / size[:, None]
+    return mixing
 
 
 def _variance(left: Float64, group: Int64) -> Float64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -26,8 +27,8 @@ EARTH_RATE_RAD_PER_S: Final = 7.292115e-5
 """WGS 84."""
 _GAP: Final = 5.0
 """Samples farther apart than so many usual intervals leave a gap between them."""
-_BESIDE_GAPS: Final = 8
-"""Knots beside a gap where splines are not trusted."""
+_REACH: Final = 4.0
+"""Beside gaps and ends, splines are not trusted over so many widths of the filter."""
 _SMOOTH_KNOTS: Final = 2.0
 _SMOOTH_S: Final = 0.01
 """Width (1 σ) of the filter that derivatives are taken behind."""
@@ -86,24 +87,27 @@ class Motion:
         """Usual time from knot to knot."""
         return float(np.median(np.diff(self.epochs_gps_ns))) / NS_PER_S
 
-    def at(self, since_s: Float64, *, total: bool) -> Float64:
-        """Rates or totals (n, p).
+    def at(self, since_s: Float64, *, total: bool) -> tuple[Float64, Float64]:
+        """Rates or totals, and their change a second, (n, p) each.
 
         Parameters
         ----------
         since_s : (n,) time since `origin_gps_ns` (s).
         """
-        return np.asarray(self._spline(since_s) if total else self._spline.derivative(1)(since_s))
+        order = 0 if total else 1
+        return np.asarray(self._spline(since_s, order)), np.asarray(self._spline(since_s, order + 1))
 
-    def change(self, since_s: Float64, *, total: bool) -> Float64:
-        """Smooth change a second (n, p) of rates or totals: it shows where a shift in time would tell.
+    def smooth(self, since_s: Float64, *, total: bool) -> tuple[Float64, Float64, Float64]:
+        """The same, and the change's own change, without what is mostly noise.
 
-        Unsmoothed, a derivative is mostly noise, and depends on how far a time lies from the next knot.
+        Errors of the knots are many times larger in what changes, and depend on how far a time lies from a knot.
         """
-        return np.asarray(self._smooth.derivative(1 if total else 2)(since_s))
+        order = 0 if total else 1
+        first, second, third = (np.asarray(self._smooth(since_s, order + k)) for k in range(3))
+        return first, second, third
 
     def known(self, since_s: Float64) -> Bool:
-        """(n,) False outside the knots, in gaps and beside them."""
+        """(n,) False outside the knots, in gaps, and beside both."""
         interval = np.searchsorted(self._knots_s, since_s, side="right") - 1
         inside = (interval >= 0) & (interval < self._sound.size)
         return inside & self._sound[np.clip(interval, 0, self._sound.size - 1)]
@@ -117,9 +121,15 @@ class Motion:
     def _sound(self) -> Bool:
         """(k − 1,) intervals whose splines are trusted."""
         sound = np.diff(self._knots_s) <= _GAP * self.interval_s
-        for at in np.flatnonzero(~sound):
-            sound[max(at - _BESIDE_GAPS, 0) : at + _BESIDE_GAPS + 1] = False
+        beside = math.ceil(_REACH * self._width_knots)
+        for at in (-1, *np.flatnonzero(~sound), sound.size):
+            sound[max(at - beside, 0) : at + beside + 1] = False
         return sound
+
+    @property
+    def _width_knots(self) -> float:
+        """1 σ of the filter."""
+        return max(_SMOOTH_KNOTS, _SMOOTH_S / self.interval_s)
 
     @cached_property
     def _spline(self) -> CubicSpline:
@@ -127,12 +137,10 @@ class Motion:
 
     @cached_property
     def _smooth(self) -> CubicSpline:
-        knots = max(_SMOOTH_KNOTS, _SMOOTH_S / self.interval_s)
-        first, last = self.totals[0], self.totals[-1]
-        # About the line through its ends: there the filter repeats the last value.
-        along = np.linspace(0.0, 1.0, self.totals.shape[0])[:, None]
-        level = first + (last - first) * along
-        return CubicSpline(self._knots_s, level + gaussian_filter1d(self.totals - level, knots, axis=0, mode="nearest"))
+        # Knots are smoothed with their times: they need not be even, and steady motion stays as it is.
+        both = np.column_stack([self._knots_s, self.totals])
+        smooth = gaussian_filter1d(both, self._width_knots, axis=0, mode="nearest")
+        return CubicSpline(smooth[:, 0], smooth[:, 1:])
 
 
 def felt_by_imu(imu: ImuReadings, finest_s: float) -> Felt:

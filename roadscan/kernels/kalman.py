@@ -69,6 +69,8 @@ class Layout(NamedTuple):
     """Time-correlated error of the GNSS position, north, east, down, in units of its σ (3)."""
     delay: int
     """How far the IMU's stamps are ahead of GNSS time (1, s)."""
+    lag: int
+    """How far the velocities of GNSS lag behind its positions (1, s)."""
 
 
 class Steps(NamedTuple):
@@ -100,6 +102,10 @@ class Nodes(NamedTuple):
     """(k,) non-holonomic constraint over the interval."""
     report: Int64
     """(k,) row of the reported states, −1 for none."""
+    rate_noise: Float64
+    """(k, 3) noise of the gyroscopes over the interval, IMU axes, rad²/s."""
+    force_noise: Float64
+    """(k, 3) noise of the accelerometers, m²/s³."""
 
 
 class Fixes(NamedTuple):
@@ -120,10 +126,6 @@ class Fixes(NamedTuple):
 class Model(NamedTuple):
     """Noise and geometry."""
 
-    gyro_density: float
-    """rad/√s."""
-    accel_density: float
-    """m/s/√s."""
     gyro_bias: float
     """σ, rad/s."""
     accel_bias: float
@@ -154,6 +156,8 @@ class Model(NamedTuple):
     """(4,) squared normalised innovation by component from which an update of 1, 2, 3 components counts less."""
     patience_s: float
     """After that long of positions that count less in a row they count in full again: then the filter errs."""
+    delay_wander: float
+    """How the IMU's clock wanders: random walk, s/√s."""
     interval_s: float
     """Length of interval that the σ of constraints hold for; their noise is white, so longer ones weigh more."""
 
@@ -248,8 +252,8 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
     values = start.values.copy()
     work = np.zeros((n, n))
     h, noise, y = np.zeros((3, n)), np.zeros((3, 3)), np.zeros(3)
-    level = np.zeros((3, 3))
-    body = np.zeros((3, 3))
+    level, body = np.zeros((3, 3)), np.zeros((3, 3))
+    turn_noise, push_noise = np.zeros((3, 3)), np.zeros((3, 3))
     sums = np.zeros((10, 3, 3))
     ways = np.zeros((6, 3))
     shift = np.zeros(n)
@@ -261,10 +265,12 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
     streak = 0.0
     last_good = 0.0
     now = 0.0
+    gained = (0.0, 0.0, 0.0)
     for k in range(nodes.bound.size):
         if k > 0:
             begin, end = nodes.bound[k - 1], nodes.bound[k]
             field = gravity_field(r[0], r[1], r[2])
+            before = v
             sums[:] = 0.0
             ways[:] = 0.0
             seconds = 0.0
@@ -287,9 +293,18 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
             for j in range(6):
                 values[j] *= keep
             record.keep[k] = keep
+            gained = ((v[0] - before[0]) / seconds, (v[1] - before[1]) / seconds, (v[2] - before[2]) / seconds)
             phi = record.transition[k]
             _transition(sums, ways, seconds, field, mixed, phi)
-            _predict(p, phi, work, keep, nodes.colour_keep[k], seconds, loose, model, layout)
+            c = matrix(q)
+            for i in range(3):
+                for j in range(3):
+                    turn_noise[i, j], push_noise[i, j] = 0.0, 0.0
+                    for m in range(3):
+                        both = c[3 * i + m] * c[3 * j + m] * seconds
+                        turn_noise[i, j] += both * nodes.rate_noise[k, m]
+                        push_noise[i, j] += both * nodes.force_noise[k, m]
+            _predict(p, phi, work, keep, nodes.colour_keep[k], seconds, loose, turn_noise, push_noise, model, layout)
             if layout.colour >= 0:
                 for j in range(3):
                     values[layout.colour - 9 + j] *= nodes.colour_keep[k]
@@ -324,7 +339,7 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
                 if k > 0:
                     at = nodes.bound[k]
                     rate = (track.rate[at, 0], track.rate[at, 1], track.rate[at, 2])
-                _gnss_velocity(fixes, g, v, rate, body, level, values, layout, model, ways, seconds, h, y, noise)
+                _gnss_velocity(fixes, g, v, gained, rate, body, level, values, layout, model, h, y, noise)
             elif kind == ODOMETER and k > 0 and not nodes.still[k] and not math.isnan(nodes.travel[k]):
                 size = 1
                 _travel(sums, ways, seconds, nodes.travel[k], values, layout, model, h, y, noise, 0)
@@ -342,7 +357,7 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
                     noise[i, i] = model.zero_sigma**2 * model.interval_s / seconds
             elif kind == ZERO_ROTATION and k > 0 and nodes.still[k]:
                 size = 3
-                _zero_rotation(ways, seconds, matrix(q), model, h, y, noise)
+                _zero_rotation(ways, seconds, matrix(q), nodes.rate_noise[k], model, h, y, noise)
             if size == 0:
                 continue
             trusting = kind == GNSS_POSITION and streak > model.patience_s
@@ -508,8 +523,8 @@ def _transition(sums, ways, seconds, field, mixed, phi):
 
 
 @kernel
-def _predict(p, phi, work, keep, colour_keep, seconds, loose, model, layout):
-    """P ← Φ P Φᵀ + Q."""
+def _predict(p, phi, work, keep, colour_keep, seconds, loose, turn_noise, push_noise, model, layout):
+    """P ← Φ P Φᵀ + Q, with the noise of attitude and velocity over the interval (3, 3), ECEF."""
     n, mixed = layout.size, layout.inertial
     colour = layout.colour
     for i in range(9):
@@ -538,26 +553,30 @@ def _predict(p, phi, work, keep, colour_keep, seconds, loose, model, layout):
             for j in range(9, n):
                 p[i, j] *= di
                 p[j, i] *= di
-    gyro, accel = model.gyro_density**2 * seconds, model.accel_density**2 * seconds
+    # Noise early in the interval reaches the states behind: integrals of white noise (Groves 2013, 14.2.6).
     for i in range(3):
-        p[ATTITUDE + i, ATTITUDE + i] += gyro + (model.loose_rate * loose) ** 2
-        p[VELOCITY + i, VELOCITY + i] += accel + (model.loose_force * loose) ** 2
-        # Noise early in the interval reaches the states behind: ∫ of white noise (Groves 2013, 14.2.6).
-        p[i, i] += accel * seconds * seconds / 3.0 + (model.loose_force * loose * loose) ** 2 / 4.0
-        p[i, VELOCITY + i] += 0.5 * accel * seconds
-        p[VELOCITY + i, i] += 0.5 * accel * seconds
+        p[ATTITUDE + i, ATTITUDE + i] += (model.loose_rate * loose) ** 2
+        p[VELOCITY + i, VELOCITY + i] += (model.loose_force * loose) ** 2
+        p[i, i] += (model.loose_force * loose * loose) ** 2 / 4.0
         for j in range(3):
-            cross = 0.5 * gyro * phi[VELOCITY + i, ATTITUDE + j]
-            p[VELOCITY + i, ATTITUDE + j] += cross
-            p[ATTITUDE + j, VELOCITY + i] += cross
-            total = 0.0
+            p[ATTITUDE + i, ATTITUDE + j] += turn_noise[i, j]
+            p[i, j] += push_noise[i, j] * seconds * seconds / 3.0
+            p[i, VELOCITY + j] += 0.5 * push_noise[i, j] * seconds
+            p[VELOCITY + j, i] += 0.5 * push_noise[i, j] * seconds
+            cross, total = 0.0, 0.0
             for m in range(3):
-                total += phi[VELOCITY + i, ATTITUDE + m] * phi[VELOCITY + j, ATTITUDE + m]
-            p[VELOCITY + i, VELOCITY + j] += gyro * total / 3.0
+                cross += phi[VELOCITY + i, ATTITUDE + m] * turn_noise[m, j]
+                for o in range(3):
+                    total += phi[VELOCITY + i, ATTITUDE + m] * turn_noise[m, o] * phi[VELOCITY + j, ATTITUDE + o]
+            p[VELOCITY + i, ATTITUDE + j] += 0.5 * cross
+            p[ATTITUDE + j, VELOCITY + i] += 0.5 * cross
+            p[VELOCITY + i, VELOCITY + j] += push_noise[i, j] + total / 3.0
         p[GYRO_BIAS + i, GYRO_BIAS + i] += model.gyro_bias**2 * (1.0 - keep * keep)
         p[ACCEL_BIAS + i, ACCEL_BIAS + i] += model.accel_bias**2 * (1.0 - keep * keep)
         if colour >= 0:
             p[colour + i, colour + i] += 1.0 - colour_keep * colour_keep
+    if layout.delay >= 0:
+        p[layout.delay, layout.delay] += model.delay_wander**2 * seconds
 
 
 @kernel
@@ -590,8 +609,8 @@ def _gnss_position(fixes, g, q, v, r, body, level, values, layout, h, y, noise):
 
 
 @kernel
-def _gnss_velocity(fixes, g, v, rate, body, level, values, layout, model, ways, seconds, h, y, noise):
-    """Antenna's velocity against the predicted one, ECEF; `rate` of the IMU in its own axes."""
+def _gnss_velocity(fixes, g, v, gained, rate, body, level, values, layout, model, h, y, noise):
+    """Antenna's velocity against the predicted one, ECEF; `rate` of the IMU in its own axes, `gained` acceleration."""
     h[:] = 0.0
     a = layout.antenna - 9
     b = model.body_from_imu
@@ -626,6 +645,12 @@ def _gnss_velocity(fixes, g, v, rate, body, level, values, layout, model, ways, 
                 total += level[i, m] * fixes.velocity_variance[g, m] * level[j, m]
             noise[i, j] = total
         y[i] = stated - v[i] - out[i]
+        if layout.delay >= 0:
+            h[i, layout.delay] = gained[i]
+            y[i] -= gained[i] * values[layout.delay - 9]
+        if layout.lag >= 0:
+            h[i, layout.lag] = -gained[i]
+            y[i] += gained[i] * values[layout.lag - 9]
 
 
 @kernel
@@ -688,7 +713,7 @@ def _travel(sums, ways, seconds, travel, values, layout, model, h, y, noise, wha
 
 
 @kernel
-def _zero_rotation(ways, seconds, c, model, h, y, noise):
+def _zero_rotation(ways, seconds, c, rate_noise, model, h, y, noise):
     """The body does not turn against the Earth: what the gyroscopes feel is the Earth's rate."""
     h[:] = 0.0
     noise[:] = 0.0
@@ -699,7 +724,7 @@ def _zero_rotation(ways, seconds, c, model, h, y, noise):
         # −Cᵀ[Ω×]ψ with Ω along z.
         h[i, ATTITUDE] = -c[3 + i] * rate
         h[i, ATTITUDE + 1] = c[i] * rate
-        noise[i, i] = model.zero_rate_sigma**2 * model.interval_s / seconds + model.gyro_density**2 / seconds
+        noise[i, i] = model.zero_rate_sigma**2 * model.interval_s / seconds + rate_noise[i] / seconds
 
 
 @kernel

@@ -27,6 +27,9 @@ class SmootherConfig(Strict):
     imu_samples: Literal["mean", "instant"] = "mean"
     """What a sample of the IMU is: the mean over the interval that ends at its stamp (IMUs that integrate), or the
     value at the stamp itself. The wrong one shifts the IMU by half a sample: 5 ms at 100 Hz."""
+    vibration_share: float = Field(default=0.1, ge=0.0, le=10.0)
+    """Share of the vibration at the upper end of the IMU's band that adds to its noise: aliases of what is above half its
+    rate, samples that are polled rather than timed (1)."""
     imu_clock_sigma_s: float = Field(default=0.0, ge=0.0, le=0.5)
     """1 σ of what remains of the IMU's clock error after its clock's correction: a constant delay against GNSS is
     estimated where this is above zero (s)."""
@@ -36,6 +39,11 @@ class SmootherConfig(Strict):
     max_imu_gap_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """A longer silence of the IMU ends the trajectory; it begins anew behind it (s)."""
 
+    gnss_velocity_lag_s: float = Field(default=0.0, ge=-1.0, le=1.0)
+    """How far the velocities of GNSS lag behind its positions: half an interval where they are means over the interval
+    that ends there (s)."""
+    gnss_velocity_lag_sigma_s: float = Field(default=0.0, ge=0.0, le=1.0)
+    """1 σ of that lag; it is estimated where this is above zero (s)."""
     gnss_sigma_factor: float = Field(default=1.0, gt=0.0, le=100.0)
     """Multiplies all σ that receivers state; they are often optimistic."""
     gnss_floor_horizontal_m: float = Field(default=0.005, ge=0.0)

@@ -1,9 +1,13 @@
-"""How far GNSS solutions are believed: by what the log states, and by their quality where it states nothing.
+"""How far readings are believed. GNSS: by what the log states, and by their quality where it states nothing.
 
 A position's error has a part that is new at each epoch and a part that changes slowly. Taken as new at each epoch, the
 slow part would let a standing receiver know its place to a millimetre after a minute. It is a state of the filter
 instead: a Gauss–Markov process of the stated σ (Bar-Shalom, Li and Kirubarajan 2001, section 8.2, "coloured measurement
 noise"). It starts anew when the quality of the solution changes.
+
+IMU: the noise of its data sheet, and a share of what it trembles at the upper end of its band. Vibration of engine and
+road lies largely above half the rate of the samples and folds back into what is integrated; where samples are polled
+their ages differ, which does the same. It depends on axis and time (standing, driving, surface), so it is measured.
 """
 
 from __future__ import annotations
@@ -13,10 +17,12 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import uniform_filter1d
 
 from roadscan.kernels.kalman import Fixes
+from roadscan.model.imu import ImuErrors
 from roadscan.model.smoothing import SmootherConfig
-from roadscan.navigation.inertial.readings import GnssSolutions
+from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings
 
 Float64 = npt.NDArray[np.float64]
 
@@ -85,3 +91,31 @@ def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
     return np.append(False, gnss.quality[1:] != gnss.quality[:-1])
 
 
+
+
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+_LEAST_DENSITY: Final = 1e-8
+"""Noise of a perfect IMU, rad/√s and m/s/√s: rounding."""
+_TREMBLING_S: Final = 1.0
+
+
+def imu_noise(
+    imu: ImuReadings, errors: ImuErrors, config: SmootherConfig, epochs: npt.NDArray[np.int64]
+) -> tuple[Float64, Float64]:
+    """Noise of gyroscopes (rad²/s) and accelerometers (m²/s³), (k, 3) in the IMU's axes, about epochs (k,)."""
+    gyro = max(float(np.radians(errors.gyro_noise_deg_per_sqrt_h)) / 60.0, _LEAST_DENSITY)
+    accel = max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY)
+    at = np.clip(np.searchsorted(imu.epochs_gps_ns, epochs), 0, imu.epochs_gps_ns.size - 1)
+    step = float(np.median(np.diff(imu.epochs_gps_ns))) * 1e-9
+    share = config.vibration_share**2 * step
+    return tuple(  # type: ignore[return-value]
+        density**2 + share * _trembling(vectors, round(_TREMBLING_S / step))[at]
+        for density, vectors in ((gyro, imu.angular_rate_rad_per_s), (accel, imu.specific_force_m_per_s2))
+    )
+
+
+def _trembling(vectors: Float64, size: int) -> Float64:
+    """Variance (n, 3) of white noise with these second differences, which pass only the upper half of the band."""
+    bend = np.zeros_like(vectors)
+    bend[1:-1] = vectors[1:-1] - 0.5 * (vectors[:-2] + vectors[2:])
+    return np.asarray(uniform_filter1d(bend**2, max(size, 1), axis=0) / 1.5)

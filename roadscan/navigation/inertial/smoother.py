@@ -58,8 +58,6 @@ _SHORTEST_PIECE_S: Final = 5.0
 _FINE_S: Final = 60.0
 """The first pass over the beginning goes on for this long behind the coarse alignment."""
 _UNKNOWN_AXLE_SIGMA_M: Final = (1.5, 0.5, 1.0)
-_LEAST_DENSITY: Final = 1e-8
-"""Noise of a perfect IMU, rad/√s and m/s/√s: rounding."""
 
 
 def solve(
@@ -155,7 +153,7 @@ def _solve_piece(
     layout = _layout(odometer, vehicle, config)
     model = _model(vehicle, config)
     start = _start(alignment, vehicle, config, layout, odometer)
-    whole = timeline(imu, gnss, odometer, still, config)
+    whole = timeline(imu, gnss, odometer, still, vehicle.imu_errors, config)
     start = _refined(start, alignment, whole, model, layout, vehicle)
     return _Run.of(whole, model, layout, start, smooth=smooth).solution(gnss.world, vehicle, config, smooth=smooth)
 
@@ -171,7 +169,8 @@ def _layout(odometer: OdometerReadings | None, vehicle: VehicleSensors, config: 
         "tilt": (2, config.land_vehicle or odometer is not None),
         "scale": (1, odometer is not None),
         "colour": (3, True),
-        "delay": (1, config.imu_clock_sigma_s > 0.0),
+        "lag": (1, config.gnss_velocity_lag_s != 0.0 or config.gnss_velocity_lag_sigma_s > 0.0),
+        "delay": (1, config.imu_clock_sigma_s > 0.0 or config.imu_clock_wander_ms_per_sqrt_s > 0.0),
     }
     for name, (width, needed) in wanted.items():
         columns[name] = size if needed else -1
@@ -182,8 +181,6 @@ def _layout(odometer: OdometerReadings | None, vehicle: VehicleSensors, config: 
 def _model(vehicle: VehicleSensors, config: SmootherConfig) -> Model:
     errors = vehicle.imu_errors
     return Model(
-        gyro_density=max(float(np.radians(errors.gyro_noise_deg_per_sqrt_h)) / 60.0, _LEAST_DENSITY),
-        accel_density=max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY),
         gyro_bias=_gyro_bias_sigma(vehicle),
         accel_bias=_accel_bias_sigma(vehicle),
         bias_seconds=errors.bias_time_constant_s,
@@ -199,6 +196,7 @@ def _model(vehicle: VehicleSensors, config: SmootherConfig) -> Model:
         loose_force=2.0,
         outlier=np.array([np.inf, *(chi2.ppf(1.0 - config.outlier_probability, c) / c for c in (1, 2, 3))]),
         patience_s=config.outlier_patience_s,
+        delay_wander=config.imu_clock_wander_ms_per_sqrt_s * 1e-3,
         interval_s=1.0 / config.constraints_per_s,
     )
 
@@ -238,6 +236,8 @@ def _start(
     sigma[layout.colour : layout.colour + 3] = 1.0
     if layout.delay >= 0:
         sigma[layout.delay] = config.imu_clock_sigma_s
+    if layout.lag >= 0:
+        values[layout.lag], sigma[layout.lag] = config.gnss_velocity_lag_s, config.gnss_velocity_lag_sigma_s
     covariance = np.diag(sigma**2)
     level = ecef_from_level(alignment.position_ecef_m[None])[0]
     tilts = np.diag([alignment.sigma_level_rad, alignment.sigma_level_rad, alignment.sigma_heading_rad]) ** 2
@@ -365,12 +365,9 @@ class _Run:
         """Poses at the IMU's epochs, states and innovations."""
         wanted = _thinned(self.timeline, config)
         poses = self.poses(wanted, vehicle)
-        late = 0
-        if self.layout.delay >= 0:
-            late = round(float(self.values[-1, self.layout.delay - NAVIGATION]) * 1e9)
         return Solution(
             world=world,
-            epochs_gps_ns=self.timeline.bounds[wanted] - late,
+            epochs_gps_ns=self._on_gnss_time(self.timeline.bounds[wanted]),
             position_world_m=poses.position,
             quaternion_world_from_body=poses.quaternion,
             velocity_ned_m_per_s=poses.velocity,
@@ -379,9 +376,18 @@ class _Run:
             covariance_velocity_ned=poses.covariance[:, 2],
             sigma_rph_rad=_sigma_rph(poses),
             states=self._states(vehicle),
-            state_epochs_gps_ns=self.timeline.reported - late,
+            state_epochs_gps_ns=self._on_gnss_time(self.timeline.reported),
             innovations=self._innovations(),
         )
+
+    def _on_gnss_time(self, epochs: Int64) -> Int64:
+        """Stamps of the IMU (ascending, ns) as GNSS time, by the delay that was found."""
+        if self.layout.delay < 0:
+            return epochs
+        known = self.timeline.reported
+        delay = self.values[:, self.layout.delay - NAVIGATION]
+        late = np.interp((epochs - known[0]).astype(np.float64), (known - known[0]).astype(np.float64), delay)
+        return np.asarray(epochs - np.rint(late * 1e9).astype(np.int64))
 
     def _states(self, vehicle: VehicleSensors) -> dict[str, tuple[Float64, Float64]]:
         layout = self.layout
@@ -396,6 +402,7 @@ class _Run:
             "odometer_scale": (layout.scale, 1),
             "gnss_slow_error_sigmas": (layout.colour, 3),
             "imu_delay_s": (layout.delay, 1),
+            "gnss_velocity_lag_s": (layout.lag, 1),
         }
         found = {}
         for name, (column, width) in columns.items():

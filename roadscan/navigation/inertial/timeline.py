@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from roadscan.kernels.inertial import increments
 from roadscan.kernels.kalman import Fixes, Nodes, Steps
+from roadscan.model.imu import ImuErrors
 from roadscan.model.smoothing import SmootherConfig
-from roadscan.navigation.inertial.noise import colour_restarts, fixes_of
+from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
 from roadscan.navigation.inertial.standing import odometer_distance
 
@@ -60,13 +61,19 @@ class Timeline:
 
 
 def timeline(
-    imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings | None, still: Bool, config: SmootherConfig
+    imu: ImuReadings,
+    gnss: GnssSolutions,
+    odometer: OdometerReadings | None,
+    still: Bool,
+    errors: ImuErrors,
+    config: SmootherConfig,
 ) -> Timeline:
     """Lay out the piece between the first and the last IMU sample.
 
     Parameters
     ----------
     imu : unbroken but for gaps up to `max_imu_gap_s`; gnss : usable solutions; still : (n,) standing samples.
+    errors : of the IMU.
     """
     epochs = imu.epochs_gps_ns
     gnss = _within(gnss, int(epochs[0]), int(epochs[-1]))
@@ -77,7 +84,7 @@ def timeline(
     return Timeline(
         bounds,
         _steps(imu, bounds, config),
-        _nodes(imu, gnss, odometer, still, config, node_epochs, bound),
+        _nodes(imu, gnss, odometer, still, errors, config, node_epochs, bound),
         fixes_of(gnss, config),
         np.searchsorted(bounds, epochs),
     )
@@ -133,6 +140,7 @@ def _nodes(
     gnss: GnssSolutions,
     odometer: OdometerReadings | None,
     still: Bool,
+    errors: ImuErrors,
     config: SmootherConfig,
     epochs: Int64,
     bound: Int64,
@@ -147,6 +155,7 @@ def _nodes(
     long_enough = np.append(False, np.diff(epochs) >= _SHORTEST_NS)
     stands = _whole(imu.epochs_gps_ns, still, epochs) & long_enough & config.land_vehicle
     travel = np.where(long_enough, _travel(odometer, epochs), np.nan)
+    rate_noise, force_noise = imu_noise(imu, errors, config, epochs)
     return Nodes(
         bound=bound,
         colour_keep=keep,
@@ -155,6 +164,8 @@ def _nodes(
         travel=travel,
         constrained=long_enough & ~stands & config.land_vehicle,
         report=_reports(epochs),
+        rate_noise=rate_noise,
+        force_noise=force_noise,
     )
 
 

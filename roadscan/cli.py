@@ -62,6 +62,12 @@ def ingest(survey_file: SurveyFile) -> None:
 
 
 @app.command()
+def navigate(survey_file: SurveyFile) -> None:
+    """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
+    _run(survey_file, _stages("navigate"), 0, None)
+
+
+@app.command()
 def footprints(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Which raw block touches which tile."""
     _run(survey_file, _stages("footprints"), workers, scheduler)
@@ -146,15 +152,14 @@ def sql(
     csv: Annotated[bool, typer.Option("--csv", help="Print comma-separated values.")] = False,
 ) -> None:
     """Ask the tables a question."""
-    from roadscan.jobs.ingest import plan_logs
+    from roadscan.jobs.navigate import known_keys
     from roadscan.model.survey import Survey
     from roadscan.tables.sql import query
     from roadscan.tables.store import Store
 
     loaded = Survey.load(survey_file)
     store = Store(loaded.store_url, loaded.config.id)
-    planned, _ = plan_logs(loaded, store)
-    result = query(store, statement, [log.key for log in planned])
+    result = query(store, statement, known_keys(loaded, store))
     if csv:
         import pyarrow.csv
 

@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from roadscan.jobs.centre_line import CentreLines
 from roadscan.jobs.clocks import load_clocks
 from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
-from roadscan.jobs.ingest import DATA_TABLES, survey_records
+from roadscan.jobs.ingest import DATA_TABLES
+from roadscan.jobs.navigate import NAVIGATION, records_with_trajectories
 from roadscan.jobs.readings import (
     CORRECTIONS,
     Ground,
@@ -74,7 +75,7 @@ class SurveyPlan:
 
 def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
     """Put together what the tables and the survey file say; reads no readings."""
-    records = tuple(survey_records(survey, store))
+    records = tuple(records_with_trajectories(survey, store))
     config = survey.config
     f = config.filters
     unlimited = float("inf")
@@ -157,11 +158,12 @@ def _mountings(nominal: Mounting, calibrated: Sequence[tuple[int, Mounting]]) ->
 
 def _trajectory(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
     own = [r for r in records if r.run == run and r.tables.get("trajectory")]
+    own = [r for r in own if r.sensor == NAVIGATION] or own  # what was computed stands in for what was logged
     worlds = {r.attributes["world_frame"] for r in own}
     if len(worlds) != 1:
         raise ConfigError(
             f"run '{run}' has " + ("no trajectory" if not worlds else "trajectories in different world frames"),
-            expected="one trajectory log, or several in one datum",
+            expected="one trajectory log, or several in one datum; or logs of GNSS and IMU with navigation.solve",
         )
     files = tuple(f for r in own for f in r.tables["trajectory"])
     return TrajectorySource(run, worlds.pop(), files)

@@ -7,9 +7,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.footprints import Footprints, index_footprints, load_footprints
 from roadscan.jobs.ingest import ingest
+from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_products, wanted_tile_products
 from roadscan.jobs.selection import Selection
@@ -59,6 +61,12 @@ def run_ingest(run: Run) -> None:
     ingest(run.survey, run.store, run.reporter.line)
 
 
+def run_navigate(run: Run) -> None:
+    """GNSS, IMU and odometer → trajectories; shared motion → clocks."""
+    navigate(run.survey, run.store, run.reporter.line)
+    estimate_clocks(run.survey, run.store, run.reporter.line)
+
+
 def run_footprints(run: Run) -> None:
     """Which raw block touches which tile."""
     plan = plan_survey(run.survey, run.store)
@@ -100,6 +108,7 @@ class Stage:
 
 STAGES: tuple[Stage, ...] = (
     Stage("ingest", "raw logs into tables", run_ingest),
+    Stage("navigate", "trajectories from GNSS, IMU and odometer, clocks from shared motion", run_navigate),
     Stage("footprints", "which raw block touches which tile", run_footprints),
     Stage("tiles", "readings into points, cells and tile files", run_tiles),
     Stage("products", "mosaics, pictures and tables over all tiles", run_products),

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from roadscan.jobs.compute import Inline
 from roadscan.jobs.footprints import PRODUCT, reading_fates
 from roadscan.jobs.ingest import plan_logs
+from roadscan.jobs.navigate import known_keys
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import plan_outputs
 from roadscan.jobs.stages import Run, plan_tile_work
@@ -83,7 +84,7 @@ def survey_status(survey: Survey, store: Store) -> Status:
                 "bytes": log.bytes,
             }
         )
-    keys = {log.key for log in planned}
+    keys = {*(log.key for log in planned), *known_keys(survey, store)}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in read_log_records(store) if r.key not in keys]
     manifest = Manifest(store)
     status.outputs = dict(Counter(r.product for r in manifest.all() if r.path and r.product != PRODUCT))

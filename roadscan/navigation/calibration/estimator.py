@@ -221,6 +221,9 @@ class _Adjustment:
 
     def _solve(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:
         """Gauss–Newton with the evidence at hand; a step that makes things worse is halved."""
+        if free is not None:
+            # Off directions that are held, which may well make things worse: no step of the descent does that.
+            z = np.concatenate([free @ (free.T @ z[: len(free)]), z[len(free) :]])
         system = self._linearised(z, reject=reject)
         for _ in range(self.settings.iterations_max):
             step = system.solution(free) - z
@@ -256,8 +259,10 @@ class _Adjustment:
         seen = seen.updated(system.information, self.unknowns)
         estimate = self.unknowns.estimate(z)
         before = self.unknowns.geometry(np.zeros_like(z))
-        root = self.unknowns.root[: self.unknowns.mounting_size, : self.unknowns.mounting_size]
-        covariance = root @ seen.covariance @ root.T
+        # Rotations that follow the boresight, not changes of the rotation vector.
+        size = self.unknowns.mounting_size
+        change = system.now.derivative[:size, :size]
+        covariance = change @ seen.covariance @ change.T
         keep = np.concatenate([MOUNTING * i + np.arange(6) for i in range(len(self.unknowns.priors))])
         spread = np.sqrt(np.diag(self.unknowns.root @ system.covariance @ self.unknowns.root.T))
         return Calibration(
@@ -318,6 +323,7 @@ class _System:
     """Normal equations at one place, whitened by the prior."""
 
     z: Float64
+    now: Geometry
     weighed: tuple[Weighed, ...]
     scales: Scales
     information: Float64
@@ -349,7 +355,7 @@ class _System:
         for kind, (own_information, own_slope) in by_kind.items():
             information += scales.gain(kind) * own_information
             slope += scales.gain(kind) * own_slope
-        return cls(z, weighed, scales, information, slope, reject)
+        return cls(z, now, weighed, scales, information, slope, reject)
 
     @cached_property
     def covariance(self) -> Float64:

@@ -74,7 +74,7 @@ def scales_of(found: Sequence[Observations], residuals: Sequence[Float64], setti
     """Spread of each kind from the median of its residuals, robust against half of them."""
     normed: dict[str, list[Float64]] = {}
     for one, residual in zip(found, residuals, strict=True):
-        normed.setdefault(one.kind, []).append(np.sum(residual**2, axis=1) / chi2.median(one.rows))
+        normed.setdefault(one.kind, []).append(np.sum(residual**2, axis=1) / _median(one.rows))
     spread = {}
     for kind, parts in normed.items():
         values = np.concatenate(parts)
@@ -140,4 +140,12 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
 @cache
 def _length(limit: float, rows: int) -> float:
     """Length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
-    return float(np.sqrt(chi2.isf(chi2.sf(limit**2, 1), rows)))
+    # Farther out probabilities have no number.
+    usual = min(limit, 30.0)
+    return float(np.sqrt(chi2.isf(chi2.sf(usual**2, 1), rows))) + limit - usual
+
+
+@cache
+def _median(rows: int) -> float:
+    """Median of the squared length of `rows` standard normal numbers."""
+    return float(chi2.median(rows))

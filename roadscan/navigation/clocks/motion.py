@@ -35,6 +35,8 @@ _LEAST_SAMPLES: Final = 20
 _LEAST_WINDOWS: Final = 3
 _POOR: Final = 30.0
 """Windows whose σ is so many times that of the better ones say nothing: no motion."""
+_SOME: Final = 0.1
+"""A shift that explains less of what was felt points nowhere."""
 _ROUNDS: Final = 25
 _LEARNING: Final = 2
 """Rounds after which the noise is known."""
@@ -296,7 +298,8 @@ def _mixing(instrument: Float64, f: Float64, y: Float64, weight: Float64) -> Flo
     instrument : (n, p) like f, without its noise.
     """
     weighted = instrument * weight[:, None]
-    size = np.sqrt((f**2).mean(axis=0)) + 1e-300  # distances and angles are of different size
+    size = np.sqrt((f**2).mean(axis=0))  # distances and angles are of different size
+    size = np.where(size > 0.0, size, 1.0)
     normal = (weighted.T @ f) / np.outer(size, size)
     right = (weighted.T @ y) / size[:, None]
     mixing: Float64 = np.linalg.pinv(normal, rcond=1e-6) @ right / size[:, None]
@@ -355,7 +358,7 @@ def _fit(felt: Felt, motion: Motion, lags: _Lags, line: Line) -> MotionFit:
 def _unclear(what: str, search_s: float, lag: Lag | None) -> NavigationError:
     if lag is None:
         return _too_little(what, f"no shift within ±{search_s:g} s brings enough of both recordings together")
-    if lag.at_edge:
+    if lag.at_edge and lag.explained > _SOME:
         return NavigationError(
             f"{what}: the best offset is the largest looked for ({lag.lag_s:+.2f} s)",
             expected=f"an offset within ±{search_s:g} s",

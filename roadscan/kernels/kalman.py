@@ -950,7 +950,9 @@ class Poses(NamedTuple):
     velocity: Float64
     """(e, 3) north-east-down."""
     covariance: Float64
-    """(e, 3, 3, 3) of position, attitude, velocity, north-east-down."""
+    """(3, e, 3, 3) of position, attitude, velocity, north-east-down."""
+    sigma_rph: Float64
+    """(e, 3) σ of roll, pitch, heading, rad."""
 
 
 @kernel
@@ -1001,11 +1003,12 @@ def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_im
         s0 = w1 * arm_imu[2] - w2 * arm_imu[1]
         s1 = w2 * arm_imu[0] - w0 * arm_imu[2]
         s2 = w0 * arm_imu[1] - w1 * arm_imu[0]
-        vel = np.zeros(3)
         for i in range(3):
             reach = c[3 * i] * arm_imu[0] + c[3 * i + 1] * arm_imu[1] + c[3 * i + 2] * arm_imu[2]
             poses.position[e, i] = track.position[b, i] + dx[i] + reach
-            vel[i] = track.velocity[b, i] + dx[3 + i] + c[3 * i] * s0 + c[3 * i + 1] * s1 + c[3 * i + 2] * s2
+        v0 = track.velocity[b, 0] + dx[3] + c[0] * s0 + c[1] * s1 + c[2] * s2
+        v1 = track.velocity[b, 1] + dx[4] + c[3] * s0 + c[4] * s1 + c[5] * s2
+        v2 = track.velocity[b, 2] + dx[5] + c[6] * s0 + c[7] * s1 + c[8] * s2
         if last != k:
             s_lat, c_lat, s_lon, c_lon, _ = geodetic(
                 track.position[b, 0], track.position[b, 1], track.position[b, 2]
@@ -1013,21 +1016,43 @@ def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_im
             level[0, 0], level[0, 1], level[0, 2] = -s_lat * c_lon, -s_lon, -c_lat * c_lon
             level[1, 0], level[1, 1], level[1, 2] = -s_lat * s_lon, c_lon, -c_lat * s_lon
             level[2, 0], level[2, 1], level[2, 2] = c_lat, 0.0, -s_lat
-            reach = np.zeros(3)
-            for i in range(3):
-                reach[i] = c[3 * i] * arm_imu[0] + c[3 * i + 1] * arm_imu[1] + c[3 * i + 2] * arm_imu[2]
-            _levelled(covariance[k], level, reach, levelled[0])
-            _levelled(covariance[min(k + 1, bound.size - 1)], level, reach, levelled[1])
+            arm = (
+                c[0] * arm_imu[0] + c[1] * arm_imu[1] + c[2] * arm_imu[2],
+                c[3] * arm_imu[0] + c[4] * arm_imu[1] + c[5] * arm_imu[2],
+                c[6] * arm_imu[0] + c[7] * arm_imu[1] + c[8] * arm_imu[2],
+            )
+            _levelled(covariance[k], level, arm, levelled[0])
+            _levelled(covariance[min(k + 1, bound.size - 1)], level, arm, levelled[1])
             last = k
         to_body = unit(product(q, back))
         for j in range(4):
             poses.quaternion[e, j] = to_body[j]
         for i in range(3):
-            poses.velocity[e, i] = level[0, i] * vel[0] + level[1, i] * vel[1] + level[2, i] * vel[2]
+            poses.velocity[e, i] = level[0, i] * v0 + level[1, i] * v1 + level[2, i] * v2
         for m in range(3):
             for i in range(3):
                 for j in range(3):
-                    poses.covariance[e, m, i, j] = (1.0 - u) * levelled[0, m, i, j] + u * levelled[1, m, i, j]
+                    poses.covariance[m, e, i, j] = (1.0 - u) * levelled[0, m, i, j] + u * levelled[1, m, i, j]
+        _note_sigma_rph(poses, e, matrix(to_body), level)
+
+
+@inlined
+def _note_sigma_rph(poses, e, c, level):
+    """σ of roll, pitch, heading from the covariance of a small rotation about north, east, down.
+
+    c : ECEF from body, row by row; level : ECEF from north-east-down.
+    """
+    north = level[0, 0] * c[0] + level[1, 0] * c[3] + level[2, 0] * c[6]
+    east = level[0, 1] * c[0] + level[1, 1] * c[3] + level[2, 1] * c[6]
+    down = level[0, 2] * c[0] + level[1, 2] * c[3] + level[2, 2] * c[6]
+    flat = max(math.hypot(north, east), 1e-9)
+    ch, sh, tan = north / flat, east / flat, -down / flat
+    nn, ee, ne = poses.covariance[1, e, 0, 0], poses.covariance[1, e, 1, 1], poses.covariance[1, e, 0, 1]
+    dd, nd, ed = poses.covariance[1, e, 2, 2], poses.covariance[1, e, 0, 2], poses.covariance[1, e, 1, 2]
+    along = ch * ch * nn + 2.0 * ch * sh * ne + sh * sh * ee
+    poses.sigma_rph[e, 0] = math.sqrt(max(along, 0.0)) / flat
+    poses.sigma_rph[e, 1] = math.sqrt(max(sh * sh * nn - 2.0 * ch * sh * ne + ch * ch * ee, 0.0))
+    poses.sigma_rph[e, 2] = math.sqrt(max(tan * tan * along + 2.0 * tan * (ch * nd + sh * ed) + dd, 0.0))
 
 
 @kernel

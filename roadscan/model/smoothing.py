@@ -27,7 +27,7 @@ class SmootherConfig(Strict):
     imu_samples: Literal["mean", "instant"] = "mean"
     """What a sample of the IMU is: the mean over the interval that ends at its stamp (IMUs that integrate), or the
     value at the stamp itself. The wrong one shifts the IMU by half a sample: 5 ms at 100 Hz."""
-    vibration_share: float = Field(default=0.1, ge=0.0, le=10.0)
+    vibration_share: float = Field(default=0.2, ge=0.0, le=10.0)
     """Share of the vibration at the upper end of the IMU's band that adds to its noise: aliases of what is above half its
     rate, samples that are polled rather than timed (1)."""
     imu_clock_sigma_s: float = Field(default=0.0, ge=0.0, le=0.5)

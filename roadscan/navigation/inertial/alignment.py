@@ -22,6 +22,7 @@ from roadscan.model.errors import NavigationError
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
+from roadscan.navigation.inertial.timeline import merged
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -143,7 +144,7 @@ class _Motion:
         epochs, position, velocity = epochs[keep], position[keep], velocity[keep]
         first_still = _first_run(still)
         bias = imu.angular_rate_rad_per_s[first_still].mean(axis=0) if first_still is not None else np.zeros(3)
-        bounds = np.unique(np.concatenate([imu.epochs_gps_ns, epochs]))
+        bounds = merged(imu.epochs_gps_ns, epochs)
         count = bounds.size - 1
         steps, turn, push = np.empty(count), np.empty((count, 3)), np.empty((count, 3))
         rate = imu.angular_rate_rad_per_s - bias

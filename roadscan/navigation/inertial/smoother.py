@@ -30,7 +30,7 @@ from roadscan.kernels.kalman import (
 )
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
-from roadscan.model.frames import quaternion_from_rotation, rotation_from_quaternion, rph_from_rotation
+from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.smoothing import SmootherConfig
 from roadscan.navigation.inertial.alignment import Alignment, align
 from roadscan.navigation.inertial.earth import ecef_from_level
@@ -344,7 +344,9 @@ class _Run:
     def poses(self, wanted: Int64, vehicle: VehicleSensors, *, at_imu: bool = False) -> Poses:
         """Poses of the reference point, or of the IMU in its own axes, at bounds (e,)."""
         count = wanted.size
-        poses = Poses(np.empty((count, 3)), np.empty((count, 4)), np.empty((count, 3)), np.empty((count, 3, 3, 3)))
+        poses = Poses(
+            *(np.empty(shape) for shape in ((count, 3), (count, 4), (count, 3), (3, count, 3, 3), (count, 3)))
+        )
         body_from_imu = np.eye(3) if at_imu else vehicle.body_from_imu
         arm = np.zeros(3) if at_imu else -vehicle.body_from_imu.T @ vehicle.imu_lever_arm_body_m
         spread(
@@ -371,10 +373,10 @@ class _Run:
             position_world_m=poses.position,
             quaternion_world_from_body=poses.quaternion,
             velocity_ned_m_per_s=poses.velocity,
-            covariance_position_ned_m2=poses.covariance[:, 0],
-            covariance_attitude_rad2=poses.covariance[:, 1],
-            covariance_velocity_ned=poses.covariance[:, 2],
-            sigma_rph_rad=_sigma_rph(poses),
+            covariance_position_ned_m2=poses.covariance[0],
+            covariance_attitude_rad2=poses.covariance[1],
+            covariance_velocity_ned=poses.covariance[2],
+            sigma_rph_rad=poses.sigma_rph,
             states=self._states(vehicle),
             state_epochs_gps_ns=self._on_gnss_time(self.timeline.reported),
             innovations=self._innovations(),
@@ -433,23 +435,6 @@ def _thinned(whole: Timeline, config: SmootherConfig) -> Int64:
     keep = np.diff(slots, prepend=slots[0] - 1) > 0
     keep[-1] = True
     return whole.samples[keep]
-
-
-def _sigma_rph(poses: Poses) -> Float64:
-    """1 σ of roll, pitch, heading (e, 3) from the covariance of a small rotation about north, east, down."""
-    level_from_body = np.swapaxes(ecef_from_level(poses.position), -1, -2) @ rotation_from_quaternion(poses.quaternion)
-    _, pitch, heading = rph_from_rotation(level_from_body)
-    ch, sh, cp, tp = np.cos(heading), np.sin(heading), np.cos(pitch), np.tan(pitch)
-    zero, one = np.zeros_like(ch), np.ones_like(ch)
-    rows = np.stack(
-        [
-            np.stack([ch / cp, sh / cp, zero], axis=-1),
-            np.stack([-sh, ch, zero], axis=-1),
-            np.stack([ch * tp, sh * tp, one], axis=-1),
-        ],
-        axis=-2,
-    )
-    return np.sqrt(np.einsum("nij,njk,nik->ni", rows, poses.covariance[:, 1], rows))
 
 
 def _joined(parts: list[Solution], notes: tuple[str, ...]) -> Solution:

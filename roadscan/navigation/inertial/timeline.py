@@ -77,9 +77,8 @@ def timeline(
     """
     epochs = imu.epochs_gps_ns
     gnss = _within(gnss, int(epochs[0]), int(epochs[-1]))
-    grid = _grid(epochs, config)
-    node_epochs = np.unique(np.concatenate([epochs[:1], epochs[-1:], grid, gnss.epochs_gps_ns]))
-    bounds = np.unique(np.concatenate([epochs, node_epochs]))
+    node_epochs = _filled(merged(epochs[[0, -1]], gnss.epochs_gps_ns), config)
+    bounds = merged(epochs, node_epochs)
     bound = np.searchsorted(bounds, node_epochs)
     return Timeline(
         bounds,
@@ -107,9 +106,21 @@ def chosen(gnss: GnssSolutions, rows: Bool) -> GnssSolutions:
     )
 
 
-def _grid(epochs: Int64, config: SmootherConfig) -> Int64:
-    step = round(1e9 / config.constraints_per_s)
-    return np.arange(-(-int(epochs[0]) // step) * step, int(epochs[-1]) + 1, step, dtype=np.int64)
+def merged(*epochs: Int64) -> Int64:
+    """Epochs of ascending lists in one, each once."""
+    together = np.sort(np.concatenate(epochs), kind="stable")
+    return together[np.diff(together, prepend=together[0] - 1) > 0]
+
+
+def _filled(epochs: Int64, config: SmootherConfig) -> Int64:
+    """Epochs with others between them, evenly, where they lie further apart than one and a half constraints."""
+    interval = 1e9 / config.constraints_per_s
+    gaps = np.diff(epochs)
+    parts = np.where(gaps > 1.5 * interval, np.ceil(gaps / interval), 1).astype(np.int64)
+    first = np.repeat(np.cumsum(parts) - parts, parts)
+    share = np.arange(parts.sum()) - first
+    between = np.repeat(epochs[:-1], parts) + share * np.repeat(gaps, parts) // np.repeat(parts, parts)
+    return np.append(between, epochs[-1:])
 
 
 def _steps(imu: ImuReadings, bounds: Int64, config: SmootherConfig) -> Steps:

@@ -101,6 +101,7 @@ def check_tipping(imu: ImuReadings, vehicle: VehicleSensors) -> None:
     if middles.size * STEP_S < _LEAST_S:
         return
     rate, force = imu_means(imu, middles, 2 * STEP_S, vehicle.body_from_imu)
+    rate, force = rate[np.isfinite(rate[:, 0])], force[np.isfinite(rate[:, 0])]
     size = round(_LEAST_S / STEP_S)
     tipped, moved = _detrended(np.cumsum(rate[:, :2], axis=0) * STEP_S, size), _detrended(force[:, 1::-1], size)
     angle, feels = np.sqrt((tipped**2).mean(axis=0)), np.sqrt((moved**2).mean(axis=0))

@@ -38,7 +38,6 @@ from roadscan.navigation.inertial.motion import (
 from roadscan.navigation.inertial.positions import check_frame, without_leaps
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.records import (
-    BRIDGED_S,
     Kept,
     Repair,
     gnss_in_order,
@@ -48,7 +47,7 @@ from roadscan.navigation.inertial.records import (
     runs,
 )
 
-__all__ = ["Prepared", "Repair", "parts", "prepared"]
+__all__ = ["Prepared", "Repair", "prepared"]
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -101,7 +100,7 @@ def prepared(
     TimeSystemError
         Clocks that step back, or do not agree with one another.
     NavigationError
-        Gaps, damaged, stuck and saturated sensors, logs of different drives.
+        Damaged, stuck and saturated sensors, logs of different drives.
     """
     samples, solutions = imu_in_order(imu), gnss_in_order(gnss)
     check_frame(solutions.log, solutions.records)
@@ -123,24 +122,6 @@ def prepared(
     if readings is None:
         return Prepared(samples.log, solutions.log, None, repairs)
     return Prepared(samples.log, solutions.log, readings.log, repairs + readings.repairs)
-
-
-def parts(imu: ImuReadings, longest_gap_s: float = BRIDGED_S) -> list[ImuReadings]:
-    """The pieces of a log between gaps that are too long to be filled, each to be smoothed on its own.
-
-    Samples are sorted first; pieces of a single sample are left out.
-    """
-    order = np.argsort(imu.epochs_gps_ns, kind="stable")
-    epochs = imu.epochs_gps_ns[order]
-    steps = np.diff(epochs)
-    usual = float(np.median(steps)) if steps.size else 0.0
-    cuts = np.flatnonzero(steps > max(longest_gap_s * NS_PER_S, 3.5 * usual)) + 1
-    pieces = np.split(order, cuts)
-    return [
-        ImuReadings(imu.epochs_gps_ns[p], imu.angular_rate_rad_per_s[p], imu.specific_force_m_per_s2[p])
-        for p in pieces
-        if p.size > 1
-    ]
 
 
 def _overlap(name: str, epochs: Int64, others: Int64) -> tuple[int, int]:

@@ -32,6 +32,7 @@ SLOWEST_M_PER_S: Final = 2.0
 """Below this speed (and below twenty times its noise) a course says little."""
 _SPIKE_M_PER_S: Final = 0.5
 _USUAL_M_PER_S2: Final = 4.0
+_GAP_S: Final = 0.25
 _LEAST_WINDOW_S: Final = 1.0
 
 
@@ -148,8 +149,15 @@ def windows_of(track: Track, span_gps_ns: tuple[int, int]) -> Windows:
 
 
 def imu_means(imu: ImuReadings, middles: Int64, window_s: float, body_from_imu: Float64) -> tuple[Float64, Float64]:
-    """Mean angular rate and specific force (n, 3) over windows, body axes; NaN where the log does not reach."""
+    """Mean angular rate and specific force (n, 3) over windows, body axes; NaN where the log does not reach or
+    has a gap.
+    """
     half = round(window_s * NS_PER_S / 2)
+    steps = np.diff(imu.epochs_gps_ns)
+    lost = np.concatenate([[0], np.cumsum(steps > max(_GAP_S * NS_PER_S, 3.5 * np.median(steps)))])
+    first, last = (np.searchsorted(imu.epochs_gps_ns, middles + shift) for shift in (-half, half))
+    inside = (first > 0) & (last < imu.epochs_gps_ns.size)
+    unknown = ~inside | (lost[np.maximum(first - 1, 0)] != lost[np.minimum(last, lost.size - 1)])
     out = []
     for values in (imu.angular_rate_rad_per_s, imu.specific_force_m_per_s2):
         seconds = np.diff(imu.epochs_gps_ns) / NS_PER_S
@@ -157,8 +165,7 @@ def imu_means(imu: ImuReadings, middles: Int64, window_s: float, body_from_imu: 
         mean = (
             _at(imu.epochs_gps_ns, total, middles + half) - _at(imu.epochs_gps_ns, total, middles - half)
         ) / window_s
-        beyond = (middles - half < imu.epochs_gps_ns[0]) | (middles + half > imu.epochs_gps_ns[-1])
-        out.append(np.where(beyond[:, None], np.nan, mean @ body_from_imu.T))
+        out.append(np.where(unknown[:, None], np.nan, mean @ body_from_imu.T))
     return out[0], out[1]
 
 

@@ -19,10 +19,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-BRIDGED_S: Final = 0.25
-"""A gap between IMU samples up to this (and up to three samples) is filled by a straight line."""
-BRIDGED_SHARE: Final = 0.05
-"""Greatest share of an IMU log's time that may be filled."""
+LOST_SHARE: Final = 0.05
+"""Greatest share of samples that an IMU log may lack in gaps up to `SHORT_GAP_S`."""
+SHORT_GAP_S: Final = 1.0
+"""A longer gap is a pause."""
 DAMAGED_SHARE: Final = 0.05
 """Greatest share of a log's records that may be left out for what they hold."""
 CONFLICT_SHARE: Final = 0.01
@@ -66,7 +66,7 @@ class Kept(Generic[Log]):
 
     log: Log
     records: Int64
-    """(n,) where each of its rows stood as they arrived; −1: filled in."""
+    """(n,) where each of its rows stood as they arrived."""
     repairs: list[Repair]
 
 
@@ -78,12 +78,12 @@ def listed(records: Int64, epochs_gps_ns: Int64) -> str:
 
 
 def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
-    """Samples sorted, each epoch once, without gaps.
+    """Samples sorted, each epoch once, all of them numbers; gaps are named, and stay.
 
     Raises
     ------
     NavigationError
-        where samples are missing or no numbers for longer than can be filled, or saturated.
+        where many samples are missing, are no numbers, or are saturated.
     TimeSystemError
         where the clock stepped back.
     """
@@ -97,9 +97,8 @@ def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
         raise NavigationError(f"the IMU log has {rows.size} usable samples", expected="at least two")
     epochs, values = imu.epochs_gps_ns[rows], values[rows]
     repairs += _saturation(epochs, values, rows)
-    epochs, values, rows, bridges = _bridged(epochs, values, rows)
     log = ImuReadings(epochs, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]))
-    return Kept(log, rows, repairs + bridges)
+    return Kept(log, rows, repairs + _gaps(epochs, rows))
 
 
 def gnss_in_order(gnss: GnssSolutions) -> Kept[GnssSolutions]:
@@ -243,46 +242,31 @@ def _left_out(sensor: str, what: str, rows: Int64, epochs: Int64, of: int) -> Re
     return Repair(sensor, f"hold {what} and were left out", rows, epochs[rows])
 
 
-def _bridged(epochs: Int64, values: Float64, rows: Int64) -> tuple[Int64, Float64, Int64, list[Repair]]:
-    """Samples with straight lines over short gaps."""
+def _gaps(epochs: Int64, rows: Int64) -> list[Repair]:
+    """What an IMU log lacks: the smoother crosses short gaps with a wider σ, and divides the run at long ones."""
     steps = np.diff(epochs)
     usual = float(np.median(steps))
-    gaps = np.flatnonzero(steps > 1.5 * usual)
-    longest_ns = max(BRIDGED_S * NS_PER_S, 3.5 * usual)
-    long = gaps[steps[gaps] > longest_ns]
-    if long.size:
-        at, gap_s = long[0], steps[long] / NS_PER_S
-        raise NavigationError(
-            f"the IMU log has {long.size} gaps of more than {longest_ns / NS_PER_S:.2f} s, the longest "
-            f"{gap_s.max():.2f} s; the first, of {gap_s[0]:.2f} s, follows "
-            f"{listed(rows[at : at + 1], epochs[at : at + 1])}",
-            expected=f"a sample each {usual / 1e6:.2f} ms",
-            change="cut the run into parts at these gaps (roadscan.navigation.inertial.checks.parts)",
-            record=int(rows[at]),
-        )
+    gaps = np.flatnonzero(steps > 2.5 * usual)
     if gaps.size == 0:
-        return epochs, values, rows, []
-    counts = np.rint(steps[gaps] / usual).astype(np.int64) - 1
-    _check_share(counts, epochs, rows, gaps)
-    missing = np.repeat(gaps, counts)
-    part = (np.arange(missing.size) - np.repeat(np.cumsum(counts) - counts, counts) + 1) / np.repeat(counts + 1, counts)
-    new_epochs = epochs[missing] + np.rint(part * steps[missing]).astype(np.int64)
-    new_values = values[missing] + part[:, None] * (values[missing + 1] - values[missing])
-    what = f"are followed by a gap; {missing.size} samples, {counts.max()} at most in one gap, were filled in"
-    return (
-        np.insert(epochs, missing + 1, new_epochs),
-        np.insert(values, missing + 1, new_values, axis=0),
-        np.insert(rows, missing + 1, -1),
-        [Repair("IMU", what, rows[gaps], epochs[gaps])],
+        return []
+    _check_share(np.rint(steps[gaps] / usual).astype(np.int64) - 1, epochs, rows, gaps)
+    longest_s = float(steps[gaps].max()) / NS_PER_S
+    what = (
+        f"are followed by gaps of up to {longest_s:.3f} s; nothing was filled in: short gaps widen σ, longer ones than "
+        "navigation.smoother.max_imu_gap_s divide the trajectory"
     )
+    return [Repair("IMU", what, rows[gaps], epochs[gaps])]
 
 
 def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None:
-    if counts.sum() > max(FEWEST_SPOILT, BRIDGED_SHARE * epochs.size):
+    """Refuse a log that loses samples all the time; a pause is one gap, whatever its length."""
+    short = counts * float(np.median(np.diff(epochs))) < SHORT_GAP_S * NS_PER_S
+    counts, gaps = counts[short], gaps[short]
+    if counts.sum() > max(FEWEST_SPOILT, LOST_SHARE * epochs.size):
         raise NavigationError(
             f"{counts.sum()} samples are missing from an IMU log of {epochs.size}, in {gaps.size} gaps; the first "
             f"follows {listed(rows[gaps[:1]], epochs[gaps[:1]])}",
-            expected=f"at most {BRIDGED_SHARE:.0%} missing samples",
+            expected=f"at most {LOST_SHARE:.0%} missing samples",
             change="check what recorded the log: it loses samples",
             record=int(rows[gaps[0]]),
         )

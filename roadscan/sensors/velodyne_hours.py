@@ -1,8 +1,8 @@
 """Which hour Velodyne stamps belong to: data packets count microseconds past a UTC hour that they do not name.
 
 The first hour comes from a GPRMC sentence or from the survey file. From there on stamps are counted over
-the ends of hours, whether they start again at 3,600 s or a little later. A gap of half an hour or more
-cannot be counted and is refused.
+the ends of hours, whether they start again at 3,600 s or a little later (at 3,601 s with a leap second). A gap of
+half an hour or more cannot be counted and is refused.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.errors import ConfigError, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem
+from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.pcap import Datagram
 from roadscan.sensors.velodyne_packets import LATEST_STAMP_US
@@ -217,6 +217,13 @@ def iso(unix_s: float) -> str:
     return dt.datetime.fromtimestamp(unix_s, dt.UTC).isoformat().replace("+00:00", "Z")
 
 
+def _early_leaps_ns(first_hour_unix_s: int, stamps_us: Int64, unrolled_us: Int64) -> Int64:
+    """Leap seconds (ns, (n,)) that POSIX time counts too early: an hour that ends with one goes on to 3,601 s."""
+    hours_s = first_hour_unix_s + (unrolled_us - stamps_us) // 1_000_000
+    within = leap_seconds_at_unix(first_hour_unix_s + unrolled_us // 1_000_000) - leap_seconds_at_unix(hours_s)
+    return within * NS_PER_S
+
+
 @dataclass
 class Hours:
     """Brings the stamps of a capture to GPS time, chunk by chunk."""
@@ -240,7 +247,9 @@ class Hours:
         unrolled = unroll(stamps_us, self.previous_us)
         self.previous_us = int(unrolled[-1])
         self._watch_for_gap(unrolled, capture_ns)
-        return self._clock.to_epoch_gps_ns((self.first_hour_unix_s or 0) * NS_PER_S + unrolled * 1000)
+        first_s = self.first_hour_unix_s or 0
+        epochs = self._clock.to_epoch_gps_ns(first_s * NS_PER_S + unrolled * 1000)
+        return epochs if self.first_hour_unix_s is None else epochs - _early_leaps_ns(first_s, stamps_us, unrolled)
 
     def check(self, packet: Datagram) -> None:
         """Compare the hour with a position packet's sentence, if it has a valid one."""

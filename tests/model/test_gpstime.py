@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.errors import TimeSystemError
+from roadscan.model.errors import ConfigError, TimeSystemError
 from roadscan.model.gpstime import (
     NS_PER_S,
     WEEK_S,
@@ -23,6 +23,7 @@ from roadscan.model.gpstime import (
     unroll_week,
     utc_from_gps_ns,
 )
+from roadscan.model.survey import ClockConfig
 
 # (GPS seconds, UTC). The gravitational-wave catalogue GWTC-1 prints both scales for its events;
 # GPS 1e9 and the leap second of 2017 are in the IGS and LIGO time tables.
@@ -45,30 +46,93 @@ def test_published_instants(gps_s: float, utc: str) -> None:
     assert dt.datetime.fromisoformat(iso_from_gps_ns(epoch)) == moment
 
 
-# GPS − UTC from a day on: TAI − UTC as IERS Bulletin C announces it, minus 19 s.
-@pytest.mark.parametrize(
-    ("day", "seconds"),
-    [
-        ("1980-01-06", 0),
-        ("1981-06-30", 0),
-        ("1981-07-01", 1),
-        ("1990-01-01", 6),
-        ("1999-01-01", 13),
-        ("2005-12-31", 13),
-        ("2006-01-01", 14),
-        ("2009-01-01", 15),
-        ("2012-07-01", 16),
-        ("2015-06-30", 16),
-        ("2015-07-01", 17),
-        ("2016-12-31", 17),
-        ("2017-01-01", 18),
-        ("2026-05-04", 18),
-    ],
-)
-def test_leap_seconds(day: str, seconds: int) -> None:
-    moment = dt.datetime.fromisoformat(day).replace(tzinfo=dt.UTC)
-    assert leap_seconds_at_unix(moment.timestamp()) == seconds
-    assert leap_seconds_at_gps(gps_ns_from_utc(moment) // NS_PER_S) == seconds
+# Every leap second since 1972 as the IERS announced it: the UTC day that had a 61st second in its last minute, and
+# TAI − UTC from the next day on (IERS Bulletin C 1 to 70; bulletin C 52 for 2016-12-31). Those of 1972 to 1979 stand
+# before GPS time and must not count.
+IERS = [
+    ("1972-06-30", 11), ("1972-12-31", 12), ("1973-12-31", 13), ("1974-12-31", 14), ("1975-12-31", 15),
+    ("1976-12-31", 16), ("1977-12-31", 17), ("1978-12-31", 18), ("1979-12-31", 19), ("1981-06-30", 20),
+    ("1982-06-30", 21), ("1983-06-30", 22), ("1985-06-30", 23), ("1987-12-31", 24), ("1989-12-31", 25),
+    ("1990-12-31", 26), ("1992-06-30", 27), ("1993-06-30", 28), ("1994-06-30", 29), ("1995-12-31", 30),
+    ("1997-06-30", 31), ("1998-12-31", 32), ("2005-12-31", 33), ("2008-12-31", 34), ("2012-06-30", 35),
+    ("2015-06-30", 36), ("2016-12-31", 37),
+]  # fmt: skip
+SINCE_GPS = [(dt.date.fromisoformat(day), tai - 19) for day, tai in IERS if day >= "1980-01-06"]
+
+
+def gps_second(moment: dt.datetime, gps_minus_utc: int) -> int:
+    """GPS seconds by counting days since 1980-01-06 and adding GPS − UTC: no table of roadscan takes part."""
+    since = moment - dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
+    return since.days * 86_400 + since.seconds + gps_minus_utc
+
+
+def test_there_are_eighteen_leap_seconds_of_gps_time() -> None:
+    assert len(SINCE_GPS) == 18
+    assert [after for _, after in SINCE_GPS] == list(range(1, 19))
+    assert leap_seconds_at_unix(0) == leap_seconds_at_gps(0) == 0
+    late = dt.datetime(2026, 12, 31, tzinfo=dt.UTC)
+    assert leap_seconds_at_unix(late.timestamp()) == 18
+
+
+@pytest.mark.parametrize(("day", "after"), SINCE_GPS)
+def test_every_leap_second(day: dt.date, after: int) -> None:
+    """The second before, the second itself (23:59:60), and the second after; both ways, and through a log's clock."""
+    midnight = dt.datetime(day.year, day.month, day.day, tzinfo=dt.UTC) + dt.timedelta(days=1)
+    last = midnight - dt.timedelta(seconds=1)  # 23:59:59
+    before_gps, next_gps = gps_second(last, after - 1), gps_second(midnight, after)
+    assert next_gps - before_gps == 2  # 23:59:60 lies between
+    assert gps_ns_from_utc(last) == before_gps * NS_PER_S
+    assert gps_ns_from_utc(midnight) == next_gps * NS_PER_S
+    assert utc_from_gps_ns(before_gps * NS_PER_S) == last
+    assert utc_from_gps_ns(next_gps * NS_PER_S) == midnight
+    unix = int(midnight.timestamp())
+    assert leap_seconds_at_unix([unix - 1, unix, unix + 1]).tolist() == [after - 1, after, after]
+    # GPS − UTC steps when 23:59:60 begins plus one: in it, GPS time is already one second on, UTC has not yet stepped.
+    assert leap_seconds_at_gps([before_gps, before_gps + 1, next_gps]).tolist() == [after - 1, after - 1, after]
+    stamps = np.array([unix - 1, unix], dtype=np.int64)
+    epochs = Clock(TimeSystem.UNIX_UTC).to_epoch_gps_ns(stamps)
+    assert epochs.tolist() == [before_gps * NS_PER_S, next_gps * NS_PER_S]
+    tai = Clock(TimeSystem.UNIX_TAI).to_epoch_gps_ns(stamps + 19 + np.array([after - 1, after]))
+    assert tai.tolist() == epochs.tolist()
+
+
+@pytest.mark.parametrize("day", [d.isoformat() for d, _ in SINCE_GPS])
+def test_days_without_a_leap_second_have_86400(day: str) -> None:
+    """The half-years beside each announced one: June and December were always candidates."""
+    announced = {d for d, _ in SINCE_GPS}
+    year = int(day[:4])
+    for date in (dt.date(year, 6, 30), dt.date(year, 12, 31)):
+        noon = dt.datetime(date.year, date.month, date.day, 12, tzinfo=dt.UTC)
+        day_s = (gps_ns_from_utc(noon + dt.timedelta(days=1)) - gps_ns_from_utc(noon)) // NS_PER_S
+        assert day_s == (86_401 if date in announced else 86_400)
+
+
+def test_23_59_60_of_posix_time_is_the_second_after() -> None:
+    """POSIX has no 61st second: a stamp that repeats 00:00:00 is read as that, never as an hour or week off."""
+    unix = int(dt.datetime(2017, 1, 1, tzinfo=dt.UTC).timestamp())
+    epochs = Clock(TimeSystem.UNIX_UTC).to_epoch_gps_ns(np.array([unix - 1, unix, unix + 1], dtype=np.int64))
+    assert (np.diff(epochs) // NS_PER_S).tolist() == [2, 1]
+
+
+@pytest.mark.parametrize("week", [0, 357, 1023])
+def test_a_week_modulo_1024_is_refused_and_the_date_resolves_it(week: int) -> None:
+    """A receiver shows the ten bits of the signal (IS-GPS-200): 357 for 2405, the week from 2026-02-08."""
+    stated = {"system": "gps_week_seconds", "week": week}
+    with pytest.raises(
+        ConfigError, match=rf"week {week} began on .*modulo 1024 means {week + 1024} .* or {week + 2048} "
+    ):
+        ClockConfig.parse(stated)
+    date = dt.date(1980, 1, 6) + dt.timedelta(weeks=week + 2048, days=3)
+    by_date = ClockConfig.parse({"system": "gps_week_seconds", "date": date}).clock()
+    full = ClockConfig.parse({"system": "gps_week_seconds", "week": week + 2048}).clock()
+    stamps = np.array([0.0, 3.5 * 86_400])
+    assert by_date.to_epoch_gps_ns(stamps).tolist() == full.to_epoch_gps_ns(stamps).tolist()
+    assert full.to_epoch_gps_ns(stamps)[0] == (week + 2048) * WEEK_S * NS_PER_S
+
+
+def test_a_log_that_is_really_of_the_nineties_states_its_date() -> None:
+    clock = ClockConfig.parse({"system": "gps_week_seconds", "date": dt.date(1999, 8, 20)}).clock()
+    assert clock.to_epoch_gps_ns(np.array([0.0]))[0] == 1023 * WEEK_S * NS_PER_S
 
 
 # Weeks 1024 and 2048 began when the broadcast ten-bit week number rolled over.

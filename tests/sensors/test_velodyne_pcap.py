@@ -325,6 +325,56 @@ def test_over_midnight(tmp_path: Path) -> None:
     assert log.epochs[-1] - log.epochs[0] == pytest.approx(1999 * 552_960 + 11 * 46_080 + 31 * 1_152, abs=1000)
 
 
+def test_over_the_end_of_a_gps_week(tmp_path: Path) -> None:
+    """Week 2418 begins on Saturday 2026-05-09 at 23:59:42 UTC, 18 s before the hour, the day and the UTC week end."""
+    hour = dt.datetime(2026, 5, 9, 23, tzinfo=dt.UTC)
+    packets: Packets = []
+    for k in range(400):  # 20 s, a packet in 50 ms
+        total_us = 3_600_000_000 - 19_000_000 + k * 50_000
+        packets.append((posix_ns(hour) + total_us * 1000, frame(data_packet(total_us % 3_600_000_000, turning(0)))))
+    path = capture(tmp_path / "a.pcap", packets)
+    log = read("velodyne_pcap", path, {"hour": 23}, clock=Clock(TimeSystem.UTC_HOUR, date=hour.date()))
+    week = 2418 * 604_800 * 10**9
+    first = log.epochs.reshape(-1, 384)[:, 0]
+    assert first[0] == week - 10**9  # a second before it
+    assert (np.diff(first) == 50_000_000).all()  # nothing at either end
+    assert week in first
+    assert first[-1] > week + 18 * 10**9  # and on over midnight
+    # The same seconds of the week as an SBET beside it would state them, in week 2418.
+    trajectory = Clock(TimeSystem.GPS_WEEK, week=2418).to_epoch_gps_ns(np.array([0.0, 18.0]))
+    assert trajectory.tolist() == [week, gps_ns(dt.datetime(2026, 5, 10))]
+
+
+def test_over_several_hours(tmp_path: Path) -> None:
+    """A packet in ten minutes for 30 hours: hours, a midnight and no drift of the count."""
+    packets: Packets = []
+    for k in range(181):
+        total_us = 90_000_000 + k * 600_000_000
+        packets.append((posix_ns(HOUR_9) + total_us * 1000, frame(data_packet(total_us % 3_600_000_000, turning(0)))))
+    log = read("velodyne_pcap", capture(tmp_path / "a.pcap", packets), {"hour": 9}, clock=CLOCK)
+    expected = HOUR_9_GPS + (90 + 600 * np.arange(181)) * 10**9
+    assert np.array_equal(log.epochs[::384], expected)
+
+
+@pytest.mark.parametrize("day", [dt.date(2015, 6, 30), dt.date(2016, 12, 31)])
+def test_over_a_leap_second(tmp_path: Path, day: dt.date) -> None:
+    """The last hour of such a day has 3,601 s; the receiver's 23:59:60 is stamped 3,600 s and more."""
+    hour = dt.datetime(day.year, day.month, day.day, 23, tzinfo=dt.UTC)
+    packets: Packets = []
+    for k in range(45):  # from 23:59:57.5 on, ten a second
+        total_us = 3_597_500_000 + k * 100_000
+        stamp_us = total_us if total_us < 3_601_000_000 else total_us - 3_601_000_000
+        packets.append((posix_ns(hour) + total_us * 1000, frame(data_packet(stamp_us, turning(0)))))
+    path = capture(tmp_path / "a.pcap", packets)
+    log = read("velodyne_pcap", path, {"hour": 23}, clock=Clock(TimeSystem.UTC_HOUR, date=day))
+    before = 16 if day.year == 2015 else 17  # GPS − UTC that day (IERS Bulletin C)
+    start = gps_ns(hour) - 18 * 10**9 + before * 10**9
+    assert np.array_equal(log.epochs[::384], start + (3_597_500_000 + 100_000 * np.arange(45)) * 1000)
+    # Midnight is one second later on the GPS scale than 86,400 s after the midnight before.
+    midnight = gps_ns(dt.datetime(day.year, day.month, day.day) + dt.timedelta(days=1)) - (17 - before) * 10**9
+    assert log.epochs[35 * 384] == midnight
+
+
 def test_the_captures_clock_only_when_told(tmp_path: Path) -> None:
     path = capture(tmp_path / "a.pcap", drive(3))
     log = read("velodyne_pcap", path, {"hour": "capture"})

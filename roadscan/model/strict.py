@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Final, Self, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -76,11 +76,23 @@ def _describe(model: type[BaseModel], fault: Any) -> str:
         return f"unknown key '{where}'{nearest(key, known)}, expected one of: {', '.join(sorted(known))}"
     if fault["type"] == "missing":
         return f"key '{where}' is missing"
+    if fault["type"] in {"union_tag_not_found", "union_tag_invalid"}:
+        return _untold(where, fault["ctx"])
     message = str(fault["msg"]).removeprefix("Value error, ")
     if not where:
         return message
     given = "" if isinstance(fault["input"], dict | list | BaseModel) else f" (got {fault['input']!r})"
     return f"'{where}'{given}: {message}"
+
+
+def _untold(where: str, context: dict[str, str]) -> str:
+    """Which of several tables is meant is not said by its key, or by a word that is none of theirs."""
+    key = context["discriminator"].strip("'")
+    if "tag" not in context:
+        return f"key '{where}.{key}' is missing"
+    known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+    tag = context["tag"]
+    return f"'{where}.{key}' (got '{tag}'): unknown{nearest(tag, known)}, expected one of: {', '.join(known)}"
 
 
 def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
@@ -91,7 +103,7 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str,
     for part in location:
         annotation, choices = _without_none(annotation)
         if choices:  # pydantic names the member of a union, which the file does not
-            annotation = next((c for c in choices if getattr(c, "__name__", "") == part), None)
+            annotation = next((c for c in choices if _is_called(c, part)), None)
             continue
         names.append(str(part))
         holder = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
@@ -105,8 +117,18 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str,
     return ".".join(names), holder
 
 
+def _is_called(member: Any, name: int | str) -> bool:
+    """Whether pydantic calls a member of a union so: by its class, or by the word that tells the members apart."""
+    if getattr(member, "__name__", "") == name:
+        return True
+    fields = getattr(member, "model_fields", {}).values()
+    return any(get_origin(f.annotation) is Literal and get_args(f.annotation) == (name,) for f in fields)
+
+
 def _without_none(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
     """The annotation without `None`, and its members where it is still a union."""
+    if get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
     if get_origin(annotation) not in {Union, UnionType}:
         return annotation, ()
     members = tuple(a for a in get_args(annotation) if a is not NoneType)

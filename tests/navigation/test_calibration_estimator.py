@@ -18,7 +18,9 @@ from roadscan.model.rig import Mounting, Sensor
 from roadscan.navigation.calibration.estimator import Estimate, ObjectPose, Prior, calibrate
 from roadscan.navigation.calibration.evidence import Directions, Known, Orientation, Seen, Ties, Traverse
 from roadscan.navigation.calibration.observations import observations
+from roadscan.navigation.calibration.report import mounting_rows, report
 from roadscan.navigation.calibration.unknowns import Geometry, Unknowns
+from roadscan.tables.schema import table_schema
 
 compiled = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="many ties")
 
@@ -396,7 +398,7 @@ def test_ties_are_found_anew_until_the_mountings_stay():
 
     found = calibrate(yard.priors, finder, yard.traverses)
     assert found.converged
-    assert found.rounds == len(seen) >= 4
+    assert found.rounds == len(seen) >= 3
     assert seen[0].mountings == {n: p.mounting for n, p in yard.priors.items()}
     last = sum(f.count for f in found.figures)
     assert last > 0.95 * sum(len(t.weight) for t in everything)
@@ -570,3 +572,34 @@ def test_geometry_places_points_as_scipy_does():
     estimate = unknowns.estimate(z)
     turn = (unknowns.root @ z)[3:6]
     assert estimate.mountings["left"].arrays()[0] == pytest.approx(Rotation.from_rotvec(turn).as_matrix())
+
+
+def test_a_sensor_held_fixed_does_not_move():
+    yard = Yard(np.random.default_rng(17))
+    fixed = yard.priors | {"left": Prior(mounting(LEVER_ARMS["left"]), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))}
+    yard.true["left"] = (Rotation.identity(), np.array(LEVER_ARMS["left"]))
+    found = calibrate(fixed, yard.ties(10), yard.traverses)
+    assert found.mountings["left"] == mounting(LEVER_ARMS["left"])
+    assert not found.sensors["left"].covariance.any()
+    error = yard.errors(found)[6:]
+    assert error @ np.linalg.solve(found.sensors["lidar"].covariance, error) < chi2.ppf(0.999, 6)
+    assert not any("'left'" in words for words in found.observability.undetermined)
+
+
+def test_rows_and_report_say_what_was_found():
+    yard = Yard(np.random.default_rng(21), sensors=("left",), flat=True)
+    found = calibrate(yard.priors, yard.ties(20), yard.traverses)
+    (row,) = mounting_rows(found, run="*", valid_from_gps_ns=5, estimated_at="2026-03-02T12:00:00Z", key="abc")
+    assert set(row) == {column.name for column in table_schema("mountings").columns}
+    turned = Rotation.from_quat([row["qw"], row["qx"], row["qy"], row["qz"]], scalar_first=True)
+    assert turned.as_matrix() == pytest.approx(found.mountings["left"].arrays()[0])
+    assert np.reshape(row["covariance"], (6, 6)) == pytest.approx(found.sensors["left"].covariance)
+    assert row["sigma_lever_down_m"] == pytest.approx(LEVER_SIGMA_M)
+    assert "vertical lever arm of 'left'" in row["not_determined"]
+    lines = report(found).splitlines()
+    (vertical,) = [line for line in lines if line.strip().startswith("vertical lever arm ") and "σ" in line]
+    assert "+0.00 mm" in vertical.replace("-0.00", "+0.00") and vertical.endswith("not determined")
+    (roll,) = [line for line in lines if line.strip().startswith("roll")]
+    assert not roll.endswith("not determined")
+    assert any(line.startswith("loops: 120 observations, 0 rejected") for line in lines)
+    assert "There is no evidence." in report(calibrate(yard.priors, [], {}))

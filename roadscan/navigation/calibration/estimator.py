@@ -61,6 +61,8 @@ Finder = Callable[[Estimate], Sequence[Evidence]]
 
 _CONVERGED: Final = 0.01
 """A step below this share of every mounting's σ ends the iteration."""
+_STAYED: Final = 0.2
+"""Mountings stay where they are if evidence that is found anew moves them by less than this share of their σ."""
 _HALVINGS: Final = 6
 
 
@@ -191,28 +193,39 @@ class _Adjustment:
 
     def run(self) -> Calibration:
         """All stages: with all directions free, then with those held that the evidence does not determine."""
-        start = np.zeros(self.unknowns.size)
-        z, _ = self._rounds(start, None, reject=False)
-        z, _ = self._rounds(z, None, reject=True)
-        system = self._linearised(z, reject=True)
-        seen = self._observe(system)
-        z, converged = self._rounds(z, seen.free, reject=True)
-        return self._result(z, seen, converged=converged)
+        z, converged = self._free(np.zeros(self.unknowns.size))
+        seen = observe(self._linearised(z, reject=True).information, self.unknowns, self.settings.determined_below)
+        z, settled = self._held(z, seen.free)
+        return self._result(z, seen, converged=converged and settled)
 
-    def _rounds(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:
+    def _free(self, z: Float64) -> tuple[Float64, bool]:
         """Find the evidence and solve, until the mountings stay where they are."""
+        self._find(z)
+        # What is far off at first may come near: nothing is rejected before.
+        z, _ = self._solve(z, None, reject=False)
+        z, settled = self._solve(z, None, reject=True)
         if not callable(self.evidence):
-            if not self.found:
-                self._find(z)
-            return self._solve(z, free, reject=reject)
-        for _ in range(self.settings.rounds_max):
-            self._find(z)
-            before = z
-            z, settled = self._solve(z, free, reject=reject)
-            system = self._linearised(z, reject=reject)
-            if settled and self._small(z - before, system, share=0.1):
+            return z, settled
+        for _ in range(self.settings.rounds_max - 1):
+            z, settled, stayed = self._again(z, None)
+            if settled and stayed:
                 return z, True
         return z, False
+
+    def _held(self, z: Float64, free: Float64) -> tuple[Float64, bool]:
+        """Solve with the mountings in the space of `free`; find the evidence once more where that changes it."""
+        before = z
+        z, settled = self._solve(z, free, reject=True)
+        if not callable(self.evidence) or self._small(z - before, self._linearised(z, reject=True), share=_STAYED):
+            return z, settled
+        z, settled, _ = self._again(z, free)
+        return z, settled
+
+    def _again(self, z: Float64, free: Float64 | None) -> tuple[Float64, bool, bool]:
+        """Find the evidence with better mountings and solve: whether that converged, and whether they stayed."""
+        self._find(z)
+        found, settled = self._solve(z, free, reject=True)
+        return found, settled, self._small(found - z, self._linearised(found, reject=True), share=_STAYED)
 
     def _find(self, z: Float64) -> None:
         found = self.evidence(self.unknowns.estimate(z)) if callable(self.evidence) else self.evidence
@@ -249,9 +262,6 @@ class _Adjustment:
     def _linearised(self, z: Float64, *, reject: bool) -> _System:
         self.iterations += 1
         return _System.at(z, self.unknowns, self.found, self.settings, reject=reject)
-
-    def _observe(self, system: _System) -> Observability:
-        return observe(system.information, self.unknowns, self.settings.determined_below)
 
     def _result(self, z: Float64, seen: Observability, *, converged: bool) -> Calibration:
         system = self._linearised(z, reject=True)

@@ -113,7 +113,7 @@ class ClockConfig(Strict):
         if self.pairs is None and self.system is TimeSystem.FREE and self.offset_s == 0.0:
             raise ValueError("a free-running clock needs offset_s, measured against GPS time, or pairs of stamps")
         if self.pairs is not None:
-            if {"offset_s", "drift_ppm", "reference_s"} & self.model_fields_set:
+            if self.offset_s or self.drift_ppm or self.reference_s:
                 raise ValueError("give pairs, or offset_s and drift_ppm, not both")
             if self.system is TimeSystem.UTC_HOUR:
                 raise ValueError("stamps past the hour cannot be paired: state the measured offset_s")

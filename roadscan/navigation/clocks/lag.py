@@ -23,6 +23,7 @@ _CLEAR: Final = 1.5
 _LEAST_SHARE: Final = 0.5
 """Shifts that leave a smaller share of the bins in common than this of the best are not looked at."""
 _LEAST_BINS: Final = 40
+_AXES: Final = 3
 _LOBE: Final = 0.5
 """The main peak reaches to where half of what it explains is left."""
 
@@ -55,9 +56,9 @@ class Lag:
 def coarse_lag(felt: Felt, motion: Motion, search_s: float, about_s: float = 0.0) -> Lag | None:
     """Shift within `about_s` ± `search_s` that explains a recording best; None where too little of it is known.
 
-    All channels are explained at once by all rates of the motion, so the sensor's orientation need not be known: for
-    each shift the share of variance that a linear regression explains, by Fourier transforms over the bins that both
-    have (masked correlation, Padfield, IEEE Trans. Image Process. 2012, 21).
+    The sensor's orientation need not be known: for each shift the share of variance that the motion explains in the
+    axes that suit it best, by Fourier transforms over the bins that both have (masked correlation, Padfield, IEEE
+    Trans. Image Process. 2012, 21).
     """
     origin = motion.origin_gps_ns
     since = (felt.epochs_gps_ns - origin).astype(np.float64) / NS_PER_S
@@ -134,7 +135,7 @@ def _explained(
 ) -> Float64:
     """Share of variance (shifts,) that rates explain, when values begin 0, 1 … bins after them; NaN: not known.
 
-    same_sign : values and rates grow together; what explains values with the other sign explains nothing.
+    same_sign : values are the rates themselves; otherwise they are the rates in other axes, or a mixture.
     """
     size = next_fast_len(rates.shape[0] + values.shape[0])
 
@@ -150,20 +151,41 @@ def _explained(
     count = np.rint(together(of_y, of_x))
     enough = count >= max(_LEAST_BINS, _LEAST_SHARE * count.max())
     n = np.maximum(count, 1.0)
-    sum_x = [together(of_y, x[:, i]) / n for i in regressors]
+    mean_x = [together(of_y, x[:, i]) / n for i in regressors]
+    mean_y = [together(y[:, c], of_x) / n for c in channels]
     xx = np.empty((shifts, x.shape[1], x.shape[1]))
     for i in regressors:
         for j in regressors:
-            xx[:, i, j] = together(of_y, x[:, i] * x[:, j]) / n - sum_x[i] * sum_x[j]
-    trace = np.einsum("sii->s", xx)
-    xx += (1e-9 * np.maximum(trace, 1e-300))[:, None, None] * np.eye(x.shape[1])
-    all_variance, all_explained = np.zeros(shifts), np.zeros(shifts)
-    for c in channels:
-        sum_y = together(y[:, c], of_x) / n
-        xy = np.stack([together(y[:, c], x[:, i]) / n - sum_x[i] * sum_y for i in regressors], axis=-1)
-        all_variance += together(np.square(y[:, c]), of_x) / n - np.square(sum_y)
-        xy = np.maximum(xy, 0.0) if same_sign else xy
-        all_explained += np.einsum("si,si->s", xy, np.linalg.solve(xx, xy[:, :, None])[:, :, 0])
+            xx[:, i, j] = together(of_y, x[:, i] * x[:, j]) / n - mean_x[i] * mean_x[j]
+    xy = np.empty((shifts, x.shape[1], y.shape[1]))
+    for i in regressors:
+        for c in channels:
+            xy[:, i, c] = together(y[:, c], x[:, i]) / n - mean_x[i] * mean_y[c]
+    yy = sum((together(np.square(y[:, c]), of_x) / n - np.square(mean_y[c]) for c in channels), np.zeros(shifts))
+    known = enough & (yy > 0.0)
+    explained = _by_rotation(xx, xy) if same_sign or x.shape[1] == y.shape[1] == _AXES else _by_mixing(xx, xy)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip(all_explained / all_variance, 0.0, 1.0)
-    return np.where(enough & (all_variance > 0.0), share, np.nan)
+        share = np.clip(explained / yy, 0.0, 1.0)
+    return np.where(known, share, np.nan)
+
+
+def _by_rotation(xx: Float64, xy: Float64) -> Float64:
+    """Variance (s,) of y that x explains in the axes that suit best: Wahba's problem (Markley 1988).
+
+    xx, xy : (s, k, k) covariances, k = 3, or 1 where y is x.
+    """
+    if xy.shape[1] == 1:
+        best = xy[:, 0, 0]
+    else:
+        left, size, right = np.linalg.svd(xy)
+        best = size[:, 0] + size[:, 1] + size[:, 2] * np.sign(np.linalg.det(left) * np.linalg.det(right))
+    explained: Float64 = 2.0 * best - np.einsum("sii->s", xx)
+    return explained
+
+
+def _by_mixing(xx: Float64, xy: Float64) -> Float64:
+    """Variance (s,) of y (s, p, c) that any mixture of x explains: a regression for each shift."""
+    trace = np.maximum(np.einsum("sii->s", xx), 1e-300)
+    held = xx + (1e-9 * trace)[:, None, None] * np.eye(xx.shape[1])
+    explained: Float64 = np.einsum("sic,sic->s", xy, np.linalg.solve(held, xy))
+    return explained

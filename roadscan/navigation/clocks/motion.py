@@ -45,6 +45,8 @@ _SETTLED: Final = 0.02
 """The estimate stands when it moves by less than this, or this share of its σ."""
 _GAIN: Final = (0.5, 2.0)
 """Rates that are so many times those of the other sensor are in another unit."""
+_OTHER_UNIT: Final = 20.0
+"""The same, before noise and offset are known."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
     NavigationError
         where the motion does not tell the lag: too little of it, periodic, or an offset beyond `search_s`.
     """
+    _check_units(felt, motion, what)
     start = _start(felt, motion, search_s, drift, what)
     windows = _Windows.of(felt, motion)
     line, keep = start, None
@@ -320,11 +323,25 @@ def _check(lags: _Lags, line: Line, start: Line, what: str) -> None:
     if away > 10 * STEP_S:
         raise _too_little(what, f"the fine estimate lies {away:.2g} s from the coarse one")
     if not _GAIN[0] <= lags.gain <= _GAIN[1]:
-        raise NavigationError(
-            f"{what} felt {lags.gain:.3g} times the motion of the other sensor",
-            expected="about the same",
-            change="check the unit of its log (degrees for radians: 57.3; ticks: metres_per_tick in the rig file)",
-        )
+        raise _wrong_unit(what, lags.gain)
+
+
+def _check_units(felt: Felt, motion: Motion, what: str) -> None:
+    """Refuse what cannot be the same motion in the same unit."""
+    steps, knots = (np.diff(e) / NS_PER_S for e in (felt.epochs_gps_ns, motion.epochs_gps_ns))
+    rates = np.diff(felt.values, axis=0) / steps[:, None] if felt.is_total else felt.values
+    moves = np.diff(motion.totals[:, :1] if motion.leads else motion.totals, axis=0) / knots[:, None]
+    felt_size, true_size = (np.sqrt((np.var(v, axis=0)).sum()) for v in (rates, moves))
+    if felt_size > _OTHER_UNIT * true_size > 0.0 or true_size > _OTHER_UNIT * felt_size:
+        raise _wrong_unit(what, float(felt_size / true_size))
+
+
+def _wrong_unit(what: str, gain: float) -> NavigationError:
+    return NavigationError(
+        f"{what} felt {gain:.3g} times the motion of the other sensor",
+        expected="about the same",
+        change="check the unit of its log (degrees for radians: 57.3; ticks: metres_per_tick in the rig file)",
+    )
 
 
 def _fit(felt: Felt, motion: Motion, lags: _Lags, line: Line) -> MotionFit:

@@ -40,6 +40,8 @@ Flags = npt.NDArray[np.bool_]
 
 SIDE_S: Final = 0.5
 """Poses over this long beside a step or a gap state the motion there."""
+RECOVERY_S: Final = 1.0
+"""Steps so long after an outage's end still belong to it: a filter comes back with more than one."""
 _SIDE_POSES: Final = 4
 _TRIALS: Final = 200
 _TRUSTED: Final = 3.0
@@ -140,8 +142,8 @@ def smoothed(
     touched = np.zeros(trajectory.epochs_gps_ns.size, dtype=bool)
     for span in rugged_spans(trajectory, config):
         trajectory = _without_jitter(trajectory, span, config, changes, touched)
-    for at, begin in _leaps(trajectory, config, outages_gps_ns):
-        trajectory = _without_step(trajectory, begin, at, config, changes, touched)
+    for at, begin, beside in _leaps(trajectory, config, outages_gps_ns):
+        trajectory = _without_step(trajectory, (begin, at, beside), config, changes, touched)
     return _filled(trajectory, config, changes, touched)
 
 
@@ -192,42 +194,52 @@ def _surprises(trajectory: Trajectory) -> Float64:
     return out
 
 
-def _leaps(trajectory: Trajectory, config: SplineConfig, outages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """(pose before the leap, pose at which its drift began) of each step, in time."""
+def _leaps(
+    trajectory: Trajectory, config: SplineConfig, outages: Sequence[tuple[int, int]]
+) -> list[tuple[int, int, slice]]:
+    """Steps in time: the pose before each, the pose at which its drift began, and the poses beside it without others.
+
+    Within an outage every step (a standstill, a constraint) corrects the drift since its begin; elsewhere what came
+    before the step before is not its concern.
+    """
     surprise = np.linalg.norm(np.nan_to_num(_surprises(trajectory)), axis=1)
     usual = float(np.median(surprise))
     large = surprise > max(config.step_m, 8 * usual)
     # A step surprises the increments beside it by half its size: only the greatest of neighbours is one.
     peak = large & (surprise >= np.maximum(np.append(surprise[1:], 0.0), np.append(0.0, surprise[:-1])))
+    steps = np.flatnonzero(peak)
+    bounds = [0, *(steps + 1).tolist(), trajectory.epochs_gps_ns.size]
     found = []
-    last = 0
-    for at in np.flatnonzero(peak):
-        begin = _begin_of(trajectory, int(at), config, outages)
-        begin = max(begin, last)
-        if at - begin >= _SIDE_POSES and _seconds(trajectory, begin, int(at)) <= config.longest_s:
-            found.append((int(at), begin))
-        last = int(at) + 1
+    for k, at in enumerate(steps.tolist()):
+        begin, in_outage = _begin_of(trajectory, at, config, outages)
+        begin = begin if in_outage else max(begin, bounds[k])
+        if at - begin >= _SIDE_POSES and _seconds(trajectory, begin, at) <= config.longest_s:
+            found.append((at, begin, slice(bounds[k], bounds[k + 2])))
     return found
 
 
-def _begin_of(trajectory: Trajectory, at: int, config: SplineConfig, outages: Sequence[tuple[int, int]]) -> int:
-    """The pose at which the drift before a step began, after the last gap."""
+def _begin_of(
+    trajectory: Trajectory, at: int, config: SplineConfig, outages: Sequence[tuple[int, int]]
+) -> tuple[int, bool]:
+    """The pose at which the drift before a step began, after the last gap; and whether an outage says so."""
     epochs = trajectory.epochs_gps_ns
-    around = [b for b, e in outages if b < epochs[at] and epochs[at] <= e + NS_PER_S]
+    after_ns = round(RECOVERY_S * NS_PER_S)
+    around = [b for b, e in outages if b < epochs[at] and epochs[at] <= e + after_ns]
     began = min(around) if around else int(epochs[at]) - round(config.step_reach_s * NS_PER_S)
     wide = np.flatnonzero(np.diff(epochs[: at + 1]) > trajectory.max_gap_s * NS_PER_S)
     after_gap = int(wide[-1]) + 1 if wide.size else 0
-    return max(int(np.searchsorted(epochs, began)), after_gap)
+    return max(int(np.searchsorted(epochs, began)), after_gap), bool(around)
 
 
 def _without_step(
-    trajectory: Trajectory, begin: int, at: int, config: SplineConfig, changes: list[Mended], touched: Flags
+    trajectory: Trajectory, step: tuple[int, int, slice], config: SplineConfig, changes: list[Mended], touched: Flags
 ) -> Trajectory:
-    """Poses `begin` + 1 … `at` moved by a cubic that ends where the pose after the step goes on."""
+    """Poses from the one after the begin to that before the step, moved by a cubic to where those after it go on."""
+    begin, at, beside = step
     epochs = trajectory.epochs_gps_ns
     middle = int(epochs[at]) + (int(epochs[at + 1]) - int(epochs[at])) // 2
     length = (middle - int(epochs[begin])) / NS_PER_S
-    leap = _leap_at(trajectory, at, middle)
+    leap = _leap_at(trajectory, at, middle, beside)
     if np.linalg.norm(leap.shift_m) < max(config.step_m, _TRUSTED * leap.sigma_m):
         return trajectory
     rows = np.arange(begin + 1, at + 1)
@@ -240,14 +252,14 @@ def _without_step(
     return _moved(trajectory, rows, shift, turn)
 
 
-def _leap_at(trajectory: Trajectory, at: int, middle: int) -> _Leap:
+def _leap_at(trajectory: Trajectory, at: int, middle: int, beside: slice) -> _Leap:
     """Size and slope of a step, by one polynomial of degree 5 on both sides with a step and a bend between them.
 
     Motion that both sides share, such as that of the springs, does not count as a step.
     """
     epochs = trajectory.epochs_gps_ns
     count = max(_SIDE_POSES, round(SIDE_S / _step_s(trajectory)))
-    rows = np.arange(max(at - count + 1, 0), min(at + 1 + count, epochs.size))
+    rows = np.arange(max(at - count + 1, beside.start), min(at + 1 + count, beside.stop))
     seconds = (epochs[rows] - middle) / NS_PER_S
     near = np.abs(seconds) < 2 * SIDE_S + _step_s(trajectory)
     rows, seconds = rows[near], seconds[near]

@@ -83,7 +83,7 @@ def test_residuals_outages_and_summary_are_what_was_put_in() -> None:
     text = _summary(one, residuals, axis)
     assert text.startswith("2026-05-04T09:29:42 UTC, 60 s, 0.68 km")
     assert "σ horizontal 0.017 m median, 0.212 m worst; down 0.024 / 0.300 m; heading 0.020° / 0.020°" in text
-    assert "1 outages, 15 s without GNSS, the longest 15 s" in text
+    assert "1 outage, 15 s without GNSS, the longest 15 s" in text
     assert "RMS 0.100 m horizontal, 0.040 m down" in text
     assert "2 down-weighted, 1 refused" in text
 

@@ -280,7 +280,7 @@ class _Adjustment:
             covariance=covariance[np.ix_(keep, keep)],
             observability=seen,
             kinds=system.kind_figures(),
-            figures=tuple(self._figures(one, system, before) for one in system.weighed),
+            figures=_figures(system.weighed, before),
             corrections=estimate.corrections,
             correction_sigma={
                 int(key): spread[self.unknowns.body_slice(body)] for body, key in enumerate(self.unknowns.traverse_keys)
@@ -305,27 +305,43 @@ class _Adjustment:
             not_determined=seen.not_determined(name),
         )
 
-    @staticmethod
-    def _figures(one: Weighed, system: _System, before: Geometry) -> Figures:
-        at_start = one.observations.residuals(before)
-        used = one.weight > 0
-        lengths_before = one.observations.metres(at_start)
-        lengths_after = one.observations.metres(one.residuals)
-        return Figures(
-            kind=one.observations.kind,
-            sensors=one.observations.label,
-            count=one.observations.count,
-            rejected=int((~used).sum()),
-            unusable=one.observations.unusable,
-            rms_before=_rms(at_start[used]),
-            rms_after=_rms(one.residuals[used]),
-            rms_before_m=None if lengths_before is None else _rms(lengths_before[used]),
-            rms_after_m=None if lengths_after is None else _rms(lengths_after[used]),
-        )
+
+def _figures(weighed: Sequence[Weighed], before: Geometry) -> tuple[Figures, ...]:
+    """Residuals of each kind and pair of sensors."""
+    pairs: dict[tuple[str, str], list[Weighed]] = {}
+    for one in weighed:
+        pairs.setdefault((one.kind, one.observations.label), []).append(one)
+    return tuple(_pair_figures(kind, label, members, before) for (kind, label), members in pairs.items())
 
 
-def _rms(values: Float64) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+def _pair_figures(kind: str, label: str, members: Sequence[Weighed], before: Geometry) -> Figures:
+    at_start = [one.observations.residuals(before) for one in members]
+    at_end = [one.residuals for one in members]
+    used = [one.weight > 0 for one in members]
+    lengths_before, lengths_after = (
+        [one.observations.metres(r) for one, r in zip(members, residuals, strict=True)]
+        for residuals in (at_start, at_end)
+    )
+    return Figures(
+        kind=kind,
+        sensors=label,
+        count=sum(one.observations.count for one in members),
+        rejected=sum(int((~u).sum()) for u in used),
+        unusable=sum(one.observations.unusable for one in members),
+        rms_before=_rms(at_start, used) or 0.0,
+        rms_after=_rms(at_end, used) or 0.0,
+        rms_before_m=_rms(lengths_before, used),
+        rms_after_m=_rms(lengths_after, used),
+    )
+
+
+def _rms(values: Sequence[Float64 | None], used: Sequence[npt.NDArray[np.bool_]]) -> float | None:
+    """Root mean square over what is used; None where nothing has such a value."""
+    known = [v[u].ravel() for v, u in zip(values, used, strict=True) if v is not None]
+    if not known:
+        return None
+    whole = np.concatenate(known)
+    return float(np.sqrt(np.mean(whole**2))) if whole.size else 0.0
 
 
 @dataclass(frozen=True)

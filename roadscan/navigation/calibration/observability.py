@@ -33,6 +33,9 @@ AXES: Final = (
 _NAMED_SHARE: Final = 0.15
 """Parts of a direction smaller than this share of the largest, in units of prior σ, are not named."""
 
+_NOTHING: Final = 0.01
+"""Parts of a held direction smaller than this share of the largest are taken out of it."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -132,7 +135,9 @@ def observe(information: Float64, unknowns: Unknowns, determined_below: float) -
     reduced = eliminated(information, size)
     values, vectors = np.linalg.eigh(reduced[np.ix_(active, active)])
     determined = values > 1.0 / determined_below**2
-    free, held = (_embedded(plain_basis(vectors[:, chosen]), active, size) for chosen in (determined, ~determined))
+    of_held = _cleared(_plain_basis(vectors[:, ~determined] @ vectors[:, ~determined].T, int((~determined).sum())))
+    of_free = _plain_basis(np.eye(active.size) - of_held @ of_held.T, int(determined.sum()))
+    free, held = (_embedded(basis, active, size) for basis in (of_free, of_held))
     held_values = np.einsum("iu,ij,ju->u", held, reduced, held)
     variances = np.diag(_inverse(free.T @ reduced @ free))
     directions = [
@@ -147,22 +152,31 @@ def observe(information: Float64, unknowns: Unknowns, determined_below: float) -
     return split.updated(information, unknowns)
 
 
-def plain_basis(vectors: Float64) -> Float64:
-    """An orthonormal basis of the same space with few parts a vector: its projector's columns, the largest first.
+def _plain_basis(projector: Float64, count: int) -> Float64:
+    """(n, count) orthonormal basis of the space that (n, n) projects on, with few parts a vector.
 
-    Parameters
-    ----------
-    vectors : (n, u) orthonormal.
+    Its vectors are columns of the projector, the largest first (Cholesky's factors with pivots).
     """
-    projector = vectors @ vectors.T
-    basis = np.zeros_like(vectors)
-    for index in range(vectors.shape[1]):
+    basis = np.zeros((len(projector), count))
+    for index in range(count):
         pivot = int(np.argmax(np.diag(projector)))
         column = projector[:, pivot] / np.linalg.norm(projector[:, pivot])
         basis[:, index] = column
-        projector = projector - np.outer(column, column) @ projector
-        projector = projector - projector @ np.outer(column, column)
+        projector = projector - np.outer(column, column @ projector)
+        projector = projector - np.outer(projector @ column, column)
     return basis
+
+
+def _cleared(basis: Float64) -> Float64:
+    """The same directions (n, u) without parts that are next to nothing: what is held then is held exactly.
+
+    To hold a slightly other direction costs what is determined a part in ten thousand; the covariance knows.
+    """
+    if not basis.size:
+        return basis
+    plain = np.where(np.abs(basis) < _NOTHING * np.abs(basis).max(axis=0), 0.0, basis)
+    orthogonal, triangle = np.linalg.qr(plain)
+    return np.asarray(orthogonal * np.sign(np.diag(triangle)))
 
 
 def _embedded(basis: Float64, active: npt.NDArray[np.int64], size: int) -> Float64:

@@ -71,7 +71,7 @@ def _sensors(calibration: Calibration) -> Iterator[str]:
             held = "   not determined" if prior > 0 and sigma > 0.9 * prior else ""
             yield (
                 f"  {AXES[axis]:18s} {of_change:+10.{digits}f} {unit:2s}  σ {sigma:8.{digits}f}"
-                f"  before {prior:8.{digits}f}{held}"
+                f"  before: {prior:.{digits}f}{held}"
             )
         if one.range_offset_sigma_m > 0:
             yield f"  {AXES[6]:18s} {1e3 * one.range_offset_m:+10.2f} mm  σ {1e3 * one.range_offset_sigma_m:8.2f}"

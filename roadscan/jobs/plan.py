@@ -116,7 +116,7 @@ def _sources(
             files = record.tables.get(table, ())
             if not files:
                 continue
-            trajectory = None if table == "cloud" else _trajectory(record.run, records)
+            trajectory = None if table == "cloud" else trajectory_source(record.run, records)
             sensor = survey.rig.sensors.get(record.sensor)
             nominal = sensor.mounting() if sensor else _UNMOUNTED
             dated = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor)) or []
@@ -156,7 +156,8 @@ def _mountings(nominal: Mounting, calibrated: Sequence[tuple[int, Mounting]]) ->
     return Mountings(tuple(since for since, _ in dated), tuple(mounting for _, mounting in dated))
 
 
-def _trajectory(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
+def trajectory_source(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
+    """Where the poses of a run lie, or :class:`ConfigError` where that is not one trajectory."""
     own = [r for r in records if r.run == run and r.tables.get("trajectory")]
     own = [r for r in own if r.sensor == NAVIGATION] or own  # what was computed stands in for what was logged
     worlds = {r.attributes["world_frame"] for r in own}

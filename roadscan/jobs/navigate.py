@@ -31,6 +31,7 @@ from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.inertial.checks import prepared
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
 from roadscan.navigation.inertial.smoother import solve
+from roadscan.products.pictures.navigation import NavigationPicture, draw_navigation
 from roadscan.tables.logs import LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -175,6 +176,10 @@ def _compute(survey: Survey, store: Store, planned: PlannedSolution, report: Cal
             if (old.run, old.sensor, old.format) == (logs.run, NAVIGATION, SMOOTHER) and old.key != planned.key:
                 retire_log(store, old)
         tables = writer.publish(store, logs.run, NAVIGATION, planned.key)
+        picture = folder / "navigation.png"
+        title = f"{survey.config.id}, run {logs.run}"
+        draw_navigation(picture, NavigationPicture(title, solution, gnss, vehicle.antenna_lever_arm_body_m))
+        store.publish(picture, f"products/navigation/{logs.run}.png")
     write_log_record(
         store,
         LogRecord(

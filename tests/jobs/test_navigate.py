@@ -101,6 +101,7 @@ def test_its_points_and_products_come_out_as_of_any_trajectory(navigated: Simula
     counted = query(store, "SELECT sum(points) AS n FROM tiles").to_pylist()[0]["n"]
     profiles = query(store, "SELECT count(*) AS n FROM scans").to_pylist()[0]["n"]
     assert 0.995 * 50 * profiles < counted <= 50 * profiles  # some readings are dropouts
+    assert store.read_bytes("products/navigation/run-1.png")[:8] == b"\x89PNG\r\n\x1a\n"
     kinds = {r["kind"] for r in query(store, "SELECT DISTINCT kind FROM innovations").to_pylist()}
     assert "gnss position" in kinds and "odometer" in kinds
     states = query(store, "SELECT state, axis, value, sigma FROM navigation_states ORDER BY epoch_gps_ns").to_pylist()

@@ -12,6 +12,8 @@ from roadscan.tables.logs import DataFile, read_log_records
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 
+_SMALL = ("clocks", "clock_residuals", "corrections", "mountings")
+"""Tables of results, held in one file each."""
 _ALWAYS = ("rejects",)
 """Tables that answer even before they have a row: no rejects is news too."""
 
@@ -21,7 +23,8 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
-    ``tiles``, ``cells``, ``footprints`` and ``outputs`` are there once a run has made them. `logs` are the keys of the
+    ``tiles``, ``cells``, ``footprints`` and ``outputs`` are there once a run has made them, ``clocks``, ``mountings``
+    and ``corrections`` once they were estimated. `logs` are the keys of the
     logs to show, all in the store where left out.
     """
     connection = duckdb.connect()
@@ -47,7 +50,8 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
     for table in _ALWAYS:
         if table not in files:
             connection.register(table, table_schema(table).arrow().empty_table())
-    for name, folder in (("footprints", "tables/footprints"), ("outputs", "manifest/outputs")):
+    held_whole = [("footprints", "tables/footprints"), ("outputs", "manifest/outputs")]
+    for name, folder in held_whole + [(name, f"tables/{name}") for name in _SMALL]:
         found = store.files(folder, ".parquet")
         if found:
             _view(connection, name, [_url(store, f) for f in found], hive=False)

@@ -308,6 +308,36 @@ def test_flat_level_ground_does_not_tell_the_vertical_lever_arm():
     assert np.degrees(one.sigma[3:5]).max() < 0.02
 
 
+@compiled
+def test_errors_of_normals_are_no_relief():
+    """Flat ground with estimated normals: they seem to tell where on it a place lies, but only that it was tied to the
+    nearest reading."""
+    yard = Yard(np.random.default_rng(27), sensors=("left",), flat=True)
+    sigma = np.radians(0.5)
+    tilted, stated = [], []
+    for ties in yard.ties(300):
+        normal = ties.weight[:, 0] * 0.002 + yard.rng.normal(0, sigma, (300, 3)) * [1, 1, 0]
+        rows = (normal / np.linalg.norm(normal, axis=1, keepdims=True) / 0.002)[:, None, :]
+        tilted.append(replace(ties, weight=rows))
+        stated.append(replace(ties, weight=rows, normal_sigma_rad=np.full(300, sigma)))
+    misled = calibrate(yard.priors, tilted, yard.traverses).observability.undetermined
+    assert "forward lever arm of 'left'" not in misled
+    found = calibrate(yard.priors, stated, yard.traverses)
+    axes = ("forward lever arm", "right lever arm", "vertical lever arm", "heading")
+    assert set(found.observability.undetermined) == {f"{axis} of 'left'" for axis in axes}
+    assert np.array(found.mountings["left"].lever_arm_body_m) == pytest.approx(LEVER_ARMS["left"], abs=1e-12)
+
+
+@compiled
+def test_relief_is_seen_in_spite_of_errors_of_normals():
+    yard = Yard(np.random.default_rng(28))
+    plain = yard.ties(40)
+    stated = [replace(t, normal_sigma_rad=np.full(40, np.radians(0.5))) for t in plain]
+    found, expected = (calibrate(yard.priors, ties, yard.traverses) for ties in (stated, plain))
+    assert found.observability.undetermined == ()
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(np.sqrt(np.diag(expected.covariance)), rel=0.01)
+
+
 def test_one_bump_ties_heading_to_the_forward_lever_arm():
     """A profiler (points in its plane x = 0) sees a step across the road at 1 m to its right only: a turn about the
     vertical moves the step forward by −1 m per radian, which a lever arm takes back."""

@@ -64,6 +64,8 @@ _CONVERGED: Final = 0.01
 _STAYED: Final = 0.2
 """Mountings stay where they are if evidence that is found anew moves them by less than this share of their σ."""
 _HALVINGS: Final = 6
+_SEEMING: Final = 2.0
+"""What errors of normals would tell is taken off this many times: their σ is an estimate, too."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,8 @@ class _Adjustment:
     def run(self) -> Calibration:
         """All stages: with all directions free, then with those held that the evidence does not determine."""
         z, converged = self._free(np.zeros(self.unknowns.size))
-        seen = observe(self._linearised(z, reject=True).information, self.unknowns, self.settings.determined_below)
+        system = self._linearised(z, reject=True)
+        seen = observe(system.told(), self.unknowns, self.settings.determined_below)
         z, settled = self._held(z, seen.free)
         return self._result(z, seen, converged=converged and settled)
 
@@ -266,7 +269,7 @@ class _Adjustment:
     def _result(self, z: Float64, seen: Observability, *, converged: bool) -> Calibration:
         system = self._linearised(z, reject=True)
         # The split into directions stays that of the solution; their σ are those at the end.
-        seen = seen.updated(system.information, self.unknowns)
+        seen = seen.updated(system.told(), self.unknowns)
         estimate = self.unknowns.estimate(z)
         before = self.unknowns.geometry(np.zeros_like(z))
         # Rotations that follow the boresight, not changes of the rotation vector.
@@ -387,6 +390,19 @@ class _System:
     def covariance(self) -> Float64:
         """(P, P) in units of prior σ, with all directions free."""
         return _inverse(self.information + np.eye(self.z.size))
+
+    def told(self) -> Float64:
+        """Information (P, P) without what errors of normals alone would give."""
+        seeming = np.zeros_like(self.information)
+        for kind, members in _by_kind(self.weighed).items():
+            own = np.zeros_like(seeming)
+            for one in members:
+                one.observations.add_seeming(self.now, one.weight, own)
+            seeming += _SEEMING * self.scales.gain(kind) * own
+        if not seeming.any():
+            return self.information
+        values, vectors = np.linalg.eigh(self.information - self.now.derivative.T @ seeming @ self.now.derivative)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def cost(self, scales: Scales) -> float:
         """What is minimised, with the weights of another place."""

@@ -62,6 +62,9 @@ class Observations(Protocol):
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
         """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
 
+    def add_seeming(self, now: Geometry, weight: Float64, information: Float64) -> None:
+        """Add the part of the information (P, P) that errors of the weights' directions alone would give."""
+
 
 def observations(evidence: Iterable[Evidence], unknowns: Unknowns) -> list[Observations]:
     """Prepare evidence for an adjustment.
@@ -154,6 +157,7 @@ class TieObservations:
         order = order[good[order]]
         self._first, self._second = first.taken(order), second.taken(order)
         self._weight = np.ascontiguousarray(ties.weight[order])
+        self._seeming = None if ties.normal_sigma_rad is None else _slanted(self._weight, ties.normal_sigma_rad[order])
         self._unusable = int(good.size - order.size)
         self._size = unknowns.mounting_size
 
@@ -186,8 +190,16 @@ class TieObservations:
 
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
         """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
+        self._add(self._weight, now, weight, information, gradient)
+
+    def add_seeming(self, now: Geometry, weight: Float64, information: Float64) -> None:
+        """Add the part of the information (P, P) that errors of the weights' directions alone would give."""
+        if self._seeming is not None:
+            self._add(self._seeming, now, weight, information, np.zeros(len(information)))
+
+    def _add(self, rows_m: Float64, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
         for part in self._chunks():
-            ties = self._weight[part]
+            ties = rows_m[part]
             residual, jacobian = np.empty(ties.shape[:2]), np.empty((*ties.shape[:2], 2 * (MOUNTING + BODY)))
             tie_rows(*self._ends(part, now), ties, self._on_object, weight[part], residual, jacobian)
             for start, end in self._pairs(part):
@@ -275,6 +287,8 @@ def _check_shapes(ties: Ties) -> None:
     count = len(ties.first.point_sensor_m)
     expected = f"{count} of each"
     sizes = {"first.traverse": len(ties.first.traverse), "weight": len(ties.weight)}
+    if ties.normal_sigma_rad is not None:
+        sizes["normal_sigma_rad"] = len(ties.normal_sigma_rad)
     if isinstance(ties.second, Seen):
         sizes |= {
             "second.point_sensor_m": len(ties.second.point_sensor_m),
@@ -337,8 +351,19 @@ class DirectionObservations:
         information[place, place] += np.einsum("nki,nkj->ij", rows, jacobian)
         gradient[place] += np.einsum("nki,nk->i", rows, self.residuals(now))
 
+    def add_seeming(self, now: Geometry, weight: Float64, information: Float64) -> None:
+        """Add nothing: these have no normals."""
+
     def _turned(self, now: Geometry) -> Float64:
         return np.asarray(self._sensor_axes @ now.body_from_sensor[self._sensor].T)
+
+
+def _slanted(weight: Float64, normal_sigma_rad: Float64) -> Float64:
+    """(n, 2 k, 3) what rows (n, k, 3) that are off by their σ (n,) hold beside themselves."""
+    length = np.linalg.norm(weight, axis=2)
+    unit = weight / np.maximum(length, 1e-300)[..., None]
+    across = _across(unit.reshape(-1, 3)) * (length * normal_sigma_rad[:, None]).reshape(-1, 1, 1)
+    return np.ascontiguousarray(across.reshape(len(weight), -1, 3))
 
 
 def _across(direction: Float64) -> Float64:
@@ -395,6 +420,9 @@ class OrientationObservation:
         place = slice(begin, begin + 3)
         information[place, place] += weight[0] * jacobian.T @ jacobian
         gradient[place] += weight[0] * jacobian.T @ self._whitening @ away
+
+    def add_seeming(self, now: Geometry, weight: Float64, information: Float64) -> None:
+        """Add nothing: these have no normals."""
 
     def _away(self, now: Geometry) -> Float64:
         return logarithm(now.body_from_sensor[self._sensor] @ self._observed.T)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import geodetic_from_world, world_from_geodetic
 from roadscan.model.errors import ConfigError, CrsError, NavigationError, RoadscanError, TimeSystemError
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
-from roadscan.model.imu import IMU_GRADES, ImuErrors
+from roadscan.model.imu import IMU_GRADES
 from roadscan.navigation.inertial.checks import Prepared, prepared
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.simulate import Scene
@@ -28,6 +27,7 @@ from roadscan.simulate.gnss import solve as solutions_of
 from roadscan.simulate.imu import _SensorErrors, felt, first_gps_ns, imu_of
 from roadscan.simulate.noise import stream
 from roadscan.simulate.surface import Surface
+from tests.navigation.recorded_drive import recorded_drive
 
 Logs = tuple[ImuReadings, GnssSolutions, OdometerReadings | None, VehicleSensors]
 Change = Callable[[ImuReadings, GnssSolutions, OdometerReadings | None], tuple[Any, Any, Any]]
@@ -42,37 +42,10 @@ TURNS = [
 STOP = {"at_m": 100.0, "duration_s": 5.0}
 
 
-@cache
-def _recorded(folder: Path) -> Logs:
-    imu = pd.read_csv(folder / "drive" / "imu.csv.gz")
-    gnss = pd.read_csv(folder / "drive" / "gnss_rtk.pos.gz", sep=r"\s+", skiprows=1, header=None)
-    late_s = 0.125
-    epochs = np.round((imu["gpst_unix_s"].to_numpy() - late_s - GPS_EPOCH_UNIX_S) * 1e4).astype(np.int64) * 100_000
-    force, rate = imu.iloc[:, 1:4].to_numpy() * 9.80665, np.radians(imu.iloc[:, 4:7].to_numpy())
-    stamps = pd.to_datetime(gnss[0] + " " + gnss[1]).astype("datetime64[ns]").astype("int64").to_numpy()
-    solutions = GnssSolutions(
-        WORLD,
-        stamps - GPS_EPOCH_UNIX_S * NS_PER_S,
-        world_from_geodetic(WORLD, gnss[[3, 2, 4]].to_numpy()),
-        np.einsum("ni,ij->nij", gnss[[7, 8, 9]].to_numpy() ** 2, np.eye(3)),
-        np.where(gnss[5] == 1, "fixed", "float"),
-        gnss[[15, 16, 17]].to_numpy() * [1, 1, -1],
-        gnss[[18, 19, 20]].to_numpy(),
-    )
-    # The recording's own configuration names the angles from the body's axes to the IMU's.
-    body_from_imu = Rotation.from_euler("ZYX", [185.35, -6.79, 180.0], degrees=True).as_matrix().T
-    errors = ImuErrors(
-        gyro_noise_deg_per_sqrt_h=0.23, gyro_bias_deg_per_h=300.0, gyro_scale_ppm=3000.0,
-        accel_noise_ug_per_sqrt_hz=70.0, accel_bias_mg=20.0, accel_scale_ppm=3000.0,
-    )  # fmt: skip
-    vehicle = VehicleSensors(body_from_imu, np.zeros(3), errors, np.array([0.0, -0.05, 0.0]), np.full(3, 0.01))
-    return ImuReadings(epochs, rate, force), solutions, None, vehicle
-
-
 @pytest.fixture
 def drive(recordings: Path) -> Logs:
     """The recorded drive: 549 s, MEMS IMU at 100 Hz, RTK at 4 Hz."""
-    return _recorded(recordings)
+    return recorded_drive(recordings)
 
 
 def simulated(

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 
 from roadscan.jobs.centre_line import CentreLines
 from roadscan.jobs.clocks import load_clocks
+from roadscan.jobs.computed_trajectory import NAVIGATION
 from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES
-from roadscan.jobs.navigate import NAVIGATION, records_with_trajectories
+from roadscan.jobs.navigate import records_with_trajectories
 from roadscan.jobs.readings import (
     CORRECTIONS,
     Ground,

@@ -14,7 +14,7 @@ from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Rig, Sensor
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.smoothing import SmootherConfig, SplineConfig
 from roadscan.model.strict import Strict, load_toml
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
@@ -195,6 +195,8 @@ class NavigationConfig(Strict):
     """Runs whose trajectory is computed from GNSS and IMU: those without a trajectory log, all that have both, none."""
     smoother: SmootherConfig = SmootherConfig()
     """How it is computed."""
+    spline: SplineConfig = SplineConfig()
+    """Whether and how trajectory logs are smoothed where GNSS dropped out."""
 
     max_gap_s: float = Field(default=1.0, gt=0)
     """Between two poses farther apart than this there is no pose: readings there are counted, not placed."""

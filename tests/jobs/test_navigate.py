@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.navigate import NAVIGATION
+from roadscan.jobs.computed_trajectory import NAVIGATION
+from roadscan.jobs.status import survey_status
 from roadscan.model.errors import RoadscanError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.survey import Survey
@@ -19,7 +20,7 @@ from roadscan.simulate import Scene, simulate
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.sql import query
 
-from .conftest import Simulated, outputs
+from .conftest import Simulated, changed, outputs
 
 MEASURED = ("imu.csv", "gnss.pos", "encoder.csv")
 
@@ -151,3 +152,38 @@ def test_an_imu_without_stated_errors_is_refused(driven: Simulated) -> None:
 def test_solve_never_says_what_is_missing(driven: Simulated) -> None:
     with pytest.raises(RoadscanError, match="no trajectory"):
         driven.run("store-6", **without_trajectory(driven.survey_file, *MEASURED), navigation__solve="never")
+
+
+def with_spline(**settings: Any) -> dict[str, Any]:
+    """Settings of a run whose trajectory logs are smoothed."""
+    return {"navigation__spline": {"on": True, **settings}}
+
+
+def test_a_sound_trajectory_log_stays_as_it_is(driven: Simulated) -> None:
+    driven.run("store-log")
+    driven.run("store-spline", **with_spline())
+    logged, smooth = outputs(driven.store("store-log")), outputs(driven.store("store-spline"))
+    assert logged == smooth
+    (record,) = [r for r in read_log_records(driven.store("store-spline")) if r.sensor == NAVIGATION]
+    assert (record.format, record.attributes["poses_changed"]) == ("spline", 0)
+
+
+def test_a_short_gap_of_a_trajectory_log_is_filled_where_that_is_wanted(navigated: Simulated, tmp_path: Path) -> None:
+    copy = navigated.copy_to(tmp_path / "survey")
+    (log,) = (copy.survey_file.parent / "raw" / "run-1").glob("*.sbet")
+    records = np.fromfile(log, dtype="<f8").reshape(-1, 17)
+    epochs = query(navigated.store(), "SELECT epoch_gps_ns AS t FROM scans ORDER BY t").column("t").to_numpy()
+    begin = epochs[epochs.size // 4] * 1e-9 % 604_800
+    records[(records[:, 0] < begin) | (records[:, 0] > begin + 1.5)].tofile(log)
+
+    def fates(store: str) -> dict[str, int]:
+        return survey_status(Survey.load(copy.survey_file), copy.store(store)).readings
+
+    copy.run("gap")
+    run = copy.run("filled", **with_spline(fill_gap_s=3.0))
+    assert fates("gap").get("no_pose", 0) > 100
+    survey = changed(Survey.load(copy.survey_file), with_spline(fill_gap_s=3.0))
+    assert survey_status(survey, copy.store("filled")).readings.get("no_pose", 0) == 0
+    assert any("gap (" in line and "filled in" in line for line in run.reporter.lines)
+    error, _ = errors_of(copy, computed(copy, "filled"))
+    assert np.linalg.norm(error, axis=1).max() < 0.15

@@ -16,8 +16,11 @@ from roadscan.model.crs import geodetic_from_world, world_from_geodetic
 from roadscan.model.errors import ConfigError, CrsError, NavigationError, RoadscanError, TimeSystemError
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
 from roadscan.model.imu import IMU_GRADES
+from roadscan.model.smoothing import SmootherConfig
 from roadscan.navigation.inertial.checks import Prepared, prepared
+from roadscan.navigation.inertial.outcome import check_outcome
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
+from roadscan.navigation.inertial.smoother import solve
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth
@@ -531,3 +534,27 @@ def test_logs_without_content() -> None:
     empty = ImuReadings(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(NavigationError, match="the IMU log is empty"):
         prepared(empty, gnss, None, vehicle)
+
+
+def outcome(logs: Logs, change: Change) -> list[str]:
+    imu, gnss, odometer, _ = mended(logs, change)
+    return check_outcome(solve(imu, gnss, odometer, logs[3], SmootherConfig()), gnss, logs[3])
+
+
+@pytest.mark.parametrize("axes", [[[-1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+                                  [[0, 1, 0], [1, 0, 0], [0, 0, 1]]])  # fmt: skip
+def test_horizontal_gyroscopes_of_a_calm_vehicle_show_in_the_result(axes: list[list[float]]) -> None:
+    """Nothing tells beforehand; the trajectory would be off by a metre, and is refused for it."""
+    with pytest.raises(NavigationError, match="the measurements contradict the trajectory.*record"):
+        outcome(turning(), mapped(axes, accelerometer=False))
+
+
+def test_accelerometer_across_an_even_straight_drive_is_doubted() -> None:
+    across = mapped(np.diag([1.0, -1, 1]).tolist(), gyro=False)
+    assert "measurements of several kinds disagree" in outcome(straight(), across)[0]
+
+
+def test_results_of_good_logs_are_not_doubted(drive: Logs) -> None:
+    outage = {"gaps": [{"start_s": 5.0, "duration_s": 10.0}], "jumps_per_minute": 10.0}
+    for logs in (drive, turning(), straight(), simulated(route=TURNS, gnss=outage)):
+        assert outcome(logs, same) == []

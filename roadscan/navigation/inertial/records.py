@@ -96,7 +96,9 @@ def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
     if rows.size < 2:
         raise NavigationError(f"the IMU log has {rows.size} usable samples", expected="at least two")
     epochs, values = imu.epochs_gps_ns[rows], values[rows]
-    repairs += _saturation(epochs, values, rows)
+    clipped, said = _saturation(epochs, values, rows)
+    repairs += said
+    epochs, values, rows = epochs[~clipped], values[~clipped], rows[~clipped]
     log = ImuReadings(epochs, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]))
     return Kept(log, rows, repairs + _gaps(epochs, rows))
 
@@ -272,9 +274,10 @@ def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None
         )
 
 
-def _saturation(epochs: Int64, values: Float64, rows: Int64) -> list[Repair]:
-    """Samples at the end of a sensor's scale: kept where they are few, refused where they are many."""
+def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Flags, list[Repair]]:
+    """Samples at the end of a sensor's scale: left out where they are few, refused where they are many."""
     repairs = []
+    out = np.zeros(epochs.size, dtype=bool)
     step_s = float(np.median(np.diff(epochs))) / NS_PER_S
     for axis in range(6):
         kind, name = axis // 3, f"{('gyroscope', 'accelerometer')[axis // 3]} {'xyz'[axis % 3]}"
@@ -296,9 +299,10 @@ def _saturation(epochs: Int64, values: Float64, rows: Int64) -> list[Repair]:
                     change="record with a wider scale, or mount the IMU more softly",
                     record=int(rows[clipped[0]]),
                 )
-            what = f"{name} stands at the end of its scale, {end:.6g}; the samples were kept as they are"
+            what = f"{name} stands at the end of its scale, {end:.6g}; what it felt is not known, the samples were left out"
             repairs.append(Repair("IMU", what, rows[clipped], epochs[clipped]))
-    return repairs
+            out[clipped] = True
+    return out, repairs
 
 
 def _is_constant(column: Float64) -> bool:

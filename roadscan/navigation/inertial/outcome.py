@@ -1,0 +1,126 @@
+"""Does the smoothed trajectory follow the positions that it was made of?
+
+Some wrong inputs no comparison of motions can tell beforehand (a horizontal gyroscope with the wrong sign on an even
+road). They leave their mark on the result: the smoother has to trust either the IMU or GNSS, and they disagree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import NavigationError
+from roadscan.model.frames import rotation_from_quaternion
+from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.navigation.inertial.motion import ned_from_world
+from roadscan.navigation.inertial.readings import GnssSolutions, Solution, VehicleSensors
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+FAR_SIGMAS: Final = 6.0
+"""A position so many σ from the trajectory disagrees with it."""
+LEAST_SIGMA_M: Final = 0.02
+"""σ of a GNSS position counts at least so much: what receivers state is often too good."""
+FAR_SHARE: Final = 0.05
+"""Greatest share of positions that may disagree."""
+CONTRADICTED: Final = 1 / 3
+"""Greatest share of another kind of measurement that may be outliers where positions disagree."""
+_DOUBTFUL: Final = 0.1
+_LEAST: Final = 20
+_CAUSE: Final = (
+    "check axes, signs and units of the IMU (its horizontal axes above all), its errors in the rig file, clocks, the "
+    "antenna's lever arm and the σ of the GNSS log"
+)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Antenna by the trajectory less antenna by GNSS."""
+
+    records: Int64
+    """(k,) rows of the GNSS log."""
+    ned_m: Float64
+    """(k, 3)."""
+    sigmas: Float64
+    """(k,) size by its σ."""
+
+
+def residuals_of(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> Residuals:
+    """Residuals of the GNSS positions within the trajectory's pieces that state a covariance."""
+    epochs = gnss.epochs_gps_ns
+    first, last = int(solution.epochs_gps_ns[0]), int(solution.epochs_gps_ns[-1])
+    pieces = solution.pieces or ((first, last),)
+    inside = np.any([(epochs >= a) & (epochs <= b) for a, b in pieces], axis=0)
+    sigma = np.sqrt(np.trace(gnss.covariance_ned_m2, axis1=1, axis2=2))
+    rows = np.flatnonzero(inside & np.isfinite(gnss.position_world_m[:, 0]) & np.isfinite(sigma))
+    arm = vehicle.antenna_lever_arm_body_m
+    found = solution.states.get("antenna_lever_arm_body_m")
+    if found is not None and len(found[0]):
+        arm = found[0][-1]
+    antenna = solution.position_world_m + rotation_from_quaternion(solution.quaternion_world_from_body) @ arm
+    origin = antenna[0]
+    known, wanted = ((e - first).astype(np.float64) / NS_PER_S for e in (solution.epochs_gps_ns, epochs[rows]))
+    at = np.stack([np.interp(wanted, known, antenna[:, k] - origin[k]) for k in range(3)], axis=-1)
+    ned = (at - (gnss.position_world_m[rows] - origin)) @ ned_from_world(solution.world, origin).T
+    own = np.interp(wanted, known, np.sqrt(np.einsum("nii->n", solution.covariance_position_ned_m2)))
+    stated = np.maximum(sigma[rows], LEAST_SIGMA_M)
+    return Residuals(rows, ned, np.linalg.norm(ned, axis=1) / np.hypot(stated, own))
+
+
+def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> list[str]:
+    """Refuse a trajectory that its own measurements contradict; note one that they doubt.
+
+    Multipath makes GNSS positions disagree, and them alone. Where an IMU is wrong, velocities, odometer and the
+    constraints of a vehicle disagree, too.
+
+    Returns
+    -------
+    What the user should know; empty where measurements and trajectory agree.
+
+    Raises
+    ------
+    NavigationError
+        where positions and another kind of measurement disagree with it.
+    """
+    doubted = _doubted(solution)
+    positions = doubted.pop("gnss position", 0.0)
+    most = max(doubted.values(), default=0.0)
+    found = residuals_of(solution, gnss, vehicle)
+    far = found.sigmas > FAR_SIGMAS
+    is_far = found.sigmas.size >= _LEAST and far.mean() > FAR_SHARE
+    if not (is_far and most > CONTRADICTED) and not min(positions, most) > 1.2 * CONTRADICTED:
+        others = sum(share > _DOUBTFUL for share in doubted.values())
+        if positions > 1.5 * _DOUBTFUL and others >= 2:
+            return [
+                f"measurements of several kinds disagree with the trajectory ({_told(positions, doubted)}): {_CAUSE}"
+            ]
+        return []
+    size = np.linalg.norm(found.ned_m, axis=1)
+    worst = int(np.argmax(size))
+    record = int(found.records[worst])
+    raise NavigationError(
+        f"the measurements contradict the trajectory: {_told(positions, doubted)} count as outliers, and "
+        f"{far.mean():.0%} of the GNSS positions lie more than {FAR_SIGMAS:g} σ away, the farthest, record {record} "
+        f"({iso_from_gps_ns(int(gnss.epochs_gps_ns[record]))}), by {size[worst]:.2f} m",
+        expected=f"less than a third of each kind, and at most {FAR_SHARE:.0%} so far away",
+        change=_CAUSE,
+        record=record,
+    )
+
+
+def _doubted(solution: Solution) -> dict[str, float]:
+    """Share of the measurements of each kind that count less than stated; kinds with too few are left out."""
+    found = solution.innovations
+    if found is None:
+        return {}
+    kinds = [kind for kind in np.unique(found.kind).tolist() if not kind.startswith("zero")]
+    return {k: float((found.weight[found.kind == k] < 1.0).mean()) for k in kinds if (found.kind == k).sum() >= _LEAST}
+
+
+def _told(positions: float, others: dict[str, float]) -> str:
+    shares = {"gnss position": positions} | others
+    return ", ".join(f"{share:.0%} of '{kind}'" for kind, share in shares.items())

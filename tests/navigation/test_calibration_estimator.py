@@ -15,7 +15,7 @@ from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import ConfigError, NavigationError
 from roadscan.model.frames import ENU_FROM_NED
 from roadscan.model.rig import Mounting, Sensor
-from roadscan.navigation.calibration.estimator import Estimate, ObjectPose, Prior, calibrate
+from roadscan.navigation.calibration.estimator import Estimate, ObjectPose, Prior, calibrate, priors_of
 from roadscan.navigation.calibration.evidence import Directions, Known, Orientation, Seen, Ties, Traverse
 from roadscan.navigation.calibration.observations import observations
 from roadscan.navigation.calibration.report import mounting_rows, report
@@ -538,6 +538,11 @@ def test_priors_come_from_the_rig_file_or_the_settings():
     default = Prior.of(Sensor(kind="profiler"), CalibrationSettings(lever_arm_sigma_m=(0.1, 0.1, 0.1)))
     assert default.lever_arm_sigma_m == (0.1, 0.1, 0.1)
     assert default.beam_axis_sensor == (0.0, 0.0, 1.0)
+    offsets = CalibrationSettings(range_offset_sigma_m={"lidar": 0.01})
+    both = priors_of({"lidar": stated, "left": Sensor(kind="profiler")}, offsets)
+    assert {name: one.range_offset_sigma_m for name, one in both.items()} == {"lidar": 0.01, "left": 0.0}
+    with pytest.raises(ConfigError, match="names the sensor 'lidar', which is not calibrated"):
+        priors_of({"left": stated}, offsets)
 
 
 def test_a_range_offset_is_found_where_it_may_be():

@@ -40,6 +40,7 @@ from roadscan.navigation.calibration.unknowns import (
     ObjectPose,
     Prior,
     Unknowns,
+    priors_of,
 )
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "ObjectPose",
     "Prior",
     "calibrate",
+    "priors_of",
 ]
 
 Float64 = npt.NDArray[np.float64]
@@ -165,7 +167,8 @@ def calibrate(
     sensors : those that are calibrated, with what is known of their mountings.
     evidence : observations, or a function that finds them with the mountings of an estimate; it is called until the
         mountings stay where they are.
-    traverses : errors of poses by the numbers that the evidence names.
+    traverses : errors of poses by the numbers that the evidence names; some hundreds, since the equations of all are
+        solved as a whole.
     settings : limits; their defaults where left out.
     objects : about where the calibration objects lie that the evidence names.
 

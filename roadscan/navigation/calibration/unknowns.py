@@ -55,6 +55,26 @@ class Prior:
         )
 
 
+def priors_of(sensors: Mapping[str, Sensor], settings: CalibrationSettings) -> dict[str, Prior]:
+    """What is known of the mountings of sensors, by name, before a calibration.
+
+    Raises
+    ------
+    ConfigError
+        where the settings allow a range offset for a sensor that is not among them.
+    """
+    for name in settings.range_offset_sigma_m:
+        if name not in sensors:
+            raise ConfigError(
+                f"range_offset_sigma_m names the sensor '{name}', which is not calibrated{nearest(name, sensors)}",
+                expected="one of " + ", ".join(sensors),
+            )
+    return {
+        name: Prior.of(sensor, settings, settings.range_offset_sigma_m.get(name, 0.0))
+        for name, sensor in sensors.items()
+    }
+
+
 @dataclass(frozen=True)
 class ObjectPose:
     """About where a calibration object lies."""

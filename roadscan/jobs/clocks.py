@@ -308,7 +308,7 @@ def _line(estimate: ClockEstimate) -> str:
     left = f", {estimate.refused} left out" if estimate.refused else ""
     return (
         f"{estimate.run}/{estimate.sensor}: {estimate.method}: {c.offset_s:+.6f} s ± {c.sigma_offset_s * 1e3:.3g} ms, "
-        f"drift {c.drift * 1e6:+.3f} ± {c.sigma_drift * 1e6:.2g} ppm, "
+        f"drift {c.drift * 1e6:+.3f} ± {c.sigma_drift * 1e6:.3g} ppm, "
         f"RMS {estimate.rms_s * 1e3:.3g} ms over {estimate.used} residuals{left}"
     )
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,10 @@ import pytest
 
 from roadscan.jobs.clocks import estimate_clocks, load_clocks
 from roadscan.jobs.ingest import ingest
+from roadscan.model.clock_evidence import MotionEvidence
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, RunError
 from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.survey import Survey
+from roadscan.model.survey import LogConfig, Survey
 from roadscan.simulate import Scene, simulate
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
@@ -166,6 +169,23 @@ def test_a_delay_of_the_sensor_is_not_one_of_its_clock(driven: tuple[Survey, Sto
     for sensor in ("profiler_left", "profiler_left_imu"):
         shift = delayed[("run-1", sensor)].offset_s - plain[("run-1", sensor)].offset_s
         assert shift == pytest.approx(0.0025, abs=1e-9)  # stamps are late by it, so the clock is less ahead
+
+
+# --- the page -----------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def test_what_the_page_states_can_be_stated() -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "clocks.md").read_text(), re.DOTALL)
+    parsed = [tomllib.loads(block) for block in blocks]
+    logs = [LogConfig.parse({"path": "a"} | one) for one in parsed if "clock" in one]
+    entries = [MotionEvidence.parse(entry) for one in parsed for entry in one.get("clocks", [])]
+    assert [log.clock is not None and log.clock.pairs is not None for log in logs] == [True, True]
+    example = tomllib.loads((ROOT / "docs" / "examples" / "clocks-survey.toml").read_text())["clocks"]
+    assert [e.sensor for e in entries] == [e["sensor"] for e in example]
+    scene = Scene.load(ROOT / "docs" / "examples" / "clocks.toml")
+    assert (scene.profilers.clock.offset_s, scene.encoder.clock.offset_s) == (-0.7312, 1.234)
 
 
 # --- pairs --------------------------------------------------------------------------------------------

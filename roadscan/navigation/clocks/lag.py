@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 
-from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.clocks.signals import Felt, Motion
 
 Bool = npt.NDArray[np.bool_]
@@ -60,8 +59,7 @@ def coarse_lag(felt: Felt, motion: Motion, search_s: float, about_s: float = 0.0
     axes that suit it best, by Fourier transforms over the bins that both have (masked correlation, Padfield, IEEE
     Trans. Image Process. 2012, 21).
     """
-    origin = motion.origin_gps_ns
-    since = (felt.epochs_gps_ns - origin).astype(np.float64) / NS_PER_S
+    since = motion.since_s(felt.epochs_gps_ns)
     reach = round(search_s / STEP_S)
     shift = round(about_s / STEP_S)
     first = int(np.floor(since[0] / STEP_S))

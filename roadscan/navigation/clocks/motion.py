@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from roadscan.model.clock_evidence import Drift
 from roadscan.model.errors import NavigationError
@@ -16,25 +15,13 @@ from roadscan.navigation.clocks.correction import ClockCorrection, Residuals
 from roadscan.navigation.clocks.lag import STEP_S, Lag, coarse_lag
 from roadscan.navigation.clocks.lines import Line, robust_line
 from roadscan.navigation.clocks.signals import Felt, Motion
+from roadscan.navigation.clocks.windows import LEAST_SAMPLES, LEAST_WINDOWS, Lags, Windows
 
-Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _CHUNK_S: Final = 300.0
 """The coarse lag is found in pieces of this length: a bad clock drifts away from a lag of the whole."""
-_WINDOWS: Final = 30
-_WINDOW_OF_RATES_S: Final = (2.0, 10.0)
-_WINDOW_OF_TOTALS_S: Final = (6.0, 30.0)
-"""Shortest and longest window. Within one a bias of the gyroscopes and the zero of a counter do not change."""
-_GAP: Final = 5.0
-_APART_S: Final = 2.0
-_ANSWER: Final = 0.05
-"""A shift changes what is left by at least this share of what the smoothed motion lets expect."""
-_LEAST_SAMPLES: Final = 20
-_LEAST_WINDOWS: Final = 3
-_POOR: Final = 30.0
-"""Windows whose σ is so many times that of the better ones say nothing: no motion."""
 _SOME: Final = 0.1
 """A shift that explains less of what was felt points nowhere."""
 _ROUNDS: Final = 25
@@ -86,7 +73,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
     """
     _check_units(felt, motion, what)
     start = _start(felt, motion, search_s, drift, what)
-    windows = _Windows.of(felt, motion)
+    windows = Windows.of(felt, motion)
     line, keep = start, None
     for round_ in range(_ROUNDS):
         lags = windows.lags(line, keep)
@@ -126,199 +113,13 @@ def _pieces(felt: Felt) -> list[Felt]:
     count = max(1, round(since[-1] / _CHUNK_S))
     cuts = np.searchsorted(since, np.linspace(0.0, since[-1], count + 1)[1:-1])
     parts = np.split(np.arange(since.size), cuts)
-    return [Felt(felt.epochs_gps_ns[p], felt.values[p], felt.is_total) for p in parts if p.size > _LEAST_SAMPLES]
+    return [Felt(felt.epochs_gps_ns[p], felt.values[p], felt.is_total) for p in parts if p.size > LEAST_SAMPLES]
 
 
-@dataclass(frozen=True)
-class _Lags:
-    """What the windows say."""
-
-    middle_s: Float64
-    """(w,) since the motion's origin, by the sensor's clock."""
-    lag_s: Float64
-    """(w,) lag that the window asks for, to be added to the sensor's epochs."""
-    sigma_s: Float64
-    """(w,)"""
-    moving: Bool
-    """(w,) False where a window says next to nothing."""
-    explained: float
-    gain: float
-    keep: float
-    """Of the filter that made the noise white."""
-
-
-@dataclass(frozen=True)
-class _Windows:
-    """A recording cut into windows of time."""
-
-    since_s: Float64
-    """(n,) since the motion's origin, by the sensor's clock."""
-    values: Float64
-    """(n, c)"""
-    window: Int64
-    """(n,) number of the window, growing."""
-    motion: Motion
-    is_total: bool
-    longest_s: float
-    """Longest time over which a bias or a zero is taken as constant."""
-
-    @classmethod
-    def of(cls, felt: Felt, motion: Motion) -> _Windows:
-        since = (felt.epochs_gps_ns - motion.origin_gps_ns).astype(np.float64) / NS_PER_S
-        shortest, longest = _WINDOW_OF_TOTALS_S if felt.is_total else _WINDOW_OF_RATES_S
-        length = float(np.clip((since[-1] - since[0]) / _WINDOWS, shortest, longest))
-        window = np.floor((since - since[0]) / length).astype(np.int64)
-        return cls(since, felt.values, window, motion, felt.is_total, longest)
-
-    def lags(self, line: Line, keep: float | None) -> _Lags | None:
-        """Lag that each window asks for, linearised about a line; None where fewer than three are left.
-
-        keep : of the filter that makes the noise white; None: it is found from the residuals.
-        """
-        shifted = self.since_s + line.at(self.since_s)
-        rows = self._rows(self.motion.known(shifted))
-        if rows.size == 0:
-            return None
-        _, group = np.unique(self.window[rows], return_inverse=True)
-        if group[-1] + 1 < _LEAST_WINDOWS:
-            return None
-        since, y = self.since_s[rows], self.values[rows]
-        f, df = self.motion.at(shifted[rows], total=self.is_total)
-        z, dz, ddz = self.motion.smooth(shifted[rows], total=self.is_total)
-        if keep is None:
-            mixing = _mixing(_centred(z, group), _centred(f, group), _centred(y, group), np.ones(rows.size))
-            keep = _keep(since, _centred(y, group) - _centred(f, group) @ mixing, self.longest_s)
-        white = _Whitening(keep, _starts(since))
-        f, df, z, dz, ddz, y = (white.applied(v) for v in (f, df, z, dz, ddz, y))
-        weight = np.ones(group[-1] + 1)
-        for _ in range(3):  # windows in which something else was felt do not shape A
-            mixing = _mixing(z, f, y, weight[group])
-            left = y - f @ mixing
-            variance = _variance(left, group)
-            usual = np.median(variance, axis=0)
-            weight = np.min(usual / np.maximum(variance, usual), axis=1)
-        noise = np.maximum(variance, usual) + 1e-300
-        shadow = _mixing(f, z, dz @ mixing, weight[group])
-        lever, turn = dz @ mixing - z @ shadow, ddz @ mixing - dz @ shadow  # a wrong A does not show in the lever
-        precision = (lever**2 / noise[group]).sum(axis=1)
-        change = (lever * (df @ mixing) - turn * left) / noise[group]
-        own, changes = (np.bincount(group, v).astype(np.float64) for v in (precision, change.sum(axis=1)))
-        answer = _answer(own, changes)
-        if answer is None:
-            return None
-        information = own * answer**2
-        asked = np.bincount(group, (lever * left / noise[group]).sum(axis=1)) * answer
-        middle = np.bincount(group, precision * since) / np.maximum(own, 1e-300)
-        middle = np.where(own > 0.0, middle, _means(since[:, None], group)[:, 0])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sigma = 1.0 / np.sqrt(information)
-            lag = line.at(middle) + np.where(information > 0.0, asked / information, 0.0)
-        moving = sigma <= _POOR * np.quantile(sigma, 0.1)
-        total = float((y**2).sum())
-        explained = 1.0 - float((left**2).sum()) / total if total > 0.0 else 0.0
-        gain = float(np.sqrt(((f @ mixing) ** 2).sum() / max(float((f**2).sum()), 1e-300)))
-        return _Lags(middle, lag, sigma, moving & np.isfinite(sigma), explained, gain, keep)
-
-    def _rows(self, known: Bool) -> Int64:
-        """Samples that are known, in windows that hold enough of them."""
-        count = np.bincount(self.window, known, minlength=int(self.window[-1]) + 1)
-        full = count >= max(_LEAST_SAMPLES, 0.3 * count.max())
-        return np.flatnonzero(known & full[self.window])
-
-
-@dataclass(frozen=True)
-class _Whitening:
-    """Filter that makes noise white which is the sum of white noise and a random walk: an ARMA(0, 1, 1) process.
-
-    e[k] = θ e[k − 1] + r[k] − r[k − 1] (Box and Jenkins 1976, 4.3.2). Ticks of a counter and gyroscopes' noise are
-    white; errors of positions and biases walk. A constant is taken away with it.
-    """
-
-    keep: float
-    """θ: near 1 where next to nothing walks, 0 where all does."""
-    starts: Int64
-    """Samples before which there is a gap, and the first one."""
-
-    def applied(self, values: Float64) -> Float64:
-        """Filtered columns (n, c). Nothing is carried over a gap; after one, the level is that of the first samples."""
-        level_of = max(1, round(1.0 / (1.0 - self.keep)))
-        out = np.empty_like(values)
-        for part in np.split(np.arange(values.shape[0]), self.starts[1:]):
-            own = values[part]
-            steps = np.diff(own, axis=0, prepend=own[:level_of].mean(axis=0, keepdims=True))
-            out[part] = lfilter([1.0], [1.0, -self.keep], steps, axis=0)
-        return out
-
-
-def _starts(since_s: Float64) -> Int64:
-    """The first sample, and those after a gap."""
-    steps = np.diff(since_s)
-    return np.concatenate([[0], np.flatnonzero(steps > _GAP * np.median(steps)) + 1])
-
-
-def _keep(since_s: Float64, left: Float64, memory_s: float) -> float:
-    """Of the filter that makes residuals (n, c) white: from how much they differ at once and after two seconds.
-
-    memory_s : longest memory.
-    """
-    step_s = float(np.median(np.diff(since_s)))
-    longest = float(np.exp(-step_s / memory_s))
-    apart = max(2, round(_APART_S / step_s))
-    if since_s.size <= 2 * apart:
-        return longest
-    unit = left / np.maximum(np.median(np.abs(left), axis=0), 1e-300)
-    near, far = (float(np.median(np.square(unit[m:] - unit[:-m]))) for m in (1, apart))
-    walk = max(far - near, 0.0) / (apart - 1)
-    ratio = walk / (max(near - walk, 1e-300) / 2)
-    return float(np.clip(1.0 + ratio / 2 - np.sqrt(ratio + ratio * ratio / 4), 0.0, longest))
-
-
-def _means(values: Float64, group: Int64) -> Float64:
-    count = np.maximum(np.bincount(group), 1)
-    return np.stack([np.bincount(group, column) / count for column in values.T], axis=-1)
-
-
-def _centred(values: Float64, group: Int64) -> Float64:
-    return values - _means(values, group)[group]
-
-
-def _answer(precision: Float64, change: Float64) -> Float64 | None:
-    """How far what is left really changes with a shift, by what the smoothed motion lets expect, a window (w,).
-
-    Windows that say little take over what all say. None where all is noise.
-    """
-    mean = float(precision.mean())
-    usual = float(change.mean()) / max(mean, 1e-300)
-    if not usual > _ANSWER:
-        return None
-    own = (change + mean * usual) / (precision + mean)
-    return np.asarray(np.maximum(own, 0.3 * usual))
-
-
-def _mixing(instrument: Float64, f: Float64, y: Float64, weight: Float64) -> Float64:
-    """A (p, c) with which f @ A explains y: instrumental variables, so that noise in f does not make A too small.
-
-    instrument : (n, p) like f, without its noise.
-    """
-    weighted = instrument * weight[:, None]
-    size = np.sqrt((f**2).mean(axis=0))  # distances and angles are of different size
-    size = np.where(size > 0.0, size, 1.0)
-    normal = (weighted.T @ f) / np.outer(size, size)
-    right = (weighted.T @ y) / size[:, None]
-    mixing: Float64 = np.linalg.pinv(normal, rcond=1e-6) @ right / size[:, None]
-    return mixing
-
-
-def _variance(left: Float64, group: Int64) -> Float64:
-    """(w, c) variance of residuals about zero a window."""
-    count = np.maximum(np.bincount(group) - 1, 1)
-    return np.stack([np.bincount(group, column**2) / count for column in left.T], axis=-1)
-
-
-def _check(lags: _Lags, line: Line, start: Line, what: str) -> None:
+def _check(lags: Lags, line: Line, start: Line, what: str) -> None:
     """Refuse an estimate that left the coarse lag's peak, or that is in another unit."""
     away = np.abs(line.at(lags.middle_s) - start.at(lags.middle_s)).max()
-    if line.sigma_offset_s > STEP_S or np.count_nonzero(line.used) < _LEAST_WINDOWS:
+    if line.sigma_offset_s > STEP_S or np.count_nonzero(line.used) < LEAST_WINDOWS:
         raise _too_little(what, f"the offset is known to {line.sigma_offset_s:.2g} s only")
     if away > 10 * STEP_S:
         raise _too_little(what, f"the fine estimate lies {away:.2g} s from the coarse one")
@@ -344,7 +145,7 @@ def _wrong_unit(what: str, gain: float) -> NavigationError:
     )
 
 
-def _fit(felt: Felt, motion: Motion, lags: _Lags, line: Line) -> MotionFit:
+def _fit(felt: Felt, motion: Motion, lags: Lags, line: Line) -> MotionFit:
     origin = motion.origin_gps_ns
 
     def epochs(since_s: Float64) -> Int64:

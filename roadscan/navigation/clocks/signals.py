@@ -82,6 +82,11 @@ class Motion:
         """Epoch from which the splines count."""
         return int(self.epochs_gps_ns[0])
 
+    def since_s(self, epochs_gps_ns: Int64) -> Float64:
+        """(n,) seconds from the origin to epochs (n,)."""
+        since: Float64 = (epochs_gps_ns - self.origin_gps_ns).astype(np.float64) / NS_PER_S
+        return since
+
     @cached_property
     def interval_s(self) -> float:
         """Usual time from knot to knot."""
@@ -114,8 +119,7 @@ class Motion:
 
     @cached_property
     def _knots_s(self) -> Float64:
-        since: Float64 = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64) / NS_PER_S
-        return since
+        return self.since_s(self.epochs_gps_ns)
 
     @cached_property
     def _sound(self) -> Bool:

@@ -59,32 +59,44 @@ def _draw_over_time(axes: Axes, picture: ClockPicture) -> None:
     axes.axhline(0.0, color="black", linewidth=0.7)
     for chosen, colour, label in ((~r.used, _GREY, "left out"), (r.used, _BLUE, "used")):
         if chosen.any():
-            shown = np.clip(r.residual_s[chosen] / scale, -high, high)
+            shown = np.clip(r.residual_s[chosen] / scale, -0.97 * high, 0.97 * high)
             axes.errorbar(
                 since[chosen], shown, np.minimum(r.sigma_s[chosen] / scale, 2 * high), fmt="o", color=colour,
                 markersize=3.5, elinewidth=0.7, label=label,
             )  # fmt: skip
-    axes.set_ylim(-high, high)
+    for at, value in zip(since, r.residual_s / scale, strict=True):
+        if abs(value) > high:  # beyond the axis: said in words
+            side = "left" if at < (left + right) / 2 else "right"
+            axes.text(at, np.copysign(0.9 * high, value), f" {value:+.4g} {unit} ", fontsize=7, color=_GREY, ha=side)
+    late = _is_late(r)
+    axes.set_ylim(-0.1 * high if late else -high, high)
     axes.set_xlim(left, right)
     begin = iso_from_gps_ns(origin) if origin > NS_PER_S * 86_400 * 365 else "the first stamp"
     axes.set_xlabel(f"s since {begin}, by the uncorrected clock", fontsize=8)
     axes.set_ylabel(f"residual, observed − fitted ({unit})", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.grid(color="#e6e6e6", linewidth=0.6)
-    axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+    axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
 
 
 def _draw_spread(axes: Axes, r: Residuals) -> None:
     normalised = np.clip((r.residual_s / r.sigma_s)[r.used], -_NORMALISED, _NORMALISED)
-    edges = np.linspace(-_NORMALISED, _NORMALISED, 21)
+    late = _is_late(r)
+    least = 0.0 if late else -_NORMALISED
+    edges = np.linspace(least, _NORMALISED, 11 if late else 21)
     axes.hist(normalised, edges.tolist(), orientation="horizontal", color=_BLUE, alpha=0.8)
-    at = np.linspace(-_NORMALISED, _NORMALISED, 201)
-    expected = normalised.size * (edges[1] - edges[0]) * np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi)
-    axes.plot(expected, at, color="black", linewidth=0.9)
-    axes.set_ylim(-_NORMALISED, _NORMALISED)
+    at = np.linspace(least, _NORMALISED, 201)
+    density = np.exp(-at) if late else np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi)
+    axes.plot(normalised.size * (edges[1] - edges[0]) * density, at, color="black", linewidth=0.9)
+    axes.set_ylim(-0.1 * _NORMALISED if late else -_NORMALISED, _NORMALISED)
     axes.set_xlabel("how many; line: as σ promise", fontsize=8)
     axes.set_ylabel("residual / σ", fontsize=8)
     axes.tick_params(labelsize=8)
+
+
+def _is_late(r: Residuals) -> bool:
+    """True for delays, which are never below zero: those of arrivals at a host."""
+    return bool(r.used.sum() > 2 and (r.residual_s >= 0.0).all())
 
 
 def _unit(r: Residuals) -> tuple[float, str]:
@@ -96,6 +108,6 @@ def _summary(picture: ClockPicture) -> str:
     c, r = picture.correction, picture.residuals
     return (
         f"{picture.method}: offset {c.offset_s:+.6f} s ± {c.sigma_offset_s * 1e3:.3g} ms, "
-        f"drift {c.drift * 1e6:+.3f} ± {c.sigma_drift * 1e6:.2g} ppm, RMS {r.rms_s * 1e3:.3g} ms, "
+        f"drift {c.drift * 1e6:+.3f} ± {c.sigma_drift * 1e6:.3g} ppm, RMS {r.rms_s * 1e3:.3g} ms, "
         f"{int(r.used.sum())} used, {int((~r.used).sum())} left out"
     )

@@ -681,15 +681,15 @@ def _travel(sums, ways, seconds, travel, values, layout, model, h, y, noise, wha
                 all_h[i, ATTITUDE + j] += b[i, m] * sums[9, m, j] / seconds
                 all_h[i, GYRO_BIAS + j] += cross_arm[i, m] * b[m, j]
     pitch, heading = values[layout.tilt - 9], values[layout.tilt - 8]
+    sp, cp, sh, ch = math.sin(pitch), math.cos(pitch), math.sin(heading), math.cos(heading)
     for j in range(h.shape[1]):
-        h0, h1, h2 = all_h[0, j], all_h[1, j], all_h[2, j]
-        all_h[0, j] = h0 - pitch * h2 + heading * h1
-        all_h[1, j] = h1 - heading * h0
-        all_h[2, j] = h2 + pitch * h0
-    all_h[0, layout.tilt], all_h[0, layout.tilt + 1] = -u[2], u[1]
-    all_h[1, layout.tilt + 1] = -u[0]
-    all_h[2, layout.tilt] = u[0]
-    forward = u[0] - pitch * u[2] + heading * u[1]
+        along, aside = ch * all_h[0, j] + sh * all_h[1, j], ch * all_h[1, j] - sh * all_h[0, j]
+        down = all_h[2, j]
+        all_h[0, j], all_h[1, j], all_h[2, j] = cp * along - sp * down, aside, sp * along + cp * down
+    along, aside = ch * u[0] + sh * u[1], ch * u[1] - sh * u[0]
+    forward, downward = cp * along - sp * u[2], sp * along + cp * u[2]
+    all_h[0, layout.tilt], all_h[2, layout.tilt] = -downward, forward
+    all_h[0, layout.tilt + 1], all_h[1, layout.tilt + 1], all_h[2, layout.tilt + 1] = cp * aside, -along, sp * aside
     noise[:] = 0.0
     if what == 0:
         counted = travel / seconds
@@ -705,10 +705,10 @@ def _travel(sums, ways, seconds, travel, values, layout, model, h, y, noise, wha
         for j in range(h.shape[1]):
             h[0, j] = all_h[1, j]
             h[1, j] = all_h[2, j]
-        y[0] = heading * u[0] - u[1]
-        y[1] = -u[2] - pitch * u[0]
+        y[0] = -aside
+        y[1] = -downward
         share = model.interval_s / seconds
-        noise[0, 0] = (model.side_sigma**2 + (model.side_slip * w[2] * u[0] * u[0]) ** 2) * share
+        noise[0, 0] = (model.side_sigma**2 + (model.side_slip * w[2] * forward * forward) ** 2) * share
         noise[1, 1] = model.up_sigma**2 * share
 
 
@@ -1010,9 +1010,7 @@ def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_im
         v1 = track.velocity[b, 1] + dx[4] + c[3] * s0 + c[4] * s1 + c[5] * s2
         v2 = track.velocity[b, 2] + dx[5] + c[6] * s0 + c[7] * s1 + c[8] * s2
         if last != k:
-            s_lat, c_lat, s_lon, c_lon, _ = geodetic(
-                track.position[b, 0], track.position[b, 1], track.position[b, 2]
-            )
+            s_lat, c_lat, s_lon, c_lon, _ = geodetic(track.position[b, 0], track.position[b, 1], track.position[b, 2])
             level[0, 0], level[0, 1], level[0, 2] = -s_lat * c_lon, -s_lon, -c_lat * c_lon
             level[1, 0], level[1, 1], level[1, 2] = -s_lat * s_lon, c_lon, -c_lat * s_lon
             level[2, 0], level[2, 1], level[2, 2] = c_lat, 0.0, -s_lat

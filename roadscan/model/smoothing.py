@@ -62,7 +62,7 @@ class SmootherConfig(Strict):
     """Updates by odometer, non-holonomic constraint and standstill a second; the σ below hold for one of them."""
     odometer_sigma_m_per_s: float = Field(default=0.02, gt=0.0)
     """1 σ of the odometer's speed (m/s)."""
-    odometer_slip: float = Field(default=0.003, ge=0.0, le=0.2)
+    odometer_slip: float = Field(default=0.002, ge=0.0, le=0.2)
     """1 σ of the part that grows with speed: slip and unevenness (1)."""
     odometer_scale_sigma: float = Field(default=0.02, ge=0.0, le=0.2)
     """1 σ of the odometer's scale before it is estimated (1)."""

@@ -42,6 +42,8 @@ _COURSE_M_PER_S: Final = 3.0
 """Speed from which a course over ground is a heading."""
 _GYROCOMPASS_RAD: Final = np.radians(3.0)
 _GYROCOMPASS_S: Final = 30.0
+"""Heading and time from which standing alone tells the heading."""
+_EARLY_NS: Final = 2_000_000_000
 _HOUR_ANGLE: Final = np.radians(15.041)
 
 
@@ -192,7 +194,7 @@ def _spaced(epochs: Int64) -> Int64:
 
 
 def _first_run(still: Bool) -> slice | None:
-    """The first standstill that begins before anything else has happened, None where there is none."""
+    """The first standstill, None where there is none."""
     where = np.flatnonzero(still)
     if where.size == 0:
         return None
@@ -230,7 +232,7 @@ def _gyrocompass(
 ) -> tuple[Float64, float] | None:
     """Attitude standing, by gravity and the Earth's rate, where the gyroscopes are good enough for it."""
     run = _first_run(still)
-    if run is None:
+    if run is None or imu.epochs_gps_ns[run.start] - imu.epochs_gps_ns[0] > _EARLY_NS:
         return None
     seconds = float(imu.epochs_gps_ns[run.stop - 1] - imu.epochs_gps_ns[run.start]) * 1e-9
     errors = vehicle.imu_errors

@@ -91,8 +91,6 @@ def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
     return np.append(False, gnss.quality[1:] != gnss.quality[:-1])
 
 
-
-
 _STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
 _LEAST_DENSITY: Final = 1e-8
 """Noise of a perfect IMU, rad/√s and m/s/√s: rounding."""

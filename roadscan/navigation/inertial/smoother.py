@@ -123,9 +123,7 @@ def _pieces(imu: ImuReadings, config: SmootherConfig) -> list[ImuReadings]:
 
 
 def _part(imu: ImuReadings, rows: slice) -> ImuReadings:
-    return ImuReadings(
-        imu.epochs_gps_ns[rows], imu.angular_rate_rad_per_s[rows], imu.specific_force_m_per_s2[rows]
-    )
+    return ImuReadings(imu.epochs_gps_ns[rows], imu.angular_rate_rad_per_s[rows], imu.specific_force_m_per_s2[rows])
 
 
 def _solve_piece(
@@ -333,7 +331,7 @@ class _Run:
             covariance[:] = record.rows[:, :, :NAVIGATION]
             values[:] = record.values
             sigmas[:] = np.sqrt(np.einsum("nii->ni", record.covariance)[:, NAVIGATION:])
-        if not np.isfinite(correction).all() or not np.isfinite(covariance).all():
+        if not all(np.isfinite(a).all() for a in (correction, covariance, sigmas, track.position, track.quaternion)):
             raise NavigationError(
                 "the filter's numbers left all bounds",
                 expected="readings in rad/s and m/s², a GNSS that fits the IMU",

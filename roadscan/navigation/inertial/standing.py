@@ -25,9 +25,7 @@ _LEARNING_S: Final = 4.0
 """Least standing time, by GNSS, from which the trembling of a standing vehicle is learnt."""
 
 
-def standing(
-    imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings | None, vehicle: VehicleSensors
-) -> Bool:
+def standing(imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings | None, vehicle: VehicleSensors) -> Bool:
     """True (n,) at samples of an IMU within a standstill.
 
     How much a standing vehicle trembles, engine on, is learnt from the times when GNSS or odometer say that it stands; a

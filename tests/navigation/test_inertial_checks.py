@@ -545,7 +545,7 @@ def outcome(logs: Logs, change: Change) -> list[str]:
                                   [[0, 1, 0], [1, 0, 0], [0, 0, 1]]])  # fmt: skip
 def test_horizontal_gyroscopes_of_a_calm_vehicle_show_in_the_result(axes: list[list[float]]) -> None:
     """Nothing tells beforehand; the trajectory would be off by a metre, and is refused for it."""
-    with pytest.raises(NavigationError, match="the measurements contradict the trajectory.*record"):
+    with pytest.raises(NavigationError, match=r"the measurements contradict the trajectory.*record"):
         outcome(turning(), mapped(axes, accelerometer=False))
 
 

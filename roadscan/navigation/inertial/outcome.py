@@ -1,4 +1,4 @@
-"""Does the smoothed trajectory follow the positions that it was made of?
+"""Whether a smoothed trajectory follows the measurements that it was made of.
 
 Some wrong inputs no comparison of motions can tell beforehand (a horizontal gyroscope with the wrong sign on an even
 road). They leave their mark on the result: the smoother has to trust either the IMU or GNSS, and they disagree.
@@ -95,9 +95,8 @@ def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSenso
     if not (is_far and most > CONTRADICTED) and not min(positions, most) > 1.2 * CONTRADICTED:
         others = sum(share > _DOUBTFUL for share in doubted.values())
         if positions > 1.5 * _DOUBTFUL and others >= 2:
-            return [
-                f"measurements of several kinds disagree with the trajectory ({_told(positions, doubted)}): {_CAUSE}"
-            ]
+            said = _told(positions, doubted)
+            return [f"measurements of several kinds disagree with the trajectory ({said} are outliers): {_CAUSE}"]
         return []
     size = np.linalg.norm(found.ned_m, axis=1)
     worst = int(np.argmax(size))

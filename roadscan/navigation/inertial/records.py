@@ -299,7 +299,7 @@ def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Flags, lis
                     change="record with a wider scale, or mount the IMU more softly",
                     record=int(rows[clipped[0]]),
                 )
-            what = f"{name} stands at the end of its scale, {end:.6g}; what it felt is not known, the samples were left out"
+            what = f"{name} stands at the end of its scale, {end:.6g}, and felt more; the samples were left out"
             repairs.append(Repair("IMU", what, rows[clipped], epochs[clipped]))
             out[clipped] = True
     return out, repairs

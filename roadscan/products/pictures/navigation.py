@@ -170,8 +170,8 @@ def _summary(picture: NavigationPicture, residuals: _Residuals, axis: _Axis) -> 
         f"σ horizontal {np.median(horizontal):.3f} m median, {horizontal.max():.3f} m worst; down "
         f"{np.median(sigma[:, 2]):.3f} / {sigma[:, 2].max():.3f} m; heading "
         f"{np.degrees(np.median(s.sigma_rph_rad[:, 2])):.3f}° / {np.degrees(s.sigma_rph_rad[:, 2].max()):.3f}°",
-        f"{len(axis.outages_s)} outage{'s' if len(axis.outages_s) != 1 else ''}, {out_s:.0f} s without GNSS, the longest "
-        f"{max((b - a for a, b in axis.outages_s), default=0.0):.0f} s",
+        f"{len(axis.outages_s)} outage{'s' if len(axis.outages_s) != 1 else ''}, {out_s:.0f} s without GNSS, "
+        f"the longest {max((b - a for a, b in axis.outages_s), default=0.0):.0f} s",
     ]
     if residuals.seconds.size:
         flat = np.hypot(residuals.ned_m[:, 0], residuals.ned_m[:, 1])

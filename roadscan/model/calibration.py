@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -116,6 +116,8 @@ class ReferenceEvidence(Strict):
     """Kind of its heights; never assumed."""
     geoid: str | None = None
     """Geoid grid of orthometric heights, where they must become ellipsoidal."""
+    options: dict[str, Any] = {}
+    """Settings of the format (`roadscan formats NAME`)."""
     sigma_m: float = Field(default=0.003, gt=0.0)
     """1 σ of its points (m)."""
     runs: list[str] = []

@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
@@ -197,6 +198,8 @@ class NavigationConfig(Strict):
     """How it is computed."""
     spline: SplineConfig = SplineConfig()
     """Whether and how trajectory logs are smoothed where GNSS dropped out."""
+    calibration: CalibrationSettings = CalibrationSettings()
+    """What all evidence of a calibration of mountings shares."""
 
     max_gap_s: float = Field(default=1.0, gt=0)
     """Between two poses farther apart than this there is no pose: readings there are counted, not placed."""
@@ -296,6 +299,8 @@ class SurveyConfig(Strict):
     """Ground control and check points."""
     clocks: list[MotionEvidence] = []
     """Clocks of sensors that are found from shared motion."""
+    calibration: list[CalibrationEvidence] = []
+    """What mountings are calibrated from (`roadscan calibrate`)."""
     navigation: NavigationConfig = NavigationConfig()
     """Poses."""
     filters: FilterConfig = FilterConfig()

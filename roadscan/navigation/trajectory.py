@@ -177,10 +177,7 @@ class Trajectory:
 
     def _world_from_ned(self) -> Float64:
         """(n, 3, 3) world from local level at each knot."""
-        if self.world == LOCAL_WORLD:
-            return np.broadcast_to(ENU_FROM_NED, (self.epochs_gps_ns.size, 3, 3))
-        geodetic = geodetic_from_world(self.world, self.position_world_m)
-        return ecef_from_ned(np.radians(geodetic[:, 1]), np.radians(geodetic[:, 0]))
+        return world_from_ned(self.world, self.position_world_m)
 
     def _refuse(self, epoch: int, count: int) -> None:
         first, last = self.span_gps_ns
@@ -195,6 +192,14 @@ class Trajectory:
             expected=f"poses no more than {self.max_gap_s:g} s apart around it",
             change="check the clocks of log and trajectory, or raise navigation.max_gap_s",
         )
+
+
+def world_from_ned(world: str, position_world_m: Float64) -> Float64:
+    """(n, 3, 3) axes of the local level, north, east, down, at positions (n, 3) of a world frame."""
+    if world == LOCAL_WORLD:
+        return np.broadcast_to(ENU_FROM_NED, (len(position_world_m), 3, 3))
+    geodetic = geodetic_from_world(world, position_world_m)
+    return ecef_from_ned(np.radians(geodetic[:, 1]), np.radians(geodetic[:, 0]))
 
 
 def _turned(quaternion: Float64, turn: Float64) -> Float64:

@@ -30,6 +30,10 @@ _LEARNING: Final = 2
 _SETTLED_S: Final = 1e-7
 _SETTLED: Final = 0.02
 """The estimate stands when it moves by less than this, or this share of its σ."""
+_LONG: Final = 12
+_SWAYING: Final = 0.25
+"""After so many rounds an estimate that sways by this share of its σ stands, too: windows at the edge of being outliers
+come and go."""
 _GAIN: Final = (0.5, 2.0)
 """Rates that are so many times those of the other sensor are in another unit."""
 _OTHER_UNIT: Final = 20.0
@@ -84,7 +88,8 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
         ends = lags.middle_s[[0, -1]]
         moved = float(np.abs(asked.at(ends) - line.at(ends)).max())
         line = asked
-        if moved < max(_SETTLED_S, _SETTLED * line.sigma_offset_s):
+        enough = _SETTLED if round_ < _LONG else _SWAYING
+        if moved < max(_SETTLED_S, enough * line.sigma_offset_s):
             break
     else:
         raise _too_little(what, f"the estimate does not settle (it still moves by {moved:.2g} s)")
@@ -120,7 +125,7 @@ def _check(lags: Lags, line: Line, start: Line, what: str) -> None:
     """Refuse an estimate that left the coarse lag's peak, or that is in another unit."""
     away = np.abs(line.at(lags.middle_s) - start.at(lags.middle_s)).max()
     if line.sigma_offset_s > STEP_S or np.count_nonzero(line.used) < LEAST_WINDOWS:
-        raise _too_little(what, f"the offset is known to {line.sigma_offset_s:.2g} s only")
+        raise _too_little(what, f"the offset would be known to {line.sigma_offset_s:.2g} s only")
     if away > 10 * STEP_S:
         raise _too_little(what, f"the fine estimate lies {away:.2g} s from the coarse one")
     if not _GAIN[0] <= lags.gain <= _GAIN[1]:

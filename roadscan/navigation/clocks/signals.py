@@ -33,7 +33,9 @@ _SMOOTH_KNOTS: Final = 2.0
 _SMOOTH_S: Final = 0.01
 """Width (1 σ) of the filter that derivatives are taken behind."""
 _FINEST_S: Final = 0.01
-"""Samples that are closer are averaged: vehicles do not move faster."""
+"""Samples and knots that are closer are averaged, or left out: vehicles do not move faster."""
+_MOST_KNOTS: Final = 1_000_000
+"""Of a whole run: three hours at 100 a second, longer ones coarser."""
 
 
 @dataclass(frozen=True)
@@ -170,14 +172,14 @@ def turning(trajectory: Trajectory) -> Motion:
         interval_s = np.diff(trajectory.epochs_gps_ns) / NS_PER_S
         pole_body = rotation_from_quaternion(trajectory.quaternion_world_from_body)[:-1, 2]
         increments = increments + EARTH_RATE_RAD_PER_S * interval_s[:, None] * pole_body
-    return Motion(trajectory.epochs_gps_ns, _summed(increments))
+    return _motion(trajectory.epochs_gps_ns, increments)
 
 
 def turning_of_imu(imu: ImuReadings) -> Motion:
     """Angles about the axes of an IMU, whose stamps are right."""
     felt = _felt(imu.epochs_gps_ns, imu.angular_rate_rad_per_s, is_total=False)
     interval_s = np.diff(felt.epochs_gps_ns)[:, None] / NS_PER_S
-    return Motion(felt.epochs_gps_ns, _summed(0.5 * (felt.values[1:] + felt.values[:-1]) * interval_s))
+    return _motion(felt.epochs_gps_ns, 0.5 * (felt.values[1:] + felt.values[:-1]) * interval_s)
 
 
 def driving(trajectory: Trajectory, *, backwards_counts_down: bool) -> Motion:
@@ -195,7 +197,7 @@ def driving(trajectory: Trajectory, *, backwards_counts_down: bool) -> Motion:
     increments = np.column_stack([distance, _turns(trajectory)[:, 1:]])
     if not backwards_counts_down:
         increments = increments * np.where(distance < 0.0, -1.0, 1.0)[:, None]
-    return Motion(trajectory.epochs_gps_ns, _summed(increments), leads=True)
+    return _motion(trajectory.epochs_gps_ns, increments, leads=True)
 
 
 def _felt(epochs: Int64, values: Float64, *, is_total: bool) -> Felt:
@@ -208,8 +210,13 @@ def _felt(epochs: Int64, values: Float64, *, is_total: bool) -> Felt:
     return Felt(epochs[kept], values[kept], is_total)
 
 
-def _summed(increments: Float64) -> Float64:
-    return np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
+def _motion(epochs: Int64, increments: Float64, *, leads: bool = False) -> Motion:
+    """Totals of increments (k − 1, p), at no more knots than vehicles and memory ask for."""
+    totals = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
+    span_s = float(epochs[-1] - epochs[0]) / NS_PER_S
+    finest_s = max(_FINEST_S, span_s / _MOST_KNOTS)
+    every = max(1, round(finest_s / (float(np.median(np.diff(epochs))) / NS_PER_S)))
+    return Motion(epochs[::every], totals[::every], leads)
 
 
 def _turns(trajectory: Trajectory) -> Float64:

@@ -23,6 +23,7 @@ from roadscan.jobs.navigation_logs import (
 from roadscan.model.survey import Survey
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.inertial.checks import prepared
+from roadscan.navigation.inertial.outcome import check_outcome
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.products.pictures.navigation import NavigationPicture, draw_navigation
@@ -59,6 +60,7 @@ class PlannedSolution:
             where logs or rig file do not suffice, or contradict one another.
         """
         logs, clocks, survey = self.logs, dict(self.clocks), self.survey
+        settings = survey.config.navigation.smoother
         vehicle = vehicle_sensors(survey.rig, logs)
         wheel = logs.encoder[0].sensor if logs.encoder else ""
         imu, gnss, odometer, repairs = prepared(
@@ -66,10 +68,14 @@ class PlannedSolution:
             _on_time(gnss_solutions(self.store, logs.gnss), clocks.get(logs.gnss[0].sensor)),
             _on_time(odometer_readings(self.store, logs.encoder, survey.rig.sensors.get(wheel)), clocks.get(wheel)),
             vehicle,
+            drove_backwards=logs.run in settings.reversed_runs,
         )
         for repair in repairs:
             report(f"repaired: run '{logs.run}': {repair}")
-        solution = solve(imu, gnss, odometer, vehicle, survey.config.navigation.smoother)
+        solution = solve(imu, gnss, odometer, vehicle, settings)
+        notes = check_outcome(solution, gnss, vehicle)
+        for note in notes:
+            report(f"doubtful: run '{logs.run}': {note}")
         picture = NavigationPicture(
             f"{survey.config.id}, run {logs.run}", solution, gnss, vehicle.antenna_lever_arm_body_m
         )
@@ -77,6 +83,7 @@ class PlannedSolution:
             "world_frame": solution.world,
             "logs": [r.key for r in logs.records],
             "repairs": [str(r) for r in repairs],
+            "doubts": notes,
             **_summary(solution, gnss),
         }
         return Computed(_batches(solution), attributes, lambda path: draw_navigation(path, picture))

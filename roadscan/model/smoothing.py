@@ -18,6 +18,8 @@ class SmootherConfig(Strict):
     """The GNSS receiver or antenna of the rig; the only one at hand where left out."""
     encoder: str | None = None
     """The odometer of the rig; the only one where left out, none where the run has none."""
+    reversed_runs: list[str] = []
+    """Runs driven backwards for the most part; elsewhere accelerations that say so mean an IMU turned by 180°."""
     poses_per_s: float = Field(default=100.0, gt=0.0, le=2000.0)
     """Poses of the trajectory a second; at most the IMU's rate."""
     land_vehicle: bool = True

@@ -24,7 +24,7 @@ from roadscan.sensors.stamps import CALENDAR_SCALES, parse_calendar
 Int64 = npt.NDArray[np.int64]
 
 _WEEK_NS: Final = WEEK_S * NS_PER_S
-_MOST_NS: Final = 1 << 62
+_MOST_NS: Final = 1 << 61
 _DELIMITERS: Final = ",;\t"
 
 Written = int | float | str | dt.datetime
@@ -96,8 +96,11 @@ def _listed(path: Path) -> Iterator[tuple[int, Written, Written, float | None]]:
         raise FormatError(f"the table of pairs cannot be read as text: {error}", file=path) from error
     lines = text.splitlines()
     delimiter = max(_DELIMITERS, key=lines[0].count) if lines else ","
-    reader = csv.reader(lines, delimiter=delimiter)
-    names = [name.strip().lower() for name in next(reader, [])]
+    try:
+        records = list(csv.reader(lines, delimiter=delimiter))
+    except csv.Error as error:
+        raise FormatError(f"the table of pairs is no text table: {error}", file=path) from error
+    names = [name.strip().lower() for name in (records[0] if records else [])]
     missing = [name for name in ("stamp", "time") if name not in names]
     if missing:
         raise FormatError(
@@ -107,7 +110,7 @@ def _listed(path: Path) -> Iterator[tuple[int, Written, Written, float | None]]:
         )
     stamp, time = names.index("stamp"), names.index("time")
     sigma = names.index("sigma_s") if "sigma_s" in names else None
-    for number, fields in enumerate(reader, 1):
+    for number, fields in enumerate(records[1:], 1):
         if not any(field.strip() for field in fields):
             continue
         full = [*fields, *[""] * (len(names) - len(fields))]

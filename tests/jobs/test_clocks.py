@@ -12,7 +12,10 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from roadscan.jobs.clock_pairs import log_pairs
 from roadscan.jobs.clocks import estimate_clocks, load_clocks
 from roadscan.jobs.ingest import ingest
 from roadscan.model.clock_evidence import MotionEvidence
@@ -355,3 +358,22 @@ def test_pairs_that_cannot_be_are_refused(tmp_path: Path, clock: dict[str, Any],
     with pytest.raises(RoadscanError, match=words) as refused:
         ingest(*pair_survey(tmp_path, log))
     assert isinstance(refused.value, ConfigError | FormatError | RunError)
+
+
+@given(damage=st.lists(st.tuples(st.integers(0, 400), st.binary(min_size=1, max_size=3)), min_size=1, max_size=6))
+@settings(max_examples=80, deadline=None)
+def test_damaged_tables_of_pairs_never_crash(tmp_path_factory: pytest.TempPathFactory, damage: list[Any]) -> None:
+    folder = tmp_path_factory.mktemp("damage")
+    rows = [f"{1000 + 7 * k},2026-05-04T09:30:{k:02d}.5Z,0.01" for k in range(12)]
+    content = bytearray("\n".join(["stamp,time,sigma_s", *rows]).encode())
+    for at, inserted in damage:
+        content[at : at + len(inserted)] = inserted
+    (folder / "pairs.csv").write_bytes(bytes(content))
+    log = {"path": "a", "clock": {"system": "free", "pairs": {"sigma_s": 0.1, "table": "pairs.csv"}}}
+    survey, _ = pair_survey(folder, log)
+    try:
+        found = log_pairs(survey, survey.config.runs[0].logs[0])
+    except RoadscanError:
+        return
+    assert found is not None
+    assert np.isfinite([found.fit.offset_s, found.fit.drift]).all()

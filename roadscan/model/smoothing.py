@@ -30,14 +30,14 @@ class SmootherConfig(Strict):
     """What a sample of the IMU is: the mean over the interval that ends at its stamp (IMUs that integrate), or the
     value at the stamp itself. The wrong one shifts the IMU by half a sample: 5 ms at 100 Hz."""
     vibration_share: float = Field(default=0.2, ge=0.0, le=10.0)
-    """Share of the vibration at the upper end of the IMU's band that adds to its noise: aliases of what is above half its
-    rate, samples that are polled rather than timed (1)."""
+    """Share of the vibration at the upper end of the IMU's band that adds to its noise: aliases of what is above half
+    its rate, samples that are polled rather than timed (1)."""
     imu_clock_sigma_s: float = Field(default=0.0, ge=0.0, le=0.5)
     """1 σ of what remains of the IMU's clock error after its clock's correction: a constant delay against GNSS is
     estimated where this is above zero (s)."""
     imu_clock_wander_ms_per_sqrt_s: float = Field(default=0.0, ge=0.0, le=100.0)
-    """How the IMU's clock wanders against GNSS where it is not disciplined: change of that delay over a second, 1 σ, as a
-    random walk (ms)."""
+    """How the IMU's clock wanders against GNSS where it is not disciplined: change of that delay over a second, 1 σ,
+    as a random walk (ms)."""
     max_imu_gap_s: float = Field(default=1.0, gt=0.0, le=10.0)
     """A longer silence of the IMU ends the trajectory; it begins anew behind it (s)."""
 

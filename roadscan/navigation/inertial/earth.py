@@ -1,5 +1,7 @@
-"""The Earth as navigation needs it: level axes, normal gravity, rotation. WGS 84; other datums differ by far less
-than an accelerometer can tell."""
+"""The Earth as navigation needs it: level axes, normal gravity, rotation.
+
+WGS 84; other datums differ by far less than an accelerometer can tell.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.inertial import EARTH_RATE_RAD_PER_S, gravity_at, geodetic_of
+from roadscan.kernels.inertial import EARTH_RATE_RAD_PER_S, geodetic_of, gravity_at
 
 Float64 = npt.NDArray[np.float64]
 
@@ -21,10 +23,12 @@ def ecef_from_level(position_ecef_m: Float64) -> Float64:
     geodetic_of(np.ascontiguousarray(position_ecef_m), found)
     sa, ca, so, co, _ = found.T
     rows = [[-sa * co, -so, -ca * co], [-sa * so, co, -ca * so], [ca, np.zeros_like(ca), -sa]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    axes: Float64 = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    return axes
 
 
 def gravity_ecef(position_ecef_m: Float64) -> Float64:
     """Normal gravity (3,) at a position (3,), ECEF axes (m/s²)."""
     size, *up = gravity_at(*(float(x) for x in position_ecef_m))
-    return -size * np.array(up)
+    gravity: Float64 = -size * np.array(up)
+    return gravity

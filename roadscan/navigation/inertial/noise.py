@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
-from roadscan.kernels.kalman import Fixes
+from roadscan.kernels.kalman_states import Fixes
 from roadscan.model.imu import ImuErrors
 from roadscan.model.smoothing import SmootherConfig
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings
@@ -83,7 +83,8 @@ def _covariance(gnss: GnssSolutions, config: SmootherConfig) -> Float64:
     raised = np.maximum(floor**2 - np.einsum("nii->ni", found), 0.0)
     found += raised[:, :, None] * np.eye(3)
     # A log that rounds its covariances may state a correlation of one: the least eigenvalue is kept off zero.
-    return found + 0.01 * np.einsum("nii->ni", found)[:, :, None] * np.eye(3)
+    kept: Float64 = found + 0.01 * np.einsum("nii->ni", found)[:, :, None] * np.eye(3)
+    return kept
 
 
 def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
@@ -106,9 +107,10 @@ def imu_noise(
     at = np.clip(np.searchsorted(imu.epochs_gps_ns, epochs), 0, imu.epochs_gps_ns.size - 1)
     step = float(np.median(np.diff(imu.epochs_gps_ns))) * 1e-9
     share = config.vibration_share**2 * step
-    return tuple(  # type: ignore[return-value]
-        density**2 + share * _trembling(vectors, round(_TREMBLING_S / step))[at]
-        for density, vectors in ((gyro, imu.angular_rate_rad_per_s), (accel, imu.specific_force_m_per_s2))
+    size = round(_TREMBLING_S / step)
+    return (
+        gyro**2 + share * _trembling(imu.angular_rate_rad_per_s, size)[at],
+        accel**2 + share * _trembling(imu.specific_force_m_per_s2, size)[at],
     )
 
 

@@ -1,33 +1,24 @@
 """The smoother: a trajectory from IMU, GNSS and odometer.
 
-A loosely coupled error-state Kalman filter runs forwards over a run, a smoother back (:mod:`roadscan.kernels.kalman`). The
-order of things is :mod:`~roadscan.navigation.inertial.timeline`, the first attitude
-:mod:`~roadscan.navigation.inertial.alignment`, standstill :mod:`~roadscan.navigation.inertial.standing`, the trust in
-GNSS :mod:`~roadscan.navigation.inertial.noise`.
+A loosely coupled error-state Kalman filter (:mod:`roadscan.kernels.kalman`) runs forwards over a run, a smoother
+(:mod:`roadscan.kernels.kalman_smoother`) back. The order of things is :mod:`~roadscan.navigation.inertial.timeline`,
+the first attitude :mod:`~roadscan.navigation.inertial.alignment`, standstill
+:mod:`~roadscan.navigation.inertial.standing`, the trust in readings :mod:`~roadscan.navigation.inertial.noise`.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
-from roadscan.kernels.kalman import (
-    NAVIGATION,
-    Layout,
-    Model,
-    Poses,
-    Record,
-    Start,
-    Track,
-    Updates,
-    filter_forwards,
-    smooth_backwards,
-    spread,
-)
+from roadscan.kernels.kalman import filter_forwards
+from roadscan.kernels.kalman_smoother import Poses, smooth_backwards, spread
+from roadscan.kernels.kalman_states import NAVIGATION, Layout, Model, Nodes, Record, Start, Track, Updates
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import quaternion_from_rotation
@@ -79,8 +70,8 @@ def solve(
 
     Returns
     -------
-    Poses at the IMU's epochs, thinned to `poses_per_s`; a silence of the IMU longer than `max_imu_gap_s` divides it into
-    pieces (`Solution.pieces`) that know nothing of one another.
+    Poses at the IMU's epochs, thinned to `poses_per_s`; a silence of the IMU longer than `max_imu_gap_s` divides it
+    into pieces (`Solution.pieces`) that know nothing of one another.
 
     Raises
     ------
@@ -119,7 +110,7 @@ def _pieces(imu: ImuReadings, config: SmootherConfig) -> list[ImuReadings]:
     """Unbroken pieces of the IMU's samples."""
     cuts = np.flatnonzero(np.diff(imu.epochs_gps_ns) > config.max_imu_gap_s * 1e9) + 1
     edges = [0, *cuts.tolist(), imu.epochs_gps_ns.size]
-    return [_part(imu, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [_part(imu, slice(a, b)) for a, b in itertools.pairwise(edges)]
 
 
 def _part(imu: ImuReadings, rows: slice) -> ImuReadings:
@@ -139,7 +130,7 @@ def _solve_piece(
     gnss = chosen(gnss, (gnss.epochs_gps_ns >= epochs[0]) & (gnss.epochs_gps_ns <= epochs[-1]))
     if gnss.epochs_gps_ns.size < 3 or epochs[-1] - epochs[0] < _SHORTEST_PIECE_S * 1e9:
         raise NavigationError(
-            f"{_span(imu) if epochs.size else 'an empty IMU log'} holds {gnss.epochs_gps_ns.size} usable GNSS solutions",
+            f"{gnss.epochs_gps_ns.size} usable GNSS solutions lie within the IMU's samples from {_span(imu)}",
             expected=f"at least 3, and {_SHORTEST_PIECE_S:g} s",
             change="check the clocks of both logs",
         )
@@ -275,7 +266,8 @@ def _refined(
 
 def _until(whole: Timeline, last: int) -> Timeline:
     """The beginning of a timeline, up to a node."""
-    nodes = type(whole.nodes)(*(column[: last + 1] for column in whole.nodes))
+    columns: list[Any] = [column[: last + 1] for column in whole.nodes]
+    nodes = Nodes(*columns)
     return Timeline(whole.bounds[: int(nodes.bound[-1]) + 1], whole.steps, nodes, whole.fixes, whole.samples)
 
 
@@ -322,7 +314,8 @@ class _Run:
             np.empty(most),
         )
         made = filter_forwards(whole.steps, whole.nodes, whole.fixes, model, layout, start, track, record, updates)
-        updates = Updates(*(column[:made] for column in updates))
+        columns: list[Any] = [column[:made] for column in updates]
+        updates = Updates(*columns)
         correction, covariance = np.zeros((count, NAVIGATION)), np.empty((count, NAVIGATION, NAVIGATION))
         values, sigmas = np.empty((reports, n - NAVIGATION)), np.empty((reports, n - NAVIGATION))
         if smooth:

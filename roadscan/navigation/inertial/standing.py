@@ -28,8 +28,8 @@ _LEARNING_S: Final = 4.0
 def standing(imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings | None, vehicle: VehicleSensors) -> Bool:
     """True (n,) at samples of an IMU within a standstill.
 
-    How much a standing vehicle trembles, engine on, is learnt from the times when GNSS or odometer say that it stands; a
-    sample stands when rate and force tremble no more than there, and nothing says that it moves. Where nothing ever
+    How much a standing vehicle trembles, engine on, is learnt from the times when GNSS or odometer say that it stands;
+    a sample stands when rate and force tremble no more than there, and nothing says that it moves. Where nothing ever
     stands, the noise of the data sheet is the measure.
     """
     seconds = (imu.epochs_gps_ns - imu.epochs_gps_ns[0]) * 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.inertial import increments
-from roadscan.kernels.kalman import Fixes, Nodes, Steps
+from roadscan.kernels.kalman_states import Fixes, Nodes, Steps
 from roadscan.model.imu import ImuErrors
 from roadscan.model.smoothing import SmootherConfig
 from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise

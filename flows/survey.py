@@ -12,7 +12,7 @@ from flows.conduct import conduct, run_name
 
 @flow(name="survey", flow_run_name=run_name, persist_result=False)
 def survey(survey_file: str, workers: int | None = None, scheduler: str | None = None) -> State[Any]:
-    """Run a survey: ingest → footprints → tiles → products; only what is missing or stale is done.
+    """Run a survey: ingest → navigate → footprints → tiles → products; only what is missing or stale is done.
 
     Parameters
     ----------

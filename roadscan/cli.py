@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from roadscan.jobs.selection import Selection
     from roadscan.jobs.stages import Run, Stage
     from roadscan.jobs.status import Status
+    from roadscan.tables.store import Store
 
 app = typer.Typer(
     name="roadscan",
@@ -23,6 +24,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+camera = typer.Typer(help="Interior orientation and mounting of cameras.", no_args_is_help=True)
+app.add_typer(camera, name="camera")
 
 SurveyFile = Annotated[Path, typer.Argument(metavar="SURVEY.toml", help="The survey file.", show_default=False)]
 Workers = Annotated[
@@ -39,7 +43,7 @@ def run(
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
 ) -> None:
-    """Run a survey: ingest, footprints, tiles, products. Does only what is missing or stale."""
+    """Run a survey: ingest, navigate, footprints, tiles, products. Does only what is missing or stale."""
     if dry_run:
         _print_status(_status(survey_file), survey_file)
         return
@@ -65,6 +69,88 @@ def ingest(survey_file: SurveyFile) -> None:
 def navigate(survey_file: SurveyFile) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
     _run(survey_file, _stages("navigate"), 0, None)
+
+
+@app.command()
+def clocks(survey_file: SurveyFile) -> None:
+    """Clocks of sensors as they were estimated; estimates those that are missing or out of date."""
+    _run(survey_file, _stages("navigate"), 0, None)
+    from roadscan.jobs.clock_tables import kept_estimates
+
+    rows = [
+        (e.run, e.sensor, f"{e.correction.offset_s:+.6f}", f"{e.correction.sigma_offset_s:.2g}",
+         f"{e.correction.drift * 1e6:+.3f}", f"{e.correction.sigma_drift * 1e6:.2g}", e.method)
+        for e in kept_estimates(_store(survey_file))
+    ]  # fmt: skip
+    _table(("run", "sensor", "added s", "σ s", "drift ppm", "σ ppm", "found from"), rows)
+
+
+@app.command()
+def calibrate(survey_file: SurveyFile) -> None:
+    """Mountings of sensors from the evidence that the survey file names; readings are placed by them from then on."""
+    from roadscan.jobs.calibrate import PICTURE, calibrate_survey
+    from roadscan.model.survey import Survey
+
+    store = _store(survey_file)
+    with store.lock():
+        done = calibrate_survey(Survey.load(survey_file), store, typer.echo)
+    typer.echo(done.text)
+    typer.echo(f"written: table mountings, {store.path(PICTURE)}")
+
+
+@camera.command("interior")
+def camera_interior(
+    pictures: Annotated[list[Path], typer.Argument(help="Pictures of a chessboard, or their folder.")],
+    rig: Annotated[Path, typer.Option(help="Rig file to write to.")],
+    sensor: Annotated[str, typer.Option(help="Camera of the rig.")],
+    board: Annotated[str, typer.Option(help="Inner corners of the board, such as 9x6.")],
+    square: Annotated[float, typer.Option(help="Edge of a square (m).")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
+) -> None:
+    """Interior orientation from pictures of a chessboard, into the rig file."""
+    from roadscan.jobs.camera import calibrate_interior
+    from roadscan.model.errors import ConfigError
+    from roadscan.navigation.calibration.chessboard import Board
+
+    sides = board.lower().split("x")
+    if len(sides) != 2 or not all(side.isdigit() for side in sides):
+        raise ConfigError(f"--board {board}", expected="inner corners along both sides, such as 9x6")
+    chessboard = Board.parse({"columns": int(sides[0]), "rows": int(sides[1]), "square_m": square})
+    listed = pictures[0] if len(pictures) == 1 and pictures[0].is_dir() else pictures
+    found = calibrate_interior(listed, chessboard, rig, sensor, write=not dry_run)
+    rows = [(p.name, f"{p.rms_px:.3f}", f"{p.tilt_deg:.0f}", f"{p.distance_m:.2f}", "") for p in found.used]
+    rows += [(p.name, "", "", "", f"left out: {p.reason}") for p in found.rejected]
+    _table(("picture", "RMS px", "tilt °", "distance m", ""), rows)
+    i = found.interior
+    typer.echo(f"focal length {_numbers(i.focal_px, 3)} px, principal point {_numbers(i.principal_px, 3)} px")
+    typer.echo(f"k1, k2, p1, p2, k3: {_numbers(i.distortion, 6)}; RMS {i.rms_px:.3f} px, coverage {found.coverage:.0%}")
+    typer.echo("nothing written" if dry_run else f"written: {rig}, [sensors.{sensor}.interior]")
+
+
+@camera.command("resect")
+def camera_resect(
+    survey_file: SurveyFile,
+    sensor: Annotated[str, typer.Option(help="Camera of the rig.")],
+    points: Annotated[Path, typer.Option(help="CSV: picture, point, u_px, v_px.")],
+    sigma_px: Annotated[float, typer.Option(help="1 σ of a measured coordinate (pixels).")] = 0.5,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
+) -> None:
+    """Mounting of a camera from control points measured in its pictures, into the rig file."""
+    from roadscan.jobs.camera import resect_camera
+    from roadscan.model.survey import Survey
+    from roadscan.navigation.calibration.report import report
+
+    loaded = Survey.load(survey_file)
+    found = resect_camera(
+        loaded, _store(survey_file), sensor, points, sigma_px, loaded.config.navigation.calibration, write=not dry_run
+    )
+    typer.echo(report(found.resection.calibration))
+    for r in found.resection.outliers:
+        typer.echo(f"outlier: {r.measured.picture}, {r.measured.point}: {r.du_px:+.1f}, {r.dv_px:+.1f} px")
+    for c in found.checks:
+        typer.echo(f"check point: {c.measured.picture}, {c.measured.point}: {c.du_px:+.2f}, {c.dv_px:+.2f} px")
+    typer.echo(f"RMS {found.resection.rms_px:.2f} px, started from {found.resection.start}")
+    typer.echo("nothing written" if found.rig_file is None else f"written: {found.rig_file}, [sensors.{sensor}]")
 
 
 @app.command()
@@ -407,6 +493,18 @@ def _run(
         finally:
             reporter.close()
     return run
+
+
+def _store(survey_file: Path) -> Store:
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    return Store(loaded.store_url, loaded.config.id)
+
+
+def _numbers(values: Sequence[float], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
 def _reporter() -> Any:

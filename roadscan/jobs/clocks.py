@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.jobs.clock_pairs import log_pairs
-from roadscan.jobs.clock_tables import CLOCKS, ClockEstimate, keep_estimates, kept_estimates, load_clocks
+from roadscan.jobs.clock_tables import ClockEstimate, keep_estimates, kept_estimates, load_clocks
 from roadscan.jobs.fingerprint import key_of, solver_version
 from roadscan.jobs.ingest import survey_records
 from roadscan.jobs.navigation_logs import imu_readings, odometer_readings
@@ -78,7 +78,7 @@ def estimate_clocks(survey: Survey, store: Store, report: Report = lambda _: Non
         _draw(survey, store, task, fresh[0])
         found += fresh
         report(f"estimated: {_line(fresh[0])}")
-    if sorted(map(_place, found)) != sorted(map(_place, known.values())) or not store.exists(CLOCKS):
+    if sorted(map(_place, found)) != sorted(map(_place, known.values())):
         keep_estimates(store, found)
     if failures:
         raise RunError(
@@ -170,6 +170,7 @@ def _motion_tasks(survey: Survey, store: Store, records: Sequence[LogRecord]) ->
         for run in found:
             felt = tuple(r for r in own if r.run == run)
             against = _against(store, records, run, evidence)
+            _check_independence(evidence, run, felt, against)
             inputs = [[f.digest for files in r.tables.values() for f in files] for r in (*felt, *against)]
             sensor = survey.rig.sensors.get(evidence.sensor)
             way = None if sensor is None else sensor.metres_per_tick
@@ -218,6 +219,20 @@ def _against(store: Store, records: Sequence[LogRecord], run: str, evidence: Mot
             change="name in against what the run has",
         )
     return tuple(found)
+
+
+def _check_independence(
+    evidence: MotionEvidence, run: str, felt: Sequence[LogRecord], against: Sequence[LogRecord]
+) -> None:
+    """Refuse a computed trajectory that has the sensor's own clock in it."""
+    own = {r.key for r in felt}
+    if any(own & set(r.attributes.get("logs", ())) for r in against):
+        raise ConfigError(
+            f"the trajectory of run '{run}' was computed with the log of '{evidence.sensor}', so it has that clock's "
+            "error in it",
+            expected="motion that was measured by other sensors",
+            change="hold it against an IMU (against), or name another sensor in [navigation.smoother]",
+        )
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ from hypothesis import strategies as st
 
 from roadscan.jobs.clock_pairs import log_pairs
 from roadscan.jobs.clocks import estimate_clocks, load_clocks
-from roadscan.jobs.ingest import ingest
+from roadscan.jobs.ingest import ingest, survey_records
 from roadscan.model.clock_evidence import MotionEvidence
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, RunError
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.survey import LogConfig, Survey
 from roadscan.simulate import Scene, simulate
+from roadscan.tables.logs import write_log_record
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 
@@ -160,6 +162,28 @@ def test_what_cannot_be_is_refused(driven: tuple[Survey, Store], entry: dict[str
     survey, store = driven
     with pytest.raises(ConfigError, match=words):
         estimate_clocks(changed(survey, {"clocks": [entry]}), store)
+
+
+def test_a_trajectory_with_the_same_clock_in_it_is_refused(driven: tuple[Survey, Store]) -> None:
+    survey, store = driven
+    records = {r.sensor: r for r in survey_records(survey, store)}
+    solved = replace(
+        records["trajectory"], key="solved", sensor="navigation", attributes={"logs": [records["imu"].key]}
+    )
+    write_log_record(store, solved)
+    stated = changed(survey, {"clocks": [{"sensor": "imu"}]})
+    runs = stated.config.model_dump()["runs"]
+    runs[0]["logs"] = [log for log in runs[0]["logs"] if log["sensor"] is not None]
+    with pytest.raises(ConfigError, match="computed with the log of 'imu'"):
+        estimate_clocks(changed(stated, {"runs": runs}), store)
+
+
+def test_a_survey_without_clocks_gets_no_tables(driven: tuple[Survey, Store], tmp_path: Path) -> None:
+    log = wheel_log(tmp_path, start_gps_ns() // 1000 + np.arange(10) * 1_000_000)
+    survey, store = pair_survey(tmp_path, log | {"clock": {"system": "gps", "unit": "us"}})
+    ingest(survey, store)
+    assert estimate_clocks(survey, store) == []
+    assert store.files("tables/clocks") == []
 
 
 def test_a_delay_of_the_sensor_is_not_one_of_its_clock(driven: tuple[Survey, Store]) -> None:

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import small_gicp
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.rig import Mounting, Rig
@@ -38,7 +39,7 @@ CARS = [  # each drives in one of the two scans only
     {"station_m": -9.0, "offset_m": 2.0, "speed_m_per_s": 1.0, "passes": [2]},
 ]
 SITE = Scene().changed(
-    length_m=4.0,
+    length_m=3.0,
     map={"crs": "local"},
     road={"lanes": 2, "lane_width_m": 8.0},
     roadside={
@@ -247,14 +248,14 @@ def test_a_start_without_a_nominal_mounting(site: Site, seed: int, kind: str):
 
 
 def test_sigma_is_honest(site: Site):
-    """Errors over their covariance: six degrees of freedom, mean of 6 seeds between 2.4 and 11.8 (99.9 % of the time)."""
+    """Errors over their covariance: six degrees of freedom, mean of 5 seeds within its 99.9 % limits."""
     normalised = []
-    for seed in range(6):
+    for seed in range(5):
         found = register(site.standing(seed), site.reference(100 + seed), away(site.true, 1.0, 0.05, seed))
         step, covariance, _ = solved(found)
         error = off(found.mounting, site.true) + step
         normalised.append(error @ np.linalg.solve(covariance, error))
-    assert 2.4 < np.mean(normalised) < 11.8
+    assert chi2.ppf(0.0005, 30) / 5 < np.mean(normalised) < chi2.ppf(0.9995, 30) / 5
 
 
 def test_against_plain_small_gicp(site: Site):
@@ -305,7 +306,7 @@ def test_a_plane_alone_determines_three_directions(site: Site):
     """Flat ground: height, roll and pitch. Of the rest the ties hold nothing, and the mounting keeps what it was."""
     rng = np.random.default_rng(11)
     centre = site.mobile.position_world_m[0]
-    flat = np.column_stack([rng.uniform(-30, 30, (400_000, 2)), np.full(400_000, -1.0)])
+    flat = np.column_stack([rng.uniform(-20, 20, (180_000, 2)), np.full(180_000, -1.0)])
     ground = centre + flat + NOISE_M * rng.standard_normal(flat.shape)
     # Readings of that same plane from one pose.
     body = flat[rng.permutation(len(flat))[:20_000]] @ site.mobile.world_from_body[0]
@@ -322,7 +323,7 @@ def test_a_plane_alone_determines_three_directions(site: Site):
     )
     found = register(scan, ground, site.nominal, ReferenceOptions(incidence_max_deg=85.0, cell_m=0.5))
     assert rank(found) == 3
-    assert np.abs(off(found.mounting, site.nominal)[:2]).max() < 0.05
+    assert np.abs(off(found.mounting, site.nominal)[:2]).max() < 0.1
     # The estimator says so, and keeps what it was given; the vertical lever arm and roll and pitch it finds.
     prior = Prior(site.nominal, (0.05, 0.05, 0.05), (0.025, 0.025, 0.025))
     result = calibrate({"lidar": prior}, [found.ties], {0: EXACT}).sensors["lidar"]
@@ -425,3 +426,14 @@ def test_what_a_transformation_adds_to_a_mounting():
 def test_points_that_hold_no_transformation(points: np.ndarray, words: str):
     with pytest.raises(ConfigError, match=words):
         rigid_transform(points, points, 0.001)
+
+
+@pytest.mark.parametrize("seed", [20, 21])
+def test_a_start_far_beyond_what_was_stated_is_not_silently_wrong(site: Site, seed: int):
+    """Either the search gets there all the same, or it says that it did not."""
+    try:
+        found = register(site.moving(), site.reference(seed), away(site.true, 40.0, 3.0, seed))
+    except ConfigError as error:
+        assert "better mounting" in str(error) or "one frame" in str(error)
+    else:
+        assert within_bar(off(found.mounting, site.true)), found.fates

@@ -56,6 +56,7 @@ _FARTHEST_GATE_M: Final = 1.5
 _AT_LEAST: Final = 0.25
 """… but for the nearest ones, this share of all."""
 _USUAL_NOISE_M: Final = 0.01
+_WORST_NOISE_M: Final = 0.04
 _LEAST_RANGE_SIGMA_M: Final = 2e-4
 _SQUARELY: Final = 0.7
 _LEAST_USED: Final = 50
@@ -66,6 +67,8 @@ _PATCH_OUTLIER: Final = 3.0
 """A patch whose readings lie this many σ off on the median is another surface by now."""
 _BY_NOISE: Final = 5.0
 """Information of less than this many times what the noise of the normals brings is none."""
+_FARTHEST: Final = 5.0
+"""An end farther from the start than this many σ of it is another place that looks alike."""
 _MAD_TO_SIGMA: Final = 1.4826
 _NEARLY: Final = 0.05
 _CONVERGED: Final = 0.005
@@ -352,6 +355,7 @@ class _Search:
     def finish(self, surfels: Surfels, scan: Seen, origin: Float64) -> Registration:
         """Ties at the mounting found."""
         options = self._options
+        self._check_way()
         readings = self._readings.thinned(_MOST_LOOKED_UP)
         met = self._meet(readings, surfels, self._gate_m(readings, *_FINEST))
         fates = {
@@ -361,6 +365,12 @@ class _Search:
         plane_variance = surfels.variance_m2(met.patch, met.place_m)
         across = np.radians(options.angle_sigma_deg) * met.readings.range_m * np.sqrt(1.0 - met.cosine**2)
         range_sigma = options.range_sigma_m or _range_sigma(met, plane_variance + across**2)
+        if range_sigma > _WORST_NOISE_M and options.range_sigma_m is None:
+            raise ConfigError(
+                f"the readings of '{scan.sensor}' scatter by {range_sigma * 1e3:.0f} mm about their planes",
+                expected=f"{_WORST_NOISE_M * 1e3:.0f} mm at most: these are not the planes that they hit",
+                change="start from a better mounting, or state range_sigma_m if the sensor is that coarse",
+            )
         variance = (range_sigma * met.cosine) ** 2 + across**2
         whitened = met.distance_m / np.sqrt(variance + plane_variance)
         changed = _changed_patches(met.patch, whitened, len(surfels))[met.patch]
@@ -374,7 +384,7 @@ class _Search:
         sigma = np.sqrt(variance[chosen] + sharing * plane_variance[chosen])
         index = met.readings.index[chosen]
         normal = _insensitive(met.readings[chosen], self._pose, surfels.normal[met.patch[chosen]],
-                              surfels.slopes[met.patch[chosen]], sigma)  # fmt: skip
+                              surfels.wobble[met.patch[chosen]], sigma)  # fmt: skip
         ties = Ties(
             KIND,
             Seen(
@@ -390,6 +400,18 @@ class _Search:
         return Registration(
             self._pose.mounting(), ties, met.distance_m[chosen], index, float(range_sigma), tuple(self.levels), fates
         )
+
+    def _check_way(self) -> None:
+        """Refuse an end that is farther from the start than its stated σ allows."""
+        lever, turn = (float(np.linalg.norm(part)) for part in np.split(self._pose.since(self._start), 2))
+        options = self._options
+        sigma_m, sigma_deg = options.start_lever_sigma_m, options.start_boresight_sigma_deg
+        if lever > _FARTHEST * sigma_m or np.degrees(turn) > _FARTHEST * sigma_deg:
+            raise ConfigError(
+                f"the search ended {lever:.2f} m and {np.degrees(turn):.1f}° from the mounting it began with",
+                expected=f"no more than {_FARTHEST:g} times {sigma_m:g} m and {sigma_deg:g}°, as known at the start",
+                change="start from a better mounting, or state larger start_lever_sigma_m, start_boresight_sigma_deg",
+            )
 
     def _gate_m(self, readings: _Readings, sigma_m: float, sigma_rad: float) -> Float64:
         """How far (n,) a reading may lie from its plane: by the mounting's uncertainty, and by its own noise."""
@@ -409,7 +431,7 @@ class _Search:
         scale = max(_MAD_TO_SIGMA * float(np.median(np.abs(met.distance_m))), 1e-4)
         weight = 1.0 / (1.0 + (met.distance_m / (_CAUCHY * scale)) ** 2)
         sigma = scale / np.sqrt(weight)
-        normal = _insensitive(met.readings, self._pose, surfels.normal[met.patch], surfels.slopes[met.patch], sigma)
+        normal = _insensitive(met.readings, self._pose, surfels.normal[met.patch], surfels.wobble[met.patch], sigma)
         rows = np.einsum("ni,nia->na", normal, met.readings.ways(self._pose))
         weighted = rows / sigma[:, None] ** 2
         offset = self._pose.since(self._start)
@@ -418,7 +440,7 @@ class _Search:
         return step, float(np.sqrt(np.average(met.distance_m**2, weights=weight)))
 
 
-def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, slopes: Float64, sigma_m: Float64) -> Float64:
+def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, wobble: Float64, sigma_m: Float64) -> Float64:
     """Normals (n, 3) that say nothing of directions of the mounting which only the noise of the normals speaks of.
 
     On flat ground each patch is tilted a little by the noise of its points, and many such tilts seem to hold the
@@ -427,7 +449,7 @@ def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, slopes: Floa
     """
     way = readings.ways(pose)
     rows = np.einsum("ni,nia->na", normal, way) / sigma_m[:, None]
-    by_noise = np.einsum("nia,nij,njb,n->ab", way, slopes, way, sigma_m**-2.0, optimize=True)
+    by_noise = np.einsum("nia,nij,njb,n->ab", way, wobble, way, sigma_m**-2.0, optimize=True)
     values, vectors = eigh(rows.T @ rows, by_noise + 1e-12 * np.trace(by_noise) * np.eye(6))
     blind = vectors[:, values < _BY_NOISE]
     if blind.shape[1] == 0:

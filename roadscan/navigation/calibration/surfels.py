@@ -30,7 +30,6 @@ _AROUND: Final = 8.0
 _SAME: Final = 3.0
 _BENT_RAD: Final = 0.005
 _FEW: Final = 8
-_BEYOND_CHANCE: Final = 2.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,8 @@ class Surfels:
     """(m,) RMS of their distances from the plane."""
     slopes: Float64
     """(m, 3, 3) covariance of the plane's tilt: an offset d from the centre adds the variance dᵀ · slopes · d (1)."""
+    wobble: Float64
+    """(m, 3, 3) covariance of the normal as the direction of an even surface."""
 
     @classmethod
     def of(cls, cloud_m: Float64, cell_m: float, least_points: int = 8) -> Self:
@@ -78,7 +79,7 @@ class Surfels:
         variance = values[flat, :1] / (np.maximum(count[flat, None] - 3, 1) * values[flat, 1:])
         axes = vectors[flat][:, :, 1:]
         slopes = np.einsum("mia,ma,mja->mij", axes, variance, axes)
-        rough = cls(cell_m, mean[flat], vectors[flat, :, 0], count[flat], np.sqrt(values[flat, 0]), slopes)
+        rough = cls(cell_m, mean[flat], vectors[flat, :, 0], count[flat], np.sqrt(values[flat, 0]), slopes, slopes)
         return rough._steadied()
 
     def __len__(self) -> int:
@@ -110,10 +111,11 @@ class Surfels:
         return np.asarray(self.thickness_m[patch] ** 2 / self.points[patch] + tilt)
 
     def _steadied(self) -> Self:
-        """Normals drawn towards those of the patches around as far as the surface is even (empirical Bayes).
+        """Normals as the mean of those of the patches around that could lie on one even surface.
 
-        Flat ground whose patches are tilted by nothing but noise would seem to hold a vehicle in its place: each
-        tilt resists a shift a little. The true tilt's variance is what the normals around scatter beyond their own.
+        Ground whose patches are tilted a little, by noise or by its own roughness, would seem to hold a vehicle in
+        its place: each tilt resists a shift. That is deceptive, because with the next patch the tilt is another one.
+        What the normals scatter counts as the plane's uncertainty, and its mean's as that of the normal.
         """
         variance = np.trace(self.slopes, axis1=1, axis2=2) / 2.0
         pairs, sign = self._alike(variance)
@@ -123,17 +125,20 @@ class Surfels:
         weight = csr_matrix((signs / variance[second], (first, second)), shape=(len(self), len(self)))
         total = np.asarray(abs(weight).sum(axis=1)).ravel()
         mean = (weight @ self.normal) / total[:, None]
-        # |n_j − mean|² summed with weights, from the sums of squares: normals are unit vectors.
-        scatter = np.maximum(1.0 - (mean**2).sum(axis=1), 0.0) / 2.0
+        length = np.linalg.norm(mean, axis=1)
         neighbours = np.bincount(first, minlength=len(self))
-        # Scatter of noise alone is known to 1/√k of itself; only what lies beyond that is the surface's own.
-        expected = neighbours / total * (1.0 + _BEYOND_CHANCE / np.sqrt(neighbours))
-        between = np.maximum(scatter - expected, 0.0) + 1.0 / total
-        own = between / (between + variance)
-        own[neighbours < _FEW] = 1.0
-        drawn = own[:, None] * self.normal + (1.0 - own)[:, None] * mean
-        normal = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-        return replace(self, normal=normal, slopes=self.slopes * own[:, None, None])
+        # |n_j − mean|² summed with weights, from the sums of squares: normals are unit vectors.
+        scatter = np.maximum((1.0 - length**2) / 2.0, 1.0 / total)
+        alone = neighbours < _FEW
+        of_mean = np.where(alone, variance, scatter / neighbours)
+        tilt = np.where(alone, variance, np.maximum(scatter - neighbours / total, 0.0) + of_mean)
+        across = self.slopes / variance[:, None, None]
+        return replace(
+            self,
+            normal=np.where(alone[:, None], self.normal, mean / length[:, None]),
+            slopes=across * tilt[:, None, None],
+            wobble=across * of_mean[:, None, None],
+        )
 
     def _alike(self, variance: Float64) -> tuple[Int64, Float64]:
         """Pairs (p, 2) of patches near each other that could lie on one even surface; sign between their normals."""

@@ -60,7 +60,8 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
             predict(k, nodes, model, layout, present, interval, record, work)
             distrust += interval.length[0]
         record.first_update[k] = count
-        record.applied[k] = 0.0
+        for j in range(NAVIGATION):
+            record.applied[k, j] = 0.0
         prepare(nodes, k, model, present, offer)
         for kind in range(KINDS):
             size = offered(kind, k, nodes, fixes, model, layout, track, present, interval, offer)
@@ -76,12 +77,25 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
             if kind == GNSS_POSITION and updates.weight[count] == 1.0:
                 distrust = 0.0
             count += 1
-        record.rows[k] = present.covariance[:NAVIGATION]
-        if nodes.report[k] >= 0:
-            record.values[nodes.report[k]] = present.values
-            record.covariance[nodes.report[k]] = present.covariance
+        _keep(k, nodes.report[k], present, record)
     record.first_update[nodes.bound.size] = count
     return count
+
+
+@inlined
+def _keep(k, report, present, record):
+    """What the way back needs of a node, and all states where they are reported."""
+    p = present.covariance
+    n = p.shape[0]
+    for i in range(NAVIGATION):
+        for j in range(n):
+            record.rows[k, i, j] = p[i, j]
+    if report >= 0:
+        for i in range(n):
+            for j in range(n):
+                record.covariance[report, i, j] = p[i, j]
+        for j in range(n - NAVIGATION):
+            record.values[report, j] = present.values[j]
 
 
 @inlined

@@ -117,6 +117,13 @@ def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
         for d in range(size):
             for j in range(n):
                 z[c, j] -= inner[c, d] * row[d, j]
+    _downdate(row, z, size, information)
+
+
+@kernel
+def _downdate(row, z, size, information):
+    """Λ ← Λ − rowᵀ z − zᵀ row."""
+    n = information.shape[0]
     for c in range(size):
         for i in range(n):
             f, g = row[c, i], z[c, i]
@@ -132,18 +139,10 @@ def _adjoint_step(phi, decay, adjoint, information, work):
     for i in range(NAVIGATION):
         for j in range(mixed):
             part[j] += adjoint[i] * phi[i, j]
-    for j in range(NAVIGATION, n):
-        adjoint[j] *= decay[j]
-    for j in range(mixed):
-        adjoint[j] = part[j] if j < NAVIGATION else adjoint[j] + part[j]
-    # work = Λ Φ
-    for i in range(n):
-        for j in range(n):
-            work[i, j] = information[i, j] * decay[j] if j >= NAVIGATION else 0.0
-        for m in range(NAVIGATION):
-            f = information[i, m]
-            for j in range(mixed):
-                work[i, j] += f * phi[m, j]
+    for j in range(n):
+        kept = adjoint[j] * decay[j] if j >= NAVIGATION else 0.0
+        adjoint[j] = kept + (part[j] if j < mixed else 0.0)
+    _times_transition(information, phi, decay, work)
     for i in range(n):
         for j in range(n):
             information[i, j] = decay[i] * work[i, j] if i >= NAVIGATION else 0.0
@@ -153,6 +152,19 @@ def _adjoint_step(phi, decay, adjoint, information, work):
             if f != 0.0:
                 for j in range(n):
                     information[i, j] += f * work[m, j]
+
+
+@kernel
+def _times_transition(information, phi, decay, out):
+    """(n, n) Λ Φ."""
+    n = decay.size
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = information[i, j] * decay[j] if j >= NAVIGATION else 0.0
+        for m in range(NAVIGATION):
+            f = information[i, m]
+            for j in range(phi.shape[1]):
+                out[i, j] += f * phi[m, j]
 
 
 class Poses(NamedTuple):

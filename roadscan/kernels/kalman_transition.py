@@ -186,24 +186,10 @@ def _transition(sums, ways, seconds, field, scaled, phi):
 def predict(k, nodes, model, layout, present, interval, record, work):
     """P ← Φ P Φᵀ + Q over the interval that ends at node k; the other states decay."""
     p, phi, values = present.covariance, record.transition[k], present.values
-    n, mixed = layout.size, layout.inertial
+    n = layout.size
     decay = np.empty(n)
     decays(record.keep[k], nodes.colour_keep[k], layout, decay)
-    for i in range(9):
-        for j in range(n):
-            work[i, j] = 0.0
-        for m in range(mixed):
-            f = phi[i, m]
-            if f != 0.0:
-                for j in range(n):
-                    work[i, j] += f * p[m, j]
-    for i in range(9):
-        for j in range(i + 1):
-            total = 0.0
-            for m in range(mixed):
-                total += work[i, m] * phi[j, m]
-            p[i, j] = total
-            p[j, i] = total
+    _moved_rows(p, phi, work)
     for i in range(9, n):
         values[i - 9] *= decay[i]
         for j in range(9):
@@ -219,6 +205,27 @@ def predict(k, nodes, model, layout, present, interval, record, work):
     if layout.delay >= 0:
         p[layout.delay, layout.delay] += model.delay_wander**2 * interval.length[0]
     _add_noise(k, nodes, model, present, interval, phi)
+
+
+@kernel
+def _moved_rows(p, phi, work):
+    """Rows of navigation: work (9, n) ← Φ P, and the block Φ P Φᵀ of them in `p`."""
+    n, mixed = p.shape[0], phi.shape[1]
+    for i in range(9):
+        for j in range(n):
+            work[i, j] = 0.0
+        for m in range(mixed):
+            f = phi[i, m]
+            if f != 0.0:
+                for j in range(n):
+                    work[i, j] += f * p[m, j]
+    for i in range(9):
+        for j in range(i + 1):
+            total = 0.0
+            for m in range(mixed):
+                total += work[i, m] * phi[j, m]
+            p[i, j] = total
+            p[j, i] = total
 
 
 @kernel

@@ -167,12 +167,14 @@ def _travel(kind, counted_m, constrained, model, layout, present, interval, offe
         # A counter that does not know its direction counts up on the way back.
         if forward < -0.5 and counted > 0.0:
             counted = -counted
-        h[0] = rows[0]
+        for j in range(h.shape[1]):
+            h[0, j] = rows[0, j]
         h[0, layout.scale] = -counted
         y[0] = (1.0 + values[layout.scale - 9]) * counted - forward
         noise[0, 0] = (model.travel_sigma**2 + (model.travel_share * counted) ** 2) * share
         return 1
-    h[0], h[1] = rows[1], rows[2]
+    for j in range(h.shape[1]):
+        h[0, j], h[1, j] = rows[1, j], rows[2, j]
     y[0], y[1] = -aside, -downward
     noise[0, 0] = (model.side_sigma**2 + (model.side_slip * turning * forward * forward) ** 2) * share
     noise[1, 1] = model.up_sigma**2 * share

@@ -102,6 +102,18 @@ def test_orientations_come_back_with_honest_sigma(yards):
     assert sum(squares) > chi2.ppf(0.005, 3 * len(squares))
 
 
+def test_sigma_stays_honest_with_cheap_imus(tmp_path):
+    """Biases that wander by 0.2 mg a second: σ has to know that they do not average out within a curve."""
+    yard = Yard(tmp_path / "s", 33, "mems")
+    squares = []
+    for head in HEADS:
+        found = yard.find(head)
+        error = yard.error(head, found)
+        squares.append(error @ np.linalg.solve(found.covariance_rad2, error))
+        assert 0.02 < np.degrees(found.sigma_rad[2]) < 0.05
+    assert sum(squares) < chi2.ppf(0.995, 6)
+
+
 def test_it_is_the_rotation_that_aligns_the_turns_of_head_and_body(yards):
     """Rates of the head's gyroscopes against rates of the true trajectory, aligned by SciPy."""
     yard, head = yards[0], "profiler_right"

@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_matrix, diags
 
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
@@ -45,9 +46,10 @@ _FORCE_S: Final = 1.0
 """Half the width of a window of forces: twice differenced positions become exact with its power 1.5."""
 _TURN_S: Final = 0.2
 """Length of a window of rotations: short enough for the body's motion on its springs."""
-_KNOT_S: Final = 10.0
-"""Slow errors are linear between knots this far apart."""
-_PIECE_S: Final = 600.0
+_KNOT_S: Final = 2.0
+"""Slow errors are linear between knots this far apart: as they wander between knots, windows of one curve err alike,
+which their residuals do not tell."""
+_PIECE_S: Final = 150.0
 """Longer runs are cut into pieces whose slow errors are independent."""
 _CLOCK_SIGMA_S: Final = 0.01
 """1 σ of the time by which stamps are late: half a sample, and what is left after the clocks' estimate."""
@@ -69,6 +71,8 @@ _SLOW: Final = 9
 """Unknowns of a knot: bias of the accelerometers (3), of the gyroscopes (3), attitude error (3)."""
 _FIXED: Final = 7
 """Unknowns of a run: scales of accelerometers (3) and gyroscopes (3), time (1)."""
+
+_Rows = tuple[Float64, Float64, csr_matrix]
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,7 @@ def find_orientation(
 
 
 def _pieces(run: HeadRun) -> Iterator[HeadRun]:
-    """A run in pieces of about ten minutes at most."""
+    """A run in pieces of some minutes at most."""
     epochs = run.readings.epochs_gps_ns
     if not epochs.size:
         return
@@ -313,44 +317,44 @@ class _Run:
         knot = np.clip(np.floor(at), 0, self.knots - 2).astype(np.int64)
         return knot, np.clip(at - knot, 0.0, 1.0)
 
-    def rows(self, rotation: Float64) -> tuple[tuple[Float64, Float64, Float64], tuple[Float64, Float64, Float64]]:
-        """Residuals (n, 3), by shared unknowns (n, 3, 6) and own ones (n, 3, 9 knots + 7): of forces, of rotations."""
+    def rows(self, rotation: Float64) -> tuple[_Rows, _Rows]:
+        """Residuals (n, 3), by shared unknowns (n, 3, 6) and own ones (3 n, 9 knots + 7): of forces, of rotations."""
         return self._force_rows(rotation), self._turn_rows(rotation)
 
-    def _force_rows(self, rotation: Float64) -> tuple[Float64, Float64, Float64]:
+    def _force_rows(self, rotation: Float64) -> _Rows:
         residual = np.einsum("nabc,bc->na", self.force, rotation) - self.felt
         by_axis = np.einsum("nabc,ec->nabe", self.force, rotation)
         by_turn = -np.einsum("nabe,bed->nad", by_axis, _LEVI_CIVITA)
         shared = np.concatenate([by_turn, -self.lever], axis=2)
         slow = np.concatenate([-self.turned @ rotation, np.zeros_like(by_turn), by_turn], axis=2)
-        own = self._own(self.force_centres, slow)
-        begin = _SLOW * self.knots
-        own[:, :, begin : begin + 3] = -np.einsum("nabc,bc->nac", self.force, rotation)
-        own[:, :, begin + 6] = -self.felt_by_time
-        return residual, shared, own
+        fixed = np.zeros((len(residual), 3, _FIXED))
+        fixed[..., :3] = -np.einsum("nabc,bc->nac", self.force, rotation)
+        fixed[..., 6] = -self.felt_by_time
+        return residual, shared, self._own(self.force_centres, slow, fixed)
 
-    def _turn_rows(self, rotation: Float64) -> tuple[Float64, Float64, Float64]:
+    def _turn_rows(self, rotation: Float64) -> _Rows:
         in_body = self.head_turn @ rotation.T
         residual = in_body - self.body_turn
         by_turn = -cross_matrix(in_body)
         by_bias = -self.turn_seconds[:, None, None] * rotation
         shared = np.concatenate([by_turn, np.zeros_like(by_turn)], axis=2)
         slow = np.concatenate([np.zeros_like(by_turn), by_bias, by_turn], axis=2)
-        own = self._own(self.turn_starts, slow)
-        begin = _SLOW * self.knots
-        own[:, :, begin + 3 : begin + 6] = -rotation * self.head_turn[:, None, :]
-        own[:, :, begin + 6] = -self.body_turn_by_time
-        return residual, shared, own
+        fixed = np.zeros((len(residual), 3, _FIXED))
+        fixed[..., 3:6] = -rotation * self.head_turn[:, None, :]
+        fixed[..., 6] = -self.body_turn_by_time
+        return residual, shared, self._own(self.turn_starts, slow, fixed)
 
-    def _own(self, samples: Int64, slow: Float64) -> Float64:
-        """(n, 3, 9 knots + 7) with the derivatives by slow errors (n, 3, 9) at the knots around."""
-        own = np.zeros((samples.size, 3, _SLOW * self.knots + _FIXED))
+    def _own(self, samples: Int64, slow: Float64, fixed: Float64) -> csr_matrix:
+        """(3 n, 9 knots + 7) of derivatives by slow errors (n, 3, 9), at the knots around, and fixed ones (n, 3, 7)."""
         knot, way = self.between(samples)
-        index = np.arange(samples.size)
-        for side, share in ((0, 1.0 - way), (1, way)):
-            for axis in range(_SLOW):
-                own[index, :, (knot + side) * _SLOW + axis] += slow[:, :, axis] * share[:, None]
-        return own
+        way = way[:, None, None]
+        values = np.concatenate([slow * (1.0 - way), slow * way, fixed], axis=2)
+        near = _SLOW * knot[:, None] + np.arange(2 * _SLOW)
+        last = np.broadcast_to(_SLOW * self.knots + np.arange(_FIXED), (samples.size, _FIXED))
+        columns = np.repeat(np.concatenate([near, last], axis=1), 3, axis=0)
+        rows, wide = columns.shape
+        starts = wide * np.arange(rows + 1)
+        return csr_matrix((values.ravel(), columns.ravel(), starts), shape=(rows, _SLOW * self.knots + _FIXED))
 
 
 _LEVI_CIVITA: Final[Float64] = cross_matrix(np.eye(3)).transpose(1, 0, 2)
@@ -464,10 +468,10 @@ def _solved(runs: Sequence[_Run], rotation: Float64, lever_arm_sigma_m: Float64,
             scale = np.sqrt(weight)[:, None] / sigma
             r = (rows[0] * scale).ravel()
             a = (rows[1] * scale[..., None]).reshape(-1, _SHARED)
-            b = (rows[2] * scale[..., None]).reshape(len(r), -1)
+            b = diags(scale.ravel()) @ rows[2]
             shared += a.T @ a
             right -= a.T @ r
-            own += b.T @ b
+            own += (b.T @ b).toarray()
             mixed += b.T @ a
             own_right -= b.T @ r
         factor = cho_factor(own)
@@ -482,7 +486,7 @@ def _solved(runs: Sequence[_Run], rotation: Float64, lever_arm_sigma_m: Float64,
 
 
 def _left_over(run: _Run, rotation: Float64, step: Float64, own: Float64) -> tuple[Float64, Float64]:
-    force, turn = (r + a @ step + b @ own for r, a, b in run.rows(rotation))
+    force, turn = (r + a @ step + (b @ own).reshape(-1, 3) for r, a, b in run.rows(rotation))
     return force, turn
 
 

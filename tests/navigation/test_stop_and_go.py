@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -52,8 +53,14 @@ class Yard:
         return [HeadRun(*self._read(run, head), (TILT_RAD, TILT_RAD, 2 * TILT_RAD)) for run in self.runs]
 
     def find(self, head: str, runs: list[HeadRun] | None = None):
+        if runs is None:
+            return self._of_all_runs(head)
         nominal = self.nominal.sensors[f"{head}_imu"].mounting()
-        return find_orientation(runs or self.head_runs(head), nominal, LEVER_SIGMA_M, self.errors)
+        return find_orientation(runs, nominal, LEVER_SIGMA_M, self.errors)
+
+    @functools.cache  # noqa: B019 - a few yards, as long as the tests
+    def _of_all_runs(self, head: str):
+        return self.find(head, self.head_runs(head))
 
     def true_rotation(self, head: str) -> Rotation:
         return Rotation.from_matrix(self.true.sensors[f"{head}_imu"].mounting().arrays()[0])
@@ -81,7 +88,7 @@ class Yard:
 
 @pytest.fixture(scope="module")
 def yards(tmp_path_factory) -> list[Yard]:
-    return [Yard(tmp_path_factory.mktemp("yard") / "s", seed) for seed in (21, 22, 23)]
+    return [Yard(tmp_path_factory.mktemp("yard") / "s", seed) for seed in (21, 22)]
 
 
 def test_orientations_come_back_with_honest_sigma(yards):
@@ -146,7 +153,7 @@ def test_biases_are_found_too(yards):
 
 
 def test_a_late_clock_is_found(yards):
-    yard, head = yards[2], "profiler_left"
+    yard, head = yards[1], "profiler_left"
     late_ns = 4_000_000
     runs = [
         replace(run, readings=replace(run.readings, epochs_gps_ns=run.readings.epochs_gps_ns + late_ns))
@@ -191,14 +198,14 @@ def test_the_head_takes_the_orientation_of_its_imu(yards):
 
 def test_gaps_and_damaged_samples_cost_their_windows(yards):
     yard, head = yards[1], "profiler_left"
-    (whole, *rest) = yard.head_runs(head)
+    whole = yard.head_runs(head)[0]
     readings = whole.readings
     keep = np.ones(readings.epochs_gps_ns.size, dtype=bool)
     keep[5000:5400] = False
     force = readings.specific_force_m_per_s2.copy()
     force[9000] = np.nan
     damaged = ImuReadings(readings.epochs_gps_ns[keep], readings.angular_rate_rad_per_s[keep], force[keep])
-    found, intact = yard.find(head, [replace(whole, readings=damaged), *rest]), yard.find(head, [whole, *rest])
+    found, intact = (yard.find(head, [run]) for run in (replace(whole, readings=damaged), whole))
     assert intact.windows - 8 <= found.windows < intact.windows
     assert np.degrees(np.abs(yard.error(head, found))).max() < 0.02
 

@@ -264,6 +264,20 @@ def test_reference_point_and_axes_are_those_of_the_rig() -> None:
     assert np.degrees(2 * np.arccos(np.minimum(dots, 1.0))).max() < 5e-3
 
 
+@pytest.mark.parametrize(("every", "limit_m"), [(1, 0.3), (5, 0.3)])
+def test_positions_alone_are_enough(every: int, limit_m: float) -> None:
+    """A receiver that states neither velocities nor covariances, at 5 Hz and at 1 Hz, gaps included."""
+    made = simulated(urban("mems"))
+    nothing = np.full_like(made.gnss.velocity_ned_m_per_s, np.nan)
+    unknown = np.full_like(made.gnss.covariance_ned_m2, np.nan)
+    gnss = replace(
+        made.gnss, covariance_ned_m2=unknown, velocity_ned_m_per_s=nothing, sigma_velocity_ned_m_per_s=nothing
+    )
+    solution = solve(made.imu, rows(gnss, slice(0, None, every)), made.odometer, made.vehicle, THINNED)
+    assert np.hypot(*made.errors(solution)[0][:, :2].T).max() < limit_m
+    assert made.normalised(solution).mean(axis=1).max() < 6.0
+
+
 def test_half_a_sample_matters() -> None:
     """Samples that hold at their stamps, taken for means: all is felt 5 ms too early, which the clock's state finds."""
     made = simulated(urban("tactical", NO_GAPS))

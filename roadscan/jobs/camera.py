@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 
 from roadscan.jobs.clocks import load_clocks
-from roadscan.jobs.ingest import survey_records
+from roadscan.jobs.navigate import records_with_trajectories
 from roadscan.jobs.plan import trajectory_source
-from roadscan.jobs.readings import TrajectorySource, load_trajectory, read_groups
+from roadscan.jobs.pose_sigma import pose_sigma
+from roadscan.jobs.readings import load_trajectory, read_groups
 from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.camera import Interior
 from roadscan.model.crs import add_grid_folder
@@ -46,9 +46,6 @@ Grey = npt.NDArray[np.uint8]
 
 PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 _MEASURED: Final = {"picture": pa.string(), "point": pa.string(), "u_px": pa.float64(), "v_px": pa.float64()}
-_SIGMAS: Final = (
-    "sigma_north_m", "sigma_east_m", "sigma_down_m", "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
-)  # fmt: skip
 _LEAST_SIGMA_M: Final = 0.001
 _DIFFERENCE_M: Final = 10.0
 _STEEP_DEG: Final = 80.0
@@ -152,7 +149,7 @@ def resect_camera(
     rig_file = _rig_file(survey) if write else None
     if survey.config.map.grids is not None:
         add_grid_folder(survey.resolve(survey.config.map.grids))
-    records = survey_records(survey, store)
+    records = records_with_trajectories(survey, store)
     pictures = _pictures(store, records, sensor)
     measured, runs = _measurements(measurements, pictures)
     exposures, world = _exposures(survey, store, records, {k: v for k, v in pictures.items() if k in runs}, settings)
@@ -312,7 +309,7 @@ def _exposures(
         worlds.add(source.world)
         spans = [(int(epochs.min()), int(epochs.max()))]
         poses = load_trajectory(store, source, spans, survey.config.navigation.max_gap_s).poses(epochs, strict=True)
-        sigma = _pose_sigma(store, records, source, epochs, settings)
+        sigma = pose_sigma(store, records, source, epochs, settings)
         level = [_world_from_ned(survey, source.world, place) for place in poses.position_world_m]
         for k, name in enumerate(own):
             error = Traverse(
@@ -331,32 +328,6 @@ def _exposures(
             change="resect the runs one by one",
         )
     return found, worlds.pop()
-
-
-def _pose_sigma(
-    store: Store,
-    records: Sequence[LogRecord],
-    source: TrajectorySource,
-    epochs: Int64,
-    settings: CalibrationSettings,
-) -> Float64:
-    """1 σ (n, 6) of poses: north, east, down (m), roll, pitch, heading (rad), as the run's logs or settings state."""
-    assumed = np.array([*settings.traverse_sigma_m, *settings.traverse_sigma_deg])
-    accuracy = [f for r in records if r.run == source.run for f in r.tables.get("trajectory_accuracy", ())]
-    sigma = np.full((epochs.size, 6), np.nan)
-    for files in (source.files, accuracy):
-        parts = [read_groups(store, f.path, range(len(f.group_rows)), ["epoch_gps_ns", *_SIGMAS]) for f in files]
-        if parts:
-            rows = pa.concat_tables(parts).sort_by("epoch_gps_ns")
-            for k, name in enumerate(_SIGMAS):
-                known = rows.filter(pc.is_valid(rows.column(name)))
-                if known.num_rows and np.isnan(sigma[:, k]).any():
-                    since = known.column("epoch_gps_ns").to_numpy() - epochs[0]
-                    values = known.column(name).to_numpy().astype(np.float64)
-                    sigma[:, k] = np.interp((epochs - epochs[0]).astype(np.float64), since.astype(np.float64), values)
-    sigma = np.where(np.isnan(sigma), assumed, sigma)
-    sigma[:, 3:] = np.radians(sigma[:, 3:])
-    return sigma
 
 
 def _world_from_ned(survey: Survey, world: str, place_m: Float64) -> Float64:

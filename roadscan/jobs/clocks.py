@@ -47,12 +47,15 @@ _MAX_GAP_S: Final = 1.0
 Report = Callable[[str], None]
 
 
-def estimate_clocks(survey: Survey, store: Store, report: Report = lambda _: None) -> list[ClockEstimate]:
+def estimate_clocks(
+    survey: Survey, store: Store, report: Report = lambda _: None, *, before_navigation: bool = False
+) -> list[ClockEstimate]:
     """Estimate the clocks that the survey file asks for, and keep them; what did not change is not estimated again.
 
     Clocks from motion (``[[clocks]]``) become corrections of ingested epochs. Pairs of stamps in a log's `clock` were
     applied when it was ingested; they are listed with their residuals. A picture of the residuals lies in
-    ``products/clocks/``.
+    ``products/clocks/``. `before_navigation`: only those that need no trajectory, so that one can be computed from
+    them.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def estimate_clocks(survey: Survey, store: Store, report: Report = lambda _: Non
     known = {(e.run, e.sensor, e.applied): e for e in kept_estimates(store)}
     found: list[ClockEstimate] = []
     failures: list[str] = []
-    for task in [*_pair_tasks(survey, records), *_motion_tasks(survey, store, records)]:
+    for task in [*_pair_tasks(survey, records), *_motion_tasks(survey, store, records, before_navigation)]:
         old = [known.get((task.run, sensor, task.applied)) for sensor in task.sensors]
         if all(e is not None and e.key == task.key for e in old) and store.exists(task.picture):
             found += [e for e in old if e is not None]
@@ -78,6 +81,9 @@ def estimate_clocks(survey: Survey, store: Store, report: Report = lambda _: Non
         _draw(survey, store, task, fresh[0])
         found += fresh
         report(f"estimated: {_line(fresh[0])}")
+    if before_navigation:
+        done = {(e.run, e.sensor, e.applied) for e in found}
+        found += [e for place, e in known.items() if place not in done]
     if sorted(map(_place, found)) != sorted(map(_place, known.values())):
         keep_estimates(store, found)
     if failures:
@@ -154,11 +160,15 @@ def _of_pairs(survey: Survey, report: Report, run: str, sensor: str, log: LogCon
     return _estimate(run, sensor, method, "ingest", found.fit.correction, found.fit.residuals, key)
 
 
-def _motion_tasks(survey: Survey, store: Store, records: Sequence[LogRecord]) -> Iterator[_Task]:
+def _motion_tasks(
+    survey: Survey, store: Store, records: Sequence[LogRecord], before_navigation: bool
+) -> Iterator[_Task]:
     """Clocks from motion, one a run; runs without the sensor's log have none."""
     runs = [run.id for run in survey.config.runs]
     for evidence in survey.config.clocks:
         _check(survey, evidence, runs)
+        if before_navigation and evidence.against == "trajectory":
+            continue
         own = [r for r in records if r.sensor == evidence.sensor and (r.tables.get("imu") or r.tables.get("encoder"))]
         found = [run for run in evidence.runs or runs if any(r.run == run for r in own)]
         if not found:

@@ -23,6 +23,10 @@ ANTENNA_SIGMA_M = 0.01
 """1 σ of an antenna's lever arm whose rig file states none: a tape measure."""
 
 
+NO_SENSOR = "none"
+"""Stands for a sensor that shall not navigate."""
+
+
 @dataclass(frozen=True)
 class RunLogs:
     """Logs of one run that its trajectory is computed from."""
@@ -48,6 +52,8 @@ def chosen(records: Sequence[LogRecord], run: str, table: str, stated: str | Non
     """
     own = [r for r in records if r.run == run and r.tables.get(table)]
     names = sorted({r.sensor for r in own})
+    if stated == NO_SENSOR:
+        return ()
     if stated is not None:
         return tuple(r for r in own if r.sensor == stated)
     if len(names) > 1:

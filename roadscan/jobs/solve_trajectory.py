@@ -73,9 +73,11 @@ class PlannedSolution:
         for repair in repairs:
             report(f"repaired: run '{logs.run}': {repair}")
         solution = solve(imu, gnss, odometer, vehicle, settings)
-        notes = check_outcome(solution, gnss, vehicle)
-        for note in notes:
-            report(f"doubtful: run '{logs.run}': {note}")
+        for note in solution.notes:
+            report(f"navigate: run '{logs.run}': {note}")
+        doubts = check_outcome(solution, gnss, vehicle)
+        for doubt in doubts:
+            report(f"doubtful: run '{logs.run}': {doubt}")
         picture = NavigationPicture(
             f"{survey.config.id}, run {logs.run}", solution, gnss, vehicle.antenna_lever_arm_body_m
         )
@@ -83,7 +85,9 @@ class PlannedSolution:
             "world_frame": solution.world,
             "logs": [r.key for r in logs.records],
             "repairs": [str(r) for r in repairs],
-            "doubts": notes,
+            "notes": list(solution.notes),
+            "pieces": [list(piece) for piece in solution.pieces],
+            "doubts": doubts,
             **_summary(solution, gnss),
         }
         return Computed(_batches(solution), attributes, lambda path: draw_navigation(path, picture))

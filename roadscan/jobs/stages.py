@@ -63,6 +63,8 @@ def run_ingest(run: Run) -> None:
 
 def run_navigate(run: Run) -> None:
     """GNSS, IMU and odometer → trajectories; shared motion → clocks."""
+    if any(evidence.against != "trajectory" for evidence in run.survey.config.clocks):
+        estimate_clocks(run.survey, run.store, before_navigation=True)
     navigate(run.survey, run.store, run.reporter.line)
     estimate_clocks(run.survey, run.store, run.reporter.line)
 

@@ -17,7 +17,8 @@ class SmootherConfig(Strict):
     gnss: str | None = None
     """The GNSS receiver or antenna of the rig; the only one at hand where left out."""
     encoder: str | None = None
-    """The odometer of the rig; the only one where left out, none where the run has none."""
+    """The odometer of the rig; the only one where left out, none where the run has none. "none": it is not used,
+    so that its clock can be found from the trajectory."""
     reversed_runs: list[str] = []
     """Runs driven backwards for the most part; elsewhere accelerations that say so mean an IMU turned by 180°."""
     poses_per_s: float = Field(default=100.0, gt=0.0, le=2000.0)

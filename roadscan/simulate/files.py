@@ -40,6 +40,8 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
     lines = [f"id = {_text(scene.id)}", f"title = {_text(scene.title)}", f"rig = {_text(RIG_FILE)}", "", "[map]"]
     lines += ['local = { name = "local" }' if earth.is_local else f"crs = {_text(scene.map.crs)}"]
     lines.append('height = "ellipsoidal"')
+    if scene.imu.on:
+        lines += ["", "[navigation.smoother]", 'imu = "imu"', 'imu_samples = "instant"']
     for number, listed in enumerate(logs):
         lines += ["", "[[runs]]", f"id = {_text(run_id(number))}"]
         for log in sorted((log for log in listed if log.format), key=lambda log: log.content != "poses"):

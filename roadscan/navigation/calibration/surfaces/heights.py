@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from roadscan.kernels.calibration_surfaces import MOMENTS, UNKNOWNS, match_patches, splat
 from roadscan.model.errors import NavigationError
@@ -30,9 +30,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-_BLUR_CELLS: Final = 1.0
-"""Images are smoothed with a Gaussian of this σ: heights of neighbouring cells then follow one another."""
-_EDGE_CELLS: Final = 3
+_BLUR_CELLS: Final = 1.5
+"""Images are smoothed with a Gaussian of this σ. With less, interpolation between cells would damp their noise and
+draw shifts to half cells, where it does so most."""
+_EDGE_CELLS: Final = 4
 """Cells this near to the edge of what was seen are one-sided means, and left out."""
 _INDEPENDENT: Final = 4.0 * math.pi * (_BLUR_CELLS**2 + 1.0 / 6.0)
 """Cells that count as one independent height: area under the correlation of the smoothed noise (bilinear splat too)."""
@@ -65,10 +66,10 @@ class HeightSettings(Strict):
     """How patches of height images are tied."""
 
     levels: tuple[HeightLevel, ...] = (
-        HeightLevel(cell_m=0.04, patch_m=1.0, stride_m=0.5, reach_m=0.4),
-        HeightLevel(cell_m=0.04, patch_m=0.6, stride_m=0.3, reach_m=0.2),
-        HeightLevel(cell_m=0.015, patch_m=0.36, stride_m=0.24, reach_m=0.04, steepest=2.0),
-        HeightLevel(cell_m=0.005, patch_m=0.24, stride_m=0.24, reach_m=0.008, steepest=1.3),
+        HeightLevel(cell_m=0.03, patch_m=1.0, stride_m=0.5, reach_m=0.4),
+        HeightLevel(cell_m=0.03, patch_m=0.6, stride_m=0.3, reach_m=0.2),
+        HeightLevel(cell_m=0.012, patch_m=0.36, stride_m=0.24, reach_m=0.04, steepest=2.0),
+        HeightLevel(cell_m=0.0035, patch_m=0.24, stride_m=0.24, reach_m=0.008, steepest=1.3),
     )
     """From coarse to fine; the last one gives the result."""
     covered: float = Field(default=0.5, gt=0.0, le=1.0)
@@ -79,7 +80,7 @@ class HeightSettings(Strict):
     """Drives that each sensor's drive is held against."""
     sigma_floor_m: float = Field(default=2e-5, gt=0.0)
     """No tie is better than this (m, 1 σ): rounding, interpolation."""
-    every: int = Field(default=2, ge=1)
+    every: int = Field(default=3, ge=1)
     """Every so many cells of a patch are used; neighbours say the same."""
     iterations: int = Field(default=14, ge=1)
     """Steps of a patch at most."""
@@ -253,15 +254,25 @@ def _image(one: Placed, corner_m: Float64, rows: int, columns: int, at: HeightLe
         height,
         carrier,
     )
-    mass, height = (gaussian_filter(a, _BLUR_CELLS, mode="constant", truncate=3.0) for a in (mass, height))
-    usual = float(np.median(mass[mass > 0])) if (mass > 0).any() else 1.0
-    seen = binary_erosion(mass > _FILLED * usual, iterations=_EDGE_CELLS)
     image = np.full((rows, columns), np.nan)
-    image[seen] = height[seen] / mass[seen]
-    if math.isfinite(at.steepest):
-        along, across = np.gradient(image, at.cell_m)
-        image[binary_dilation(np.hypot(along, across) > at.steepest, iterations=_EDGE_CELLS)] = np.nan
+    hit = np.flatnonzero(mass.any(axis=1)), np.flatnonzero(mass.any(axis=0))
+    if hit[0].size:
+        part = tuple(slice(int(h[0]), int(h[-1]) + 1) for h in hit)
+        image[part] = _smoothed(mass[part], height[part], at)
     return Image(one, image, carrier, corner_m, at.cell_m)
+
+
+def _smoothed(mass: Float64, height: Float64, at: HeightLevel) -> Float64:
+    """Heights of cells; NaN near the edge of what was seen and near slopes that are too steep."""
+    mass, height = (gaussian_filter(a, _BLUR_CELLS, mode="constant", truncate=3.0) for a in (mass, height))
+    near = 2 * _EDGE_CELLS + 1
+    seen = minimum_filter(mass > _FILLED * float(np.median(mass[mass > 0])), near, mode="constant")
+    image = np.full(mass.shape, np.nan)
+    image[seen] = height[seen] / mass[seen]
+    if math.isfinite(at.steepest) and min(image.shape) > 1:
+        along, across = np.gradient(image, at.cell_m)
+        image[maximum_filter(along**2 + across**2 > at.steepest**2, near)] = np.nan
+    return image
 
 
 def _pairs(images: Sequence[Image], partners: int) -> list[tuple[int, int]]:

@@ -6,6 +6,10 @@ vector λ and matrix Λ run backwards, and no covariance is inverted:
     before an update   λ ← λ − Hᵀ(S⁻¹ y + Kᵀ λ),  Λ ← (I − K H)ᵀ Λ (I − K H) + Hᵀ S⁻¹ H
     before a step      λ ← Φᵀ λ,  Λ ← Φᵀ Λ Φ
     smoothed           δx = −P λ,  P − P Λ P
+
+Λ is symmetric to the last bit after each step. The shortened forms in use here, as (I − K H)ᵀ Λ (I − K H) multiplied
+out, shrink an error of Λ only where it is symmetric; an antisymmetric one from rounding would pass all updates
+unchanged, grow with each Φ, and make the covariances at the start of a long drive indefinite.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ def smooth_backwards(nodes, layout, record, updates, correction, covariance, val
         :func:`roadscan.kernels.kalman.filter_forwards`.
     correction : (k, 9) out, to be added to the nominal states after each node's updates.
     covariance : (k, 9, 9) out.
-    values, sigmas : (j, n − 9) out, smoothed states at the reported nodes and their σ.
+    values, sigmas : (j, n − 9) out, smoothed states at the reported nodes and their σ, NaN for a negative variance.
     """
     n = layout.size
     adjoint, information = np.zeros(n), np.zeros((n, n))
@@ -87,7 +91,7 @@ def _smoothed_values(p, nominal, adjoint, information, values, sigmas):
                 part += information[j, m] * p[i, m]
             variance -= p[i, j] * part
         values[i - 9] = nominal[i - 9] - total
-        sigmas[i - 9] = math.sqrt(max(variance, 0.0))
+        sigmas[i - 9] = math.sqrt(variance)
 
 
 @kernel
@@ -122,7 +126,7 @@ def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
 
 @kernel
 def _downdate(row, z, size, information):
-    """Λ ← Λ − rowᵀ z − zᵀ row."""
+    """Λ ← Λ − rowᵀ z − zᵀ row; a symmetric Λ stays symmetric to the last bit."""
     n = information.shape[0]
     for c in range(size):
         for i in range(n):
@@ -133,7 +137,10 @@ def _downdate(row, z, size, information):
 
 @kernel
 def _adjoint_step(phi, decay, adjoint, information, work):
-    """λ ← Φᵀλ and Λ ← ΦᵀΛΦ; phi : (9, inertial) rows of navigation, decay : (n,) diagonal of the others."""
+    """λ ← Φᵀλ and Λ ← ΦᵀΛΦ; phi : (9, inertial) rows of navigation, decay : (n,) diagonal of the others.
+
+    One triangle is worked out and copied to the other.
+    """
     n, mixed = adjoint.size, phi.shape[1]
     part = np.zeros(mixed)
     for i in range(NAVIGATION):
@@ -144,14 +151,17 @@ def _adjoint_step(phi, decay, adjoint, information, work):
         adjoint[j] = kept + (part[j] if j < mixed else 0.0)
     _times_transition(information, phi, decay, work)
     for i in range(n):
-        for j in range(n):
+        for j in range(i + 1):
             information[i, j] = decay[i] * work[i, j] if i >= NAVIGATION else 0.0
     for m in range(NAVIGATION):
         for i in range(mixed):
             f = phi[m, i]
             if f != 0.0:
-                for j in range(n):
+                for j in range(i + 1):
                     information[i, j] += f * work[m, j]
+    for i in range(n):
+        for j in range(i):
+            information[j, i] = information[i, j]
 
 
 @kernel
@@ -269,9 +279,9 @@ def _note_sigma_rph(poses, e, c, level):
     nn, ee, ne = poses.covariance[1, e, 0, 0], poses.covariance[1, e, 1, 1], poses.covariance[1, e, 0, 1]
     dd, nd, ed = poses.covariance[1, e, 2, 2], poses.covariance[1, e, 0, 2], poses.covariance[1, e, 1, 2]
     along = ch * ch * nn + 2.0 * ch * sh * ne + sh * sh * ee
-    poses.sigma_rph[e, 0] = math.sqrt(max(along, 0.0)) / flat
-    poses.sigma_rph[e, 1] = math.sqrt(max(sh * sh * nn - 2.0 * ch * sh * ne + ch * ch * ee, 0.0))
-    poses.sigma_rph[e, 2] = math.sqrt(max(tan * tan * along + 2.0 * tan * (ch * nd + sh * ed) + dd, 0.0))
+    poses.sigma_rph[e, 0] = math.sqrt(along) / flat
+    poses.sigma_rph[e, 1] = math.sqrt(sh * sh * nn - 2.0 * ch * sh * ne + ch * ch * ee)
+    poses.sigma_rph[e, 2] = math.sqrt(tan * tan * along + 2.0 * tan * (ch * nd + sh * ed) + dd)
 
 
 @kernel

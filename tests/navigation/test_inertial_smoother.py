@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from roadscan.kernels.kalman_smoother import smooth_backwards
+from roadscan.kernels.kalman_states import NAVIGATION, WITHOUT_SCALES
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.imu import IMU_GRADES, ImuGrade
 from roadscan.model.smoothing import SmootherConfig
+from roadscan.navigation.inertial import smoother
 from roadscan.navigation.inertial.readings import ImuReadings, Solution
 from roadscan.navigation.inertial.smoother import solve
 from tests.navigation.inertial_drives import (
@@ -132,6 +135,100 @@ def test_two_runs_are_the_same_bytes_and_nothing_is_lost() -> None:
         assert np.isfinite(a).all() or a.dtype.kind != "f" or a is first.innovations.residual  # type: ignore[union-attr]
     assert np.all(np.diff(first.epochs_gps_ns) > 0)
     assert (np.linalg.eigvalsh(first.covariance_position_ned_m2) > 0).all()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_covariances_of_the_real_drive_are_positive(recordings: Path, masked: bool) -> None:
+    drive = recorded(recordings)
+    gnss = drive.masked if masked else drive.gnss
+    solution = solve(drive.imu, gnss, None, drive.vehicle, DRIVE_CONFIG)
+    assert_positive(solution, stated_exactly={"gnss_velocity_lag_s"})
+    moving = np.linalg.norm(solution.velocity_ned_m_per_s, axis=1) > 0.5
+    assert_begins_plausibly(solution, standing=slice(0, int(np.argmax(moving))))
+
+
+@pytest.mark.parametrize("grade", ["navigation", "tactical", "mems"])
+@pytest.mark.parametrize("odometer", [False, True])
+@pytest.mark.parametrize("start_s", [None, 100.0])
+def test_covariances_are_positive(grade: ImuGrade, odometer: bool, start_s: float | None) -> None:
+    """From a standing start, and from the middle of a drive."""
+    made = simulated(urban(grade))
+    imu = made.imu if start_s is None else part(made.imu, made.seconds_of_imu >= start_s)
+    config = THINNED.model_copy(update={"land_vehicle": odometer})
+    solution = solve(imu, made.gnss, made.odometer if odometer else None, made.vehicle, config)
+    assert_positive(solution)
+    moving = np.linalg.norm(solution.velocity_ned_m_per_s, axis=1) > 0.5
+    if start_s is None:
+        assert_begins_plausibly(solution, standing=slice(0, int(np.argmax(moving))))
+
+
+def assert_positive(solution: Solution, stated_exactly: frozenset[str] | set[str] = frozenset()) -> None:
+    """Covariances have positive eigenvalues, all σ are positive but those of states that were stated exactly."""
+    for covariance in (
+        solution.covariance_position_ned_m2,
+        solution.covariance_velocity_ned,
+        solution.covariance_attitude_rad2,
+    ):
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert solution.sigma_rph_rad.min() > 0.0
+    for name, (_, sigma) in solution.states.items():
+        assert sigma.max() == 0.0 if name in stated_exactly else sigma.min() > 0.0
+
+
+def assert_begins_plausibly(solution: Solution, standing: slice) -> None:
+    """Nothing but gravity levels a standing IMU: its tilt is as little known as its accelerometers' biases.
+
+    The first half minute of a standstill differs in nothing from the next but for the way to what comes before it.
+    """
+    tilt = solution.sigma_rph_rad[standing, :2]
+    assert len(tilt) > 50
+    assert (tilt >= 0.5 * np.median(tilt, axis=0)).all()
+    bias = solution.states["accel_bias_imu_m_per_s2"][1][0, :2]
+    assert (tilt.min(axis=0) >= 0.5 * bias.min() / 9.81).all()
+
+
+def test_the_way_back_is_the_textbooks(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against Bierman's equations with full matrices: (I − KH)ᵀ Λ (I − KH) + Hᵀ S⁻¹ H before an update, ΦᵀΛΦ a step."""
+    calls: list[tuple] = []
+
+    def kept(*arguments) -> None:  # type: ignore[no-untyped-def]
+        smooth_backwards(*arguments)
+        calls.append(arguments)
+
+    monkeypatch.setattr(smoother, "smooth_backwards", kept)
+    drive = recorded(recordings)
+    solve(drive.imu, drive.masked, None, drive.vehicle, DRIVE_CONFIG)
+    nodes, layout, record, updates, _, covariance, _, _ = calls[-1]
+    information, identity = np.zeros((layout.size, layout.size)), np.eye(layout.size)
+    for k in range(nodes.bound.size - 1, -1, -1):
+        p = record.rows[k]
+        expected = p[:, :NAVIGATION] - p @ information @ p.T
+        sigma = np.sqrt(np.diag(expected))
+        assert (np.abs(covariance[k] - expected) <= 1e-4 * np.outer(sigma, sigma)).all()
+        for u in range(record.first_update[k + 1] - 1, record.first_update[k] - 1, -1):
+            row, gain = (a[u, : updates.size[u]] for a in (updates.row, updates.gain))
+            kept_share = identity - gain.T @ row
+            information = kept_share.T @ information @ kept_share + row.T @ row
+        if k > 0:
+            transition = identity.copy()
+            transition[:NAVIGATION, : layout.inertial] = record.transition[k]
+            biases = np.arange(NAVIGATION, WITHOUT_SCALES)
+            transition[biases, biases] = record.keep[k]
+            colour = np.arange(layout.colour, layout.colour + 3)
+            transition[colour, colour] = nodes.colour_keep[k]
+            information = transition.T @ information @ transition
+
+
+def test_indefinite_covariances_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adjoint that went wrong: no σ of 0 comes out of it."""
+
+    def spoilt(nodes, layout, record, updates, correction, covariance, values, sigmas) -> None:  # type: ignore[no-untyped-def]
+        smooth_backwards(nodes, layout, record, updates, correction, covariance, values, sigmas)
+        covariance[5, 6, 7] = covariance[5, 7, 6] = 2.0 * np.sqrt(covariance[5, 6, 6] * covariance[5, 7, 7])
+
+    monkeypatch.setattr(smoother, "smooth_backwards", spoilt)
+    with pytest.raises(NavigationError, match="not positive definite"):
+        smoothed(simulated(urban("tactical", NO_GAPS)))
 
 
 def test_outliers_count_less_and_are_listed() -> None:

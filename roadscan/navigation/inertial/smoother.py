@@ -330,6 +330,12 @@ class _Run:
                 expected="readings in rad/s and m/s², a GNSS that fits the IMU",
                 change="check axes, units and clocks of IMU and GNSS",
             )
+        if not _definite(covariance):
+            raise NavigationError(
+                "covariances of position, velocity and attitude are not positive definite: rounding exceeds them",
+                expected="σ of the sensors, none of them many orders of magnitude below the others",
+                change="check noise and biases of the IMU and σ of lever arms in the rig file, and σ of the GNSS log",
+            )
         return cls(whole, layout, track, record, updates, correction, covariance, values, sigmas, smooth)
 
     def poses(self, wanted: Int64, vehicle: VehicleSensors, *, at_imu: bool = False) -> Poses:
@@ -417,6 +423,15 @@ class _Run:
             updates.normalised,
             updates.weight,
         )
+
+
+def _definite(covariance: Float64) -> bool:
+    """Whether all of them (k, n, n) are positive definite; Cholesky's factors do not depend on the states' units."""
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _thinned(whole: Timeline, config: SmootherConfig) -> Int64:

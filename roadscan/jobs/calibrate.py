@@ -14,13 +14,14 @@ from roadscan.jobs.calibration_evidence import Collected, collect
 from roadscan.jobs.fingerprint import key_of, solver_version
 from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.readings import MOUNTINGS
+from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.survey import Survey
 from roadscan.navigation.calibration.estimator import Calibration, Prior, calibrate
-from roadscan.navigation.calibration.evidence import Evidence
+from roadscan.navigation.calibration.evidence import Evidence, Traverse
 from roadscan.navigation.calibration.report import mounting_rows, report
-from roadscan.navigation.calibration.unknowns import Estimate
+from roadscan.navigation.calibration.unknowns import Estimate, ObjectPose
 from roadscan.products.pictures.calibration import draw_calibration
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -71,13 +72,9 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
     sensors = list(dict.fromkeys(sensor for one in collected for sensor in one.sensors))
     priors = {name: _prior(survey, name) for name in sensors}
     traverses = {number: t for one in collected for number, t in one.traverses.items()}
-    objects = {name: pose for one in collected for name, pose in one.objects.items()}
-
-    def evidence(estimate: Estimate) -> Sequence[Evidence]:
-        return [found for one in collected for found in one.find(estimate)]
-
+    objects = _objects(collected, priors, traverses, settings, say)
     say(f"estimating: {', '.join(sensors)}")
-    calibration = calibrate(priors, evidence, traverses, settings, objects)
+    calibration = calibrate(priors, _finder(collected), traverses, settings, objects)
     since = 0 if settings.valid_from is None else gps_ns_from_utc(settings.valid_from)
     rows = mounting_rows(
         calibration,
@@ -93,6 +90,31 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
         draw_calibration(folder / "calibration.png", calibration, title=config.id)
         store.publish(folder / "calibration.png", PICTURE)
     return Calibrated(calibration, rows, text)
+
+
+def _finder(collected: Sequence[Collected]) -> Callable[[Estimate], Sequence[Evidence]]:
+    """All evidence as one."""
+    return lambda estimate: [found for one in collected for found in one.find(estimate)]
+
+
+def _objects(
+    collected: Sequence[Collected],
+    priors: dict[str, Prior],
+    traverses: dict[int, Traverse],
+    settings: CalibrationSettings,
+    say: Report,
+) -> dict[str, ObjectPose]:
+    """Where the calibration objects lie, as seen with the mountings that all other evidence gives by itself."""
+    locating = [one.locate for one in collected if one.locate is not None]
+    if not locating:
+        return {}
+    others = [one for one in collected if one.locate is None]
+    mountings = {name: prior.mounting for name, prior in priors.items()}
+    if others:
+        say("estimating without the objects")
+        mountings |= calibrate(priors, _finder(others), traverses, settings).mountings
+    estimate = Estimate(mountings, dict.fromkeys(mountings, 0.0), {}, {})
+    return {name: pose for locate in locating for name, pose in locate(estimate).items()}
 
 
 def _prior(survey: Survey, name: str) -> Prior:

@@ -19,6 +19,7 @@ from roadscan.model.calibration import (
     Area,
     CalibrationEvidence,
     CalibrationSettings,
+    ObjectEvidence,
     OverlapEvidence,
     ReferenceEvidence,
     StopAndGoEvidence,
@@ -29,6 +30,7 @@ from roadscan.navigation.calibration.evidence import Evidence, Seen, Traverse
 from roadscan.navigation.calibration.reference import ReferenceOptions, register
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
 from roadscan.navigation.calibration.surfaces.heights import HeightTies
+from roadscan.navigation.calibration.surfaces.objects import ObjectTies, find_object
 from roadscan.navigation.calibration.surfaces.planes import PlaneTies
 from roadscan.navigation.calibration.surfaces.readings import Pieces, Readings
 from roadscan.navigation.calibration.unknowns import Estimate, ObjectPose
@@ -53,7 +55,8 @@ class Collected:
     find: Find
     """Finds the observations with the mountings of an estimate."""
     traverses: Mapping[int, Traverse] = field(default_factory=dict)
-    objects: Mapping[str, ObjectPose] = field(default_factory=dict)
+    locate: Callable[[Estimate], dict[str, ObjectPose]] | None = None
+    """Finds the calibration objects that it names, with the mountings of an estimate; None where it names none."""
 
 
 def collect(plan: SurveyPlan, entry: CalibrationEvidence, settings: CalibrationSettings) -> Collected:
@@ -71,6 +74,8 @@ def collect(plan: SurveyPlan, entry: CalibrationEvidence, settings: CalibrationS
             return _reference(plan, entry, settings)
         case OverlapEvidence():
             return _overlap(plan, entry, settings)
+        case ObjectEvidence():
+            return _object(plan, entry, settings)
 
 
 def traverses_of(
@@ -104,6 +109,35 @@ def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSett
     if clouds:
         finders.append(PlaneTies(clouds, pieces, traverses))
     return Collected(sensors, lambda estimate: [t for find in finders for t in find(estimate)], traverses)
+
+
+def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettings) -> Collected:
+    """Ties of the readings on a calibration object to its known shape."""
+    reach = max(max(length, width) for length, width, _ in entry.steps) / 2 + 1.0
+    area = Area(
+        easting_min_m=entry.easting_m - reach, northing_min_m=entry.northing_m - reach,
+        easting_max_m=entry.easting_m + reach, northing_max_m=entry.northing_m + reach,
+    )  # fmt: skip
+    wanted = Wanted(tuple(entry.sensors), tuple(entry.runs), tuple(entry.passes), area, settings.max_distance_m)
+    readings = list(wanted_readings(plan, wanted))
+    pieces, traverses = traverses_of(plan, readings, settings)
+    world = trajectory_source(readings[0].drive.split(" drive ")[0], plan.records).world
+    frame = plan.ground.map
+    height = frame.map_from_world(world, readings[0].position_world_m[:1])[0, 2]
+    middle = np.array([[entry.easting_m, entry.northing_m, height]])
+    heading = np.radians(entry.heading_deg)
+    ahead = np.array([np.sin(heading), np.cos(heading), 0.0])
+    axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
+    ways = frame.world_from_map(world, middle + axes) - frame.world_from_map(world, middle - axes)
+    u, _, vt = np.linalg.svd(ways.T)  # the nearest rotation: the map's scale is not that of the world
+    about = ObjectPose(frame.world_from_map(world, middle)[0], u @ vt, sigma_m=0.02, sigma_rad=0.02)
+    name = f"object at {entry.easting_m:.1f}, {entry.northing_m:.1f}"
+    ties = ObjectTies(readings, pieces, traverses, name, entry.steps, entry.sigma_m)
+
+    def locate(estimate: Estimate) -> dict[str, ObjectPose]:
+        return {name: find_object(readings, estimate, entry.steps, about)}
+
+    return Collected(tuple(entry.sensors), ties, traverses, locate)
 
 
 def _stop_and_go(plan: SurveyPlan, entry: StopAndGoEvidence, settings: CalibrationSettings) -> Collected:

@@ -60,16 +60,15 @@ class ObjectEvidence(Strict):
     """"object"."""
     sensors: list[str] = Field(min_length=1)
     """Sensors of the rig that saw it."""
-    path: Path | None = None
-    """Shape of the object as a mesh or a point cloud (PLY, LAS, E57) in its own axes, relative to the survey file."""
-    steps: list[tuple[float, float, float]] = []
-    """In place of `path`: a stepped pyramid, from the lowest step up: length, width, height above the ground (m)."""
-    easting_m: float | None = None
-    """About where its middle lies on the map (m); needed unless `path` is in map coordinates."""
-    northing_m: float | None = None
+    steps: list[tuple[float, float, float]] = Field(min_length=1)
+    """Its shape, a stepped block: length, width, and height of the top above the ground, of each step (m), all about
+    one middle. One step is a plain block."""
+    easting_m: float
+    """About where its middle lies on the map (m): within 0.3 m."""
+    northing_m: float
     """About where its middle lies on the map (m)."""
     heading_deg: float = 0.0
-    """About how it is turned, clockwise from the map's north (degrees)."""
+    """About which way its length points, clockwise from the map's north (degrees): within 8."""
     sigma_m: float = Field(default=0.0002, gt=0.0)
     """1 σ of the object's surface, as it was made or measured (m)."""
     runs: list[str] = []
@@ -79,10 +78,8 @@ class ObjectEvidence(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if (self.path is None) == (not self.steps):
-            raise ValueError("give the object's shape once: path, or steps")
-        if self.steps and (self.easting_m is None or self.northing_m is None):
-            raise ValueError("steps need easting_m and northing_m: about where the object lies")
+        if any(min(step) <= 0.0 for step in self.steps):
+            raise ValueError("each step needs a length, a width and a height above 0")
         return self
 
 
@@ -124,21 +121,8 @@ class ReferenceEvidence(Strict):
     """Runs that passed it; all where left out."""
 
 
-class ControlEvidence(Strict):
-    """Control points of the survey that a sensor saw."""
-
-    kind: Literal["control"]
-    """"control"."""
-    sensors: list[str] = Field(min_length=1)
-    """Sensors of the rig that saw them."""
-    sigma_m: float = Field(default=0.005, gt=0.0)
-    """1 σ of a point as it is found among the readings (m); the survey's own σ comes on top."""
-    runs: list[str] = []
-    """Runs that passed them; all where left out."""
-
-
 CalibrationEvidence = Annotated[
-    OverlapEvidence | ObjectEvidence | StopAndGoEvidence | ReferenceEvidence | ControlEvidence,
+    OverlapEvidence | ObjectEvidence | StopAndGoEvidence | ReferenceEvidence,
     Field(discriminator="kind"),
 ]
 """One source of evidence; `kind` says which."""

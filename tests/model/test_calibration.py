@@ -8,6 +8,8 @@ from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings,
 from roadscan.model.errors import ConfigError
 from roadscan.model.strict import Strict
 
+OBJECT = {"steps": [[1.2, 1.2, 0.02]], "easting_m": 1.0, "northing_m": 2.0}
+
 
 class Holder(Strict):
     """Stands for the survey file."""
@@ -25,9 +27,8 @@ def test_kind_says_which_evidence_it_is():
         kind="overlap", sensors=["lidar"], runs=["run-1"]
     )
     assert isinstance(parse(kind="stop_and_go", sensor="left", imu="left_imu"), StopAndGoEvidence)
-    assert parse(kind="object", sensors=["left", "right"], path="step.ply").kind == "object"
+    assert parse(kind="object", sensors=["left", "right"], **OBJECT).kind == "object"
     assert parse(kind="reference", sensor="lidar", path="a.las", crs="local", height="ellipsoidal").sigma_m == 0.003
-    assert parse(kind="control", sensors=["lidar"]).kind == "control"
 
 
 @pytest.mark.parametrize(
@@ -37,8 +38,8 @@ def test_kind_says_which_evidence_it_is():
         ({"kind": "overlap"}, "key 'calibration.0.sensors' is missing"),
         ({"kind": "overlaps"}, r"0.kind' \(got 'overlaps'\): unknown \(did you mean 'overlap'\?\), expected"),
         ({"sensors": ["a"]}, "key 'calibration.0.kind' is missing"),
-        ({"kind": "object", "sensors": ["a"]}, "give the object's shape once"),
-        ({"kind": "object", "sensors": ["a"], "steps": [[1, 1, 0.02]]}, "steps need easting_m and northing_m"),
+        ({"kind": "object", "sensors": ["a"]}, "key 'calibration.0.steps' is missing"),
+        ({"kind": "object", "sensors": ["a"], "steps": [[1, 1, 0.02]]}, "key 'calibration.0.easting_m' is missing"),
         ({"kind": "reference", "sensor": "a", "path": "x.las", "crs": "local"}, "'calibration.0.height' is missing"),
         (
             {"kind": "overlap", "sensors": ["a"], "area": dict.fromkeys(

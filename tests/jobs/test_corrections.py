@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.clocks import CLOCKS
+from roadscan.jobs.clock_tables import CLOCKS
 from roadscan.jobs.readings import MOUNTINGS
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.survey import Survey

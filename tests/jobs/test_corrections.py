@@ -12,7 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.jobs.clock_tables import CLOCKS
+from roadscan.jobs.compute import Inline
 from roadscan.jobs.readings import MOUNTINGS
+from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.survey import Survey
 from roadscan.simulate import simulate
@@ -20,7 +22,7 @@ from roadscan.tables.schema import table_schema
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 
-from .conftest import Simulated, outputs, small_scene
+from .conftest import Simulated, changed, outputs, small_scene
 
 SHORT = {"length_m": 12.0, "lidar": {"on": False}, "passes": [{"lane": 2}]}
 PRODUCTS = {"products__make": ["las", "tile_table"]}
@@ -66,7 +68,9 @@ def test_an_estimated_clock_puts_readings_where_a_right_one_does(right: Simulate
     reference = start + 500_000_000
     table = [clock_row(s, -0.5, drift, reference) for s in ("profiler_left", "profiler_right")]
     write_table(wrong.store(), CLOCKS, "clocks", table)
-    wrong.run(**PRODUCTS)
+    # The stage `navigate` would take the rows away: the survey file names no evidence for them.
+    survey = changed(Survey.load(wrong.survey_file), PRODUCTS)
+    run_stages(Run(survey, wrong.store(), Inline()), [s for s in STAGES if s.name != "navigate"])
     totals = [
         query(one.store(), "SELECT sum(points) AS n, avg(height_mean_m) AS h, min(first_epoch_gps_ns) AS a FROM tiles")
         for one in (wrong, right)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -26,6 +26,7 @@ from roadscan.model.calibration import (
 )
 from roadscan.model.crs import LOCAL_WORLD, MapFrame
 from roadscan.model.errors import ConfigError, RunError, nearest
+from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.navigation.calibration.evidence import Evidence, Seen, Traverse
 from roadscan.navigation.calibration.reference import ReferenceOptions, register
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
@@ -41,6 +42,9 @@ from roadscan.sensors.base import Rows, format_named, format_of
 Float64 = npt.NDArray[np.float64]
 
 Find = Callable[[Estimate], Sequence[Evidence]]
+
+_ANY_TIME: Final = Clock(TimeSystem.FREE, offset_s=1e9)
+"""Brings stamps of any system, even zeros, to where time stamps may be: the epochs of a reference scan mean nothing."""
 
 REFERENCE_READINGS: Final = 400_000
 """Of a sensor that are held against a reference scan; more are thinned evenly."""
@@ -206,7 +210,10 @@ def _reference_map(plan: SurveyPlan, entry: ReferenceEvidence) -> Float64:
     """
     path = plan.survey.resolve(entry.path)
     log_format = format_named(entry.format) if entry.format else format_of(path)
-    opened = open_log(log_format, path, Stated(None, entry.crs, entry.height, entry.geoid, dict(entry.options)))
+    stated = Stated(None, entry.crs, entry.height, entry.geoid, dict(entry.options))
+    opened = open_log(log_format, path, stated)
+    if opened.needs_key("clock"):
+        opened = open_log(log_format, path, replace(stated, clock=_ANY_TIME))
     open_questions = [need.line for need in opened.needs if not need.is_of_time]
     if open_questions:
         raise ConfigError("the reference scan leaves open: " + "; ".join(open_questions), file=path)

@@ -98,13 +98,16 @@ def head_errors(folder: Path, seed: int) -> Iterator[tuple[np.ndarray, float]]:
     made = simulate(scene, folder / f"yard-{seed}").folder
     name = "profiler_left_imu"
     nominal, true = (Rig.load(made / rig).sensors[name].mounting() for rig in ("RIG.toml", "truth/RIG.toml"))
-    runs = [
-        HeadRun(*_logs(made / "raw" / f"run-{k + 1}", name), (TILT_RAD, TILT_RAD, 2 * TILT_RAD))
-        for k in range(len(scene.passes))
-    ]
+    runs = head_runs(made, name, len(scene.passes), TILT_RAD)
     found = find_orientation(runs, nominal, (0.03, 0.03, 0.03), IMU_GRADES["tactical"])
     error = Rotation.from_matrix(true.arrays()[0] @ found.body_from_imu.T).as_rotvec()
     yield error, float(error @ np.linalg.solve(found.covariance_rad2, error))
+
+
+def head_runs(made: Path, name: str, count: int, tilt_rad: float) -> list[HeadRun]:
+    """Runs of a simulated survey with the samples of one head's IMU; σ of roll and pitch, heading twice that."""
+    sigma = (tilt_rad, tilt_rad, 2 * tilt_rad)
+    return [HeadRun(*_logs(made / "raw" / f"run-{k + 1}", name), sigma) for k in range(count)]
 
 
 def _logs(folder: Path, name: str) -> tuple[ImuReadings, Trajectory]:

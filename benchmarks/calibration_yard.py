@@ -1,20 +1,26 @@
-"""The simulated calibration yard as arrays: short drives over the object in four directions, mountings unknown."""
+"""The simulated calibration yard as arrays: short drives in four directions, mountings unknown."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.rig import Mounting
-from roadscan.navigation.calibration.evidence import Traverse
+from benchmarks.bench_calibration import head_runs
+from roadscan.model.imu import IMU_GRADES
+from roadscan.model.rig import Mounting, Rig
+from roadscan.navigation.calibration.evidence import Orientation, Traverse
+from roadscan.navigation.calibration.stop_and_go import find_orientation
 from roadscan.navigation.calibration.surfaces.readings import Pieces, Readings
 from roadscan.navigation.calibration.unknowns import Prior, mounting_of
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.simulate import Scene, profiler
+from roadscan.simulate import Scene, lidar, profiler, simulate
+from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import GaussMarkov, stream
@@ -30,6 +36,10 @@ _BEHIND_M = 2.3
 """The heads follow the IMU reference point by this."""
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _OFF = {"on": False}
+HEADINGS_DEG = (0.0, 180.0, 90.0, 270.0)
+"""There and back, along and across."""
+LIDAR_HEADINGS_DEG = (0.0, 0.0, 180.0, 90.0, 270.0)
+"""A loop, back-through, right angles."""
 _POSES_PER_S = 200
 
 
@@ -82,9 +92,9 @@ def profiler_yard(
 def profiler_scene(
     seed: int, drives: int, length_m: float, position_m: float, attitude_deg: float, time_constant_s: float
 ) -> Scene:
-    """The shipped yard with short routes, bowls, and mountings that are off by up to 1° and 5 cm."""
+    """The shipped yard with short routes, bowls, and mountings that are 1° and 5 cm off about and along each axis."""
     rng = np.random.default_rng(seed)
-    passes = [_route(k, length_m, rng) for k in range(drives)]
+    passes = [_route(HEADINGS_DEG[k % 4], length_m, _BEHIND_M, rng) for k in range(drives)]
     bowls = [
         {"station_m": CENTRE[0] + a * 1.45, "offset_m": CENTRE[1] + b * 1.45, "radius_m": 0.55, "depth_m": 0.25}
         for a in (-1, 1)
@@ -99,10 +109,10 @@ def profiler_scene(
     )  # fmt: skip
 
 
-def _route(number: int, length_m: float, rng: np.random.Generator) -> dict[str, object]:
-    heading = (0.0, 180.0, 90.0, 270.0)[number % 4]
+def _route(heading: float, length_m: float, ahead_m: float, rng: np.random.Generator) -> dict[str, object]:
+    """Straight on, with its middle so far beyond the object."""
     c, s = math.cos(math.radians(heading)), math.sin(math.radians(heading))
-    start, side = _BEHIND_M - length_m / 2, rng.uniform(-0.2, 0.2)
+    start, side = ahead_m - length_m / 2, rng.uniform(-0.2, 0.2)
     route = {
         "station_m": CENTRE[0] + start * c - side * s,
         "offset_m": CENTRE[1] + start * s + side * c,
@@ -113,7 +123,7 @@ def _route(number: int, length_m: float, rng: np.random.Generator) -> dict[str, 
 
 
 def _error(rng: np.random.Generator) -> dict[str, object]:
-    lever, (roll, pitch, heading) = rng.uniform(-0.05, 0.05, 3), rng.uniform(-1.0, 1.0, 3)
+    lever, (roll, pitch, heading) = 0.05 * rng.choice([-1.0, 1.0], 3), rng.choice([-1.0, 1.0], 3).tolist()
     return {"lever_arm_body_m": lever.tolist(), "roll_deg": roll, "pitch_deg": pitch, "heading_deg": heading}
 
 
@@ -122,13 +132,104 @@ def _arrays(mount: Mount) -> tuple[Float64, Float64]:
     return Rotation.from_euler("ZYX", angles, degrees=True).as_matrix(), np.array(mount.lever_arm_body_m)
 
 
+def head_orientations(yard: Yard, folder: Path, rounds: int = 3) -> list[Orientation]:
+    """Stop and go with the IMUs in the heads: the same mountings and errors of trajectories, in the shipped runs.
+
+    Loops, back-through and right angle, so many rounds of them, each run with a standstill before and after it.
+    """
+    shipped = Scene.load("calibration_yard")
+    passes = rounds * [one.model_dump() for one in shipped.passes]
+    heads = {side: {"error": getattr(yard.scene.profilers, side).error.model_dump()} for side in ("left", "right")}
+    noise = yard.scene.noise
+    scene = shipped.changed(
+        seed=yard.scene.seed, passes=passes, profilers={"spacing_m": 2.0, "readings": 2, **heads}, road={"texture": None},
+        noise={k: getattr(noise, k) for k in ("position_m", "attitude_deg", "time_constant_s")},
+        lidar=_OFF, sick=_OFF, camera=_OFF, imu=_OFF, gnss=_OFF, encoder=_OFF,
+    )  # fmt: skip
+    made = simulate(scene, folder).folder
+    sensors = Rig.load(made / "RIG.toml").sensors
+    found = []
+    for name in yard.priors:
+        runs = head_runs(made, f"{name}_imu", len(scene.passes), math.radians(noise.attitude_deg))
+        nominal = sensors[f"{name}_imu"].mounting()
+        one = find_orientation(runs, nominal, (0.05, 0.05, 0.05), IMU_GRADES["tactical"])
+        found.append(one.evidence(name, sensors[name].mounting(), nominal))
+    return found
+
+
+def lidar_yard(
+    seed: int,
+    position_m: float,
+    attitude_deg: float,
+    time_constant_s: float = 60.0,
+    piece_s: float = 0.5,
+    length_m: float = 30.0,
+    share: float = 0.15,
+    headings_deg: Sequence[float] = LIDAR_HEADINGS_DEG,
+) -> Yard:
+    """Drives of the lidar past the yard's façade, poles and object; that share of its returns, chosen at random."""
+    rng = np.random.default_rng(seed)
+    noise = {"position_m": position_m, "attitude_deg": attitude_deg, "time_constant_s": time_constant_s}
+    scene = Scene.load("calibration_yard").changed(
+        seed=seed, passes=[_route(h, length_m, 0.0, rng) for h in headings_deg], vehicle={"standstill_s": 0.0},
+        road={"texture": None}, noise=noise, lidar={"range_max_m": 45.0, "mount": {"error": _error(rng)}},
+        profilers=_OFF, sick=_OFF, camera=_OFF, imu=_OFF, gnss=_OFF,
+    )  # fmt: skip
+    readings = _returns(scene, share, rng)
+    pieces = Pieces.of_seconds(piece_s)
+    tilt, place = math.radians(max(attitude_deg, 1e-4)), max(position_m, 1e-5)
+    traverses = pieces.traverses(readings, _ENU_FROM_NED, (place,) * 3, (tilt, tilt, 2 * tilt), time_constant_s)
+    nominal, true = (
+        (rotation @ lidar.BODY_FROM_AXES, lever)
+        for rotation, lever in (_arrays(scene.lidar.mount.nominal()), _arrays(scene.lidar.mount))
+    )
+    prior = Prior(mounting_of(*nominal), (0.05,) * 3, (math.radians(1.0),) * 3)
+    return Yard(scene, readings, pieces, traverses, {"lidar": prior}, {"lidar": true})
+
+
+def _returns(scene: Scene, share: float, rng: np.random.Generator) -> list[Readings]:
+    earth = Earth(scene.map.crs)
+    surface, ride = Surface(scene), Surface(scene, ride=True)
+    world = World(scene, surface)
+    origin, enu = _local_frame(scene, surface, earth)
+    beams = lidar.hdl32e_beams()
+    elevation = np.radians(beams.elevation_deg)
+    found = []
+    for drive in drives_of(scene, earth, ride):
+        points, epochs = [], []
+        for block in lidar.measure(scene, world, drive):
+            seen = (block.ranges > 0) & (rng.random(block.ranges.shape) < share)
+            laser, azimuth = np.nonzero(seen)[2], np.radians(block.azimuth_deg[seen])
+            ranges = lidar.RANGE_STEP_M * block.ranges[seen]
+            flat = ranges * np.cos(elevation[laser])
+            up = ranges * np.sin(elevation[laser]) + beams.rise_m[laser]
+            points.append(np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], axis=-1))
+            epochs.append(block.firing_gps_ns()[seen])
+        at, pose = np.unique(np.concatenate(epochs), return_inverse=True)
+        poses = stated_trajectory(scene, drive, origin, enu).poses(at)
+        kept = poses.found[pose]
+        number = np.cumsum(poses.found) - 1
+        found.append(
+            Readings(
+                "lidar", f"run-{drive.number + 1}", np.concatenate(points)[kept], number[pose[kept]].astype(np.int32),
+                at[poses.found], poses.position_world_m[poses.found], poses.world_from_body[poses.found],
+            )
+        )  # fmt: skip
+    return found
+
+
+def _local_frame(scene: Scene, surface: Surface, earth: Earth) -> tuple[Float64, Rotation]:
+    """Origin (ECEF) at the calibration object, and east-north-up from ECEF there."""
+    easting, northing, _ = surface.place(np.array([CENTRE[0]]), np.array([CENTRE[1]]))
+    origin = earth.ecef_from_map(np.array([[easting[0], northing[0], scene.map.height_m]]))[0]
+    return origin, Rotation.from_matrix(_ENU_FROM_NED) * earth.ecef_from_level(origin[None])[0].inv()
+
+
 def _readings(scene: Scene) -> list[Readings]:
     earth = Earth(scene.map.crs)
     surface, ride = Surface(scene), Surface(scene, ride=True)
     things = objects_of(scene, surface)
-    easting, northing, _ = surface.place(np.array([CENTRE[0]]), np.array([CENTRE[1]]))
-    origin = earth.ecef_from_map(np.array([[easting[0], northing[0], scene.map.height_m]]))[0]
-    enu = Rotation.from_matrix(_ENU_FROM_NED) * earth.ecef_from_level(origin[None])[0].inv()
+    origin, enu = _local_frame(scene, surface, earth)
     found = []
     for drive in drives_of(scene, earth, ride):
         trajectory = stated_trajectory(scene, drive, origin, enu)

@@ -48,7 +48,8 @@ class OverlapEvidence(Strict):
     passes: list[int] = []
     """Passes that drove over it, in place of whole runs."""
     area: Area | None = None
-    """Only readings within it; all that overlaps where left out."""
+    """Only readings within it; each time the vehicle comes by is a drive of its own, so that loops of one run are told
+    apart. Where left out, each run (or pass) is one drive, and all that overlaps counts."""
     tie_spacing_m: float | None = Field(default=None, gt=0.0)
     """Distance from one tie to the next; found from the readings' spacing where left out (m)."""
 

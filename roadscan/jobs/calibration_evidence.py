@@ -101,7 +101,7 @@ def traverses_of(
 def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSettings) -> Collected:
     """Ties between drives over one place: heights of what profilers saw, planes of what lidars saw."""
     sensors = tuple(entry.sensors)
-    wanted = Wanted(sensors, tuple(entry.runs), tuple(entry.passes), entry.area, settings.max_distance_m)
+    wanted = Wanted(sensors, tuple(entry.runs), tuple(entry.passes), entry.area, settings.margin_m)
     readings = list(wanted_readings(plan, wanted))
     pieces, traverses = traverses_of(plan, readings, settings)
     kinds = {name: plan.survey.rig.sensors[name].kind for name in sensors}
@@ -122,7 +122,7 @@ def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettin
         easting_min_m=entry.easting_m - reach, northing_min_m=entry.northing_m - reach,
         easting_max_m=entry.easting_m + reach, northing_max_m=entry.northing_m + reach,
     )  # fmt: skip
-    wanted = Wanted(tuple(entry.sensors), tuple(entry.runs), tuple(entry.passes), area, settings.max_distance_m)
+    wanted = Wanted(tuple(entry.sensors), tuple(entry.runs), tuple(entry.passes), area, settings.margin_m)
     readings = list(wanted_readings(plan, wanted))
     pieces, traverses = traverses_of(plan, readings, settings)
     world = trajectory_source(readings[0].drive.split(" drive ")[0], plan.records).world

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from roadscan.jobs.clock_pairs import log_pairs
 from roadscan.jobs.clock_tables import ClockEstimate, keep_estimates, kept_estimates, load_clocks
+from roadscan.jobs.computed_trajectory import NAVIGATION
 from roadscan.jobs.fingerprint import key_of, solver_version
 from roadscan.jobs.ingest import survey_records
 from roadscan.jobs.navigation_logs import imu_readings, odometer_readings
@@ -40,8 +41,6 @@ from roadscan.tables.store import Store
 __all__ = ["ClockEstimate", "estimate_clocks", "load_clocks"]
 
 _POSES: Final = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz"]
-_NAVIGATION: Final = "navigation"
-"""Sensor of computed trajectories."""
 _MAX_GAP_S: Final = 1.0
 
 Report = Callable[[str], None]
@@ -217,7 +216,7 @@ def _against(store: Store, records: Sequence[LogRecord], run: str, evidence: Mot
     """Logs that hold the same motion on GPS time: a trajectory, stated or computed, or those of an IMU."""
     if evidence.against == "trajectory":
         found = [r for r in records if r.run == run and r.tables.get("trajectory")]
-        found = found or [r for r in read_log_records(store) if (r.run, r.sensor) == (run, _NAVIGATION)]
+        found = found or [r for r in read_log_records(store) if (r.run, r.sensor) == (run, NAVIGATION)]
     else:
         found = [r for r in records if (r.run, r.sensor) == (run, evidence.against) and r.tables.get("imu")]
     if not found:

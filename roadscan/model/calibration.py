@@ -50,8 +50,6 @@ class OverlapEvidence(Strict):
     area: Area | None = None
     """Only readings within it; each time the vehicle comes by is a drive of its own, so that loops of one run are told
     apart. Where left out, each run (or pass) is one drive, and all that overlaps counts."""
-    tie_spacing_m: float | None = Field(default=None, gt=0.0)
-    """Distance from one tie to the next; found from the readings' spacing where left out (m)."""
 
 
 class ObjectEvidence(Strict):
@@ -116,8 +114,6 @@ class ReferenceEvidence(Strict):
     """Geoid grid of orthometric heights, where they must become ellipsoidal."""
     options: dict[str, Any] = {}
     """Settings of the format (`roadscan formats NAME`)."""
-    sigma_m: float = Field(default=0.003, gt=0.0)
-    """1 σ of its points (m)."""
     runs: list[str] = []
     """Runs that passed it; all where left out."""
 
@@ -156,8 +152,8 @@ class CalibrationSettings(Strict):
     determined_below: float = Field(default=0.5, gt=0.0, lt=1.0)
     """A direction counts as determined where the evidence alone gives it a σ below this share of its prior σ. Others
     keep their prior value."""
-    max_distance_m: float = Field(default=0.3, gt=0.0)
-    """Readings farther apart than this with the rig file's mountings are never taken for the same place (m)."""
+    margin_m: float = Field(default=0.3, ge=0.0)
+    """Readings so far outside an area are looked at too: the mountings of the rig file may be wrong by that (m)."""
     iterations_max: int = Field(default=40, ge=1, le=1000)
     """Linearisations for one set of ties."""
     rounds_max: int = Field(default=20, ge=1, le=200)

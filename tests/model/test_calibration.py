@@ -28,7 +28,7 @@ def test_kind_says_which_evidence_it_is():
     )
     assert isinstance(parse(kind="stop_and_go", sensor="left", imu="left_imu"), StopAndGoEvidence)
     assert parse(kind="object", sensors=["left", "right"], **OBJECT).kind == "object"
-    assert parse(kind="reference", sensor="lidar", path="a.las", crs="local", height="ellipsoidal").sigma_m == 0.003
+    assert parse(kind="reference", sensor="lidar", path="a.las", crs="local", height="ellipsoidal").geoid is None
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ OBJECT = {
 }
 
 
-QUARTER = [{"length_m": 6.0}, {"length_m": 18.85, "radius_m": 12.0}, {"length_m": 6.0}]
+QUARTER = [{"length_m": 4.0}, {"length_m": 15.7, "radius_m": 10.0}, {"length_m": 4.0}]
 """A turn to the right: what lies along the drive at first lies across it afterwards."""
 
 
@@ -130,8 +130,8 @@ def test_what_the_survey_does_not_have_is_named(yard: Path, entries: list[dict[s
 def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
     scene = Scene.load("calibration_yard").changed(
         profilers={"on": False}, sick={"on": False}, camera={"on": False}, gnss={"on": False}, encoder={"on": False},
-        imu={"on": False}, lidar={"range_max_m": 45.0}, noise={"position_m": 0.0, "attitude_deg": 0.0},
-        passes=[{"route": {"station_m": 30.0, "offset_m": -18.0, "pieces": QUARTER}}],
+        imu={"on": False}, lidar={"range_max_m": 30.0}, noise={"position_m": 0.0, "attitude_deg": 0.0},
+        passes=[{"route": {"station_m": 30.0, "offset_m": -20.0, "pieces": QUARTER}}],
         vehicle={"standstill_s": 0.0},
     )  # fmt: skip
     made = simulate(scene, tmp_path / "survey", write_hits=True)

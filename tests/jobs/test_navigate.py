@@ -22,6 +22,7 @@ from roadscan.tables.sql import query
 
 from .conftest import Simulated, changed, outputs
 
+FEW = {"products__make": ["tile_table"]}
 MEASURED = ("imu.csv", "gnss.pos", "encoder.csv")
 
 
@@ -47,7 +48,7 @@ def without_trajectory(survey_file: Path, *names: str) -> dict[str, Any]:
     runs = Survey.load(survey_file).config.model_dump()["runs"]
     for run in runs:
         run["logs"] = [log for log in run["logs"] if Path(log["path"]).name in {*names, "profiler_left.parquet"}]
-    return {"runs": runs}
+    return {"runs": runs, **FEW}
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +137,7 @@ def test_same_logs_same_bytes(navigated: Simulated) -> None:
 
 
 def test_solve_always_prefers_the_computed_one(driven: Simulated) -> None:
-    driven.run("store-4", navigation__solve="always")
+    driven.run("store-4", navigation__solve="always", **FEW)
     logged = [r for r in read_log_records(driven.store("store-4")) if r.format == "sbet"]
     assert len(logged) == 1
     assert computed(driven, "store-4").equals(computed(driven)) or len(computed(driven, "store-4")) > 1000
@@ -156,11 +157,11 @@ def test_solve_never_says_what_is_missing(driven: Simulated) -> None:
 
 def with_spline(**settings: Any) -> dict[str, Any]:
     """Settings of a run whose trajectory logs are smoothed."""
-    return {"navigation__spline": {"on": True, **settings}}
+    return {"navigation__spline": {"on": True, **settings}, **FEW}
 
 
 def test_a_sound_trajectory_log_stays_as_it_is(driven: Simulated) -> None:
-    driven.run("store-log")
+    driven.run("store-log", **FEW)
     driven.run("store-spline", **with_spline())
     logged, smooth = outputs(driven.store("store-log")), outputs(driven.store("store-spline"))
     assert logged == smooth
@@ -179,7 +180,7 @@ def test_a_short_gap_of_a_trajectory_log_is_filled_where_that_is_wanted(navigate
     def fates(store: str) -> dict[str, int]:
         return survey_status(Survey.load(copy.survey_file), copy.store(store)).readings
 
-    copy.run("gap")
+    copy.run("gap", **FEW)
     run = copy.run("filled", **with_spline(fill_gap_s=3.0))
     assert fates("gap").get("no_pose", 0) > 100
     survey = changed(Survey.load(copy.survey_file), with_spline(fill_gap_s=3.0))

@@ -1,7 +1,7 @@
 """Mountings from the simulated yard, over many seeds: of the profiler pair, and of the lidar.
 
 Profilers: from overlaps alone, and together with stop and go of the IMUs in the heads. Lidar: from planes.
-`ROADSCAN_SEEDS` says how many seeds (20), `ROADSCAN_PARTS` which of the parts ("overlap stop_and_go lidar"),
+Where the evidence leaves an axis open, its error is that of the start. `ROADSCAN_SEEDS` says how many seeds (20), `ROADSCAN_PARTS` which of the parts ("overlap stop_and_go lidar"),
 `ROADSCAN_DRIVES` how many drives of the profilers from overlaps alone (8).
 """
 
@@ -44,7 +44,7 @@ Solve = Callable[[int], tuple[Yard, Calibration]]
 def figures(folder: Path) -> Iterator[Figure]:
     """Errors over all seeds: of each seed the worst, then root mean squares with the largest beside them."""
     parts = os.environ.get("ROADSCAN_PARTS", "overlap stop_and_go lidar").split()
-    drives = int(os.environ.get("ROADSCAN_DRIVES", 8))
+    drives = int(os.environ.get("ROADSCAN_DRIVES", "8"))
     if "overlap" in parts:
         for name, level in TRAJECTORIES.items():
             yield from _seeds(f"heads, {name}", lambda seed, level=level: _overlap(seed, drives, level))
@@ -78,7 +78,7 @@ def solved(yard: Yard, orientations: Sequence[Orientation] = ()) -> Calibration:
 
 def _seeds(name: str, solve: Solve) -> Iterator[Figure]:
     """Of each seed its worst error against the bar, then all seeds' figures."""
-    seeds = int(os.environ.get("ROADSCAN_SEEDS", 20))
+    seeds = int(os.environ.get("ROADSCAN_SEEDS", "20"))
     errors, sigmas, overlaps, seconds = [], [], [], []
     for seed in range(1, seeds + 1):
         started = time.perf_counter()

@@ -41,7 +41,7 @@ HEADINGS_DEG = (0.0, 180.0, 90.0, 270.0)
 LIDAR_HEADINGS_DEG = (0.0, 0.0, 180.0, 90.0, 270.0)
 """A loop, back-through, right angles."""
 _POSES_PER_S = 200
-_EVERY = 3
+_EVERY = 6
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ def head_orientations(yard: Yard, folder: Path, rounds: int = 3) -> list[Orienta
     heads = {side: {"error": getattr(yard.scene.profilers, side).error.model_dump()} for side in ("left", "right")}
     noise = yard.scene.noise
     scene = shipped.changed(
-        seed=yard.scene.seed, passes=passes, profilers={"spacing_m": 2.0, "readings": 2, **heads}, road={"texture": None},
-        noise={k: getattr(noise, k) for k in ("position_m", "attitude_deg", "time_constant_s")},
+        seed=yard.scene.seed, passes=passes, profilers={"spacing_m": 2.0, "readings": 2, **heads},
+        road={"texture": None}, noise={k: getattr(noise, k) for k in ("position_m", "attitude_deg", "time_constant_s")},
         lidar=_OFF, sick=_OFF, camera=_OFF, imu=_OFF, gnss=_OFF, encoder=_OFF,
     )  # fmt: skip
     made = simulate(scene, folder).folder
@@ -163,20 +163,21 @@ def lidar_yard(
     position_m: float,
     attitude_deg: float,
     time_constant_s: float = 60.0,
-    piece_s: float = 0.5,
+    piece_s: float = 1.0,
     length_m: float = 30.0,
-    share: float = 0.4,
+    even_to_m: float = 30.0,
     headings_deg: Sequence[float] = LIDAR_HEADINGS_DEG,
 ) -> Yard:
-    """Drives of the lidar past the yard's façade, poles and object; that share of its returns, chosen at random."""
+    """Drives of the lidar past façade, poles and object; nearer returns thinned to the density at that range."""
     rng = np.random.default_rng(seed)
     noise = {"position_m": position_m, "attitude_deg": attitude_deg, "time_constant_s": time_constant_s}
     scene = Scene.load("calibration_yard").changed(
-        seed=seed, passes=[_route(h, length_m, 0.0, rng) for h in headings_deg], vehicle={"standstill_s": 0.0, "speed_m_per_s": 10.0},
-        road={"texture": None}, noise=noise, lidar={"range_max_m": 45.0, "mount": {"error": _error(rng)}},
+        seed=seed, passes=[_route(h, length_m, 0.0, rng) for h in headings_deg],
+        vehicle={"standstill_s": 0.0, "speed_m_per_s": 10.0}, road={"texture": None}, noise=noise,
+        lidar={"range_max_m": 45.0, "mount": {"error": _error(rng)}},
         profilers=_OFF, sick=_OFF, camera=_OFF, imu=_OFF, gnss=_OFF,
     )  # fmt: skip
-    readings = _returns(scene, share, rng)
+    readings = _returns(scene, even_to_m, rng)
     pieces = Pieces.of_seconds(piece_s)
     tilt, place = math.radians(max(attitude_deg, 1e-4)), max(position_m, 1e-5)
     traverses = pieces.traverses(readings, _ENU_FROM_NED, (place,) * 3, (tilt, tilt, 2 * tilt), time_constant_s)
@@ -188,7 +189,7 @@ def lidar_yard(
     return Yard(scene, readings, pieces, traverses, {"lidar": prior}, {"lidar": true})
 
 
-def _returns(scene: Scene, share: float, rng: np.random.Generator) -> list[Readings]:
+def _returns(scene: Scene, even_to_m: float, rng: np.random.Generator) -> list[Readings]:
     earth = Earth(scene.map.crs)
     surface, ride = Surface(scene), Surface(scene, ride=True)
     world = World(scene, surface)
@@ -199,7 +200,8 @@ def _returns(scene: Scene, share: float, rng: np.random.Generator) -> list[Readi
     for drive in drives_of(scene, earth, ride):
         points, epochs = [], []
         for block in _some_packets(scene, world, drive):
-            seen = (block.ranges > 0) & (rng.random(block.ranges.shape) < share)
+            kept = np.square(lidar.RANGE_STEP_M / even_to_m * block.ranges)
+            seen = (block.ranges > 0) & (rng.random(block.ranges.shape) < kept)
             laser, azimuth = np.nonzero(seen)[2], np.radians(block.azimuth_deg[seen])
             ranges = lidar.RANGE_STEP_M * block.ranges[seen]
             flat = ranges * np.cos(elevation[laser])
@@ -220,7 +222,7 @@ def _returns(scene: Scene, share: float, rng: np.random.Generator) -> list[Readi
 
 
 def _some_packets(scene: Scene, world: World, drive: Drive) -> Iterator[lidar.Packets]:
-    """One block of packets in `_EVERY`, 71 ms of each 0.21 s: casting all beams would take most of the time."""
+    """One block of packets in `_EVERY`, 71 ms of each 0.42 s: casting all beams would take most of the time."""
     span_ns = drive.recorded_span_gps_ns[1] - lidar.starts_gps_ns(drive)
     blocks = int(span_ns // (lidar.BLOCK_PACKETS * lidar.PACKET_NS))
     for block in range(0, blocks, _EVERY):

@@ -1,8 +1,9 @@
 """Mountings from the simulated yard, over many seeds: of the profiler pair, and of the lidar.
 
 Profilers: from overlaps alone, and together with stop and go of the IMUs in the heads. Lidar: from planes.
-Where the evidence leaves an axis open, its error is that of the start. `ROADSCAN_SEEDS` says how many seeds (20), `ROADSCAN_PARTS` which of the parts ("overlap stop_and_go lidar"),
-`ROADSCAN_DRIVES` how many drives of the profilers from overlaps alone (8).
+Where the evidence leaves an axis open, its error is that of the start. `ROADSCAN_SEEDS` says how many seeds (20),
+`ROADSCAN_PARTS` which of the parts ("overlap stop_and_go lidar"), `ROADSCAN_DRIVES` how many drives of the profilers
+from overlaps alone (8).
 """
 
 from __future__ import annotations

@@ -585,6 +585,8 @@ def _print_status(found: Status, survey_file: Path) -> None:
     )
     if found.outputs:
         typer.echo("files: " + ", ".join(f"{n} {c:,}" for n, c in sorted(found.outputs.items())))
+    for note in found.notes:
+        typer.echo(f"note: {note}")
     for failure in found.failures:
         typer.echo(f"failed in the last run: {failure['stage']} {failure['unit']}: {failure['reason']}")
     if found.next_run:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import pyarrow as pa
@@ -14,12 +14,12 @@ from roadscan.jobs.calibration_evidence import Collected, collect
 from roadscan.jobs.fingerprint import key_of, solver_version
 from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.readings import MOUNTINGS
-from roadscan.model.calibration import CalibrationSettings
-from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
+from roadscan.model.errors import ConfigError, RunError, nearest
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.survey import Survey
 from roadscan.navigation.calibration.estimator import Calibration, Prior, calibrate
-from roadscan.navigation.calibration.evidence import Evidence, Traverse
+from roadscan.navigation.calibration.evidence import Directions, Evidence, Orientation, Ties, Traverse
 from roadscan.navigation.calibration.report import mounting_rows, report
 from roadscan.navigation.calibration.unknowns import Estimate, ObjectPose
 from roadscan.products.pictures.calibration import draw_calibration
@@ -29,6 +29,8 @@ from roadscan.tables.store import Store
 Report = Callable[[str], None]
 
 ALL_RUNS: Final = "*"
+_HELD: Final = 0.9
+"""A σ above this share of the prior's is the prior's."""
 PICTURE: Final = "products/calibration/calibration.png"
 TEXT: Final = "products/calibration/calibration.txt"
 
@@ -74,10 +76,21 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
     traverses = {number: t for one in collected for number, t in one.traverses.items()}
     objects = _objects(collected, priors, traverses, settings, say)
     say(f"estimating: {', '.join(sensors)}")
-    calibration = calibrate(priors, _finder(collected), traverses, settings, objects)
+    finder = _Finder(collected, say)
+    calibration = calibrate(priors, finder, traverses, settings, objects)
+    _refuse_empty(finder, [entry.kind for entry in config.calibration])
+    known = _determined(calibration)
+    if not known:
+        raise RunError(
+            "the evidence determines no part of any mounting; nothing is written:\n" + report(calibration),
+            change="see docs/calibration.md, what to drive",
+        )
+    for name in sensors:
+        if name not in known:
+            say(f"not determined at all, not written: {name}")
     since = 0 if settings.valid_from is None else gps_ns_from_utc(settings.valid_from)
     rows = mounting_rows(
-        calibration,
+        replace(calibration, sensors={name: calibration.sensors[name] for name in known}),
         run=ALL_RUNS,
         valid_from_gps_ns=since,
         estimated_at=dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
@@ -92,9 +105,49 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
     return Calibrated(calibration, rows, text)
 
 
-def _finder(collected: Sequence[Collected]) -> Callable[[Estimate], Sequence[Evidence]]:
-    """All evidence as one."""
-    return lambda estimate: [found for one in collected for found in one.find(estimate)]
+class _Finder:
+    """All evidence as one; it says how much each round finds, and remembers what found nothing."""
+
+    def __init__(self, collected: Sequence[Collected], say: Report) -> None:
+        self._collected = collected
+        self._say = say
+        self._round = 0
+        self.counts: list[int] = [0] * len(collected)
+        """Observations of each entry in the last round."""
+
+    def __call__(self, estimate: Estimate) -> list[Evidence]:
+        self._round += 1
+        found = [list(one.find(estimate)) for one in self._collected]
+        self.counts = [sum(_size(evidence) for evidence in one) for one in found]
+        self._say(f"round {self._round}: {', '.join(f'{count:,}' for count in self.counts)} observations")
+        return [evidence for one in found for evidence in one]
+
+
+def _size(evidence: Evidence) -> int:
+    match evidence:
+        case Ties():
+            return len(evidence.weight)
+        case Directions():
+            return len(evidence.sigma_rad)
+        case Orientation():
+            return 1
+
+
+def _refuse_empty(finder: _Finder, kinds: Sequence[str]) -> None:
+    """Evidence that was asked for and holds nothing is an error, and not a smaller calibration."""
+    counted = enumerate(zip(kinds, finder.counts, strict=True), 1)
+    empty = [f"number {number} ({kind})" for number, (kind, count) in counted if not count]
+    if empty:
+        raise RunError(
+            f"of the [[calibration]] entries, {', '.join(empty)} found not one place that was seen twice; "
+            "nothing is written",
+            change="check its area, runs and object; profiles have to be dense (2.5 mm along and across for overlap)",
+        )
+
+
+def _determined(calibration: Calibration) -> list[str]:
+    """Sensors of which the evidence determines any part."""
+    return [n for n, one in calibration.sensors.items() if (one.sigma < _HELD * one.prior_sigma).any()]
 
 
 def _objects(
@@ -112,7 +165,7 @@ def _objects(
     mountings = {name: prior.mounting for name, prior in priors.items()}
     if others:
         say("estimating without the objects")
-        mountings |= calibrate(priors, _finder(others), traverses, settings).mountings
+        mountings |= calibrate(priors, _Finder(others, say), traverses, settings).mountings
     estimate = Estimate(mountings, dict.fromkeys(mountings, 0.0), {}, {})
     return {name: pose for locate in locating for name, pose in locate(estimate).items()}
 
@@ -128,13 +181,37 @@ def _prior(survey: Survey, name: str) -> Prior:
     return Prior.of(survey.rig.sensors[name], settings, settings.range_offset_sigma_m.get(name, 0.0))
 
 
+def outdated_calibrations(plan: SurveyPlan) -> list[str]:
+    """In words, the calibrations of the table that were made from other logs, rig, settings or code than there are."""
+    if not plan.store.exists(MOUNTINGS):
+        return []
+    by_key: dict[str, dict[str, str]] = {}
+    for row in pq.read_table(pa.BufferReader(plan.store.read_bytes(MOUNTINGS))).to_pylist():
+        if row["calibration"]:
+            by_key.setdefault(row["calibration"], {})[row["sensor"]] = row["estimated_at"] or ""
+    return [
+        f"the mountings of {', '.join(sensors)} (calibrated {max(sensors.values())}) stand above the rig file, and "
+        "were made from other logs, rig, settings or code; `roadscan calibrate` makes them anew"
+        for key, sensors in by_key.items()
+        if not all(s in plan.survey.rig.sensors for s in sensors) or _key(plan, _asked(plan)) != key
+    ]
+
+
+def _asked(plan: SurveyPlan) -> list[str]:
+    """Sensors that the survey file's evidence names and the rig has."""
+    named: list[str] = []
+    for entry in plan.survey.config.calibration:
+        named += entry.sensors if isinstance(entry, OverlapEvidence | ObjectEvidence) else [entry.sensor]
+    return [name for name in named if name in plan.survey.rig.sensors]
+
+
 def _key(plan: SurveyPlan, sensors: Iterable[str]) -> str:
     """What the calibration was made from: logs, rig, settings, code."""
     config = plan.survey.config
     return key_of(
         solver_version(),
         [r.key for r in plan.records],
-        {name: plan.survey.rig.sensors[name].model_dump(mode="json") for name in sensors},
+        {name: plan.survey.rig.sensors[name].model_dump(mode="json") for name in sorted(set(sensors))},
         [entry.model_dump(mode="json") for entry in config.calibration],
         config.navigation.calibration.model_dump(mode="json"),
     )

@@ -48,6 +48,7 @@ _ANY_TIME: Final = Clock(TimeSystem.FREE, offset_s=1e9)
 
 REFERENCE_READINGS: Final = 400_000
 """Of a sensor that are held against a reference scan; more are thinned evenly."""
+_WIDEST_M2: Final = 700.0
 _REFERENCE_MARGIN_M: Final = 5.0
 
 
@@ -101,6 +102,9 @@ def traverses_of(
 def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSettings) -> Collected:
     """Ties between drives over one place: heights of what profilers saw, planes of what lidars saw."""
     sensors = tuple(entry.sensors)
+    rig = plan.survey.rig.sensors
+    if entry.area is None and any(name in rig and rig[name].kind == "profiler" for name in sensors):
+        _refuse_wide(plan, entry)
     wanted = Wanted(sensors, tuple(entry.runs), tuple(entry.passes), entry.area, settings.margin_m)
     readings = list(wanted_readings(plan, wanted))
     pieces, traverses = traverses_of(plan, readings, settings)
@@ -113,6 +117,25 @@ def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSett
     if clouds:
         finders.append(PlaneTies(clouds, pieces, traverses))
     return Collected(sensors, lambda estimate: [t for find in finders for t in find(estimate)], traverses)
+
+
+def _refuse_wide(plan: SurveyPlan, entry: OverlapEvidence) -> None:
+    """Whole runs may lie far apart: refuse them before their readings are loaded."""
+    runs = entry.runs or list(dict.fromkeys(s.run for s, _ in plan.sources))
+    boxes = []
+    for run in runs:
+        source = trajectory_source(run, plan.records)
+        spans = [s for f in source.files for s in f.group_spans]
+        trajectory = load_trajectory(plan.store, source, spans, plan.ground.max_gap_s)
+        enh = plan.ground.map.map_from_world(trajectory.world, trajectory.position_world_m[::20])
+        boxes.append((enh[:, :2].min(axis=0), enh[:, :2].max(axis=0)))
+    extent = np.max([high for _, high in boxes], axis=0) - np.min([low for low, _ in boxes], axis=0)
+    if extent[0] * extent[1] > _WIDEST_M2:
+        raise ConfigError(
+            f"the drives of an overlap without an area extend over {extent[0]:.0f} m × {extent[1]:.0f} m",
+            expected=f"at most {_WIDEST_M2:.0f} m² that profilers are compared on",
+            change="give its [[calibration]] entry an area: a rectangle of the map about the place, such as 8 m × 8 m",
+        )
 
 
 def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettings) -> Collected:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.footprints import Footprints, index_footprints, load_footprints
@@ -72,6 +73,8 @@ def run_navigate(run: Run) -> None:
 def run_footprints(run: Run) -> None:
     """Which raw block touches which tile."""
     plan = plan_survey(run.survey, run.store)
+    for note in outdated_calibrations(plan):
+        run.reporter.line(f"note: {note}")
     found = index_footprints(plan, Manifest(run.store), run.compute, _bar(run, "footprints"))
     run.failed("footprints", found)
 

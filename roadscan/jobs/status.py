@@ -11,6 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.compute import Inline
 from roadscan.jobs.footprints import PRODUCT, reading_fates
 from roadscan.jobs.ingest import plan_logs
@@ -47,6 +48,8 @@ class Status:
     """What failed in the last run."""
     next_run: dict[str, int] = field(default_factory=dict)
     """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
+    notes: list[str] = field(default_factory=list)
+    """What the user should know, beside what is to do."""
     note: str = ""
     """Why nothing can be said of tiles."""
 
@@ -106,6 +109,7 @@ def survey_status(survey: Survey, store: Store) -> Status:
 
 def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifest) -> None:
     plan = plan_survey(survey, store)
+    status.notes = outdated_calibrations(plan)
     status.readings = reading_fates(plan, manifest)
     if not any(manifest.of(PRODUCT)):
         status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}

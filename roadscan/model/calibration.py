@@ -149,7 +149,7 @@ class CalibrationSettings(Strict):
     independent_ties: float = Field(default=10_000.0, ge=10.0)
     """A kind of evidence counts at most as so many independent ties: neighbouring readings share errors of surface,
     matching and pose, which a million of them do not average out."""
-    determined_below: float = Field(default=0.5, gt=0.0, lt=1.0)
+    determined_below: float = Field(default=0.3, gt=0.0, lt=1.0)
     """A direction counts as determined where the evidence alone gives it a σ below this share of its prior σ. Others
     keep their prior value."""
     margin_m: float = Field(default=0.3, ge=0.0)

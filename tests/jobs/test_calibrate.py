@@ -11,11 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey
+from roadscan.jobs.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey, outdated_calibrations
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.readings import load_mountings
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.readings import MOUNTINGS, load_mountings
 from roadscan.jobs.stages import STAGES, Run, run_stages
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate
@@ -155,3 +156,34 @@ def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
     assert np.abs(Rotation.from_matrix(rotation @ true.T).as_rotvec(degrees=True)).max() < 0.01
     assert np.abs(lever - arm).max() < 0.005
     assert np.abs((lever - arm) / found.sigma[:3]).max() < 4.0
+
+
+def test_evidence_that_finds_nothing_is_refused_and_what_was_known_stays(
+    yard: Path, calibrated: tuple[Survey, Calibrated]
+) -> None:
+    store = store_of(calibrated[0])
+    before = store.read_bytes(MOUNTINGS)
+    west, south = 566002.0, 5933047.0
+    beside = {"easting_min_m": west, "northing_min_m": south, "easting_max_m": west + 1, "northing_max_m": south + 1}
+    entry = {"kind": "overlap", "sensors": ["profiler_left", "profiler_right"], "area": beside}
+    survey = changed(Survey.load(yard), {"calibration": [entry, stop_and_go("profiler_left")]})
+    with pytest.raises(RoadscanError):
+        calibrate_survey(survey, store)
+    assert store.read_bytes(MOUNTINGS) == before
+
+
+def test_an_overlap_of_whole_runs_is_refused_before_their_readings_are_loaded(yard: Path) -> None:
+    entry = {"kind": "overlap", "sensors": ["profiler_left"]}
+    survey = changed(Survey.load(yard), {"calibration": [entry]})
+    with pytest.raises(ConfigError, match="an area"):
+        calibrate_survey(survey, store_of(survey))
+
+
+def test_status_says_when_the_rig_is_another_than_the_calibrated_one(calibrated: tuple[Survey, Calibrated]) -> None:
+    survey, _ = calibrated
+    store = store_of(survey)
+    rig = survey.rig.model_dump()
+    rig["sensors"]["profiler_left"]["lever_arm_body_m"] = (-2.35, -0.98, -2.08)
+    other = changed(survey, {"rig": rig})
+    assert not any("profiler_right" in note for note in outdated_calibrations(plan_survey(survey, store)))
+    assert any("profiler_right" in note for note in outdated_calibrations(plan_survey(other, store)))

@@ -244,7 +244,7 @@ def _counting_right(
     if np.abs(speed[wrong]).sum() > 0 and np.abs(speed[right]).sum() < 0.05 * np.abs(speed[wrong]).sum():
         log = readings.log
         turned = replace(log, distance_m=-log.distance_m, speed_m_per_s=-log.speed_m_per_s)
-        what = "counts downwards where the vehicle drives forward; all its readings changed their sign"
+        what = "counts downwards, against the direction of travel; all its readings changed their sign"
         ends = np.array([0, readings.records.size - 1])
         repair = Repair("odometer", what, readings.records[ends], log.epochs_gps_ns[ends])
         readings = Kept(turned, readings.records, [*readings.repairs, repair])

@@ -19,8 +19,8 @@ from benchmarks.calibration_yard import Yard, head_orientations, lidar_yard, mou
 from benchmarks.timing import Figure
 from roadscan.model.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Calibration, calibrate
-from roadscan.navigation.calibration.evidence import Orientation
-from roadscan.navigation.calibration.surfaces.heads import agreement
+from roadscan.navigation.calibration.evidence import Evidence, Orientation
+from roadscan.navigation.calibration.surfaces.heads import HeadTies, agreement
 from roadscan.navigation.calibration.surfaces.heights import HeightTies
 from roadscan.navigation.calibration.surfaces.planes import PlaneTies
 from roadscan.navigation.calibration.surfaces.readings import level_from_world, placed
@@ -72,9 +72,13 @@ def _lidar(seed: int) -> tuple[Yard, Calibration]:
 
 
 def solved(yard: Yard, orientations: Sequence[Orientation] = ()) -> Calibration:
-    """Calibrate the heads with heights, and with their orientations where there are any."""
-    heights = HeightTies(yard.readings, yard.pieces, yard.traverses)
-    return calibrate(yard.priors, lambda e: [*heights(e), *orientations], yard.traverses, CalibrationSettings())
+    """Calibrate the heads with heights, the strip they both see, and their orientations where there are any."""
+    heights, strip = (find(yard.readings, yard.pieces, yard.traverses) for find in (HeightTies, HeadTies))
+
+    def evidence(estimate: Estimate) -> list[Evidence]:
+        return [*heights(estimate), *strip(estimate), *orientations]
+
+    return calibrate(yard.priors, evidence, yard.traverses, CalibrationSettings())
 
 
 def _seeds(name: str, solve: Solve) -> Iterator[Figure]:

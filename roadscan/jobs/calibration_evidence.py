@@ -30,6 +30,7 @@ from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.navigation.calibration.evidence import Evidence, Seen, Traverse
 from roadscan.navigation.calibration.reference import ReferenceOptions, register
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
+from roadscan.navigation.calibration.surfaces.heads import HeadTies
 from roadscan.navigation.calibration.surfaces.heights import HeightTies
 from roadscan.navigation.calibration.surfaces.objects import ObjectTies, find_object
 from roadscan.navigation.calibration.surfaces.planes import PlaneTies
@@ -113,7 +114,7 @@ def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSett
     clouds = [one for one in readings if kinds[one.sensor] != "profiler"]
     finders: list[Find] = []
     if profiles:
-        finders.append(HeightTies(profiles, pieces, traverses))
+        finders += [HeightTies(profiles, pieces, traverses), HeadTies(profiles, pieces, traverses)]
     if clouds:
         finders.append(PlaneTies(clouds, pieces, traverses))
     return Collected(sensors, lambda estimate: [t for find in finders for t in find(estimate)], traverses)

@@ -15,7 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.calibration_yard import Yard, head_orientations, lidar_yard, mounting_error, profiler_yard
+from benchmarks.calibration_yard import (
+    LIDAR_HEADINGS_DEG,
+    Yard,
+    head_orientations,
+    lidar_yard,
+    mounting_error,
+    profiler_yard,
+)
 from benchmarks.timing import Figure
 from roadscan.model.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Calibration, calibrate
@@ -61,12 +68,12 @@ def _overlap(seed: int, drives: int, level: tuple[float, float]) -> tuple[Yard, 
 
 
 def _with_stop_and_go(seed: int, folder: Path) -> tuple[Yard, Calibration]:
-    yard = profiler_yard(seed, 4, *TRAJECTORIES[TACTICAL], length_m=3.5)
+    yard = profiler_yard(seed, 8, *TRAJECTORIES[TACTICAL], length_m=3.5)
     return yard, solved(yard, head_orientations(yard, folder / f"heads-{seed}"))
 
 
 def _lidar(seed: int) -> tuple[Yard, Calibration]:
-    yard = lidar_yard(seed, *TRAJECTORIES[TACTICAL])
+    yard = lidar_yard(seed, *TRAJECTORIES[TACTICAL], headings_deg=2 * LIDAR_HEADINGS_DEG)
     evidence = PlaneTies(yard.readings, yard.pieces, yard.traverses)
     return yard, calibrate(yard.priors, evidence, yard.traverses, CalibrationSettings())
 

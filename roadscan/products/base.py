@@ -51,9 +51,10 @@ class ProductContext:
 
 @dataclass(frozen=True)
 class Tile:
-    """A computed tile, as tile products receive it."""
+    """A computed tile, as tile products receive it. Its arrays may be reused when the product has been written."""
 
-    points: TilePoints
+    points: TilePoints | None
+    """None unless one of the products wanted needs points."""
     cells: TileCells
     marked: TilePoints | None = None
     """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
@@ -107,6 +108,8 @@ class TileProduct(ABC):
     """Model of its settings."""
     default: ClassVar[bool] = True
     """Made where the survey file does not list products."""
+    needs_points: ClassVar[bool] = False
+    """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
 
     def suffix_for(self, options: Strict) -> str:
         """File suffix under these settings."""

@@ -86,6 +86,7 @@ class Las(TileProduct):
     title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
     suffix: ClassVar[str] = ".laz"
     options: ClassVar[type[Strict]] = LasOptions
+    needs_points: ClassVar[bool] = True
 
     def suffix_for(self, options: Strict) -> str:
         """``.laz`` or ``.las``."""
@@ -125,6 +126,8 @@ class Las(TileProduct):
 
 def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:
     """Points to write: thinned out, or all, and behind them those that filters leave out, where they are kept."""
+    if tile.points is None:
+        raise StoreError(f"tile {tile.cells.tile} came without its points", expected="points, which the product needs")
     if options.spacing_m is not None:
         return thin_out(tile.points, options.spacing_m, context.grid)
     return tile.points if tile.marked is None else tile.points.and_then(tile.marked)
@@ -308,7 +311,7 @@ def _facts(
         "survey": context.survey_id,
         "tile": str(points.tile),
         "height": context.map.height,
-        "points_of_tile": len(tile.points),
+        "points_of_tile": int(tile.cells.count.sum()),
         "spacing_m": options.spacing_m,
         "rounding_error_max_m": {name: round(axis.error_max_m, 9) for name, axis in zip("xyz", axes, strict=True)},
         "gps_time_step_ns": _gps_time_step_ns(points),

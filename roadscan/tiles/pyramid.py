@@ -1,0 +1,110 @@
+"""Overviews of a tile: its cells in ever larger pixels, for looking at a road from far away."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.pyramid import reduce_cells
+from roadscan.model.errors import ConfigError
+from roadscan.tiles.cells import TileCells
+
+WANTED_FACTORS: Final = (2, 8, 32)
+"""Cells along an edge of a pixel: cells of 5 mm become pixels of 10, 40 and 160 mm."""
+
+LARGEST_FACTOR: Final = 256
+"""Sums stay exact while a pixel's cells, times their height above the tile's first cell, are below 2²¹ m."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Pixels of one overview that hold a point, in order of row and column; all arrays are (n,)."""
+
+    factor: int
+    """Cells of the tile along an edge of a pixel."""
+    column: npt.NDArray[np.uint16]
+    """Of the pixel in its tile, from the west edge."""
+    row: npt.NDArray[np.uint16]
+    """Of the pixel in its tile, from the south edge."""
+    count: npt.NDArray[np.uint32]
+    """Points in the pixel."""
+    cells: npt.NDArray[np.uint32]
+    """Cells of the pixel that hold a point."""
+    height_m: npt.NDArray[np.float64]
+    """Mean of the robust heights of those cells, each counted once, rounded to 2⁻³² m before they are added."""
+    intensity: npt.NDArray[np.float32]
+    """Mean intensity of the pixel's points."""
+
+    def __len__(self) -> int:
+        return int(self.column.size)
+
+
+def overview_factors(cells_per_edge: int, wanted: Sequence[int] = WANTED_FACTORS) -> tuple[int, ...]:
+    """Factors of a tile's overviews: for each wanted one the nearest that fits, ascending.
+
+    A factor fits if it divides the tile's edge, so that no pixel straddles two tiles, and is a multiple of the
+    factor before it. Nearest is by ratio, the smaller of two equally near. 10 m tiles with cells of 5 mm get
+    2, 8 and 40 (10, 40 and 200 mm; 160 mm does not divide 10 m); tiles of 8 or 16 m get 2, 8 and 32. A wanted
+    factor is left out where none within twice or half of it fits.
+    """
+    found: list[int] = []
+    for near in wanted:
+        last = found[-1] if found else 1
+        fits = [
+            f
+            for f in range(2 * last, min(2 * near, cells_per_edge, LARGEST_FACTOR) + 1, last)
+            if cells_per_edge % f == 0 and 2 * f >= near
+        ]
+        if fits:
+            found.append(min(fits, key=lambda f: (max(f / near, near / f), f)))
+    return tuple(found)
+
+
+def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
+    """Overviews of a tile by `factors`, in that order; equal to the bit whichever others are made with them.
+
+    Sums are of whole units: heights of 2⁻³² m, intensities of digital numbers (a cell's mean times its count,
+    rounded: exact up to 128 readings of 65,535 a cell). Raises :class:`ConfigError` for factors that do not
+    divide the tile's edge or are not ascending multiples of one another.
+    """
+    edge = cells.cells_per_edge
+    _check(edge, factors)
+    if not factors:
+        return []
+    steps = np.array(factors, np.int64)
+    edges = edge // steps
+    rooms = np.minimum(edges * edges, len(cells))
+    ends = np.cumsum(rooms)
+    starts, total = ends - rooms, int(ends[-1])
+    column, row = np.empty(total, np.uint16), np.empty(total, np.uint16)
+    count, covered = np.empty(total, np.uint32), np.empty(total, np.uint32)
+    height, intensity = np.empty(total, np.float64), np.empty(total, np.float32)
+    written = np.zeros(len(factors), np.int64)
+    base = float(np.rint(cells.height_robust_m[0])) if len(cells) else 0.0
+    reduce_cells(
+        cells.column, cells.row, cells.count, cells.height_robust_m, cells.intensity_mean, base,
+        steps, edges, starts, (np.arange(edge) // factors[0]).astype(np.uint16),
+        np.zeros((len(factors), edges[0], 4)),
+        column, row, count, covered, height, intensity, written,
+    )  # fmt: skip
+    levels: list[Level] = []
+    for factor, start, size in zip(factors, starts.tolist(), written.tolist(), strict=True):
+        own = slice(start, start + size)
+        levels.append(Level(factor, column[own], row[own], count[own], covered[own], height[own], intensity[own]))
+    return levels
+
+
+def _check(edge: int, factors: Sequence[int]) -> None:
+    for before, factor in itertools.pairwise((1, *factors)):
+        if not before < factor <= LARGEST_FACTOR or factor % before or math.gcd(edge, factor) != factor:
+            raise ConfigError(
+                f"overviews by {', '.join(map(str, factors))} of a tile of {edge} cells",
+                expected=f"ascending factors up to {LARGEST_FACTOR} that divide the tile and one another",
+                change="use overview_factors(cells_per_edge)",
+            )

@@ -60,9 +60,9 @@ def run(
 
 
 @app.command()
-def ingest(survey_file: SurveyFile) -> None:
+def ingest(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
     """Raw logs into tables."""
-    _run(survey_file, _stages("ingest"), 0, None)
+    _run(survey_file, _stages("ingest"), workers, scheduler)
 
 
 @app.command()

@@ -2,47 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.clock_pairs import log_clock
-from roadscan.jobs.fingerprint import grid_digest, key_of
-from roadscan.model.crs import Geoid, add_grid_folder
-from roadscan.model.errors import FormatError, RoadscanError, RunError
-from roadscan.model.survey import ControlConfig, LogConfig, Survey
-from roadscan.sensors.base import LogFormat, LogSource, Reject, Rows, format_named, format_of
+from roadscan.jobs.compute import Compute, Done, Inline
+from roadscan.jobs.planned_logs import PlannedLog, grid_folder, plan_logs
+from roadscan.model.crs import add_grid_folder
+from roadscan.model.errors import FormatError, RoadscanError, RunError, StoreError
+from roadscan.model.survey import Survey
+from roadscan.sensors.base import LogHeader, Reject, Rows
 from roadscan.tables.logs import LogRecord, has_log, read_log_records, retire_log, write_log_record
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store, file_digest
+from roadscan.tables.store import Store
 from roadscan.tables.writer import LogWriter
 
-CONTROL_RUN: Final = "survey"
-CONTROL_SENSOR: Final = "control"
 DATA_TABLES: Final = ("scans", "returns", "cloud")
 """Tables whose readings become points."""
 
-_SOURCES: Final = "manifest/sources.json"
-
-
-@dataclass(frozen=True)
-class PlannedLog:
-    """A log of the survey file with all that identifies it."""
-
-    run: str
-    sensor: str
-    config: LogConfig | ControlConfig
-    format: LogFormat
-    source: LogSource
-    key: str
-    content: str
-    bytes: int
+_SMALL_BYTES: Final = 64 << 20
+"""Logs that are smaller together are read in this process: to start workers takes longer."""
 
 
 @dataclass(frozen=True)
@@ -55,66 +37,51 @@ class IngestResult:
 
 
 @dataclass(frozen=True)
-class UnplannedLog:
-    """A log of the survey file that cannot be planned, and why."""
+class IngestTask:
+    """One log to be read, by any worker that sees the log and the store."""
 
-    run: str
-    path: str
-    error: RoadscanError
-
-
-def plan_logs(survey: Survey, store: Store) -> tuple[list[PlannedLog], list[UnplannedLog]]:
-    """All logs of the survey file, trajectories first, with their keys; and those that cannot be planned.
-
-    Bytes are read only to fingerprint them. A log that was ingested and then moved away keeps its fingerprint.
-    """
-    if survey.config.map.grids is not None:
-        add_grid_folder(survey.resolve(survey.config.map.grids))
-    known = _Sources(store)
-    listed: list[tuple[str, LogConfig | ControlConfig]] = [
-        (run.id, log) for run in survey.config.runs for log in run.logs
-    ]
-    listed += [(CONTROL_RUN, control) for control in survey.config.control]
-    planned: list[PlannedLog] = []
-    unplanned: list[UnplannedLog] = []
-    for run, config in listed:
-        try:
-            planned.append(_plan_log(survey, run, config, known))
-        except RoadscanError as error:
-            unplanned.append(UnplannedLog(run, str(config.path), error))
-    known.save()
-    once = {log.key: log for log in reversed(planned)}  # a log listed twice is one log
-    ordered = sorted(once.values(), key=lambda p: ("trajectory" not in p.format.yields, p.run, p.sensor, p.key))
-    return ordered, unplanned
+    store: Store
+    log: PlannedLog
+    replaces: tuple[LogRecord, ...] = ()
+    """The same bytes read before under other settings; no two tasks replace the same."""
+    grids: Path | None = None
+    """Folder of the survey's geoid grids."""
 
 
-def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda _: None) -> list[IngestResult]:
-    """Bring every log of the survey file into the tables.
+def ingest(
+    survey: Survey, store: Store, report: Callable[[str], None] = lambda _: None, compute: Compute | None = None
+) -> list[IngestResult]:
+    """Bring every log of the survey file into the tables: a task a log, trajectories before the others.
+
+    Parameters
+    ----------
+    report : hears of each log, in the order of :func:`plan_logs` whichever ends first.
+    compute : where logs are read; this process by default.
 
     Raises
     ------
     RunError
         after all logs were tried, if any could not be read; the others are kept.
     """
-    results: list[IngestResult] = []
     planned, unplanned = plan_logs(survey, store)
     failures = [str(u.error) for u in unplanned]
     for failure in failures:
         report(f"failed: {failure}")
+    results: list[IngestResult] = []
     spans: dict[str, tuple[int, int]] = {}
-    for log in planned:
-        try:
-            result = ingest_log(store, log, spans.get(log.run), frozenset(p.key for p in planned))
-        except RoadscanError as error:
-            failures.append(str(error))
-            report(f"failed: {error}")
-            continue
-        results.append(result)
-        span = result.record.span("trajectory")
-        if span is not None:
-            before = spans.get(log.run, span)
-            spans[log.run] = (min(before[0], span[0]), max(before[1], span[1]))
-        report(_line(result))
+    listed = frozenset(p.key for p in planned)
+    held = frozenset(key for key in listed if has_log(store, key))
+    for first in (True, False):
+        logs = [_with_span(p, spans.get(p.run)) for p in planned if p.is_trajectory == first]
+        tasks = _tasks(store, logs, listed, held, grid_folder(survey))
+        for done in _ingested(tasks, held, compute or Inline()):
+            if done.result is None:
+                failures.append(_reason(done))
+                report(f"failed: {failures[-1]}")
+                continue
+            results.append(done.result)
+            _widen(spans, done.result.record)
+            report(_line(done.result))
     if failures:
         raise RunError(
             f"{len(failures)} of {len(failures) + len(results)} logs could not be ingested: " + " | ".join(failures),
@@ -123,29 +90,21 @@ def ingest(survey: Survey, store: Store, report: Callable[[str], None] = lambda 
     return results
 
 
-def ingest_log(
-    store: Store,
-    log: PlannedLog,
-    trajectory_span: tuple[int, int] | None = None,
-    listed: frozenset[str] = frozenset(),
-) -> IngestResult:
-    """Bring one log into the tables, unless it is there already.
-
-    The same bytes read before under other settings are retired, unless the survey file lists them so too (`listed`
-    keys: two layers of one file, say).
-    """
+def ingest_log(task: IngestTask) -> IngestResult:
+    """Bring one log into the tables, unless it is there already (runs on a worker)."""
+    store, log = task.store, task.log
     if has_log(store, log.key):
         return IngestResult(read_log_records(store, [log.key])[0], fresh=False)
-    source = _with_span(log.source, trajectory_span)
-    header = log.format.header(source)
+    if task.grids is not None:
+        add_grid_folder(task.grids)
+    header = log.format.header(log.source)
     with store.scratch() as folder:
         writer = LogWriter(folder, header.list_size)
-        for item in _items(log, source, header):
+        for item in _items(log, header):
             _take(writer, item)
         writer.finish()
-        for old in read_log_records(store):
-            if old.key not in listed and (old.run, old.sensor, old.content) == (log.run, log.sensor, log.content):
-                retire_log(store, old)
+        for old in task.replaces:
+            retire_log(store, old)
         tables = writer.publish(store, log.run, log.sensor, log.key)
     record = LogRecord(
         key=log.key,
@@ -178,13 +137,66 @@ def survey_records(survey: Survey, store: Store) -> list[LogRecord]:
     return read_log_records(store, [p.key for p in planned])
 
 
-def _items(log: PlannedLog, source: LogSource, header: Any) -> Iterator[Rows | Reject]:
+def _tasks(
+    store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str], grids: Path | None
+) -> list[IngestTask]:
+    """A task a log. What the survey file still lists (`listed` keys: two layers of one file, say) is not replaced."""
+    missing = [log for log in logs if log.key not in held]
+    older: dict[tuple[str, str, str], list[LogRecord]] = {}
+    for old in read_log_records(store) if missing else ():
+        if old.key not in listed:
+            older.setdefault((old.run, old.sensor, old.content), []).append(old)
+    replaced = {log.key: tuple(older.pop((log.run, log.sensor, log.content), ())) for log in missing}
+    return [IngestTask(store, log, replaced.get(log.key, ()), grids) for log in logs]
+
+
+def _ingested(
+    tasks: Sequence[IngestTask], held: frozenset[str], compute: Compute
+) -> Iterator[Done[IngestTask, IngestResult]]:
+    """What came of each task, in their order; logs that the store holds (`held` keys) are sent nowhere."""
+    missing = [t for t in tasks if t.log.key not in held]
+    if len(missing) < 2 or sum(t.log.bytes for t in missing) < _SMALL_BYTES:
+        yield from Inline().map(ingest_log, tasks)
+        return
+    arriving = compute.map(ingest_log, sorted(missing, key=lambda t: -t.log.bytes))
+    arrived: dict[str, Done[IngestTask, IngestResult]] = {}
+    for task in tasks:
+        if task.log.key in held:
+            yield from Inline().map(ingest_log, [task])
+            continue
+        while task.log.key not in arrived:
+            done = next(arriving)
+            arrived[done.task.log.key] = done
+        yield arrived.pop(task.log.key)
+
+
+def _reason(done: Done[IngestTask, IngestResult]) -> str:
+    """Why a log failed; what is no fault of a log or of its worker goes on."""
+    error = done.error or StoreError("no result", file=done.task.log.source.path)
+    if isinstance(error, RoadscanError):
+        return str(error)
+    if type(error).__name__ == "KilledWorker":
+        return f"{done.task.log.source.path}: the worker process died twice while it read this log"
+    raise error
+
+
+def _widen(spans: dict[str, tuple[int, int]], record: LogRecord) -> None:
+    """Take the record's trajectory into the span of its run."""
+    span = record.span("trajectory")
+    if span is not None:
+        before = spans.get(record.run, span)
+        spans[record.run] = (min(before[0], span[0]), max(before[1], span[1]))
+
+
+def _items(log: PlannedLog, header: LogHeader) -> Iterator[Rows | Reject]:
     try:
-        yield from log.format.read(source, header)
+        yield from log.format.read(log.source, header)
     except RoadscanError as error:
         if error.file is None:
-            error.file = str(source.path)
+            error.file = str(log.source.path)
         raise
+    except OSError as error:
+        raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
 def _take(writer: LogWriter, item: Rows | Reject) -> None:
@@ -205,44 +217,8 @@ def _consecutive(rows: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part.size)) for part in np.split(rows, breaks)]
 
 
-def _plan_log(survey: Survey, run: str, config: LogConfig | ControlConfig, known: _Sources) -> PlannedLog:
-    path = survey.resolve(config.path)
-    format_ = known.format(path, config.format)
-    is_log = isinstance(config, LogConfig)
-    in_map = format_.needs_map or not is_log
-    sensor = config.sensor if isinstance(config, LogConfig) else None
-    clock = log_clock(survey, config) if isinstance(config, LogConfig) else None
-    needs_sensor = bool({"scans", "returns"} & set(format_.yields))
-    if is_log and sensor is None and needs_sensor:
-        raise RoadscanError(
-            "the log names no sensor", expected=f"sensor = one of {', '.join(survey.rig.sensors)}", file=path
-        )
-    options = format_.options.parse(config.options, file=path)
-    content, size = known.digest(path, format_, format_.companions(path, options))
-    source = LogSource(
-        path=path,
-        options=options,
-        clock=clock,
-        sensor=survey.sensor(sensor) if sensor else None,
-        crs=config.crs,
-        height=config.height,
-        geoid=Geoid(config.geoid) if config.geoid else None,
-        map=survey.config.map.frame() if in_map else None,
-    )
-    schemas = [
-        [(c.name, c.type) for c in table_schema(t).columns] + [table_schema(t).partition_s] for t in format_.yields
-    ]
-    shaping = [
-        format_.name, format_.version, content, options.model_dump(mode="json"), clock,
-        config.crs, config.height, grid_digest(config.geoid), run, sensor, schemas,
-        [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)] if in_map else None,
-    ]  # fmt: skip
-    name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
-    return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size)
-
-
-def _with_span(source: LogSource, span: tuple[int, int] | None) -> LogSource:
-    return LogSource(**{**source.__dict__, "trajectory_span_gps_ns": span})
+def _with_span(log: PlannedLog, span: tuple[int, int] | None) -> PlannedLog:
+    return replace(log, source=replace(log.source, trajectory_span_gps_ns=span))
 
 
 def _line(result: IngestResult) -> str:
@@ -250,54 +226,3 @@ def _line(result: IngestResult) -> str:
     state = "read" if result.fresh else "known"
     rejected = f", {r.rejected:,} rejected" if r.rejected else ""
     return f"{state}: {r.run}/{r.sensor} {r.path} ({r.format}) {r.rows:,} rows{rejected}"
-
-
-class _Sources:
-    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._before: dict[str, Any] = json.loads(store.read_bytes(_SOURCES)) if store.exists(_SOURCES) else {}
-        self._now: dict[str, Any] = {}
-
-    def format(self, path: Path, stated: str | None) -> LogFormat:
-        """Format of a log: as stated, as remembered, or found from its bytes."""
-        if stated is None and not path.exists() and str(path) in self._before:
-            stated = str(self._before[str(path)]["format"])
-        return format_named(stated) if stated else format_of(path)
-
-    def digest(self, path: Path, format_: LogFormat, companions: list[Path]) -> tuple[str, int]:
-        """Fingerprint over names and contents of a log's files and companions, and their bytes in all."""
-        before = self._before.get(str(path), {"files": {}})["files"]
-        if path.exists():
-            named = {_name(file, path): file for file in format_.files(path)}
-            named |= {f"beside:{file.name}": file for file in companions if file not in named.values()}
-            missing = next((file for file in named.values() if not file.exists()), None)
-            if missing is not None:
-                raise FormatError("a file that the log's options name does not exist", file=missing)
-            files = {name: _fingerprint(file, before.get(name)) for name, file in named.items()}
-        elif before:
-            files = before
-        else:
-            raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
-        self._now[str(path)] = {"format": format_.name, "files": files}
-        combined = hashlib.blake2b(digest_size=16)
-        for name, (_, _, digest) in files.items():
-            combined.update(f"{name}\0{digest}\n".encode())
-        return combined.hexdigest(), sum(size for size, _, _ in files.values())
-
-    def save(self) -> None:
-        """Keep what was learnt; logs that are no longer listed stay known."""
-        if {**self._before, **self._now} != self._before:
-            self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
-
-
-def _name(file: Path, log: Path) -> str:
-    return file.relative_to(log).as_posix() if file != log and log in file.parents else ""
-
-
-def _fingerprint(file: Path, known: list[Any] | None) -> list[Any]:
-    stat = file.stat()
-    if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
-        return known
-    return [stat.st_size, stat.st_mtime_ns, file_digest(file)]

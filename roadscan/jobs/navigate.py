@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from roadscan.jobs.computed_trajectory import NAVIGATION, PlannedTrajectory
-from roadscan.jobs.ingest import plan_logs, survey_records
+from roadscan.jobs.ingest import survey_records
+from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.solve_trajectory import plan_solutions
 from roadscan.jobs.spline_trajectory import plan_splines
 from roadscan.model.errors import ConfigError, RoadscanError, RunError

@@ -59,7 +59,7 @@ class Run:
 
 def run_ingest(run: Run) -> None:
     """Raw logs → tables."""
-    ingest(run.survey, run.store, run.reporter.line)
+    ingest(run.survey, run.store, run.reporter.line, run.compute)
 
 
 def run_navigate(run: Run) -> None:

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.compute import Inline
 from roadscan.jobs.footprints import PRODUCT, reading_fates
-from roadscan.jobs.ingest import plan_logs
 from roadscan.jobs.navigate import known_keys
 from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.products import plan_outputs
 from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.tiles import TILE
@@ -25,7 +25,7 @@ from roadscan.model.survey import Survey
 from roadscan.products.base import products
 from roadscan.tables.logs import has_log, read_log_records
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
-from roadscan.tables.store import Store, file_digest
+from roadscan.tables.store import Store, digest_holds
 
 
 @dataclass
@@ -166,7 +166,7 @@ def _check_digest(store: Store, folder: Path, path: str, size: int, digest: str)
         return f"{path}: missing"
     if found != size:
         return f"{path}: {found} bytes, expected {size}"
-    if file_digest(store.local_copy(path, folder)) != digest:
+    if not digest_holds(store.local_copy(path, folder), digest):
         return f"{path}: the content has changed (digest differs)"
     return None
 

@@ -1,16 +1,40 @@
-"""Record batches of Arrow IPC files (Feather), held against the list in the file's footer.
+"""Record batches of Arrow IPC files (Feather): mapped, and held against the list in the file's footer.
 
 Arrow reads what the footer lists. A damaged or truncated list would leave out readings without a word.
 """
 
 from __future__ import annotations
 
+import mmap
 from pathlib import Path
 
 import pyarrow as pa
 
 _FIRST_MESSAGE = 8
 """Byte behind the file's mark."""
+
+
+class MappedBatches:
+    """Record batches of a file as views of its mapped pages: nothing is copied, whatever the size of a batch.
+
+    Raises
+    ------
+    pa.ArrowException, OSError, ValueError
+        where the file is no whole Arrow IPC file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as stream:
+            self._pages = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self.reader = pa.ipc.open_file(pa.BufferReader(pa.py_buffer(self._pages)))
+
+    def release(self) -> None:
+        """Give the pages read so far back; views stay good, a page that is asked for again is mapped again.
+
+        Without this, the process would seem to hold all of the log that it has passed.
+        """
+        if hasattr(mmap, "MADV_DONTNEED"):
+            self._pages.madvise(mmap.MADV_DONTNEED)
 
 
 def unlisted_batches(path: Path, listed: int) -> int:

@@ -13,7 +13,10 @@ or ``time`` (integer or float)            or the stamp in the clock that the sur
 ``encoder_ticks`` (integer, optional)     wheel encoder
 ========================================  ==============================================================
 
-Other columns are ignored. Lists may be fixed-size or not. The geometry of the readings
+Other columns are ignored. Lists may be fixed-size or not. A capture program that has to keep up with a line-rate
+head writes Arrow IPC without compression, lists of fixed size without nulls, some hundred profiles a record batch:
+no byte of it is changed on the way to the disk, and it is read without a copy. Compressed IPC and Parquet are read
+as well, for logs that are to be kept or sent. The geometry of the readings
 (:class:`roadscan.points.readings.ScanGeometry`) stands as JSON in the file's schema metadata under
 ``roadscan.scan_geometry``, or in the log's options.
 """
@@ -36,7 +39,7 @@ from roadscan.model.errors import ConfigError, FormatError
 from roadscan.model.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, Clock, TimeSystem
 from roadscan.model.strict import Strict
 from roadscan.points.readings import ScanGeometry
-from roadscan.sensors.arrow_batches import unlisted_batches, unlisted_reason
+from roadscan.sensors.arrow_batches import MappedBatches, unlisted_batches, unlisted_reason
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.parquet_pages import ParquetPages
 from roadscan.sensors.records import EpochReader, Sieve, options_of
@@ -47,6 +50,8 @@ GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 _EPOCH: Final = "epoch_gps_ns"
 _STAMP: Final = "time"
 _CHUNK_BYTES: Final = 8 << 20
+_MAPPED_CHUNKS: Final = 8
+"""Chunks of a mapped file after which its pages are given back."""
 _LARGE_FILE_BYTES: Final = 32 << 20
 _BUFFER_BYTES: Final = 1 << 20
 _SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
@@ -171,11 +176,12 @@ class _Parquet:
 class _Arrow:
     def __init__(self, file: Path) -> None:
         self._path = file
-        self._reader = pa.ipc.open_file(pa.memory_map(str(file)))
+        self._mapped = MappedBatches(file)
+        self._reader = self._mapped.reader
         self.schema = self._reader.schema
 
     def parts(self, rows: int) -> Iterator[tuple[int, pa.RecordBatch | _Lost]]:
-        first = 0
+        first, passed = 0, 0
         for number in range(self._reader.num_record_batches):
             try:
                 batch = self._reader.get_batch(number)
@@ -185,6 +191,9 @@ class _Arrow:
                 continue
             for start in range(0, batch.num_rows, rows):
                 yield first + start, batch.slice(start, rows)
+                passed += 1
+                if passed % _MAPPED_CHUNKS == 0:
+                    self._mapped.release()
             first += batch.num_rows
         unlisted = unlisted_batches(self._path, self._reader.num_record_batches)
         if unlisted:

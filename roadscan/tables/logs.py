@@ -23,7 +23,7 @@ class DataFile:
     rows: int
     bytes: int
     digest: str
-    """BLAKE2b-128 of its bytes."""
+    """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
     group_rows: tuple[int, ...]
     """Rows of each row group."""
     group_spans: tuple[tuple[int, int], ...]

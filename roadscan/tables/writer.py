@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.tables.logs import DataFile, log_folder
+from roadscan.tables.merge import merged
 from roadscan.tables.schema import TableSchema, table_schema
 from roadscan.tables.store import Store, file_digest
 
@@ -26,6 +28,8 @@ BUDGET_BYTES: Final = 128 << 20
 class _Bin:
     batches: list[pa.RecordBatch] = field(default_factory=list)
     bytes: int = 0
+    row_bytes: float = 1.0
+    """Bytes of a row, as the largest batch average."""
     parts: list[tuple[Path, int, int]] = field(default_factory=list)
     """Written parts with their first and last epoch."""
 
@@ -55,6 +59,7 @@ class LogWriter:
             held = self._bins[(table, start)]
             held.batches.append(part)
             held.bytes += part.nbytes
+            held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
             self._held += part.nbytes
         self.rows[table] += rows.num_rows
         while self._held > BUDGET_BYTES:
@@ -73,7 +78,7 @@ class LogWriter:
             self._flush(key)
         for (table, start), held in sorted(self._bins.items()):
             if _overlap(held.parts):
-                held.parts = [self._merge(table, start, held)]
+                held.parts = self._merge(table, start, held)
 
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
         """Move the finished tables into the store, each at once."""
@@ -98,11 +103,18 @@ class LogWriter:
         held.batches, held.bytes = [], 0
         held.parts.append(self._write(table, start, len(held.parts), rows))
 
-    def _merge(self, table: str, start: int, held: _Bin) -> tuple[Path, int, int]:
-        rows = pa.concat_tables([pq.read_table(p, partitioning=None) for p, _, _ in held.parts])
-        for path, _, _ in held.parts:
-            path.unlink()
-        return self._write(table, start, 0, rows)
+    def _merge(self, table: str, start: int, held: _Bin) -> list[tuple[Path, int, int]]:
+        """Parts anew, one after another in time, none larger than what is held in memory."""
+        apart = held.parts[0][0].parent / "overlapping"
+        apart.mkdir()
+        moved = [path.rename(apart / path.name) for path, _, _ in held.parts]
+        rows = max(1, int(BUDGET_BYTES / held.row_bytes))
+        parts = [
+            self._write(table, start, number, piece)
+            for number, piece in enumerate(merged(moved, table_schema(table), rows))
+        ]
+        shutil.rmtree(apart)
+        return parts
 
     def _write(self, table: str, start: int, number: int, rows: pa.Table) -> tuple[Path, int, int]:
         schema = table_schema(table)

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.ingest import ingest, plan_logs
+from roadscan.jobs.ingest import ingest
+from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.survey import Survey
 from roadscan.sensors.nmea_writer import Fix, write_nmea

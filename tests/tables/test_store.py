@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from roadscan.model.errors import StoreError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.tables.logs import DataFile, LogRecord, read_log_records, write_log_record
 from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.merge import merged
+from roadscan.tables.schema import table_schema
 from roadscan.tables.sql import connect, query
 from roadscan.tables.store import Store
 from roadscan.tables.writer import LogWriter
@@ -27,6 +30,11 @@ START = 1_400_000_000
 @pytest.fixture(params=["folder", "memory"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
     return Store(str(tmp_path) if request.param == "folder" else f"memory://{tmp_path.name}", "s1")
+
+
+def read_stored(store: Store, file: DataFile) -> pa.Table:
+    with store.fs.open(store.path(file.path)) as stream:
+        return pq.ParquetFile(stream).read()
 
 
 def returns(epochs_ns: np.ndarray) -> pa.RecordBatch:
@@ -78,9 +86,29 @@ def test_parts_of_a_partition_that_overlap_are_merged(store: Store, monkeypatch:
     epochs = START * NS_PER_S + np.arange(3000, dtype=np.int64) * 1_000_000
     in_turn = write(store, [returns(p) for p in np.split(epochs, 10)], "one")["returns"]
     assert len(in_turn) > 1
-    swapped = write(store, [returns(p) for p in np.split(epochs, 10)[::-1]], "two")["returns"]
-    assert len(swapped) == 1
-    assert sum(f.rows for f in in_turn) == swapped[0].rows == 3000
+    batches = [returns(p) for p in np.split(np.random.default_rng(0).permutation(epochs), 10)]
+    mixed = write(store, batches, "two")["returns"]
+    assert all(a.span[1] < b.span[0] for a, b in itertools.pairwise(mixed))  # type: ignore[index]
+    assert max(f.rows for f in mixed) * batches[0].nbytes / batches[0].num_rows <= 20_000
+    found = pa.concat_tables([read_stored(store, f) for f in mixed])
+    expected = pa.Table.from_batches(batches).sort_by("epoch_gps_ns")
+    assert found.select(expected.column_names).cast(expected.schema).equals(expected)
+
+
+def test_merged_rows_of_equal_epochs_keep_the_order_of_their_files(tmp_path: Path) -> None:
+    """A stable sort of all rows by Arrow is the oracle."""
+    rng = np.random.default_rng(1)
+    order = [("epoch_gps_ns", "ascending"), ("laser", "ascending"), ("x_sensor_m", "ascending")]
+    tables = []
+    for k, n in enumerate((700, 800, 900, 1000)):
+        batch = returns(START * NS_PER_S + rng.integers(0, 50, n))
+        batch = batch.set_column(6, "laser", pa.array(rng.integers(0, 3, n), pa.uint8()))
+        batch = batch.set_column(2, "x_sensor_m", pa.array(np.arange(n) + 1000 * k, pa.float32()))
+        tables.append(pa.Table.from_batches([batch]).sort_by(order))
+        pq.write_table(tables[-1], tmp_path / f"{k}.parquet", row_group_size=64)
+    pieces = list(merged(sorted(tmp_path.glob("*.parquet")), table_schema("returns"), 250))
+    assert [p.num_rows for p in pieces] == [250] * 13 + [150]
+    assert pa.concat_tables(pieces).equals(pa.concat_tables(tables).sort_by(order))
 
 
 def test_rows_that_break_the_schema_cost_themselves(store: Store) -> None:

@@ -1,0 +1,101 @@
+"""Fingerprints of raw logs: what a log is known by, whatever its path."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from roadscan.model.errors import FormatError
+from roadscan.sensors.base import LogFormat, format_named, format_of
+from roadscan.tables.store import Store, digest_holds, file_digest
+
+_SOURCES: Final = "manifest/sources.json"
+
+Known = list[Any]
+"""Size (bytes), time of the last change (ns) and digest of a file."""
+
+
+class Sources:
+    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered."""
+
+    def __init__(self, store: Store, threads: ThreadPoolExecutor) -> None:
+        self._store = store
+        self._threads = threads
+        self._before: dict[str, Any] = json.loads(store.read_bytes(_SOURCES)) if store.exists(_SOURCES) else {}
+        self._now: dict[str, Any] = {}
+
+    def format(self, path: Path, stated: str | None) -> LogFormat:
+        """Format of a log: as stated, as remembered, or found from its bytes."""
+        if stated is None and not path.exists() and str(path) in self._before:
+            stated = str(self._before[str(path)]["format"])
+        return format_named(stated) if stated else format_of(path)
+
+    def begin(self, path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Future[Known]]:
+        """Start to fingerprint a log's files and companions, by their names: hashing runs in threads."""
+        before = self._before.get(str(path), {"files": {}})["files"]
+        if path.exists():
+            named = {_name(file, path): file for file in format_.files(path)}
+            named |= {f"beside:{file.name}": file for file in companions if file not in named.values()}
+            missing = next((file for file in named.values() if not file.exists()), None)
+            if missing is not None:
+                raise FormatError("a file that the log's options name does not exist", file=missing)
+            return {n: self._threads.submit(_fingerprint, file, before.get(n)) for n, file in named.items()}
+        if before:
+            return {name: _done(known) for name, known in before.items()}
+        raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
+
+    def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int]:
+        """Fingerprint over names and contents of a log's files and companions, and their bytes in all."""
+        files = {name: future.result() for name, future in begun.items()}
+        self._now[str(path)] = {"format": format_.name, "files": files}
+        combined = hashlib.blake2b(digest_size=16)
+        for name, (_, _, digest) in files.items():
+            combined.update(f"{name}\0{digest}\n".encode())
+        return combined.hexdigest(), sum(size for size, _, _ in files.values())
+
+    def save(self) -> None:
+        """Keep what was learnt; logs that are no longer listed stay known."""
+        if {**self._before, **self._now} != self._before:
+            self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
+
+
+@contextmanager
+def open_sources(store: Store) -> Iterator[Sources]:
+    """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end."""
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        sources = Sources(store, threads)
+        try:
+            yield sources
+        except BaseException:
+            threads.shutdown(cancel_futures=True)
+            raise
+        sources.save()
+
+
+def _name(file: Path, log: Path) -> str:
+    return file.relative_to(log).as_posix() if file != log and log in file.parents else ""
+
+
+def _fingerprint(file: Path, known: Known | None) -> Known:
+    try:
+        stat = file.stat()
+        if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+            return known
+        old = known is not None and known[0] == stat.st_size and ":" not in known[2]
+        if known is not None and old and digest_holds(file, known[2]):
+            return [stat.st_size, stat.st_mtime_ns, known[2]]  # an older algorithm's: the log's key follows from it
+        return [stat.st_size, stat.st_mtime_ns, file_digest(file)]
+    except OSError as error:
+        raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error
+
+
+def _done(known: Known) -> Future[Known]:
+    future: Future[Known] = Future()
+    future.set_result(known)
+    return future

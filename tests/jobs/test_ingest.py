@@ -1,0 +1,191 @@
+"""Logs side by side give what logs one after another give; digests of older stores hold; logs that cannot be read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from blake3 import blake3
+
+from roadscan.jobs.compute import Compute, Done, Inline, R, T
+from roadscan.jobs.ingest import ingest
+from roadscan.jobs.status import verify_store
+from roadscan.model.errors import RunError
+from roadscan.model.survey import Survey
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.store import Store, digest_holds, file_digest
+
+GEOMETRY = {"kind": "cartesian", "readings": 8, "first": 0.0, "step": 0.001, "range_offset_m": 1.5,
+            "range_step_m": 0.0001}  # fmt: skip
+EPOCH = 1_400_000_000_000_000_000
+
+
+class Backwards(Inline):
+    """The last task ends first; tasks and results travel as between processes."""
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        for task in reversed(tasks):
+            for done in super().map(function, [pickle.loads(pickle.dumps(task))]):
+                yield pickle.loads(pickle.dumps(done))
+
+
+@pytest.fixture(autouse=True)
+def all_logs_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadscan.jobs.ingest._SMALL_BYTES", 0)
+
+
+def write_log(path: Path, seed: int) -> None:
+    """300 profiles over three partitions, not quite in order."""
+    rng = np.random.default_rng(seed)
+    columns = {
+        "epoch_gps_ns": pa.array(EPOCH + rng.permutation(300) * 100_000_000),
+        "range": pa.FixedSizeListArray.from_arrays(pa.array(rng.integers(1, 9999, 2400).astype(np.uint16)), 8),
+        "intensity": pa.FixedSizeListArray.from_arrays(pa.array(rng.integers(0, 255, 2400).astype(np.uint8)), 8),
+    }
+    table = pa.table(columns).replace_schema_metadata({"roadscan.scan_geometry": json.dumps(GEOMETRY)})
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table, 70)
+
+
+def survey_of(folder: Path, logs: int = 4) -> Survey:
+    lines = ['id = "s"', 'store = "store"', "[map]", 'crs = "EPSG:25832"', "[rig.sensors.head]", 'kind = "profiler"']
+    for k in range(logs):
+        if not (folder / f"{k}.arrow").exists():
+            write_log(folder / f"{k}.arrow", k)
+        lines += ["[[runs]]", f'id = "r{k}"', "[[runs.logs]]", f'path = "{k}.arrow"', 'sensor = "head"']
+    (folder / "SURVEY.toml").write_text("\n".join(lines))
+    return Survey.load(folder / "SURVEY.toml")
+
+
+def ingested(survey: Survey, name: str, compute: Compute | None) -> tuple[Store, list[str]]:
+    store, lines = Store(str(survey.folder / name), "s"), []
+    ingest(survey, store, lines.append, compute)
+    return store, lines
+
+
+def tables_of(store: Store) -> dict[str, bytes]:
+    return {path: store.read_bytes(path) for path in store.files("tables") + store.files("manifest/logs")}
+
+
+def test_side_by_side_is_as_one_after_another(tmp_path: Path) -> None:
+    survey = survey_of(tmp_path)
+    one, lines = ingested(survey, "one", None)
+    other, same_lines = ingested(survey, "other", Backwards())
+    assert tables_of(one) == tables_of(other)
+    assert lines == same_lines
+    assert [line.split()[1] for line in lines] == [f"r{k}/head" for k in range(4)]
+    assert [line[:6] for line in ingested(survey, "other", Backwards())[1]] == ["known:"] * 4
+
+
+def test_little_memory_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was written out early and overlaps in time is merged."""
+    survey = survey_of(tmp_path, 1)
+    whole, _ = ingested(survey, "whole", None)
+    monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 2000)
+    pieces, _ = ingested(survey, "pieces", None)
+    assert len(whole.files("tables")) == 3 < len(pieces.files("tables"))
+    one, other = (
+        pa.concat_tables([pq.read_table(s.path(f), partitioning=None) for f in s.files("tables")])
+        for s in (whole, pieces)
+    )
+    assert one.equals(other)
+
+
+def test_one_bad_log_costs_itself(tmp_path: Path) -> None:
+    survey = survey_of(tmp_path)
+    (tmp_path / "1.arrow").write_bytes(b"ARROW1 and no more")
+    (tmp_path / "3.arrow").unlink()
+    lines: list[str] = []
+    store = Store(str(tmp_path / "store"), "s")
+    with pytest.raises(RunError, match=r"2 of 4 logs could not be ingested: .*3\.arrow.* \| .*1\.arrow"):
+        ingest(Survey.load(_stated(tmp_path)), store, lines.append, Backwards())
+    assert [line.split(":")[0] for line in lines] == ["failed", "read", "failed", "read"]
+    assert [r.run for r in read_log_records(store)] == ["r0", "r2"]
+    survey_of(tmp_path, 4)  # writes what is missing
+    write_log(tmp_path / "1.arrow", 1)
+    assert [r.fresh for r in ingest(survey, store, compute=Backwards())] == [False, True, False, True]
+
+
+def _stated(folder: Path) -> Path:
+    """The survey file with the format stated, so that a damaged log is planned."""
+    file = folder / "SURVEY.toml"
+    file.write_text(file.read_text().replace('sensor = "head"', 'sensor = "head"\nformat = "scans"'))
+    return file
+
+
+def test_the_same_bytes_under_another_clock_replace_each_their_own(tmp_path: Path) -> None:
+    survey = survey_of(tmp_path, 3)
+    store, _ = ingested(survey, "store", Backwards())
+    geometry = ", ".join(f"{k} = {json.dumps(v)}" for k, v in GEOMETRY.items())
+    text = (tmp_path / "SURVEY.toml").read_text()
+    stated = text.replace('sensor = "head"', f'sensor = "head"\noptions = {{ scan_geometry = {{ {geometry} }} }}')
+    (tmp_path / "SURVEY.toml").write_text(stated)
+    before = {r.key for r in read_log_records(store)}
+    ingested(Survey.load(tmp_path / "SURVEY.toml"), "store", Backwards())
+    assert len(read_log_records(store)) == 3
+    assert {Path(p).stem for p in store.files("superseded/manifest/logs")} == before
+    assert len({p.split("/log=")[1][:16] for p in store.files("tables")}) == 3
+
+
+def test_digests(tmp_path: Path) -> None:
+    """The libraries' own one-call functions are the oracle."""
+    for size in (0, 1, (1 << 18) - 1, 1 << 18, (1 << 19) + 5):
+        content = np.random.default_rng(size).bytes(size)
+        file = tmp_path / "file"
+        file.write_bytes(content)
+        assert file_digest(file) == "blake3:" + blake3(content).hexdigest(length=16)
+        assert digest_holds(file, file_digest(file))
+        old = hashlib.blake2b(content, digest_size=16).hexdigest()
+        assert digest_holds(file, old)
+        file.write_bytes(content + b"x")
+        assert not digest_holds(file, old)
+        assert not digest_holds(file, "blake3:" + blake3(content).hexdigest(length=16))
+
+
+def test_a_store_with_older_digests_stays_sound_and_current(tmp_path: Path) -> None:
+    survey = survey_of(tmp_path, 2)
+    store = Store(str(tmp_path / "store"), "s")
+    older = {str(f): hashlib.blake2b(f.read_bytes(), digest_size=16).hexdigest() for f in tmp_path.glob("*.arrow")}
+    sources = {
+        f: {"format": "scans", "files": {"": [Path(f).stat().st_size, Path(f).stat().st_mtime_ns, digest]}}
+        for f, digest in older.items()
+    }
+    store.write_bytes("manifest/sources.json", json.dumps(sources).encode())
+    ingest(survey, store)
+    for path in store.files("manifest/logs"):
+        record = json.loads(store.read_bytes(path))
+        for files in record["tables"].values():
+            for file in files:
+                file["digest"] = hashlib.blake2b(store.read_bytes(file["path"]), digest_size=16).hexdigest()
+        store.write_bytes(path, json.dumps(record).encode())
+    assert verify_store(store) == []
+    for file in older:
+        os.utime(file)  # copied: another time, the same bytes
+    assert [r.fresh for r in ingest(survey, store)] == [False, False]
+    write_log(tmp_path / "1.arrow", 7)  # as long as before, other bytes
+    assert [r.fresh for r in ingest(survey, store)] == [False, True]
+    damaged = store.files("tables")[0]
+    content = store.read_bytes(damaged)
+    store.write_bytes(damaged, content[:50] + bytes([content[50] ^ 1]) + content[51:])
+    assert [f.split(":")[0] for f in verify_store(store)] == [damaged]
+
+
+def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(path: Path) -> str:
+        if path.name == "0.arrow":
+            raise OSError(5, "Input/output error")
+        return file_digest(path)
+
+    monkeypatch.setattr("roadscan.jobs.sources.file_digest", broken)
+    store = Store(str(tmp_path / "store"), "s")
+    with pytest.raises(RunError, match=r"1 of 2 logs .*0\.arrow: the log cannot be read: Input/output error"):
+        ingest(survey_of(tmp_path, 2), store)
+    assert len(read_log_records(store)) == 1

@@ -46,7 +46,7 @@ def write_log(path: Path, seed: int) -> None:
     """300 profiles over three partitions, not quite in order."""
     rng = np.random.default_rng(seed)
     columns = {
-        "epoch_gps_ns": pa.array(EPOCH + rng.permutation(300) * 100_000_000),
+        "epoch_gps_ns": pa.array(EPOCH + np.argsort(np.arange(300) + rng.uniform(0, 60, 300)) * 100_000_000),
         "range": pa.FixedSizeListArray.from_arrays(pa.array(rng.integers(1, 9999, 2400).astype(np.uint16)), 8),
         "intensity": pa.FixedSizeListArray.from_arrays(pa.array(rng.integers(0, 255, 2400).astype(np.uint8)), 8),
     }

@@ -1,38 +1,228 @@
-"""``geotiff``: height, intensity, count and standard deviation of a tile's cells."""
+"""``geotiff``: height, intensity and count of a tile's cells."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Final, cast
+from xml.sax.saxutils import escape
 
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from pydantic import Field
+from rasterio.io import MemoryFile
+from rasterio.transform import Affine
+
+from roadscan.kernels.raster_blocks import encode_block
+from roadscan.model.crs import MapFrame
 from roadscan.model.strict import Strict
+from roadscan.products import raster
 from roadscan.products.base import ProductContext, Tile, TileProduct
-from roadscan.products.quantities import QUANTITIES, band_of, values_of
-from roadscan.products.raster import CellBox, cell_image, check_cog, memory_raster, raster_settings, write_cog
+from roadscan.products.quantities import Quantity, band_of
+from roadscan.products.raster import CellBox
+from roadscan.products.tiff import Page, Tag, check_tiff, digest_item, tiff_parts
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
+
+STEPS: Final[dict[Quantity, float]] = {
+    "height": 2.0**-15,
+    "intensity": 1.0,
+    "count": 1.0,
+    "height_std": 2.0**-20,
+}
+"""Pixels are whole multiples of this. Bits below it are noise that takes time and room; float32 itself has no finer
+heights from 256 m on."""
+
+BLOCK: Final = 512
+"""Largest edge of a block (pixels)."""
+
+_SMALLEST_OVERVIEW: Final = 32
+_COMPRESSIONS: Final = {"ZSTD": 50000, "DEFLATE": 8}
+
+
+class GeoTiffOptions(Strict):
+    """Settings of `geotiff`."""
+
+    bands: tuple[Quantity, ...] = Field(default=("height", "intensity", "count"), min_length=1)
+    """Bands in their order: height (robust, rounded to 2⁻¹⁵ of its unit), intensity (mean, rounded to a whole
+    number), count (points), height_std (standard deviation of the heights, rounded to 2⁻²⁰ of the unit)."""
 
 
 class GeoTiff(TileProduct):
-    """One cloud-optimised GeoTIFF a tile: four float32 bands, NaN where no point lies.
+    """One cloud-optimised GeoTIFF a tile: float32 bands, NaN where no point lies, and overviews.
 
-    The bands are the robust height (in the unit of the map's heights), the mean intensity, the number of
-    points and the standard deviation of the heights. The georeference is in the CRS's own unit.
+    The bands are the robust height (in the unit of the map's heights), the mean intensity and the number of
+    points; the standard deviation of the heights can be added. The georeference is in the CRS's own unit.
+    Overviews have pixels of 2, 8 and 32 cells, or the numbers nearest to these that divide the tile (10, 40 and
+    200 mm for 10 m tiles of 5 mm cells), while they are 32 pixels or more: the mean of the cells' heights, the mean
+    intensity of all points, the mean number of points a cell that holds one.
     """
 
     name: ClassVar[str] = "geotiff"
-    title: ClassVar[str] = "cells of a tile as a GeoTIFF (height, intensity, count, standard deviation), for GIS"
+    title: ClassVar[str] = "cells of a tile as a GeoTIFF (height, intensity, count) with overviews, for GIS"
     suffix: ClassVar[str] = ".tif"
+    version: ClassVar[int] = 2
+    options: ClassVar[type[Strict]] = GeoTiffOptions
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
-        """Write the tile's four bands."""
-        cells = tile.cells
-        box = CellBox.around([cells.tile], context.grid)
-        bands = [band_of(quantity, context) for quantity in QUANTITIES]
-        with raster_settings(), memory_raster(box, bands, context) as raster:
-            raster.update_tags(ROADSCAN_TILE=str(cells.tile))
-            for number, quantity in enumerate(QUANTITIES, start=1):
-                raster.write(cell_image(cells, values_of(quantity, cells, context), "float32"), number)
-            write_cog(raster, path)
+        """Write the tile's bands; only blocks that hold a cell are made."""
+        bands = cast(GeoTiffOptions, options).bands
+        images = [_image(tile.cells, bands, context), *_overviews(tile.cells, bands, context)]
+        pages = [_page(image, bands, number > 0) for number, image in enumerate(images)]
+        first = dataclasses.replace(pages[0], tags=(*pages[0].tags, *_description(tile.cells, bands, context)))
+        with path.open("wb") as stream:
+            stream.writelines(tiff_parts([first, *pages[1:]]))
 
     def check(self, path: Path) -> None:
-        """Decode every block of every band and overview and compare with the stored digest."""
-        check_cog(path, bands=len(QUANTITIES), dtype="float32")
+        """Compare every byte with the stored digest."""
+        check_tiff(path)
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Sparse pixels of all bands, in order of row (from the south) and column."""
+
+    edge: int
+    column: npt.NDArray[np.uint16]
+    row: npt.NDArray[np.uint16]
+    bands: tuple[tuple[npt.NDArray[Any], float], ...]
+    """(n,) values of each band, and what they are multiplied with."""
+
+
+def _image(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContext) -> _Image:
+    unit_m = context.map.vertical_unit_m
+    sources: dict[Quantity, tuple[npt.NDArray[Any], float]] = {
+        "height": (cells.height_robust_m, 1 / unit_m),
+        "intensity": (cells.intensity_mean, 1.0),
+        "count": (cells.count.astype(np.float32), 1.0),
+        "height_std": (cells.height_std_m, 1 / unit_m),
+    }
+    return _Image(cells.cells_per_edge, cells.column, cells.row, tuple(sources[b] for b in bands))
+
+
+def _overviews(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContext) -> list[_Image]:
+    edge, unit_m = cells.cells_per_edge, context.map.vertical_unit_m
+    factors = [f for f in overview_factors(edge) if edge // f >= _SMALLEST_OVERVIEW]
+    levels = pyramid_of(cells, factors)
+    spread = levels
+    if "height_std" in bands:
+        deviations = cells.height_std_m.astype(np.float64)
+        spread = pyramid_of(dataclasses.replace(cells, height_robust_m=deviations), factors)
+    sources: dict[Quantity, Callable[[Level, Level], tuple[npt.NDArray[Any], float]]] = {
+        "height": lambda level, _: (level.height_m, 1 / unit_m),
+        "intensity": lambda level, _: (level.intensity, 1.0),
+        "count": lambda level, _: (level.count / level.cells, 1.0),
+        "height_std": lambda _, of_std: (of_std.height_m, 1 / unit_m),
+    }
+    return [
+        _Image(edge // level.factor, level.column, level.row, tuple(sources[b](level, of_std) for b in bands))
+        for level, of_std in zip(levels, spread, strict=True)
+    ]
+
+
+def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool) -> Page:
+    """Encode and compress the blocks of an image, band by band."""
+    edge = min(BLOCK, -(-image.edge // 16) * 16)
+    across = -(-image.edge // edge)
+    compress = _compressor()
+    starts = np.searchsorted(image.row, np.arange(image.edge + 1, dtype=np.int32)).astype(np.int64)
+    out, shuffled = np.empty(edge * edge * 4, np.uint8), np.empty(edge * 4, np.uint8)
+    line, whole = np.empty((2, edge), np.float32)
+    blocks: list[Any] = []
+    for (values, factor), quantity in zip(image.bands, bands, strict=True):
+        step = STEPS[quantity]
+        for strip in range(across):
+            rows = image.edge - 1 - np.arange(strip * edge, (strip + 1) * edge)
+            first, last = (np.where(rows >= 0, starts[np.maximum(rows, 0) + k], 0) for k in (0, 1))
+            for west in range(0, across * edge, edge):
+                filled = encode_block(
+                    image.column, values, factor / step, step, first, last, west, out, line, whole, shuffled
+                )
+                blocks.append(compress(out) if filled else None)
+    return Page(_layout(image.edge, edge, len(bands), reduced, raster.compression()), blocks)
+
+
+def _compressor() -> Callable[[Any], Any]:
+    if raster.compression() == "ZSTD":
+        codec = pa.Codec("zstd", compression_level=1)
+        return lambda block: codec.compress(block).slice(0)  # a new view: the buffer's own keeps the size it began with
+    return lambda block: zlib.compress(block, 6)
+
+
+@functools.lru_cache(maxsize=64)
+def _layout(edge: int, block: int, bands: int, reduced: bool, compression: str) -> tuple[Tag, ...]:
+    return (
+        Tag(254, "I", [1 if reduced else 0]),
+        Tag(256, "I", [edge]),
+        Tag(257, "I", [edge]),
+        Tag(258, "H", [32] * bands),
+        Tag(259, "H", [_COMPRESSIONS[compression]]),
+        Tag(262, "H", [1]),
+        Tag(277, "H", [bands]),
+        Tag(284, "H", [2]),  # each band in blocks of its own
+        Tag(317, "H", [3]),
+        Tag(322, "I", [block]),
+        Tag(323, "I", [block]),
+        *([Tag(338, "H", [0] * (bands - 1))] if bands > 1 else []),
+        Tag(339, "H", [3] * bands),
+        Tag(42113, "s", [b"nan"]),
+    )
+
+
+def _description(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContext) -> list[Tag]:
+    """Place on the map, names, units and the rest of the metadata."""
+    place = CellBox.around([cells.tile], context.grid).transform(context)
+    items = [
+        f'<Item name="{name}">{escape(value)}</Item>'
+        for name, value in (
+            ("ROADSCAN_SURVEY", context.survey_id),
+            ("ROADSCAN_HEIGHT", "local" if context.map.is_local else context.map.height),
+            ("ROADSCAN_TILE", str(cells.tile)),
+        )
+    ]
+    text = "\n  ".join(["<GDALMetadata>", digest_item(), *items, *_band_items(bands, context)])
+    return [
+        Tag(305, "s", [raster.SOFTWARE.encode()]),
+        Tag(306, "s", [f"{context.date:%Y:%m:%d} 00:00:00".encode()]),
+        Tag(33550, "d", [place.a, -place.e, 0.0]),
+        Tag(33922, "d", [0.0, 0.0, 0.0, place.c, place.f, 0.0]),
+        *geo_keys(context.map),
+        Tag(42112, "s", [text.encode() + b"\n</GDALMetadata>\n"]),
+    ]
+
+
+def _band_items(bands: tuple[Quantity, ...], context: ProductContext) -> list[str]:
+    items: list[str] = []
+    for number, band in enumerate(band_of(b, context) for b in bands):
+        for name, value in (("DESCRIPTION", band.description), ("UNITTYPE", band.unit)):
+            items.append(f'<Item name="{name}" sample="{number}" role="{name.lower()}">{escape(value)}</Item>')
+    return items
+
+
+@functools.lru_cache(maxsize=16)
+def geo_keys(frame: MapFrame) -> tuple[Tag, ...]:
+    """Tags that state the CRS, as GDAL itself writes them into a file with that CRS."""
+    profile = {"driver": "GTiff", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
+    with raster.raster_settings(), MemoryFile() as memory:
+        with memory.open(**profile, crs=raster.raster_crs(frame), transform=Affine(1, 0, 1, 0, -1, 1)):
+            pass
+        content = bytes(memory.getbuffer())
+    start = struct.unpack_from("<I", content, 4)[0]
+    kinds = {2: ("s", 1), 3: ("H", 2), 12: ("d", 8)}
+    found: list[Tag] = []
+    for number in range(struct.unpack_from("<H", content, start)[0]):
+        at = start + 2 + 12 * number
+        tag, kind, count = struct.unpack_from("<HHI", content, at)
+        if tag not in {34735, 34736, 34737}:
+            continue
+        code, size = kinds[kind]
+        place = at + 8 if count * size <= 4 else struct.unpack_from("<I", content, at + 8)[0]
+        values: Any = struct.unpack_from(f"<{count}{code}", content, place)
+        found.append(Tag(tag, code, [values[0].removesuffix(b"\0")] if code == "s" else values))
+    return tuple(found)

@@ -112,6 +112,7 @@ class CellBox:
         return [self.block(column, row) for row, column in sorted(found)]
 
 
+@functools.lru_cache(maxsize=16)
 def height_unit(frame: MapFrame) -> str:
     """Name of the unit that heights are written in."""
     return "metre" if frame.vertical_crs is None else str(crs_from_text(frame.vertical_crs).axis_info[-1].unit_name)

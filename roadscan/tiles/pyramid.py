@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -45,7 +46,8 @@ class Level:
         return int(self.column.size)
 
 
-def overview_factors(cells_per_edge: int, wanted: Sequence[int] = WANTED_FACTORS) -> tuple[int, ...]:
+@functools.cache
+def overview_factors(cells_per_edge: int, wanted: tuple[int, ...] = WANTED_FACTORS) -> tuple[int, ...]:
     """Factors of a tile's overviews: for each wanted one the nearest that fits, ascending.
 
     A factor fits if it divides the tile's edge, so that no pixel straddles two tiles, and is a multiple of the

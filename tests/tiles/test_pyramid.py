@@ -59,7 +59,7 @@ def test_pixels_are_what_pandas_says(edge, filled):
 
 
 def test_a_level_does_not_depend_on_the_others():
-    one = cells(400, 0.3)
+    one = cells(160, 0.3)
     together = pyramid_of(one, (2, 8, 40))
     for level in together:
         assert bits(level) == bits(pyramid_of(one, (level.factor,))[0])

@@ -1,7 +1,8 @@
 """Every reader: records and bytes a second, beside the library that one would otherwise call.
 
 A reader checks each record, brings it to SI units, GPS time and the world frame, and yields table rows; most of the
-libraries only parse. A last group brings logs to partitioned Parquet, fingerprint included.
+libraries only parse. A last group brings logs to partitioned Parquet, fingerprint included. `ROADSCAN_PARTS` names the
+parts: "formats" (each reader), "scans" (a line-rate pair of profilers, :mod:`benchmarks.line_rate_ingest`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import functools
 import io
 import json
+import os
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,6 +29,7 @@ import pyarrow.feather
 import pyarrow.parquet as pq
 import shapely
 
+from benchmarks.line_rate_ingest import line_rate_figures
 from benchmarks.timing import Figure, best_seconds
 from roadscan.jobs.ingest import ingest
 from roadscan.model.crs import MapFrame
@@ -71,6 +74,17 @@ class Log:
 
 def figures(folder: Path) -> Iterator[Figure]:
     """Reading, then ingest."""
+    parts = os.environ.get("ROADSCAN_PARTS", "formats scans").split()
+    if "formats" in parts:
+        yield from format_figures(folder)
+    if "scans" in parts:
+        place = folder / "pair"
+        place.mkdir()
+        yield from line_rate_figures(place)
+
+
+def format_figures(folder: Path) -> Iterator[Figure]:
+    """Every format."""
     made = makers()
     missing = set(log_formats()) - {name.split(" ", 1)[0] for name in made}
     assert not missing, f"no benchmark for {missing}"

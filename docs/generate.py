@@ -270,15 +270,18 @@ def product_list(_: str) -> str:
     found = _own(products(), "roadscan.products")
     overview = markdown_table(
         ("product", "what it is", "files", "made"),
-        [
-            (f"[`{n}`](#{n})", plain(p.title), _files_words(p), "always" if p.default else "on request")
-            for n, p in found.items()
-        ],
+        [(f"[`{n}`](#{n})", plain(p.title), _files_words(p), _made_words(p)) for n, p in found.items()],
     )
     sections = (
         "\n\n".join([f"## {p.name}", sentence(p.title), *manual(type(p)), *settings(p.options)]) for p in found.values()
     )
     return "\n\n".join([overview, *sections])
+
+
+def _made_words(product: Product) -> str:
+    if not product.default:
+        return "on request"
+    return {"any": "always", "fine": "cells below 2 cm", "coarse": "cells of 2 cm or more"}[product.default_cells]
 
 
 def _files_words(product: Product) -> str:

@@ -9,19 +9,20 @@ from pathlib import Path
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.tiles import TILE, WantedProduct, read_cells, summary_of
+from roadscan.jobs.tile_files import WantedProduct
+from roadscan.jobs.tiles import TILE, read_cells, summary_of
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.model.survey import Survey
 from roadscan.products.base import (
-    LoadCells,
     Output,
     Product,
     ProductContext,
     SurveyProduct,
     TileProduct,
     TileSummary,
+    is_default,
     product_named,
     products,
     source_digest,
@@ -29,6 +30,7 @@ from roadscan.products.base import (
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store, file_digest
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.pyramid import Level, pyramid_of
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class OutputTask:
 def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
     """Products that the survey file asks for, with their checked settings."""
     config = survey.config.products
-    names = config.make if config.make is not None else [n for n, p in products().items() if p.default]
+    cell_m = survey.config.tiles.cell_m
+    names = config.make if config.make is not None else [n for n, p in products().items() if is_default(p, cell_m)]
     for name in config.options:
         product_named(name)
     return [(p, p.options.parse(config.options.get(p.name, {}))) for p in (product_named(n) for n in names)]
@@ -119,7 +122,7 @@ def write_output(task: OutputTask) -> OutputRecord:
     with task.store.scratch() as folder:
         path = folder / Path(task.output.name).name
         task.product.write(
-            task.output, task.summaries, cell_loader(task.store, task.cells, task.context), task.options,
+            task.output, task.summaries, StoredTiles(task.store, task.cells, task.context), task.options,
             task.context, path,
         )  # fmt: skip
         size, digest = path.stat().st_size, file_digest(path)
@@ -127,15 +130,23 @@ def write_output(task: OutputTask) -> OutputRecord:
     return OutputRecord(task.product.name, task.output.name, task.key, task.target, size, digest)
 
 
-def cell_loader(store: Store, records: Sequence[OutputRecord], context: ProductContext) -> LoadCells:
-    """Cells by tile, from the store."""
-    by_unit = {r.unit: r for r in records}
+class StoredTiles:
+    """Finished tiles of the store, as survey products ask for them."""
 
-    def load(tile: TileId) -> TileCells | None:
-        record = by_unit.get(str(tile))
-        return None if record is None else read_cells(store, record, context.grid.cells_per_edge)
+    def __init__(self, store: Store, records: Sequence[OutputRecord], context: ProductContext) -> None:
+        self._store = store
+        self._by_unit = {r.unit: r for r in records}
+        self._edge = context.grid.cells_per_edge
 
-    return load
+    def __call__(self, tile: TileId) -> TileCells | None:
+        """Cells of a tile; None where the survey has no such tile."""
+        record = self._by_unit.get(str(tile))
+        return None if record is None else read_cells(self._store, record, self._edge)
+
+    def overview(self, tile: TileId, factor: int) -> Level | None:
+        """Overview of a tile, made from its cells."""
+        cells = self(tile)
+        return None if cells is None else pyramid_of(cells, (factor,))[0]
 
 
 def _tasks(
@@ -147,11 +158,11 @@ def _tasks(
     summaries: Sequence[TileSummary],
 ) -> list[OutputTask]:
     by_tile = {TileId.parse(r.unit): r for r in records}
+    summary_by_tile = {s.tile: s for s in summaries}
     tasks: list[OutputTask] = []
     for output in product.outputs(summaries, options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         key = key_of(_product_key(product, options, context), output.name, [(r.unit, r.digest, r.detail) for r in own])
-        wanted = set(output.tiles)
         tasks.append(
             OutputTask(
                 plan.store,
@@ -160,7 +171,7 @@ def _tasks(
                 context,
                 output,
                 key,
-                tuple(s for s in summaries if s.tile in wanted),
+                tuple(summary_by_tile[t] for t in sorted(output.tiles) if t in summary_by_tile),
                 own,
             )
         )

@@ -14,13 +14,14 @@ from roadscan.jobs.footprints import Footprints, index_footprints, load_footprin
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import SurveyPlan, plan_survey
-from roadscan.jobs.products import make_products, product_context, wanted_products, wanted_tile_products
+from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.tiles import TILE, BlockTask, WantedProduct, block_tasks, plan_tiles, run_blocks, stale_tiles
+from roadscan.jobs.tile_files import WantedProduct, tile_file_names
+from roadscan.jobs.tiles import TILE, BlockTask, block_tasks, plan_tiles, run_blocks, stale_tiles
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext, TileProduct, products
+from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord, write_failures
 from roadscan.tables.store import Store
 
@@ -90,7 +91,7 @@ def run_tiles(run: Run) -> None:
     failures = run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles"))
     manifest.forget(TILE, [unit for unit, _ in failures])
     empty = {unit for unit, r in manifest.of(TILE).items() if not r.path}
-    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in tile_product_names()])
+    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in tile_file_names()])
     run.failed("tiles", failures)
 
 
@@ -189,18 +190,13 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
         chosen = run.selection.tiles(tiles, footprints, plan.ground.grid)
     else:
         chosen = stale_tiles(tiles, wanted, manifest)
-    per_tile = tile_product_names()
-    dropped = per_tile - {p.name for p, _ in wanted_products(run.survey)}
+    per_tile = tile_file_names()
+    dropped = per_tile - tile_file_names({w.product.name for w in wanted})
     units = {str(t) for t in tiles}
     gone = [
         r for r in manifest.all() if r.product in {TILE, *per_tile} and (r.unit not in units or r.product in dropped)
     ]
     return TileWork(plan, footprints, tiles, chosen, gone, wanted, context)
-
-
-def tile_product_names() -> set[str]:
-    """Names of all tile products there are."""
-    return {n for n, p in products().items() if isinstance(p, TileProduct)}
 
 
 def _bar(run: Run, stage: str) -> Callable[[int, int], None]:

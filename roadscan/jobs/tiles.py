@@ -7,7 +7,6 @@ import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,20 +20,20 @@ from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.footprints import Footprints
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, Placer, RawSlice, ReadingSource
+from roadscan.jobs.tile_files import WantedProduct, publish_file, write_product
 from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, TileId
-from roadscan.model.strict import Strict
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.centre_line import CentreLineBuffer
 from roadscan.points.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
 from roadscan.points.cloud import QUANTUM_M, TilePoints, fill_of
 from roadscan.points.order import canonical_order
 from roadscan.points.place import EXTRA_COLUMNS, Placed, Window, passes_of
-from roadscan.products.base import ProductContext, Tile, TileProduct, TileSummary
+from roadscan.products.base import ProductContext, Tile, TileSummary
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store, file_digest
+from roadscan.tables.store import Store
 from roadscan.tables.writer import write_parquet
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.cells import TileCells
@@ -44,15 +43,6 @@ TILE = "tile"
 """Manifest name of a tile as a whole; its file holds the cells."""
 
 _MOMENT_NS = 50_000_000
-
-
-@dataclass(frozen=True)
-class WantedProduct:
-    """A tile product with its settings and the key of its inputs beside the tile's own."""
-
-    product: TileProduct
-    options: Strict
-    key: str
 
 
 @dataclass(frozen=True)
@@ -307,7 +297,7 @@ def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manif
     record = manifest.get(TILE, str(tile))
     if record is not None and not record.path:
         return True  # without points there are no files
-    return all(manifest.is_current(w.product.name, str(tile), key_of(key, w.key)) for w in products)
+    return all(manifest.is_current(name, str(tile), key_of(key, w.key)) for w in products for name in w.files)
 
 
 def _rows_by_tile(footprints: Footprints, chosen: frozenset[TileId]) -> dict[TileId, npt.NDArray[np.int64]]:
@@ -494,17 +484,12 @@ def _write_tile(
     records: list[OutputRecord] = []
     with task.store.scratch() as folder:
         for wanted in task.products:
-            suffix = wanted.product.suffix_for(wanted.options)
-            path = folder / f"tile{suffix}"
-            wanted.product.write(Tile(points, cells, marked), wanted.options, context, path)
-            target = f"tiles/{wanted.product.name}/{tile}{suffix}"
-            own_key = key_of(key, wanted.key)
-            records.append(_publish(task.store, path, target, wanted.product.name, str(tile), own_key))
+            records += write_product(wanted, Tile(points, cells, marked), context, key, task.store, folder)
         path = folder / "cells.parquet"
         write_parquet(path, cells_table(cells), table_schema("cells"))
         detail = json.dumps(_figures(points, cells, sigma))
         records.append(
-            _publish(task.store, path, f"tiles/cells/{tile}.parquet", TILE, str(tile), key, detail)
+            publish_file(task.store, path, f"tiles/cells/{tile}.parquet", TILE, str(tile), key, detail)
         )  # last: a tile is current only with all its files
     return records
 
@@ -531,14 +516,6 @@ def _figures(points: TilePoints, cells: TileCells, sigma: PositionSigma) -> dict
         "sigma_horizontal_m": sigma.horizontal_m,
         "sigma_down_m": sigma.down_m,
     }
-
-
-def _publish(
-    store: Store, path: Path, target: str, product: str, unit: str, key: str, detail: str = ""
-) -> OutputRecord:
-    size, digest = path.stat().st_size, file_digest(path)
-    store.publish(path, target)
-    return OutputRecord(product, unit, key, target, size, digest, detail)
 
 
 def _reason(error: Exception | None) -> str:

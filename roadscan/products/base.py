@@ -14,11 +14,11 @@ import importlib
 import inspect
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import ClassVar, Final, TypeAlias
+from typing import ClassVar, Final, Literal, Protocol, TypeAlias
 
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, nearest
@@ -27,9 +27,16 @@ from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.pyramid import Level
 
 ENTRY_POINT_GROUP: Final = "roadscan.products"
 """Entry-point group through which a third party's package adds a product."""
+
+
+FINE_CELL_M: Final = 0.02
+"""Cells below this are those of profilers at line rate: a network of them is looked at tile by tile, or from far."""
+
+Cells = Literal["any", "fine", "coarse"]
 
 
 class NoOptions(Strict):
@@ -89,8 +96,17 @@ class Output:
     """Tiles its content depends on; it is rewritten when one of them changes."""
 
 
-LoadCells: TypeAlias = Callable[[TileId], TileCells | None]
-"""Gives the cells of a tile, or None where the survey has no such tile."""
+class LoadCells(Protocol):
+    """Gives what the store holds of a tile, for products over many tiles."""
+
+    def __call__(self, tile: TileId) -> TileCells | None:
+        """Cells of a tile, or None where the survey has no such tile."""
+
+    def overview(self, tile: TileId, factor: int) -> Level | None:
+        """Overview of a tile in pixels of `factor` squared cells, or None where the survey has no such tile.
+
+        `factor` is one of :func:`roadscan.tiles.pyramid.overview_factors`.
+        """
 
 
 class TileProduct(ABC):
@@ -108,12 +124,22 @@ class TileProduct(ABC):
     """Model of its settings."""
     default: ClassVar[bool] = True
     """Made where the survey file does not list products."""
+    default_cells: ClassVar[Cells] = "any"
+    """Made by default only with fine cells (below 2 cm) or only with coarse ones, if it is made by default."""
     needs_points: ClassVar[bool] = False
     """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
 
     def suffix_for(self, options: Strict) -> str:
         """File suffix under these settings."""
         return self.suffix
+
+    def companions(self, options: Strict) -> dict[str, str]:
+        """Small files that belong beside each file, such as a world file: suffix by name.
+
+        They are written with the file, under its path with their suffix instead of its own; the names do not
+        depend on the settings.
+        """
+        return {}
 
     def check_options(self, options: Strict, context: ProductContext) -> None:
         """Raise :class:`ConfigError` where the settings do not fit the survey; asked once, before any work."""
@@ -136,6 +162,7 @@ class SurveyProduct(ABC):
     version: ClassVar[int] = 1
     options: ClassVar[type[Strict]] = NoOptions
     default: ClassVar[bool] = True
+    default_cells: ClassVar[Cells] = "any"
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
@@ -163,6 +190,12 @@ class SurveyProduct(ABC):
 
 
 Product: TypeAlias = TileProduct | SurveyProduct
+
+
+def is_default(product: Product, cell_m: float) -> bool:
+    """True for a product that is made where the survey file does not list products."""
+    fits = product.default_cells in ("any", "fine" if cell_m < FINE_CELL_M else "coarse")
+    return product.default and fits
 
 
 @functools.cache

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from rasterio.windows import Window
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
-from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.raster import (
     Band,
     CellBox,
@@ -50,7 +50,7 @@ _STEM: Final = "hillshade"
 _PICTURE: Final = "hillshade.png"
 _EMPTY: Final = 0
 _STRIP_ROWS: Final = 128
-_BAND: Final = Band("hillshade", "")
+SHADE_BAND: Final = Band("hillshade", "")
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 
 
@@ -82,13 +82,15 @@ class Hillshade(SurveyProduct):
     name: ClassVar[str] = "hillshade"
     title: ClassVar[str] = "shaded relief of the surface, as a GeoTIFF and as a picture for pages and reports"
     options: ClassVar[type[Strict]] = HillshadeOptions
+    default_cells: ClassVar[Cells] = "coarse"
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets, the index that joins them, and the picture."""
         sheet_m = cast(HillshadeOptions, options).sheet_m
         sheets = cut_sheets(_STEM, (t.tile for t in tiles), sheet_m, context.grid)
         everything = tuple(sorted(t.tile for t in tiles))
-        found = [Output(sheet.name, _with_neighbours(sheet, everything)) for sheet in sheets]
+        known = frozenset(everything)
+        found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
         found += index_output(_STEM, sheets)
         return [*found, Output(_PICTURE, everything)] if everything else []
 
@@ -105,14 +107,19 @@ class Hillshade(SurveyProduct):
         settings = cast(HillshadeOptions, options)
         sheet = sheet_of(_STEM, output, settings.sheet_m, context.grid)
         if output.name == index_name(_STEM):
-            write_index(path, cut_sheets(_STEM, output.tiles, settings.sheet_m, context.grid), _BAND, "uint8", context)
+            sheets = cut_sheets(_STEM, output.tiles, settings.sheet_m, context.grid)
+            write_index(path, sheets, SHADE_BAND, "uint8", context)
         elif output.name == _PICTURE:
             _write_picture(sorted(output.tiles), load_cells, settings, context, path)
         elif sheet is not None:
-            members = set(output.tiles)
-            base_m = float(math.floor(min(t.height_min_m for t in tiles if t.tile in members)))
-            surface = Surface(output.tiles, base_m, load_cells)
-            _write_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
+            base_m = base_below(tiles, output)
+
+            def heights_of(tile: TileId) -> Float64:
+                cells = cells_of(tile, load_cells)
+                return cell_image(cells, cells.height_robust_m - base_m, "float64")
+
+            surface = Surface(output.tiles, heights_of)
+            write_shaded_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
         else:
             raise unknown_output(output)
 
@@ -131,14 +138,29 @@ class Surface:
     """Tiles whose heights are drawn, counted from a base near them to keep float arithmetic fine."""
 
     tiles: Sequence[TileId]
-    base_m: float
-    load_cells: LoadCells
+    heights_of: Callable[[TileId], Float64]
+    """Gives a tile's (rows, columns) heights above the base (m), north up, NaN where no point lies."""
 
     def images(self) -> Iterator[tuple[TileId, Float64]]:
-        """Tile and its (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
+        """Tile and its heights, row by row."""
         for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
-            cells = cells_of(tile, self.load_cells)
-            yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
+            yield tile, self.heights_of(tile)
+
+
+class Light(Protocol):
+    """Settings of a shaded picture."""
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Where the light comes from, clockwise from map north (degrees)."""
+
+    @property
+    def altitude_deg(self) -> float:
+        """Height of the light above the horizon (degrees)."""
+
+    @property
+    def z_factor(self) -> float:
+        """Exaggeration of the heights."""
 
 
 def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
@@ -179,7 +201,7 @@ def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
     return np.where(missing, continued, near)
 
 
-def shade(heights_m: Float64, cell_m: float, options: HillshadeOptions) -> npt.NDArray[np.uint8]:
+def shade(heights_m: Float64, cell_m: float, options: Light) -> npt.NDArray[np.uint8]:
     """Shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where the height is unknown.
 
     The brightness of a matt surface: the cosine between its normal and the direction of the light.
@@ -195,17 +217,22 @@ def shade(heights_m: Float64, cell_m: float, options: HillshadeOptions) -> npt.N
     return np.where(np.isnan(grey), _EMPTY, grey).astype(np.uint8)
 
 
-def _with_neighbours(sheet: Sheet, everything: Iterable[TileId]) -> tuple[TileId, ...]:
+def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
     """Tiles of a sheet and those of the survey that touch one of them, in order."""
     around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
-    return tuple(sorted(around & set(everything)))
+    return tuple(sorted(around & everything))
 
 
-def _write_sheet(
-    sheet: Sheet, surface: Surface, options: HillshadeOptions, context: ProductContext, path: Path
-) -> None:
+def base_below(tiles: Sequence[TileSummary], output: Output) -> float:
+    """Whole metres at or below the lowest height of the tiles of `output`."""
+    members = set(output.tiles)
+    return float(math.floor(min(one.height_min_m for one in tiles if one.tile in members)))
+
+
+def write_shaded_sheet(sheet: Sheet, surface: Surface, options: Light, context: ProductContext, path: Path) -> None:
+    """Write the shade of the tiles of a sheet; the context's grid is that of the surface's images."""
     box = CellBox.around(sheet.tiles, context.grid)
-    shaded = SparseRaster(box, _BAND, "uint8", _EMPTY, context)
+    shaded = SparseRaster(box, SHADE_BAND, "uint8", _EMPTY, context)
     with raster_settings(), shaded.cog(path) as raster, _heights(surface, box, context, path) as heights:
         for block in box.blocks_under(sheet.tiles, context.grid.cells_per_edge):
             halo = Window(block.col_off, block.row_off, block.width + 2, block.height + 2)

@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Final, cast
 
 import laspy
 import numpy as np
 import numpy.typing as npt
-from laspy.header import GpsTimeType
-from laspy.vlrs.known import WktCoordinateSystemVlr
-from lazrs import LazrsError
 from pydantic import Field
-from pyproj.exceptions import CRSError
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, CrsError, StoreError
+from roadscan.model.errors import ConfigError, StoreError
 from roadscan.model.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.model.strict import Strict
-from roadscan.points.cloud import QUANTA_PER_M, TilePoints
-from roadscan.products.base import ProductContext, Tile, TileProduct
-from roadscan.products.raster import SOFTWARE
+from roadscan.points.cloud import TilePoints
+from roadscan.products.base import Cells, ProductContext, Tile, TileProduct
+from roadscan.products.las_file import (
+    ONE_OF_ONE,
+    Axes,
+    axis,
+    check_points,
+    new_header,
+    rounding_errors,
+    set_coordinates,
+    write_points,
+)
 from roadscan.tiles.grid import TileGrid
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-VLR_USER_ID: Final = "roadscan"
-VLR_RECORD_ID: Final = 1
-
 _SCAN_ANGLE_STEP_DEG: Final = 0.006
-_ONE_OF_ONE: Final = 0x11
-_CHUNK_POINTS: Final = 1_000_000
-_INT32_MAX: Final = 2**31 - 1
 
 _FLAG_BITS: Final = {
     "scan_direction_flag": 1,
@@ -86,6 +80,7 @@ class Las(TileProduct):
     title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
     suffix: ClassVar[str] = ".laz"
     options: ClassVar[type[Strict]] = LasOptions
+    default_cells: ClassVar[Cells] = "coarse"
     needs_points: ClassVar[bool] = True
 
     def suffix_for(self, options: Strict) -> str:
@@ -105,23 +100,11 @@ class Las(TileProduct):
         axes = _axes(points, settings.scale_m, context)
         header = _header(points, axes, context)
         record = _record(points, axes, header)
-        digest = _Digest(header)
-        digest.add(record.array)
-        facts = _facts(points, tile, axes, digest.text(), settings, context)
-        header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, "survey, tile, rounding", facts))
-        backend = laspy.LazBackend.Lazrs if settings.compress else None
-        with path.open("wb") as stream:
-            writer = laspy.LasWriter(stream, header, do_compress=settings.compress, laz_backend=backend, closefd=False)
-            writer.write_points(record)
-            writer.close()
+        write_points(path, header, record, _facts(points, tile, axes, settings, context), settings.compress)
 
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""
-        try:
-            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
-                _check_points(reader, path)
-        except (laspy.LaspyException, LazrsError, OSError, ValueError, EOFError) as error:
-            raise StoreError(f"the point file cannot be read: {error}", change="make it again", file=path) from error
+        check_points(path)
 
 
 def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:
@@ -183,59 +166,18 @@ def _selected(points: TilePoints, kept: Int64) -> TilePoints:
     )
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """One coordinate as LAS stores it: value = stored · scale + offset, in the CRS's unit."""
-
-    stored: npt.NDArray[np.int32]
-    scale: float
-    offset: float
-    error_max_m: float
-    """Largest difference between a point and what a reader gets back (m)."""
-
-
-def _axes(points: TilePoints, scale_m: float, context: ProductContext) -> tuple[_Axis, _Axis, _Axis]:
+def _axes(points: TilePoints, scale_m: float, context: ProductContext) -> Axes:
     size, frame = context.grid.size_quanta, context.map
     horizontal_m, vertical_m = frame.horizontal_unit_m, frame.vertical_unit_m
     return (
-        _axis(points.x_quanta, points.tile.column * size, scale_m, horizontal_m),
-        _axis(points.y_quanta, points.tile.row * size, scale_m, horizontal_m),
-        _axis(points.height_quanta, 0, scale_m, vertical_m),
+        axis(points.x_quanta, points.tile.column * size, scale_m, horizontal_m, Las.name),
+        axis(points.y_quanta, points.tile.row * size, scale_m, horizontal_m, Las.name),
+        axis(points.height_quanta, 0, scale_m, vertical_m, Las.name),
     )
 
 
-def _axis(quanta: npt.NDArray[np.int32], corner_quanta: int, scale_m: float, unit_m: float) -> _Axis:
-    """Store `quanta` from `corner_quanta`; offsets are whole units, so that all tiles share one lattice."""
-    unit_quanta = QUANTA_PER_M * unit_m
-    scale = _scale(scale_m, unit_m)
-    offset = float(math.floor(corner_quanta / unit_quanta))
-    steps = np.rint((quanta + (corner_quanta - offset * unit_quanta)) / (unit_quanta * scale))
-    if steps.size and np.abs(steps).max() > _INT32_MAX:
-        raise ConfigError(f"las.scale_m = {scale_m:g} is too fine for these coordinates", change="make it larger")
-    true_m = (quanta.astype(np.float64) + corner_quanta) / QUANTA_PER_M
-    error_m = np.abs((steps * scale + offset) * unit_m - true_m)
-    return _Axis(steps.astype(np.int32), scale, offset, float(error_m.max(initial=0.0)))
-
-
-def _scale(scale_m: float, unit_m: float) -> float:
-    if unit_m == 1.0:
-        return scale_m
-    exponent = math.floor(math.log10(scale_m / unit_m))
-    leading = scale_m / unit_m / 10.0**exponent
-    step = max(digit for digit in (1, 2, 5) if digit <= leading or digit == 1)
-    return float(f"{step}e{exponent}")
-
-
-def _header(points: TilePoints, axes: tuple[_Axis, _Axis, _Axis], context: ProductContext) -> laspy.LasHeader:
-    header = laspy.LasHeader(version="1.4", point_format=7 if "red" in points.extra else 6)
-    header.scales = np.array([axis.scale for axis in axes])
-    header.offsets = np.array([axis.offset for axis in axes])
-    header.creation_date = context.date
-    header.generating_software = SOFTWARE
-    header.system_identifier = "OTHER"
-    header.global_encoding.gps_time_type = GpsTimeType.STANDARD
-    header.global_encoding.wkt = True
-    header.vlrs.append(WktCoordinateSystemVlr(_wkt1(context.map)))
+def _header(points: TilePoints, axes: Axes, context: ProductContext) -> laspy.LasHeader:
+    header = new_header(7 if "red" in points.extra else 6, axes, context, Las.name)
     for column in _further(points):
         header.add_extra_dim(
             laspy.ExtraBytesParams(_RENAMED.get(column, column), points.extra[column].dtype, "as recorded")
@@ -243,31 +185,19 @@ def _header(points: TilePoints, axes: tuple[_Axis, _Axis, _Axis], context: Produ
     return header
 
 
-def _wkt1(frame: MapFrame) -> str:
-    try:
-        return frame.wkt("WKT1_GDAL")
-    except CRSError as error:
-        raise CrsError(
-            f"map.crs '{frame.crs}' cannot be written as WKT 1",
-            expected="a CRS that LAS 1.4 can state (WKT of OGC 01-009)",
-            change="choose another CRS, or leave the product 'las' out",
-        ) from error
-
-
 def _further(points: TilePoints) -> list[str]:
     """Recorded columns that LAS has no dimension for."""
     return sorted(name for name in points.extra if name not in _HANDLED)
 
 
-def _record(points: TilePoints, axes: tuple[_Axis, _Axis, _Axis], header: laspy.LasHeader) -> Any:
+def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
-    for name, axis in zip("XYZ", axes, strict=True):
-        record[name] = axis.stored
+    set_coordinates(record, axes)
     record["intensity"] = points.intensity
     record["classification"] = points.classification
     record["point_source_id"] = points.pass_id
     record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
-    record.array["bit_fields"] = _ONE_OF_ONE
+    record.array["bit_fields"] = ONE_OF_ONE
     _copy_recorded(record, points)
     return record
 
@@ -289,8 +219,10 @@ def _copy_recorded(record: Any, points: TilePoints) -> None:
 
 def adjusted_gps_s(epoch_gps_ns: Int64) -> Float64:
     """Adjusted standard GPS time (s): the double nearest to GPS seconds minus 1e9 (LAS 1.4 R15, 2.4)."""
-    whole = epoch_gps_ns // NS_PER_S
-    return (whole - ADJUSTED_OFFSET_S) + (epoch_gps_ns - whole * NS_PER_S) / NS_PER_S
+    since_ns = epoch_gps_ns - ADJUSTED_OFFSET_S * NS_PER_S
+    whole = np.sign(since_ns) * (np.abs(since_ns) // NS_PER_S)  # towards zero: the parts never cancel
+    time_s: Float64 = whole + (since_ns - whole * NS_PER_S) / NS_PER_S
+    return time_s
 
 
 def _gps_time_step_ns(points: TilePoints) -> float:
@@ -299,72 +231,16 @@ def _gps_time_step_ns(points: TilePoints) -> float:
     return round(float(np.spacing(np.abs(last))[0]) * NS_PER_S, 3)
 
 
-def _facts(
-    points: TilePoints,
-    tile: Tile,
-    axes: tuple[_Axis, _Axis, _Axis],
-    blake2b: str,
-    options: LasOptions,
-    context: ProductContext,
-) -> bytes:
-    facts = {
+def _facts(points: TilePoints, tile: Tile, axes: Axes, options: LasOptions, context: ProductContext) -> dict[str, Any]:
+    facts: dict[str, Any] = {
         "survey": context.survey_id,
         "tile": str(points.tile),
         "height": context.map.height,
         "points_of_tile": int(tile.cells.count.sum()),
         "spacing_m": options.spacing_m,
-        "rounding_error_max_m": {name: round(axis.error_max_m, 9) for name, axis in zip("xyz", axes, strict=True)},
+        "rounding_error_max_m": rounding_errors(axes),
         "gps_time_step_ns": _gps_time_step_ns(points),
-        "blake2b": blake2b,
     }
     if tile.marked is not None and options.spacing_m is None:
         facts["marked_points"] = len(tile.marked)
-    return json.dumps(facts, sort_keys=True).encode("ascii")
-
-
-class _Digest:
-    """BLAKE2b (128 bits) of point records as they lie in a LAS file, and of what gives them their place."""
-
-    def __init__(self, header: laspy.LasHeader) -> None:
-        self._state = hashlib.blake2b(digest_size=16)
-        wkt = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
-        self._state.update(repr((header.scales.tolist(), header.offsets.tolist(), wkt)).encode())
-
-    def add(self, records: npt.NDArray[np.void]) -> None:
-        self._state.update(np.ascontiguousarray(records).view(np.uint8).data)
-
-    def text(self) -> str:
-        return self._state.hexdigest()
-
-
-def _check_points(reader: laspy.LasReader, path: Path) -> None:
-    header = reader.header
-    stated = _stated_facts(header, path)
-    digest, count = _Digest(header), 0
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for chunk in _chunks(reader):
-        count += len(chunk)
-        digest.add(chunk.array)
-        xyz = np.stack([chunk.x, chunk.y, chunk.z])
-        low, high = np.minimum(low, xyz.min(axis=1)), np.maximum(high, xyz.max(axis=1))
-    if count != header.point_count or count == 0:
-        raise StoreError(f"{count} points", expected=f"the {header.point_count} of the header", file=path)
-    if not (np.allclose(low, header.mins, atol=1e-9) and np.allclose(high, header.maxs, atol=1e-9)):
-        raise StoreError("points lie outside the header's box", change="make the file again", file=path)
-    if digest.text() != stated.get("blake2b"):
-        raise StoreError("the points do not match their digest", change="make the file again", file=path)
-
-
-def _chunks(reader: laspy.LasReader) -> Iterator[Any]:
-    for chunk in reader.chunk_iterator(_CHUNK_POINTS):
-        if len(chunk) == 0:
-            return
-        yield chunk
-
-
-def _stated_facts(header: laspy.LasHeader, path: Path) -> dict[str, Any]:
-    records = [v for v in header.vlrs if v.user_id == VLR_USER_ID and v.record_id == VLR_RECORD_ID]
-    if not records or not header.global_encoding.wkt:
-        raise StoreError("the file has no CRS or no record of roadscan", change="make the file again", file=path)
-    facts: dict[str, Any] = json.loads(records[0].record_data)
     return facts

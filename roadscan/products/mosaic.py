@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from roadscan.model.strict import Strict
-from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.quantities import QUANTITIES, Quantity, band_of, values_of
 from roadscan.products.raster import CellBox, SparseRaster, cell_image, paste_tile, raster_settings
 from roadscan.products.sheets import (
@@ -47,6 +47,7 @@ class Mosaic(SurveyProduct):
     name: ClassVar[str] = "mosaic"
     title: ClassVar[str] = "cells of the whole survey as GeoTIFFs (height, intensity, count, standard deviation)"
     options: ClassVar[type[Strict]] = MosaicOptions
+    default_cells: ClassVar[Cells] = "coarse"
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets of each quantity, followed by the index that joins them."""

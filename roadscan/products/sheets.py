@@ -79,10 +79,19 @@ def index_name(stem: str) -> str:
 
 
 def index_output(stem: str, sheets: Sequence[Sheet]) -> list[Output]:
-    """The index over `sheets`, where there is more than one."""
+    """The index over `sheets`, where there is more than one.
+
+    It depends on where the sheets lie, and so names the outermost tiles of each alone: a network has millions.
+    """
     if len(sheets) < 2:
         return []
-    return [Output(index_name(stem), tuple(sorted(tile for sheet in sheets for tile in sheet.tiles)))]
+    return [Output(index_name(stem), tuple(sorted({tile for sheet in sheets for tile in _outermost(sheet.tiles)})))]
+
+
+def _outermost(tiles: Sequence[TileId]) -> set[TileId]:
+    """Up to four tiles that span the same box as all."""
+    by_column, by_row = [sorted(tiles, key=key) for key in (lambda t: (t.column, t.row), lambda t: (t.row, t.column))]
+    return {by_column[0], by_column[-1], by_row[0], by_row[-1]}
 
 
 def unknown_output(output: Output) -> StoreError:

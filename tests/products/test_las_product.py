@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pyproj
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from roadscan.model.crs import MapFrame
@@ -88,6 +88,7 @@ def test_time_is_adjusted_standard_gps_time(las, workshop, places, tmp_path):
 
 
 @given(st.integers(0, 2**61))
+@example(999_999_999_760_996_700)  # the last second before the moment that it is counted from
 def test_adjusted_time_is_the_nearest_double(epoch_gps_ns):
     stored = adjusted_gps_s(np.array([epoch_gps_ns]))[0]
     exact = Fraction(epoch_gps_ns - 10**18, 10**9)

@@ -93,7 +93,7 @@ def test_large_survey_is_sheets_and_an_index(mosaic, survey, place, tmp_path):
             column, row = (int(part) for part in output.name[7:-4].split("_"))
             assert set(output.tiles) == {t for t in survey.tiles if (t.column // 2, t.row // 2) == (column, row)}
         elif output.name.endswith(".vrt"):
-            assert set(output.tiles) == set(survey.tiles)
+            assert set(output.tiles) <= set(survey.tiles)
     for quantity in ("height", "count"):
         found = cells_in(tmp_path / f"{quantity}.vrt", place.unit_m)
         assert found == expected_cells(survey, place, quantity), quantity

@@ -1,0 +1,114 @@
+"""A tile's cells → one point a square: the pavement's height, without stones that lie on it and cracks in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.decimate import LANES, decimate_strip, fill_strip
+from roadscan.model.errors import ConfigError
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import TileGrid
+
+PATCH_M: Final = 0.1
+"""A slope is told from at least this much of the road: fewer cells, and a few stones would make one."""
+
+FLOOR_UM: Final = 1000
+"""Residuals within 1 mm of the median always count."""
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Squares of a tile that hold a cell, in order of row and column; all arrays are (s,)."""
+
+    column: npt.NDArray[np.uint16]
+    """Of the square in its tile, from the west edge."""
+    row: npt.NDArray[np.uint16]
+    """Of the square in its tile, from the south edge."""
+    height_m: npt.NDArray[np.float64]
+    """At the square's centre, in the map frame."""
+    intensity: npt.NDArray[np.float32]
+    """Mean of the cells that count."""
+    cells: npt.NDArray[np.uint32]
+    """Cells that count."""
+    points: npt.NDArray[np.uint32]
+    """Points in those cells."""
+    sloped: npt.NDArray[np.bool_]
+    """False where too few cells lie around the square to tell its slope: the height is that of its cells' middle."""
+
+    def __len__(self) -> int:
+        return int(self.column.size)
+
+
+def cells_per_square(spacing_m: float, grid: TileGrid, setting: str) -> int:
+    """Cells along a square's edge, or :class:`ConfigError` where squares are no whole cells or do not fill the tile."""
+    side = round(spacing_m / grid.cell_m)
+    if side < 1 or abs(side * grid.cell_m - spacing_m) > 1e-9 or grid.cells_per_edge % side:
+        raise ConfigError(
+            f"{setting} = {spacing_m:g}",
+            expected=f"whole cells of {grid.cell_m:g} m that divide the tile's edge of {grid.size_m:g} m",
+            change=f"choose for example {20 * grid.cell_m:g}, or smaller cells (tiles.cell_m)",
+        )
+    return side
+
+
+def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
+    """Robust height of every square of `side`² cells.
+
+    Let z be the robust heights of a square's cells and (x, y) their centres, counted from the square's centre.
+
+    1. A slope towards east (north) is the lower median of the steps between two cells of a row (column) that lie
+       half a patch apart, divided by that distance. A patch is the square itself, or as many squares as make
+       0.1 m. Without such pairs over an eighth of the patch, a quarter of it is taken, and so on; without any
+       the slope is 0 and the square is marked (`sloped`).
+    2. r = z − slope · (x, y); m is the lower median of r.
+    3. Cells within 3 · 1.4826 · MAD (at least 1 mm) of m count. The height is m + mean(r − m) over them.
+
+    The median step holds while fewer than 29 % of the cells lie off the surface (then most pairs are clean), the
+    median height up to half of them; both do so on any cross-fall. Heights are rounded to 1 µm before. Equal to
+    the bit whatever else is computed.
+
+    Parameters
+    ----------
+    side : cells along an edge of a square, a divisor of the tile's.
+    cell_m : edge of a cell (m).
+    """
+    edge = cells.cells_per_edge
+    patch = patch_cells(side, edge, cell_m)
+    room = min(len(cells), (edge // side) ** 2)
+    column, row = np.empty(room, np.uint16), np.empty(room, np.uint16)
+    height, intensity = np.empty(room, np.float64), np.empty(room, np.float32)
+    used, points, sloped = np.empty(room, np.uint32), np.empty(room, np.uint32), np.empty(room, np.bool_)
+    heights, lights, counts = np.empty((3, patch, edge), np.int32)
+    scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
+    base = math.floor(float(cells.height_robust_m.min(initial=np.inf))) if len(cells) else 0.0
+    start, written = 0, 0
+    for first_row in range(0, edge, patch):
+        end, west, east = fill_strip(
+            cells.column, cells.row, cells.height_robust_m, cells.intensity_mean, cells.count,
+            start, base, first_row, heights, lights, counts,
+        )  # fmt: skip
+        if end == start:
+            continue
+        to = written + decimate_strip(
+            heights, lights, counts, west // patch, east // patch + 1, patch, side, base, FLOOR_UM, scratch,
+            column[written:], row[written:], height[written:], intensity[written:], used[written:], points[written:],
+            sloped[written:],
+        )  # fmt: skip
+        row[written:to] += np.uint16(first_row // side)
+        start, written = end, to
+    return Squares(
+        column[:written], row[:written], height[:written], intensity[:written],
+        used[:written], points[:written], sloped[:written],
+    )  # fmt: skip
+
+
+def patch_cells(side: int, edge: int, cell_m: float) -> int:
+    """Edge of a patch in cells: the fewest squares that make 0.1 m and divide the tile."""
+    squares = edge // side
+    enough = max(1, math.ceil(PATCH_M / (side * cell_m) - 1e-9))
+    return side * next(n for n in range(min(enough, squares), squares + 1) if squares % n == 0)

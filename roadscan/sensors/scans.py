@@ -13,12 +13,14 @@ or ``time`` (integer or float)            or the stamp in the clock that the sur
 ``encoder_ticks`` (integer, optional)     wheel encoder
 ========================================  ==============================================================
 
-Other columns are ignored. Lists may be fixed-size or not. A capture program that has to keep up with a line-rate
-head writes Arrow IPC without compression, lists of fixed size without nulls, some hundred profiles a record batch:
-no byte of it is changed on the way to the disk, and it is read without a copy. Compressed IPC and Parquet are read
-as well, for logs that are to be kept or sent. The geometry of the readings
+Other columns are ignored. Lists may be fixed-size or not. The geometry of the readings
 (:class:`roadscan.points.readings.ScanGeometry`) stands as JSON in the file's schema metadata under
 ``roadscan.scan_geometry``, or in the log's options.
+
+A capture program that has to keep up with a line-rate head writes Arrow IPC without compression, lists of fixed
+size without nulls, some hundred profiles a record batch: no byte of it is changed on the way to the disk, and it
+is read without a copy (shorter batches cost one). Compressed IPC and Parquet are read as well, for logs that are to
+be kept or sent; reading them takes many times as long.
 """
 
 from __future__ import annotations
@@ -182,12 +184,9 @@ class _Arrow:
 
     def parts(self, rows: int) -> Iterator[tuple[int, pa.RecordBatch | _Lost]]:
         first, passed = 0, 0
-        for number in range(self._reader.num_record_batches):
-            try:
-                batch = self._reader.get_batch(number)
-                batch.validate(full=True)
-            except _UNREADABLE as error:
-                yield first, _Lost(f"record batch is damaged: {_brief(error)}", 1)
+        for batch in self._joined(rows):
+            if isinstance(batch, _Lost):
+                yield first, batch
                 continue
             for start in range(0, batch.num_rows, rows):
                 yield first + start, batch.slice(start, rows)
@@ -198,6 +197,31 @@ class _Arrow:
         unlisted = unlisted_batches(self._path, self._reader.num_record_batches)
         if unlisted:
             yield first, _Lost(unlisted_reason(unlisted), unlisted)
+
+    def _joined(self, rows: int) -> Iterator[pa.RecordBatch | _Lost]:
+        """Batches in their order; short ones are copied into one of at most `rows` rows: each costs some calls."""
+        short: list[pa.RecordBatch] = []
+        held = 0
+        for number in range(self._reader.num_record_batches):
+            batch = self._batch(number)
+            if short and (isinstance(batch, _Lost) or held + batch.num_rows > rows):
+                yield short[0] if len(short) == 1 else pa.concat_batches(short)
+                short, held = [], 0
+            if isinstance(batch, _Lost):
+                yield batch
+            else:
+                short.append(batch)
+                held += batch.num_rows
+        if short:
+            yield short[0] if len(short) == 1 else pa.concat_batches(short)
+
+    def _batch(self, number: int) -> pa.RecordBatch | _Lost:
+        try:
+            batch = self._reader.get_batch(number)
+            batch.validate(full=True)
+        except _UNREADABLE as error:
+            return _Lost(f"record batch is damaged: {_brief(error)}", 1)
+        return batch
 
 
 def _open(file: Path) -> _Table:

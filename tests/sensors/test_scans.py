@@ -14,7 +14,7 @@ import pytest
 
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
+from roadscan.sensors.base import LogSource, NoOptions, Rows, format_named, format_of
 from tests.sensors.readings import read, survive
 
 READINGS = 12
@@ -104,6 +104,54 @@ def test_chunks_stay_small_whatever_the_row_groups(tmp_path: Path) -> None:
         log = read("scans", tmp_path / name)  # checks the size of every chunk
         assert len(log.rows) > 1
         assert np.array_equal(log.table.column("range").combine_chunks().flatten().to_numpy(), wide.ravel())
+
+
+def test_short_batches_are_joined_and_a_damaged_one_costs_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrow"
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, profiles().schema) as writer:
+        writer.write_table(profiles(), 3)
+    data = path.read_bytes()
+    at = data.index(RANGES[30:33].tobytes())
+    message = data.rindex(b"\xff\xff\xff\xff", 0, at)  # where the eleventh batch begins
+    path.write_bytes(data[: message + 8] + bytes(16) + data[message + 24 :])
+    log = read("scans", path)
+    assert np.array_equal(log["epoch_gps_ns"], np.delete(EPOCHS, [30, 31, 32]))
+    assert [(r.record, r.records) for r in log.rejects] == [(30, 1)]
+    assert [len(part.batch) for part in log.rows] == [30, len(EPOCHS) - 33]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux states what a process holds")
+def test_a_long_log_is_passed_without_holding_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadscan.sensors.scans._CHUNK_BYTES", 1 << 20)
+    wide = np.arange(2000 * 4000, dtype=np.uint64).reshape(2000, 4000).astype(np.uint16)
+    geometry = GEOMETRY | {"readings": 4000}
+    write_arrow(
+        profiles(
+            geometry, range=fixed(wide), intensity=fixed(wide.astype(np.uint8)), epoch_gps_ns=np.arange(2000) + 10**18
+        ),
+        tmp_path / "long.arrow",
+    )
+    source = LogSource(tmp_path / "long.arrow", NoOptions())
+    scans = format_named("scans")
+    before, most, kept, first = _mapped_mb(), 0.0, [], 0
+    for item in scans.read(source, scans.header(source)):
+        assert isinstance(item, Rows)
+        kept.append(item.batch)
+        values = item.batch.column("range").flatten().to_numpy()
+        assert np.array_equal(values, wide[first : first + item.batch.num_rows].ravel())
+        first += item.batch.num_rows
+        assert item.batch.column("intensity").flatten().to_numpy().any()
+        most = max(most, _mapped_mb() - before)
+    assert first == 2000
+    assert most < 14, "24 MB are in the log, 8 MB are handed on before pages are given back"
+    again = pa.concat_arrays([batch.column("range").flatten() for batch in kept])
+    assert np.array_equal(again.to_numpy(), wide.ravel())  # what was given back is there again when asked for
+
+
+def _mapped_mb() -> float:
+    """Pages of files that this process holds (MB)."""
+    (line,) = (t for t in Path("/proc/self/status").read_text().splitlines() if t.startswith("RssFile"))
+    return int(line.split()[1]) * 1024 / 1e6
 
 
 # --- geometry ---------------------------------------------------------------------------------------

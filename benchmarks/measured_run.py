@@ -1,0 +1,127 @@
+"""Runs of a survey in fresh processes, each with a fresh store; their peak memory is watched from outside."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import psutil
+
+from benchmarks.surveys import BenchSurvey
+
+_EVERY_S = 0.05
+_WORKER_MARK = "multiprocessing.spawn"
+"""In the command line of Dask's workers."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Several runs of one survey with the same number of workers."""
+
+    survey: BenchSurvey
+    workers: int
+    figures: list[dict[str, Any]] = field(default_factory=list)
+    """One run each, as :mod:`benchmarks.pipeline` prints it, with `main_mb` and `worker_mb`."""
+
+    def wall_s(self, *stages: str) -> float:
+        """Median over the runs of the wall time of these stages together."""
+        return self._stages("wall_s", stages)
+
+    def cpu_s(self, *stages: str) -> float:
+        """Median over the runs of the processor time of these stages together, all processes."""
+        return self._stages("cpu_s", stages)
+
+    def tasks(self, *stages: str) -> float:
+        """Tasks handed to workers."""
+        return self._stages("tasks", stages)
+
+    def figure(self, name: str) -> float:
+        """Median over the runs of a figure of the whole run."""
+        return float(median(f[name] for f in self.figures))
+
+    def _stages(self, what: str, stages: tuple[str, ...]) -> float:
+        return float(median(sum(f["stages"][s][what] for s in stages) for f in self.figures))
+
+
+def measured_runs(survey: BenchSurvey, folder: Path, workers: int = 2, repeats: int = 5) -> Runs:
+    """Run a survey `repeats` times; stores are made below `folder` and removed."""
+    runs = Runs(survey, workers)
+    for _ in range(repeats):
+        store = folder / "store"
+        shutil.rmtree(store, ignore_errors=True)
+        try:
+            runs.figures.append(_one_run(survey, store, workers))
+        finally:
+            shutil.rmtree(store, ignore_errors=True)
+    return runs
+
+
+def _one_run(survey: BenchSurvey, store: Path, workers: int) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.pipeline", str(survey.file), str(store), str(workers)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        watch = _Watch(process.pid)
+        watch.start()
+        out, _ = process.communicate()
+        watch.stop()
+    if process.returncode:
+        raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}")
+    main_mb, worker_mb = watch.peaks_mb()
+    return json.loads(out.splitlines()[-1]) | {"main_mb": main_mb, "worker_mb": worker_mb}
+
+
+class _Watch(threading.Thread):
+    """Looks at a process and its children until it is stopped, and keeps the largest resident memory of each."""
+
+    def __init__(self, pid: int) -> None:
+        super().__init__(daemon=True)
+        self._pid = pid
+        self._over = threading.Event()
+        self._peak_bytes: dict[int, int] = {}
+        self._workers: set[int] = set()
+
+    def run(self) -> None:
+        """Sample."""
+        try:
+            top = psutil.Process(self._pid)
+            while not self._over.wait(_EVERY_S):
+                self._look(top)
+                for child in top.children(recursive=True):
+                    self._look(child)
+        except psutil.NoSuchProcess:
+            return
+
+    def stop(self) -> None:
+        """End it."""
+        self._over.set()
+        self.join()
+
+    def peaks_mb(self) -> tuple[float, float]:
+        """Peak of the first process, and of the worker that took most (MiB; of the first where there is none)."""
+        first = self._peak_bytes.get(self._pid, 0)
+        return first / 2**20, max((self._peak_bytes[p] for p in self._workers), default=first) / 2**20
+
+    def _look(self, process: psutil.Process) -> None:
+        try:
+            self._peak_bytes[process.pid] = max(self._peak_bytes.get(process.pid, 0), _peak_rss(process))
+            if process.pid != self._pid and _WORKER_MARK in " ".join(process.cmdline()):
+                self._workers.add(process.pid)
+        except (psutil.NoSuchProcess, psutil.ZombieProcess, psutil.AccessDenied):
+            return
+
+
+def _peak_rss(process: psutil.Process) -> int:
+    """High-water mark of resident memory (bytes) where the system keeps one, else what is resident now."""
+    try:
+        for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return int(process.memory_info().rss)

@@ -1,0 +1,110 @@
+"""A whole run of a benchmark's survey in a process of its own, as `roadscan run` does it; prints figures as JSON.
+
+``python -m benchmarks.pipeline SURVEY.toml STORE WORKERS [PRODUCT …]``; started by :mod:`benchmarks.measured_run`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import psutil
+
+from roadscan.jobs.compute import Compute, compute_on
+from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
+from roadscan.jobs.tiles import TILE
+from roadscan.model.strict import load_toml
+from roadscan.model.survey import Survey
+from roadscan.products.base import products
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.store import Store
+
+READING_TABLES = ("scans", "returns")
+WANTED = ("geotiff", "model_las")
+"""5 mm height, intensity and count; LAZ at 100 mm."""
+
+
+def main() -> None:
+    """Run all stages, one after another."""
+    survey = survey_with(Path(sys.argv[1]), sys.argv[4:] or list(WANTED))
+    store = Store(sys.argv[2], survey.config.id)
+    figures: dict[str, object] = {"products": survey.config.products.make}
+    stages: dict[str, dict[str, float]] = {}
+    with compute_on(int(sys.argv[3])) as compute:
+        started = time.perf_counter()
+        for _ in compute.map(_nothing, range(int(sys.argv[3]))):
+            pass
+        figures["start_s"] = time.perf_counter() - started
+        run = Run(survey, store, _Counted(compute))
+        with store.lock():
+            for stage in STAGES:
+                stages[stage.name] = _timed(run, stage)
+            close_run(run)
+    print(json.dumps(figures | {"stages": stages} | _stored(store)))
+
+
+def survey_with(file: Path, wanted: list[str]) -> Survey:
+    """The survey, making those of the wanted products that there are."""
+    made = [name for name in wanted if name in products()]
+    values = load_toml(file)
+    return Survey.parse(values | {"products": {"make": made}}, folder=file.resolve().parent, file=file)
+
+
+class _Counted:
+    """Compute that counts its tasks."""
+
+    def __init__(self, compute: Compute) -> None:
+        self._compute = compute
+        self.tasks = 0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._compute, name)
+
+    def map(self, function, tasks):  # type: ignore[no-untyped-def]
+        """As the compute underneath."""
+        self.tasks += len(tasks)
+        return self._compute.map(function, tasks)
+
+
+def _nothing(number: int) -> int:
+    return number
+
+
+def _timed(run: Run, stage: Stage) -> dict[str, float]:
+    """Wall and processor seconds of a stage, and its tasks."""
+    counted = run.compute
+    tasks, cpu, started = counted.tasks, _cpu_s(), time.perf_counter()  # type: ignore[attr-defined]
+    run_stage(run, stage)
+    return {
+        "wall_s": time.perf_counter() - started,
+        "cpu_s": _cpu_s() - cpu,
+        "tasks": counted.tasks - tasks,  # type: ignore[attr-defined]
+    }
+
+
+def _cpu_s() -> float:
+    """Processor seconds so far of this process and its workers."""
+    me = psutil.Process()
+    times = [p.cpu_times() for p in (me, *me.children(recursive=True))]
+    return sum(t.user + t.system for t in times)
+
+
+def _stored(store: Store) -> dict[str, float]:
+    """Bytes of the tables of readings and of everything written, readings placed, tiles and cells."""
+    files = [f for r in read_log_records(store) for t in READING_TABLES for f in r.tables.get(t, ())]
+    records = Manifest(store).all()
+    tiles = [r.figures() for r in records if r.product == TILE and r.path]
+    return {
+        "reading_bytes": sum(f.bytes for f in files),
+        "tile_bytes": sum(r.bytes for r in records if r.path),
+        "tiles": len(tiles),
+        "placed": sum(t["points"] for t in tiles),
+        "cells": sum(t["cells"] for t in tiles),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""Sizes of the benchmarks of whole runs; ``--set NAME=VALUE`` on the command line changes one."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+VARIABLE = "ROADSCAN_BENCH_SETTINGS"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How large the surveys are and how often they run."""
+
+    pair_m: float = 250.0
+    """Length of the pair's drive (m): 4 million readings and 12 MB of raw log a metre."""
+    hdl_s: float = 60.0
+    """Duration of the HDL-32E's drive (s)."""
+    sick_s: float = 3600.0
+    """Duration of the SICK's drive (s)."""
+    repeats: int = 5
+    """Runs of each survey, of which the median counts; one more before them is not counted."""
+    workers: int = 2
+    sample_m: float = 5.0
+    """Part of the pair's drive that is done with NumPy, too (m); it needs about 2 GB for each 5 m."""
+    las_points: int = 20_000_000
+    """Points that are gridded by roadscan, NumPy and PDAL."""
+    scaling_spacing_mm: float = 100.0
+    """From profile to profile of the drives whose length grows."""
+    scaling_km: str = "1,2,4,8"
+    """Their lengths."""
+
+    @classmethod
+    def current(cls) -> Settings:
+        """The defaults, and what the environment changes."""
+        stated = dict(pair.split("=", 1) for pair in os.environ.get(VARIABLE, "").split())
+        kinds = {f.name: type(f.default) for f in fields(cls)}
+        unknown = set(stated) - set(kinds)
+        if unknown:
+            raise SystemExit(f"no setting {', '.join(sorted(unknown))}; there are {', '.join(kinds)}")
+        return cls(**{name: kinds[name](value) for name, value in stated.items()})
+
+
+def bench_folder(scratch: Path) -> Path:
+    """Where surveys are kept from run to run: `ROADSCAN_BENCH`, else the scratch folder of this run."""
+    kept = os.environ.get("ROADSCAN_BENCH")
+    folder = Path(kept) if kept else scratch
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -237,6 +237,13 @@ def _tar_without_magic(path: Path) -> bool:
         return False
 
 
+def _is_of(table: str, names: list[str]) -> bool:
+    """True if a file with columns of these `names` has all of a table, or all that is always there and no other."""
+    columns = table_schema(table).columns
+    whole, needed = {c.name for c in columns}, {c.name for c in columns if not c.nullable}
+    return whole <= set(names) or needed <= set(names) <= whole
+
+
 def _table(path: Path, words: str) -> FileKind:
     if "Parquet" in words:
         import pyarrow.parquet as pq
@@ -247,7 +254,7 @@ def _table(path: Path, words: str) -> FileKind:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
         schema, rows = reader.schema, None
     names = list(schema.names)
-    own = next((n for n in schema_names() if {c.name for c in table_schema(n).columns} <= set(names)), "")
+    own = next((n for n in schema_names() if _is_of(n, names)), "")
     details = {
         "rows": f"{rows:,}" if rows is not None else "",
         "columns": ", ".join(f"{f.name} ({f.type})" for f in list(schema)[:40]),

@@ -174,15 +174,6 @@ def compression() -> str:
     return "ZSTD"
 
 
-@contextlib.contextmanager
-def memory_raster(box: CellBox, bands: Sequence[Band], context: ProductContext) -> Iterator[Any]:
-    """A float32 raster in memory, NaN where empty, to be filled and handed to `write_cog`."""
-    profile = _profile(box.width, box.height, len(bands), "float32", np.nan) | {"driver": "MEM"}
-    with rasterio.open("memory", "w+", **profile, **_place(box, context)) as raster:
-        _describe(raster, bands, context)
-        yield raster
-
-
 @dataclass(frozen=True)
 class SparseRaster:
     """What a one-band raster is to be, before it has pixels."""

@@ -55,9 +55,10 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
         found = store.files(folder, ".parquet")
         if found:
             _view(connection, name, [_url(store, f) for f in found], hive=False)
-    cells = store.files("tiles/cells", ".parquet")
-    if cells:
-        _view(connection, "cells", [_url(store, f) for f in cells], hive=False, filename=True)
+    for name in ("cells", "overviews"):
+        found = store.files(f"tiles/{name}", ".parquet")
+        if found:
+            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=True)
     tiles = store.files("products/tile_table", ".parquet")
     if tiles:
         _view(connection, "tiles", [_url(store, f) for f in tiles], hive=False)

@@ -83,15 +83,15 @@ def test_geotiff_counts_the_points_of_the_las(place: Place, kitti: Path) -> None
     las = laspy.read(folder / "las" / "2_1.laz")
     with rasterio.open(folder / "geotiff" / "2_1.tif") as raster:
         assert raster.bounds == (20, 10, 30, 20)
-        assert raster.descriptions == ("height", "intensity", "count", "height standard deviation")
-        height, _, count, _ = raster.read()
+        assert raster.descriptions == ("height", "intensity", "count")
+        height, _, count = raster.read()
     column, row = (np.floor(np.asarray(v) / 0.2).astype(int) for v in (las.x, las.y))
     expected = np.zeros((50, 50))
     np.add.at(expected, (99 - row, column - 100), 1)
     # A point on the edge of a cell is rounded to 0.1 mm in the LAS file, to 0.01 mm in the cells.
     assert np.abs(expected - np.nan_to_num(count)).sum() < 0.002 * len(las)
     assert np.nansum(count) == len(las) > 50_000
-    assert np.nanmax(height) <= las.z.max()
+    assert np.nanmax(height) <= las.z.max() + 1e-4
     assert np.nanmin(height) >= las.z.min() - 1e-4
 
 

@@ -1,0 +1,227 @@
+"""Cells of the tiles that are being worked on: readings go in, finished tiles come out, memory is used again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.accumulate import LANES, SLOTS
+from roadscan.kernels.cells import AT_ONCE, count_cells, finish_cells
+from roadscan.model.errors import RoadscanError
+from roadscan.model.ids import TileId
+from roadscan.points.cloud import QUANTUM_M
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import TileGrid
+
+ROBUST_FLOOR_QUANTA: Final = 100
+"""Heights within 1 mm of the median always count."""
+
+_FIRST_ELEMENTS: Final = 4096
+_NEVER: Final = np.array([2**62, -(2**62)])
+
+
+@dataclass(frozen=True)
+class TileEvidence:
+    """When and how well the readings of a tile were placed."""
+
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+    sigma_horizontal_m: float
+    """Largest 1 σ of the poses; NaN where a trajectory does not state it."""
+    sigma_down_m: float
+
+
+class Pool:
+    """Elements that hold the heights of cells (``kernels.accumulate``); it grows, and is never given back."""
+
+    def __init__(self, words: int) -> None:
+        self.words = words
+        self.held = np.zeros(1, np.int64)
+        self._make(_FIRST_ELEMENTS)
+
+    @property
+    def size(self) -> int:
+        """Elements there are."""
+        return int(self.free.size)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the elements."""
+        return sum(a.nbytes for a in self.arrays)
+
+    @property
+    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """slots, bases, chain, filled, light, marks, free, held, as the kernels take them."""
+        return self.slots, self.bases, self.chain, self.filled, self.light, self.marks, self.free, self.held
+
+    def make_room(self, elements: int, most_bytes: int) -> bool:
+        """Grow until so many elements are free; False where that would take more than `most_bytes`."""
+        needed = int(self.held[0]) + elements
+        if needed <= self.size:
+            return True
+        size = max(needed, self.size * 3 // 2)
+        each = self.bytes // self.size
+        if size * each > most_bytes:
+            size = most_bytes // each
+        if size < needed:
+            return False
+        old = self.arrays[:-1]
+        before = self.size
+        self._make(size)
+        for new, kept in zip(self.arrays[:-2], old[:-1], strict=True):
+            new[:before] = kept
+        self.free[:before] = old[-1]
+        return True
+
+    def clear(self) -> None:
+        """Take all elements back."""
+        self.filled[:] = 0
+        self.light[:] = 0
+        self.marks[:] = 0
+        self.held[0] = 0
+        self.free[:] = np.arange(self.size, dtype=np.int32)
+
+    def _make(self, size: int) -> None:
+        self.slots = _aligned((size, LANES, SLOTS), np.int16)
+        self.bases = np.zeros(size, np.int32)
+        self.chain = np.zeros(size, np.int32)
+        self.filled = np.zeros((size, LANES), np.uint8)
+        self.light = np.zeros((size, LANES), np.uint32)
+        self.marks = np.zeros((size, LANES, self.words), np.uint8)
+        self.free = np.arange(size, dtype=np.int32)
+
+
+def _aligned(shape: tuple[int, ...], kind: type[np.generic]) -> npt.NDArray[Any]:
+    """An array that starts with a line of the cache; memory that is never written takes none."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    raw = np.empty(size + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + size].view(kind).reshape(shape)
+
+
+class Accumulator:
+    """Counts readings into the cells of the tiles that are active.
+
+    Tiles are activated before readings of theirs come, and finished once all have; what falls outside the active
+    tiles is not counted. A finished tile does not depend on the order of the readings, nor on what else was active.
+    """
+
+    def __init__(
+        self, grid: TileGrid, tiles: Sequence[TileId], passes: Sequence[int], most_bytes: int = 1 << 30
+    ) -> None:
+        """`tiles` that may become active, `passes` that readings may belong to, memory that cells may take."""
+        self.grid = grid
+        self.passes = np.array(sorted(set(passes)), np.uint16)
+        self._most_bytes = most_bytes
+        columns, rows = [t.column for t in tiles], [t.row for t in tiles]
+        self._west, self._south = min(columns), min(rows)
+        self.tile_rows = np.full((max(rows) + 1 - self._south, max(columns) + 1 - self._west), -1, np.int32)
+        self._pool = Pool(max(1, -(-self.passes.size // 8)))
+        self._unused: list[int] = []
+        self._groups = np.empty((0, self._groups_per_tile), np.int32)
+        self._spans = np.empty((0, 2), np.int64)
+        self._sigmas = np.empty((0, 2), np.float64)
+        self._heights = np.empty((AT_ONCE, LANES), np.int32)
+
+    @property
+    def corner_quanta(self) -> tuple[int, int]:
+        """South-west corner of the box of all tiles."""
+        return self._west * self.grid.size_quanta, self._south * self.grid.size_quanta
+
+    @property
+    def _groups_per_tile(self) -> int:
+        edge = self.grid.cells_per_edge
+        return edge * -(-edge // LANES)
+
+    def activate(self, tiles: Sequence[TileId]) -> None:
+        """Count readings of these tiles from now on."""
+        for tile in tiles:
+            if self._row(tile) >= 0:
+                continue
+            if not self._unused:
+                self._add_rows(max(4, len(self._groups)))
+            row = self._unused.pop()
+            self.tile_rows[tile.row - self._south, tile.column - self._west] = row
+            self._spans[row], self._sigmas[row] = _NEVER, -1.0
+
+    def is_active(self, tile: TileId) -> bool:
+        """True between :meth:`activate` and :meth:`finish`."""
+        return self._row(tile) >= 0
+
+    def run(self, kernel: Callable[..., int], items: int, elements: int) -> None:
+        """Call `kernel` with the pool and the item to begin with until it has done all items.
+
+        The kernel stops before an item for which the pool is short of `elements`; the pool is then made larger.
+        """
+        done = 0
+        while True:
+            done = kernel(self.tile_rows, self._groups, self._pool.arrays, self._spans, self._sigmas, done)
+            if done >= items:
+                return
+            if not self._pool.make_room(elements, self._most_bytes):
+                raise PoolExhaustedError(f"the cells of the tiles in work take more than {self._most_bytes >> 20} MB")
+
+    def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
+        """Cells of a tile, which becomes inactive; None where no reading fell into it."""
+        row = self._row(tile)
+        self.tile_rows[tile.row - self._south, tile.column - self._west] = -1
+        self._unused.append(row)
+        groups, pool = self._groups[row], self._pool
+        count, most = count_cells(groups, pool.chain, pool.filled)
+        if count == 0:
+            return None
+        cells = self._cells(tile, groups, count, most)
+        (first, last), (horizontal, down) = self._spans[row].tolist(), self._sigmas[row].tolist()
+        return cells, TileEvidence(first, last, horizontal, down)
+
+    def drop(self) -> None:
+        """Forget all active tiles."""
+        self._groups[:] = -1
+        self.tile_rows[:] = -1
+        self._unused = list(range(len(self._groups)))
+        self._pool.clear()
+
+    def _row(self, tile: TileId) -> int:
+        return int(self.tile_rows[tile.row - self._south, tile.column - self._west])
+
+    def _add_rows(self, more: int) -> None:
+        before = len(self._groups)
+        self._groups = np.concatenate([self._groups, np.full((more, self._groups_per_tile), -1, np.int32)])
+        self._spans = np.concatenate([self._spans, np.zeros((more, 2), np.int64)])
+        self._sigmas = np.concatenate([self._sigmas, np.zeros((more, 2))])
+        self._unused += range(before, before + more)
+
+    def _cells(self, tile: TileId, groups: npt.NDArray[np.int32], c: int, most: int) -> TileCells:
+        pool, edge = self._pool, self.grid.cells_per_edge
+        work = np.empty(most, np.int64)
+        column, row, count = np.empty(c, np.uint16), np.empty(c, np.uint16), np.empty(c, np.uint32)
+        mean, robust, low, high, deviation, bright = np.empty((6, c))
+        offsets, ids = np.empty(c + 1, np.int32), np.empty(c * self.passes.size, np.uint16)
+        written = finish_cells(
+            groups, edge, *pool.arrays, ROBUST_FLOOR_QUANTA, self.passes, self._heights, work,
+            column, row, count, mean, robust, low, high, deviation, bright, offsets, ids,
+        )  # fmt: skip
+        return TileCells(
+            tile=tile,
+            cells_per_edge=edge,
+            column=column,
+            row=row,
+            count=count,
+            height_mean_m=mean * QUANTUM_M,
+            height_robust_m=robust * QUANTUM_M,
+            height_min_m=low * QUANTUM_M,
+            height_max_m=high * QUANTUM_M,
+            height_std_m=(deviation * QUANTUM_M).astype(np.float32),
+            intensity_mean=bright.astype(np.float32),
+            pass_count=np.diff(offsets).astype(np.uint16),
+            pass_offsets=offsets,
+            pass_ids=ids[:written].copy(),
+        )
+
+
+class PoolExhaustedError(RoadscanError):
+    """The tiles in work hold more readings than memory allows: work on fewer of them at a time."""

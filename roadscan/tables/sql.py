@@ -23,9 +23,9 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
-    ``tiles``, ``cells``, ``footprints`` and ``outputs`` are there once a run has made them, ``clocks``, ``mountings``
-    and ``corrections`` once they were estimated. `logs` are the keys of the
-    logs to show, all in the store where left out.
+    ``tiles``, ``cells``, ``overviews``, ``footprints`` and ``outputs`` are there once a run has made them,
+    ``clocks``, ``mountings`` and ``corrections`` once they were estimated. `logs` are the keys of the logs to
+    show, all in the store where left out.
     """
     connection = duckdb.connect()
     if not store.is_folder:
@@ -55,13 +55,11 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
         found = store.files(folder, ".parquet")
         if found:
             _view(connection, name, [_url(store, f) for f in found], hive=False)
-    for name in ("cells", "overviews"):
-        found = store.files(f"tiles/{name}", ".parquet")
+    places = {"cells": "tiles/cells", "overviews": "tiles/overviews", "tiles": "products/tile_table"}
+    for name, folder in places.items():
+        found = store.files(folder, ".parquet")
         if found:
-            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=True)
-    tiles = store.files("products/tile_table", ".parquet")
-    if tiles:
-        _view(connection, "tiles", [_url(store, f) for f in tiles], hive=False)
+            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=name != "tiles")
     return connection
 
 

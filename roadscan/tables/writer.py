@@ -15,6 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.tables.derived import with_derived
+from roadscan.tables.list_table import is_list_table, write_list_table
 from roadscan.tables.logs import DataFile, log_folder
 from roadscan.tables.merge import merged
 from roadscan.tables.schema import TableSchema, table_schema
@@ -55,6 +57,7 @@ class LogWriter:
             for bad, _ in faults:
                 good[bad] = False
             rows = rows.filter(pa.array(good))
+        rows = with_derived(schema, rows)
         for start, part in _by_bin(schema, rows):
             held = self._bins[(table, start)]
             held.batches.append(part)
@@ -133,6 +136,9 @@ class LogWriter:
 
 def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     """Write rows in the encodings that measured best for their kind; same rows, same bytes."""
+    if is_list_table(rows.schema):
+        write_list_table(path, rows, schema.row_group_rows)
+        return
     encodings: dict[str, str] = {}
     strings: list[str] = []
     for column in schema.columns:

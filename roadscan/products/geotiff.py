@@ -151,7 +151,7 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool) -> Page:
 def _compressor() -> Callable[[Any], Any]:
     if raster.compression() == "ZSTD":
         codec = pa.Codec("zstd", compression_level=1)
-        return lambda block: codec.compress(block).slice(0)  # a new view: the buffer's own keeps the size it began with
+        return lambda block: codec.compress(block).to_pybytes()  # the codec's buffer is as large as the block
     return lambda block: zlib.compress(block, 6)
 
 

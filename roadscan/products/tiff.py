@@ -7,7 +7,6 @@ nothing is left out (offset and size 0), as GDAL reads sparse files.
 
 from __future__ import annotations
 
-import hashlib
 import re
 import struct
 from collections.abc import Iterable, Sequence
@@ -15,10 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from blake3 import blake3
+
 from roadscan.model.errors import StoreError
 
-DIGEST_ITEM: Final = "ROADSCAN_FILE_BLAKE2B"
-"""Metadata item with the BLAKE2b digest (128 bits, hexadecimal) of the whole file, this digest's characters as 0."""
+DIGEST_ITEM: Final = "ROADSCAN_FILE_BLAKE3"
+"""Metadata item with the BLAKE3 digest (128 bits, hexadecimal) of the whole file, this digest's characters as 0."""
 
 _NO_DIGEST: Final = b"0" * 32
 _DIGEST: Final = re.compile(rb'<Item name="' + DIGEST_ITEM.encode() + rb'">([0-9a-f]{32})</Item>')
@@ -140,7 +141,7 @@ def _directory(tags: Sequence[Tag], start: int, following: int, big: bool) -> by
 
 
 def _digest(parts: Iterable[Any]) -> bytes:
-    digest = hashlib.blake2b(digest_size=16)
+    digest = blake3()
     for part in parts:
         digest.update(part)
-    return digest.hexdigest().encode()
+    return digest.hexdigest(length=16).encode()

@@ -90,6 +90,7 @@ def test_little_memory_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.M
     survey = survey_of(tmp_path, 1)
     whole, _ = ingested(survey, "whole", None)
     monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 2000)
+    monkeypatch.setattr("roadscan.sensors.scans._CHUNK_BYTES", 2000)
     pieces, _ = ingested(survey, "pieces", None)
     assert len(whole.files("tables")) == 3 < len(pieces.files("tables"))
     one, other = (

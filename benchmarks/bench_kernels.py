@@ -13,18 +13,21 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Figure, best_seconds
+from roadscan.kernels.georeference import FATES
+from roadscan.kernels.placing import CHUNK, place_returns
 from roadscan.model.crs import MapFrame, world_from_geodetic
 from roadscan.model.ids import TileId
-from roadscan.model.rig import Sensor
+from roadscan.model.rig import Mountings, Sensor
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import charts_along
-from roadscan.points.cloud import TilePoints
+from roadscan.points.cloud import QUANTA_PER_M, TilePoints
 from roadscan.points.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.points.readings import ScanGeometry
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 
 N = 4_000_000
+HDL_32E_PER_S = 700_000
 
 
 def figures(_: Path) -> Iterator[Figure]:
@@ -44,7 +47,8 @@ def figures(_: Path) -> Iterator[Figure]:
     world = path.poses(few).position_world_m
     proj = rate(few.size, lambda: to_map.transform(*world.T))
     placement = placed_by(path)
-    batch = returns(epochs, rng)
+    first = path.span_gps_ns[0]
+    batch = returns(np.sort(rng.integers(first, first + int(N / HDL_32E_PER_S * 1e9), N)), rng)
     yield Figure(
         "lidar returns → points (pose, mounting, map)",
         rate(N, lambda: placement.returns(batch, EVERYWHERE)),
@@ -57,6 +61,23 @@ def figures(_: Path) -> Iterator[Figure]:
     yield Figure(
         "profiler readings → points",
         rate(count, lambda: placement.profiles(scans, geometry, EVERYWHERE)),
+        "M/s",
+        proj,
+        "PROJ, the map step alone",
+    )
+    mirror, turning = mirror_profiles(path)
+    count = mirror.num_rows * turning.readings
+    yield Figure(
+        "turning mirror's readings, a pose each → points",
+        rate(count, lambda: placement.profiles(mirror, turning, EVERYWHERE)),
+        "M/s",
+        proj,
+        "PROJ, the map step alone",
+    )
+    work = np.empty((3, CHUNK)), np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32), np.zeros(FATES, np.int64)
+    yield Figure(
+        "lidar returns, placed only (no rows written)",
+        rate(N, lambda: placed_only(placement, batch, *work)),
         "M/s",
         proj,
         "PROJ, the map step alone",
@@ -96,7 +117,7 @@ def placed_by(path: Trajectory) -> Placement:
     frame = MapFrame(crs="EPSG:32632")
     sensor = Sensor(kind="lidar", lever_arm_body_m=(0.3, 0.1, -1.5))
     charts = charts_along(frame, path.world, path.position_world_m)
-    return Placement(path, charts, sensor.mounting(), 0.0, np.inf, HeightLimits(), 1_000_000)
+    return Placement(path, charts, Mountings.one(sensor.mounting()), 0.0, np.inf, HeightLimits(), 1_000_000)
 
 
 def returns(epochs: np.ndarray, rng: np.random.Generator) -> pa.RecordBatch:
@@ -117,6 +138,38 @@ def profiles(path: Trajectory) -> tuple[pa.RecordBatch, ScanGeometry]:
     ]
     epochs = np.linspace(*path.span_gps_ns, rows).astype(np.int64)
     return pa.RecordBatch.from_pydict({"epoch_gps_ns": epochs, "range": lists[0], "intensity": lists[1]}), geometry
+
+
+def mirror_profiles(path: Trajectory) -> tuple[pa.RecordBatch, ScanGeometry]:
+    """A SICK LMS at 75 Hz, 181 readings over half a turn."""
+    geometry = ScanGeometry(
+        kind="polar", readings=181, first=-np.pi / 2, step=np.pi / 180, range_step_m=0.001,
+        reading_period_ns=1e9 / 75 / 360,
+    )  # fmt: skip
+    first, last = path.span_gps_ns
+    epochs = np.arange(first, last, 1e9 / 75).astype(np.int64)[:20_000]
+    ranges = np.random.default_rng(2).integers(1000, 30_000, epochs.size * geometry.readings).astype(np.uint16)
+    lists = [
+        pa.FixedSizeListArray.from_arrays(pa.array(v), geometry.readings) for v in (ranges, ranges.astype(np.uint8))
+    ]
+    return pa.RecordBatch.from_pydict({"epoch_gps_ns": epochs, "range": lists[0], "intensity": lists[1]}), geometry
+
+
+def placed_only(
+    placement: Placement,
+    batch: pa.RecordBatch,
+    enh: np.ndarray,
+    classes: np.ndarray,
+    found: np.ndarray,
+    fates: np.ndarray,
+) -> None:
+    """What every way from returns to points or cells begins with."""
+    columns = [batch.column(c).to_numpy() for c in ("pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m")]
+    ((_, mounting),) = placement.mountings.pieces(columns[0])
+    common = (*placement.poses(mounting), placement.limits, float(QUANTA_PER_M))
+    for start in range(0, columns[0].size, CHUNK):
+        end = min(start + CHUNK, columns[0].size)
+        place_returns(start, end, *columns, *common, *enh, classes, found, fates)
 
 
 def tile(rng: np.random.Generator) -> TilePoints:

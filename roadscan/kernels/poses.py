@@ -163,13 +163,16 @@ def _interval(dt, k, positions, quaternions, velocity, rate, out):
 
 @inlined
 def find_interval(epoch, epochs, k):
-    """Interval that holds `epoch`, searched from interval `k` on; −1 outside the knots."""
+    """Interval that holds `epoch`, searched from interval `k` on; −1 outside the knots.
+
+    An interval holds its first knot, the last one both of its knots, whatever `k` is.
+    """
     n = epochs.size
     if n < 2 or epoch < epochs[0] or epoch > epochs[n - 1]:
         found = -1
     else:
         found = min(max(k, 0), n - 2)
-        if epoch < epochs[found] or epoch > epochs[min(found + 2, n - 1)]:
+        if epoch < epochs[found] or epoch >= epochs[min(found + 2, n - 1)]:
             found = min(np.searchsorted(epochs, epoch, side="right") - 1, n - 2)
         elif epoch >= epochs[found + 1] and found < n - 2:
             found += 1

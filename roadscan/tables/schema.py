@@ -43,6 +43,8 @@ class Column:
     min: float | None = None
     max: float | None = None
     values: tuple[str, ...] = ()
+    encoding: str = ""
+    """Parquet encoding, where another than the usual one of its type measured better."""
 
     @property
     def is_list(self) -> bool:
@@ -72,6 +74,8 @@ class TableSchema:
     row_group_rows: int
     partition_s: int | None = None
     """Length of a partition of GPS time (s); None for tables that are not partitioned."""
+    compression: str = "zstd"
+    """Parquet codec of all columns."""
 
     def arrow(self, list_size: int | None = None) -> pa.Schema:
         """Arrow schema, with unit, frame and meaning as field metadata."""
@@ -188,4 +192,5 @@ def table_schema(name: str) -> TableSchema:
         sort=tuple(raw["sort"]),
         row_group_rows=raw["row_group_rows"],
         partition_s=raw.get("partition_s"),
+        compression=raw.get("compression", "zstd"),
     )

@@ -146,6 +146,8 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
         kind = column.type[5:-1] if column.is_list else column.type
         if kind == "string":
             strings.append(leaf)
+        elif column.encoding:
+            encodings[leaf] = column.encoding
         elif kind.startswith("float"):
             encodings[leaf] = "BYTE_STREAM_SPLIT"
         elif kind != "uint8" and not column.variable:
@@ -154,8 +156,8 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
         rows,
         path,
         row_group_size=schema.row_group_rows,
-        compression="zstd",
-        compression_level=1,
+        compression=schema.compression,
+        compression_level=1 if schema.compression == "zstd" else None,
         use_dictionary=strings,
         column_encoding=encodings,
         write_statistics=[c.name for c in schema.columns if not c.is_list],

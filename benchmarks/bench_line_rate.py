@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks import same_grid, surveys
 from benchmarks.by_hand import by_hand
 from benchmarks.measured_run import Runs, measured_runs
-from benchmarks.roofline import triad_bytes_per_s
+from benchmarks.roofline import roofline, triad_bytes_per_s
 from benchmarks.settings import Settings, bench_folder
 from benchmarks.timing import Figure
 
@@ -59,6 +59,7 @@ def of_runs(runs: Runs) -> Iterator[Figure]:
     yield Figure(f"{name}: start of {runs.workers} workers, once a run", runs.figure("start_s"), "s")
     per_reading = 1e9 * runs.cpu_s(*END_TO_END) / survey.readings
     yield Figure(f"{name}: processor time end to end", per_reading, "ns/reading")
+    yield _stage_roofline(runs)
     raw = survey.raw_bytes / survey.readings
     yield Figure(f"{name}: stored", runs.figure("reading_bytes") / survey.readings, "B/reading", raw, "raw logs")
     yield Figure(f"{name}: tiles and products", runs.figure("tile_bytes") / runs.figure("cells"), "B/cell")
@@ -69,6 +70,17 @@ def of_runs(runs: Runs) -> Iterator[Figure]:
 def rate(runs: Runs, *stages: str) -> float:
     """Million readings a second."""
     return runs.survey.readings / runs.wall_s(*stages) / 1e6
+
+
+def _stage_roofline(runs: Runs) -> Figure:
+    """The tiles stage against memory: bytes that it cannot do without, reading and decoding the raw readings.
+
+    They are read as they are stored, written decoded (3 bytes: range and intensity), and read again.
+    """
+    stored = runs.figure("reading_bytes") / runs.survey.readings
+    line = roofline(stored + 2 * 3, 1e6 * rate(runs, "tiles"), runs.workers)
+    limit, what = line.limit_readings_per_s / 1e6, f"{_NAMES[runs.survey.name]}: tiles against memory"
+    return Figure(what, line.readings_per_s / 1e6, "M/s", limit, line.line())
 
 
 def _by_hand(folder: Path, survey: surveys.BenchSurvey, here: float | None) -> Iterator[Figure]:

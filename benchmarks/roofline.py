@@ -48,7 +48,7 @@ class Roofline:
     def line(self) -> str:
         """One line for a table."""
         return (
-            f"{self.bytes_per_reading:g} bytes a reading of {self.bandwidth_bytes_per_s / 1e9:.1f} GB/s (triad) allow "
+            f"{self.bytes_per_reading:.3g} bytes a reading of {self.bandwidth_bytes_per_s / 1e9:.1f} GB/s (triad) allow "
             f"{self.limit_readings_per_s / 1e6:,.0f} M readings/s"
         )
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
@@ -14,7 +15,7 @@ import psutil
 
 from roadscan.jobs.compute import Compute, compute_on
 from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
-from roadscan.jobs.tiles import TILE
+from roadscan.jobs.tile_plan import TILE
 from roadscan.model.strict import load_toml
 from roadscan.model.survey import Survey
 from roadscan.products.base import products
@@ -35,7 +36,7 @@ def main() -> None:
     stages: dict[str, dict[str, float]] = {}
     with compute_on(int(sys.argv[3])) as compute:
         started = time.perf_counter()
-        for _ in compute.map(_nothing, range(int(sys.argv[3]))):
+        for _ in compute.map(_imports, range(int(sys.argv[3]))):
             pass
         figures["start_s"] = time.perf_counter() - started
         run = Run(survey, store, _Counted(compute))
@@ -69,8 +70,9 @@ class _Counted:
         return self._compute.map(function, tasks)
 
 
-def _nothing(number: int) -> int:
-    return number
+def _imports(_: int) -> None:
+    """What every worker does once, before its first task."""
+    importlib.import_module("roadscan.jobs.stages")
 
 
 def _timed(run: Run, stage: Stage) -> dict[str, float]:

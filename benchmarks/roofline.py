@@ -48,8 +48,8 @@ class Roofline:
     def line(self) -> str:
         """One line for a table."""
         return (
-            f"{self.bytes_per_reading:.3g} bytes a reading of {self.bandwidth_bytes_per_s / 1e9:.1f} GB/s (triad) allow "
-            f"{self.limit_readings_per_s / 1e6:,.0f} M readings/s"
+            f"{self.bytes_per_reading:.3g} bytes a reading of {self.bandwidth_bytes_per_s / 1e9:.1f} GB/s (triad) "
+            f"allow {self.limit_readings_per_s / 1e6:,.0f} M readings/s"
         )
 
 

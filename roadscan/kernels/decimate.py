@@ -12,8 +12,8 @@ from roadscan.kernels.options import inlined, kernel
 
 ABSENT = np.int32(2**31 - 1)
 """Height of a place without a cell."""
-HIGHEST_UM = 2.0**29
-"""Heights are cut off here, 537 m above a tile's lowest, so that no difference overflows."""
+FARTHEST_UM = 2.0**28
+"""Heights are cut off here, 268 m above and below the base, so that no difference overflows."""
 LIGHT_STEPS = 64.0
 """Intensities are summed in sixty-fourths of a digital number."""
 LANES = 16
@@ -107,7 +107,7 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, he
     ----------
     column, row : (n,) uint16, sorted by row, column; height : (n,) float64, m; intensity : (n,) float32;
         count : (n,) uint32.
-    base : float64, m; not above the lowest height.
+    base : float64, m, near most of the heights.
     first_row : int, row of the strip's south.
     heights : (rows, edge) int32, µm above `base`, `ABSENT` where no cell lies; lights : int32, sixty-fourths of a
         digital number; counts : int32. Out; lights and counts mean nothing where no cell lies.
@@ -128,7 +128,8 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, he
         first, last = min(first, np.int64(column[i])), max(last, np.int64(column[i]) + run - 1)
         at = (np.int64(row[i]) - first_row) * edge + column[i]
         for k in range(run):
-            flat_heights[at + k] = np.int32(min((height[i + k] - base) * 1e6 + 0.5, HIGHEST_UM))
+            above = np.floor((height[i + k] - base) * 1e6 + 0.5)
+            flat_heights[at + k] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
         for k in range(run):
             flat_lights[at + k] = np.int32(intensity[i + k] * LIGHT_STEPS + 0.5)
         for k in range(run):

@@ -73,7 +73,7 @@ def write_bmp(path: Path, grey: Grey, pixel_m: float) -> None:
 
 def world_file(transform: Affine) -> str:
     """Six lines that place a picture: pixel size, rotations, and the centre of the north-west pixel."""
-    x, y = transform * (0.5, 0.5)
+    x, y = transform.c + (transform.a + transform.b) / 2, transform.f + (transform.d + transform.e) / 2
     return "".join(f"{v!r}\n" for v in (transform.a, transform.d, transform.b, transform.e, x, y))
 
 

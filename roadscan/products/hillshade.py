@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,14 +112,8 @@ class Hillshade(SurveyProduct):
         elif output.name == _PICTURE:
             _write_picture(sorted(output.tiles), load_cells, settings, context, path)
         elif sheet is not None:
-            base_m = base_below(tiles, output)
-
-            def heights_of(tile: TileId) -> Float64:
-                cells = cells_of(tile, load_cells)
-                return cell_image(cells, cells.height_robust_m - base_m, "float64")
-
-            surface = Surface(output.tiles, heights_of)
-            write_shaded_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
+            surface = Surface(output.tiles, base_below(tiles, output), load_cells)
+            _write_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
         else:
             raise unknown_output(output)
 
@@ -138,13 +132,14 @@ class Surface:
     """Tiles whose heights are drawn, counted from a base near them to keep float arithmetic fine."""
 
     tiles: Sequence[TileId]
-    heights_of: Callable[[TileId], Float64]
-    """Gives a tile's (rows, columns) heights above the base (m), north up, NaN where no point lies."""
+    base_m: float
+    load_cells: LoadCells
 
     def images(self) -> Iterator[tuple[TileId, Float64]]:
-        """Tile and its heights, row by row."""
+        """Tile and its (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
         for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
-            yield tile, self.heights_of(tile)
+            cells = cells_of(tile, self.load_cells)
+            yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
 
 
 class Light(Protocol):
@@ -229,8 +224,9 @@ def base_below(tiles: Sequence[TileSummary], output: Output) -> float:
     return float(math.floor(min(one.height_min_m for one in tiles if one.tile in members)))
 
 
-def write_shaded_sheet(sheet: Sheet, surface: Surface, options: Light, context: ProductContext, path: Path) -> None:
-    """Write the shade of the tiles of a sheet; the context's grid is that of the surface's images."""
+def _write_sheet(
+    sheet: Sheet, surface: Surface, options: HillshadeOptions, context: ProductContext, path: Path
+) -> None:
     box = CellBox.around(sheet.tiles, context.grid)
     shaded = SparseRaster(box, SHADE_BAND, "uint8", _EMPTY, context)
     with raster_settings(), shaded.cog(path) as raster, _heights(surface, box, context, path) as heights:

@@ -9,20 +9,18 @@ from typing import Any, ClassVar, Final, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
 from pydantic import Field
-from rasterio.errors import RasterioError
 
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
-from roadscan.products.hillshade import SHADE_BAND, Surface, base_below, with_neighbours, write_shaded_sheet
+from roadscan.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
 from roadscan.products.quantities import band_of
-from roadscan.products.raster import Band, CellBox, SparseRaster, paste_tile, raster_settings, without_place_warning
+from roadscan.products.raster import Band, CellBox
 from roadscan.products.sheets import (
     Sheet,
-    check_sheet,
+    check_index,
     cut_sheets,
     dated,
     index_name,
@@ -31,6 +29,8 @@ from roadscan.products.sheets import (
     unknown_output,
     write_index,
 )
+from roadscan.products.sparse_cog import SparseCog
+from roadscan.products.tiff import check_tiff
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.pyramid import Level, overview_factors
 
@@ -107,16 +107,20 @@ class Kilometre(SurveyProduct):
             sheet = sheet_of(raster.stem, output, settings.sheet_m, grid)
             if sheet is not None:
                 drawn = replace(raster, context=dated(raster.context, tiles, output.tiles))
-                if raster.view == "shaded":
-                    write_shaded_sheet(sheet, _surface(drawn, output, tiles, load_cells), settings, drawn.context, path)
-                else:
-                    _write_sheet(drawn, sheet, load_cells, path)
+                _write_sheet(
+                    drawn, sheet, _Overviews(output, base_below(tiles, output), raster, load_cells), settings, path
+                )
                 return
         raise unknown_output(output)
 
     def check(self, path: Path) -> None:
-        """Decode every block and compare with the stored digest; of an index, check its geometry."""
-        check_sheet(path, _stored_type(path))
+        """Compare every byte of a sheet with its stored digest; of an index, check its geometry."""
+        with path.open("rb") as stream:
+            is_index = stream.read(1) == b"<"
+        if is_index:
+            check_index(path)
+        else:
+            check_tiff(path)
 
 
 @dataclass(frozen=True)
@@ -137,19 +141,6 @@ class _Raster:
         """Its band."""
         return SHADE_BAND if self.view == "shaded" else band_of(self.view, self.context)
 
-    def image(self, tile: TileId, load_cells: LoadCells, base_m: float = 0.0) -> npt.NDArray[Any]:
-        """(rows, columns) of a tile, north up, NaN where no point lies: intensities, or heights above a base.
-
-        Heights are in the unit of the map's heights; for the relief, in metres.
-        """
-        level = _overview(tile, self.factor, load_cells)
-        edge = self.context.grid.cells_per_edge
-        image = np.full((edge, edge), np.nan, np.float64 if self.view == "shaded" else np.float32)
-        unit_m = self.context.map.vertical_unit_m if self.view == "height" else 1.0
-        values = level.intensity if self.view == "intensity" else (level.height_m - base_m) / unit_m
-        image[edge - 1 - level.row.astype(np.int64), level.column] = values
-        return image
-
 
 def _rasters(options: KilometreOptions, context: ProductContext) -> Iterator[_Raster]:
     """What the settings ask for; two pixel sizes that have the same nearest overview are one."""
@@ -162,30 +153,59 @@ def _rasters(options: KilometreOptions, context: ProductContext) -> Iterator[_Ra
             yield _Raster(view, factor, replace(context, grid=pixels))
 
 
-def _overview(tile: TileId, factor: int, load_cells: LoadCells) -> Level:
-    level = load_cells.overview(tile, factor)
-    if level is None:
-        raise StoreError(f"tile {tile} is listed and has no cells", change="run the survey again")
-    return level
+class _Overviews:
+    """Overviews of the tiles of a sheet, asked for row by row from the north; each is loaded once."""
+
+    def __init__(self, output: Output, base_m: float, raster: _Raster, load_cells: LoadCells) -> None:
+        self._tiles = frozenset(output.tiles)
+        self._base_m = base_m
+        self._raster = raster
+        self._load = load_cells
+        self._near: dict[TileId, Level] = {}
+
+    def image(self, tile: TileId, light: Light) -> npt.NDArray[Any]:
+        """(rows, columns) of a tile, north up, in the unit of the band."""
+        raster, level = self._raster, self._level(tile)
+        unit_m = raster.context.map.vertical_unit_m
+        edge = raster.context.grid.cells_per_edge
+        if raster.view == "shaded":
+            return shade(self._heights_around(tile, edge), raster.context.grid.cell_m, light)
+        image = np.full((edge, edge), np.nan, np.float32)
+        values = level.intensity if raster.view == "intensity" else level.height_m / unit_m
+        image[edge - 1 - level.row.astype(np.int64), level.column] = values
+        return image
+
+    def _heights_around(self, tile: TileId, edge: int) -> npt.NDArray[np.float64]:
+        """(edge + 2, edge + 2) heights above the base (m) of a tile and the pixels around it."""
+        heights_m = np.full((edge + 2, edge + 2), np.nan)
+        for right in (-1, 0, 1):
+            for up in (-1, 0, 1):
+                other = TileId(tile.column + right, tile.row + up)
+                if other not in self._tiles:
+                    continue
+                level = self._level(other)
+                x, y = level.column.astype(np.int64) + right * edge + 1, edge - level.row.astype(np.int64) - up * edge
+                inside = (x >= 0) & (x < edge + 2) & (y >= 0) & (y < edge + 2)
+                heights_m[y[inside], x[inside]] = level.height_m[inside] - self._base_m
+        self._near = {near: level for near, level in self._near.items() if near.row <= tile.row + 1}
+        return heights_m
+
+    def _level(self, tile: TileId) -> Level:
+        if self._raster.view != "shaded":
+            self._near.clear()
+        if tile not in self._near:
+            level = self._load.overview(tile, self._raster.factor)
+            if level is None:
+                raise StoreError(f"tile {tile} is listed and has no cells", change="run the survey again")
+            self._near[tile] = level
+        return self._near[tile]
 
 
-def _surface(raster: _Raster, output: Output, tiles: Sequence[TileSummary], load_cells: LoadCells) -> Surface:
-    base_m = base_below(tiles, output)
-    return Surface(output.tiles, lambda tile: raster.image(tile, load_cells, base_m))
-
-
-def _write_sheet(raster: _Raster, sheet: Sheet, load_cells: LoadCells, path: Path) -> None:
-    context = raster.context
-    canvas = SparseRaster(CellBox.around(sheet.tiles, context.grid), raster.band, "float32", np.nan, context)
-    with raster_settings(), canvas.cog(path) as file:
-        for tile in sheet.tiles:
-            paste_tile(file, canvas.box, tile, raster.image(tile, load_cells))
-
-
-def _stored_type(path: Path) -> str:
-    """Type of a sheet's pixels, so far as the file can be read."""
-    try:
-        with without_place_warning(), rasterio.open(path) as raster:
-            return "uint8" if raster.dtypes[0] == "uint8" else "float32"
-    except RasterioError:
-        return "float32"
+def _write_sheet(raster: _Raster, sheet: Sheet, overviews: _Overviews, light: Light, path: Path) -> None:
+    edge, box = raster.context.grid.cells_per_edge, CellBox.around(sheet.tiles, raster.context.grid)
+    corners = {t: (t.column * edge - box.west, box.north - (t.row + 1) * edge) for t in sheet.tiles}
+    SparseCog(box, raster.band, _TYPES[raster.view], raster.context).write(
+        path,
+        ((*corners[tile], overviews.image(tile, light)) for tile in sheet.tiles),
+        [(*corner, edge) for corner in corners.values()],
+    )

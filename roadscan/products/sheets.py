@@ -142,12 +142,13 @@ def check_sheet(path: Path, dtype: str) -> None:
     with path.open("rb") as stream:
         is_index = stream.read(1) == b"<"
     if is_index:
-        _check_index(path)
+        check_index(path)
     else:
         check_cog(path, bands=1, dtype=dtype)
 
 
-def _check_index(path: Path) -> None:
+def check_index(path: Path) -> None:
+    """Raise :class:`StoreError` unless `path` is an index whose sheets lie inside it."""
     try:
         root = ET.parse(path).getroot()
         width, height = int(root.attrib["rasterXSize"]), int(root.attrib["rasterYSize"])

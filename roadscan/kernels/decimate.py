@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.cells import MAD_TO_SIGMA, OUTLIER_SIGMAS
+from roadscan.kernels.lanes import LANES, medians_of_16
 from roadscan.kernels.options import inlined, kernel
 
 ABSENT = np.int32(2**31 - 1)
@@ -16,18 +17,12 @@ FARTHEST_UM = 2.0**28
 """Heights are cut off here, 268 m above and below the base, so that no difference overflows."""
 LIGHT_STEPS = 64.0
 """Intensities are summed in sixty-fourths of a digital number."""
-LANES = 16
-"""Scratch arrays are whole registers of as many int32."""
 
 
 @inlined
 def count_upto(values, n, limit):
     """How many of the first `n` values (int32) are `limit` or less."""
     below = np.int32(0)
-    if n == LANES:
-        for i in range(LANES):
-            below = np.int32(below + np.int32(values[i] <= limit))
-        return below
     for i in range(n):
         below = np.int32(below + np.int32(values[i] <= limit))
     return below
@@ -37,14 +32,8 @@ def count_upto(values, n, limit):
 def value_of_rank(values, n, rank):
     """Value of `rank` (from 0) among the first `n` (int32): the least that more than `rank` of them do not exceed.
 
-    One register of values is compared with itself; for more, the interval of values is halved, so that each pass is
-    a count that the processor does many at a time.
+    Halves the interval of values, so that each pass is a count that the processor does many at a time.
     """
-    if n == LANES:
-        least = ABSENT
-        for i in range(LANES):
-            least = min(least, values[i] if count_upto(values, LANES, values[i]) > rank else ABSENT)
-        return least
     low, high = ABSENT, np.int32(-ABSENT)
     for i in range(n):
         low = min(low, values[i])
@@ -138,16 +127,116 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, he
     return i, first, last
 
 
+@inlined
+def reach_of(mad, floor_um):
+    """µm from the median within which a cell counts."""
+    return np.int32(max(OUTLIER_SIGMAS * MAD_TO_SIGMA * mad, floor_um))
+
+
+@inlined
+def large_squares(strip, squares, south, per_patch, side, slopes, base, floor_um, scratch, out, written):
+    """Squares `squares` (first, end) of one row, one after another; returns how many are written by now."""
+    heights, lights, counts, edge = strip
+    residual, distance = scratch[0], scratch[1]
+    out_column, out_height, out_intensity, out_cells, out_points, out_sloped = out
+    size = -(-side * side // LANES) * LANES
+    middle = 0.5 * (side - 1)
+    plain = np.int32(floor_um / (OUTLIER_SIGMAS * MAD_TO_SIGMA))  # a MAD up to this leaves the reach at its floor
+    residual[:] = ABSENT
+    for square in range(squares[0], squares[1]):
+        corner = south * edge + square * side
+        p = (square - squares[0]) // per_patch
+        east, north = slopes[p, 0], slopes[p, 1]
+        for r in range(side):
+            slant = north * (r - middle) - east * middle
+            for c in range(side):
+                h = heights[corner + r * edge + c]
+                residual[r * side + c] = np.int32(h - np.int32(slant + east * c)) if h != ABSENT else ABSENT
+        found = count_upto(residual, size, np.int32(ABSENT - 1))
+        if found == 0:
+            continue
+        rank = (found - 1) // 2
+        median = value_of_rank(residual, size, rank)
+        for k in range(size):
+            off = np.int32(abs(np.int32(residual[k] - median)))
+            distance[k] = off if residual[k] != ABSENT else ABSENT
+        reach = np.int32(floor_um)
+        if count_upto(distance, size, plain) <= rank:
+            reach = reach_of(value_of_rank(distance, size, rank), floor_um)
+        total, used, points, light = 0, 0, 0, 0
+        for k in range(size):
+            total += np.int64(np.int32(residual[k] - median) if distance[k] <= reach else np.int32(0))
+            used += np.int64(distance[k] <= reach)
+        for r in range(side):
+            for c in range(side):
+                at, counted = corner + r * edge + c, distance[r * side + c] <= reach
+                points += np.int64(counts[at] if counted else np.int32(0))
+                light += np.int64(lights[at] if counted else np.int32(0))
+        out_column[written] = square
+        out_height[written] = base + 1e-6 * (median + total / used)
+        out_intensity[written] = light / (LIGHT_STEPS * used)
+        out_cells[written], out_points[written], out_sloped[written] = used, points, slopes[p, 2] > 0
+        written += 1
+    return written
+
+
+@inlined
+def small_squares(strip, squares, south, per_patch, side, slopes, base, floor_um, table, out, written):
+    """As `large_squares` for squares of up to 16 cells, sixteen of them side by side."""
+    heights, lights, counts, edge = strip
+    residual, place, found, median, mad = table
+    out_column, out_height, out_intensity, out_cells, out_points, out_sloped = out
+    middle = 0.5 * (side - 1)
+    for first in range(squares[0], squares[1], LANES):
+        lanes = min(LANES, squares[1] - first)
+        found[:] = 0
+        for lane in range(lanes):
+            corner = south * edge + (first + lane) * side
+            p = (first + lane - squares[0]) // per_patch
+            east, north = slopes[p, 0], slopes[p, 1]
+            cells = 0
+            for r in range(side):
+                slant = north * (r - middle) - east * middle
+                for c in range(side):
+                    at = corner + r * edge + c
+                    h = heights[at]
+                    if h != ABSENT:
+                        residual[cells, lane] = np.int32(h - np.int32(slant + east * c))
+                        place[lane, cells] = at
+                        cells += 1
+            found[lane] = cells
+        medians_of_16(residual, found, median, mad)
+        for lane in range(lanes):
+            if found[lane] == 0:
+                continue
+            reach = reach_of(mad[lane], floor_um)
+            total, used, points, light = 0, 0, 0, 0
+            for k in range(found[lane]):
+                off = np.int64(residual[k, lane]) - median[lane]
+                counted = np.int64(abs(off) <= reach)
+                total += off * counted
+                used += counted
+                points += counts[place[lane, k]] * counted
+                light += lights[place[lane, k]] * counted
+            out_column[written] = first + lane
+            out_height[written] = base + 1e-6 * (median[lane] + total / used)
+            out_intensity[written] = light / (LIGHT_STEPS * used)
+            out_cells[written], out_points[written] = used, points
+            out_sloped[written] = slopes[(first + lane - squares[0]) // per_patch, 2] > 0
+            written += 1
+    return written
+
+
 @kernel
 def decimate_strip(
-    heights_2d, lights_2d, counts_2d, first_patch, end_patch, patch, side, base, floor_um, scratch,
+    heights, lights, counts, first_patch, end_patch, patch, side, base, floor_um, scratch,
     out_column, out_row, out_height, out_intensity, out_cells, out_points, out_sloped,
 ):  # fmt: skip
     """Robust height at the centre of every square of a strip that holds a cell, in order of row and column.
 
     Parameters
     ----------
-    heights_2d, lights_2d, counts_2d : (patch, edge), from :func:`fill_strip`.
+    heights, lights, counts : (patch, edge), from :func:`fill_strip`.
     first_patch, end_patch : int, patches (of `patch`² cells) to look at, from the west.
     patch, side : cells along an edge of a patch, which has one slope, and of a square, which divides it.
     base : float64, m; floor_um : int, µm within which a residual always counts.
@@ -160,57 +249,28 @@ def decimate_strip(
     -------
     int, how many squares were written.
     """
-    edge = heights_2d.shape[1]
-    heights, lights, counts = heights_2d.ravel(), lights_2d.ravel(), counts_2d.ravel()
-    residual, distance = scratch[0], scratch[1]
-    per_patch = patch // side
-    size = -(-side * side // LANES) * LANES
-    middle = 0.5 * (side - 1)
-    sigmas = OUTLIER_SIGMAS * MAD_TO_SIGMA
-    plain = np.int32(floor_um / sigmas)  # a MAD up to this leaves the reach at its floor
-    patches = end_patch - first_patch
-    slopes, sloped = np.empty((patches, 2)), np.empty(patches, np.bool_)
+    edge, per_patch, patches = heights.shape[1], patch // side, end_patch - first_patch
+    strip = (heights.ravel(), lights.ravel(), counts.ravel(), edge)
+    slopes = np.empty((patches, 3))
     for p in range(patches):
-        corner = (first_patch + p) * patch
-        slopes[p, 0], slopes[p, 1], sloped[p] = slopes_of(heights, corner, edge, patch, residual)
+        east, north, known = slopes_of(strip[0], (first_patch + p) * patch, edge, patch, scratch[0])
+        slopes[p, 0], slopes[p, 1], slopes[p, 2] = east, north, np.float64(known)
+    table = (
+        np.empty((LANES, LANES), np.int32), np.empty((LANES, LANES), np.int64),
+        np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32),
+    )  # fmt: skip
+    out = (out_column, out_height, out_intensity, out_cells, out_points, out_sloped)
+    squares = (first_patch * per_patch, end_patch * per_patch)
     written = 0
-    for square_row in range(per_patch):
-        residual[:] = ABSENT
-        for square in range(first_patch * per_patch, end_patch * per_patch):
-            corner = square_row * side * edge + square * side
-            p = square // per_patch - first_patch
-            east, north = slopes[p, 0], slopes[p, 1]
-            for r in range(side):
-                slant = north * (r - middle) - east * middle
-                for c in range(side):
-                    h = heights[corner + r * edge + c]
-                    residual[r * side + c] = np.int32(h - np.int32(slant + east * c)) if h != ABSENT else ABSENT
-            found = count_upto(residual, size, np.int32(ABSENT - 1))
-            if found == 0:
-                continue
-            rank = (found - 1) // 2
-            median = value_of_rank(residual, size, rank)
-            for k in range(size):
-                off = np.int32(abs(np.int32(residual[k] - median)))
-                distance[k] = off if residual[k] != ABSENT else ABSENT
-            reach = np.int32(floor_um)
-            if count_upto(distance, size, plain) <= rank:
-                reach = np.int32(max(sigmas * value_of_rank(distance, size, rank), floor_um))
-            total, used, points, light = 0, 0, 0, 0
-            for k in range(size):
-                total += np.int64(np.int32(residual[k] - median) if distance[k] <= reach else np.int32(0))
-                used += np.int64(distance[k] <= reach)
-            for r in range(side):
-                for c in range(side):
-                    at, counted = corner + r * edge + c, distance[r * side + c] <= reach
-                    points += np.int64(counts[at] if counted else np.int32(0))
-                    light += np.int64(lights[at] if counted else np.int32(0))
-            out_column[written] = square
-            out_row[written] = square_row
-            out_height[written] = base + 1e-6 * (median + total / used)
-            out_intensity[written] = light / (LIGHT_STEPS * used)
-            out_cells[written] = used
-            out_points[written] = points
-            out_sloped[written] = sloped[p]
-            written += 1
+    for row in range(per_patch):
+        start = written
+        if side * side <= LANES:
+            written = small_squares(
+                strip, squares, row * side, per_patch, side, slopes, base, floor_um, table, out, written
+            )
+        else:
+            written = large_squares(
+                strip, squares, row * side, per_patch, side, slopes, base, floor_um, scratch, out, written
+            )
+        out_row[start:written] = row
     return written

@@ -8,6 +8,10 @@ from roadscan.kernels.options import inlined, kernel
 
 EMPTY = np.uint8(0)
 
+ONE, TWO = np.float32(1.0), np.float32(2.0)
+DARKEST, STEPS = np.float32(1.5), np.float32(254.0)
+"""Grey is 1 plus so many steps, rounded."""
+
 
 @kernel
 def grey_intensity(column, row, intensity, black, white, west, north, picture):
@@ -28,7 +32,7 @@ def grey_intensity(column, row, intensity, black, white, west, north, picture):
 @inlined
 def continued(near, opposite, centre):
     """A neighbour's height; where it is missing, the surface continues what lies opposite, or is level."""
-    other = centre if np.isnan(opposite) else 2.0 * centre - opposite
+    other = centre if np.isnan(opposite) else TWO * centre - opposite
     return other if np.isnan(near) else near
 
 
@@ -45,11 +49,11 @@ def shade_line(south, here, north, slope_scale, light_east, light_north, light_u
         nw = continued(north[k], south[k + 2], centre)
         n = continued(north[k + 1], south[k + 1], centre)
         ne = continued(north[k + 2], south[k], centre)
-        east = ((ne + 2.0 * e + se) - (nw + 2.0 * w + sw)) * slope_scale
-        up = ((nw + 2.0 * n + ne) - (sw + 2.0 * s + se)) * slope_scale
+        east = ((ne + TWO * e + se) - (nw + TWO * w + sw)) * slope_scale
+        up = ((nw + TWO * n + ne) - (sw + TWO * s + se)) * slope_scale
         towards = light_up - (light_east * east + light_north * up)
-        bright = max(towards / np.sqrt(1.0 + east * east + up * up), 0.0)
-        line[k] = np.uint8(1.5 + 254.0 * bright) if not np.isnan(centre) else EMPTY
+        bright = max(towards / np.sqrt(ONE + east * east + up * up), np.float32(0.0))
+        line[k] = np.uint8(DARKEST + STEPS * bright) if not np.isnan(centre) else EMPTY
 
 
 @kernel
@@ -62,10 +66,10 @@ def shade_cells(
     ----------
     column, row : (n,) uint16, sorted by row, column; height : (n,) float64, m, in the map frame.
     base : float64, m, a height near them.
-    slope_scale : float64, exaggeration / (8 · edge of a cell in m).
-    light_east, light_north, light_up : float64, unit vector towards the light.
+    slope_scale : float32, exaggeration / (8 · edge of a cell in m).
+    light_east, light_north, light_up : float32, unit vector towards the light.
     west, north : int, column of the picture's first pixel and row of its first line.
-    heights : (3, columns + 2) float64, overwritten.
+    heights : (3, columns + 2) float32, overwritten.
     picture : (rows, columns) uint8, out, north up.
     """
     rows = picture.shape[0]

@@ -149,11 +149,11 @@ class PavementShaded(_Picture):
         settings = cast(ShadedOptions, options)
         azimuth, altitude = math.radians(settings.azimuth_deg), math.radians(settings.altitude_deg)
         level = math.cos(altitude)
+        light = (level * math.sin(azimuth), level * math.cos(azimuth), math.sin(altitude))
+        scale, *towards = (np.float32(v) for v in (settings.z_factor / (8.0 * context.grid.cell_m), *light))
         shade_cells(
-            cells.column, cells.row, cells.height_robust_m, float(cells.height_robust_m[0]),
-            settings.z_factor / (8.0 * context.grid.cell_m),
-            level * math.sin(azimuth), level * math.cos(azimuth), math.sin(altitude),
-            box.west, box.north - 1, np.empty((3, box.width + 2)), picture,
+            cells.column, cells.row, cells.height_robust_m, float(cells.height_robust_m[0]), scale, *towards,
+            box.west, box.north - 1, np.empty((3, box.width + 2), np.float32), picture,
         )  # fmt: skip
 
 

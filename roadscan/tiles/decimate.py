@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.decimate import LANES, decimate_strip, fill_strip
+from roadscan.kernels.decimate import decimate_strip, fill_strip
+from roadscan.kernels.lanes import LANES
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid

@@ -205,7 +205,7 @@ def test_damage_is_found(kilometre, workshop, places, tmp_path, damage):
 def test_what_it_does_not_know_is_refused(kilometre, workshop, places, tmp_path):
     survey = survey_at(workshop, places["local"])
     tiles = tuple(survey.tiles)
-    with pytest.raises(StoreError, match="'heights.tif' is no file of this product"):
+    with pytest.raises(StoreError, match=r"'heights\.tif' is no file of this product"):
         kilometre.write(
             Output("heights.tif", tiles), survey.summaries, Overviews(survey), options(), survey.context, tmp_path / "x"
         )

@@ -179,8 +179,14 @@ def make_products(
         return
     from roadscan.products.base import TileProduct, products
 
+    made = {"any": "yes", "fine": "of cells below 2 cm", "coarse": "of cells of 2 cm or more"}
     rows = [
-        (name, "tile" if isinstance(p, TileProduct) else "survey", "yes" if p.default else "on request", p.title)
+        (
+            name,
+            "tile" if isinstance(p, TileProduct) else "survey",
+            made[p.default_cells] if p.default else "on request",
+            p.title,
+        )
         for name, p in products().items()
     ]
     _table(("product", "of", "made", "what"), rows)

@@ -15,9 +15,10 @@ from benchmarks.course import HOUR_UTC, START_GPS_NS
 from benchmarks.packets import PACKETS_PER_S, repeat_capture
 from benchmarks.roofline import Roofline
 from benchmarks.same_grid import difference_m, pdal_pipeline, with_numpy, with_roadscan, write_points
+from roadscan.jobs.cell_files import read_cells
 from roadscan.jobs.compute import Inline
 from roadscan.jobs.stages import Run, run_stages
-from roadscan.jobs.tiles import TILE, read_cells
+from roadscan.jobs.tile_plan import TILE
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.strict import load_toml
 from roadscan.model.survey import Survey

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from roadscan.jobs.centre_line import load_buffer
 from roadscan.jobs.plan import SurveyPlan, plan_survey
 from roadscan.jobs.readings import Placer, RawSlice, geometry_of
-from roadscan.jobs.tiles import near_lines
+from roadscan.jobs.tile_points import near_lines
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.survey import Survey

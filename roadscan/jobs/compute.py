@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -26,6 +27,11 @@ class Done(Generic[T, R]):
 class Compute(Protocol):
     """Runs a function over tasks; results come in any order."""
 
+    @property
+    def workers(self) -> int:
+        """How many tasks run at the same time."""
+        ...
+
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks; an error of one does not stop the others."""
         ...
@@ -33,6 +39,8 @@ class Compute(Protocol):
 
 class Inline:
     """Runs tasks one after another in this process (tests, debugging, one tile)."""
+
+    workers = 1
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks in order."""
@@ -48,6 +56,11 @@ class OnDask:
 
     def __init__(self, client: Any) -> None:
         self._client = client
+
+    @property
+    def workers(self) -> int:
+        """Threads of all workers."""
+        return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks, most of them at the same time; a task is tried once more if its worker dies."""
@@ -85,14 +98,24 @@ class WhenNeeded:
         self._scheduler = scheduler
         self._opened: OnDask | None = None
 
+    @property
+    def workers(self) -> int:
+        """Workers asked for; those of a cluster that runs elsewhere are known once it is opened."""
+        if self._scheduler is not None:
+            return self._open().workers
+        return self._workers or os.cpu_count() or 1
+
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks on the cluster."""
         if not tasks:
             return
+        yield from self._open().map(function, tasks)
+
+    def _open(self) -> OnDask:
         if self._opened is None:
             client = _connect(self._scheduler) if self._scheduler is not None else _embedded(self._stack, self._workers)
             self._opened = OnDask(self._stack.enter_context(client))
-        yield from self._opened.map(function, tasks)
+        return self._opened
 
 
 @contextlib.contextmanager

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.jobs.cell_files import read_cells
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.tiles import TILE, read_cells
+from roadscan.jobs.tile_plan import TILE
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.tables.logs import read_log_records

@@ -1,28 +1,41 @@
-"""Footprints: which raw block touches which tile. One task a data file."""
+"""Footprints: which raw block touches which tile. One task a data file.
+
+Profiles and returns are not placed for it: bounds (``points/reach.py``) name every tile that a row group may touch.
+Clouds, whose points are placed already, are read.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
+from roadscan.jobs.reach import touched_tiles
 from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
-from roadscan.points.place import FATE_NAMES
+from roadscan.points.place import FATE_NAMES, Window
+from roadscan.points.reach import Touched, joined
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, file_digest
 from roadscan.tables.writer import write_parquet
 
 PRODUCT = "footprints"
+
+_LOADED: Final = [
+    "tile_column", "tile_row", "first_group", "last_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,7 +55,7 @@ class FootprintTask:
 
 @dataclass(frozen=True)
 class Footprints:
-    """Footprints of all data files: one row a (row group, tile) pair; arrays are (n,)."""
+    """Footprints of data files: one row a (row group, tile) pair; arrays are (n,)."""
 
     tile_column: npt.NDArray[np.int32]
     tile_row: npt.NDArray[np.int32]
@@ -50,10 +63,50 @@ class Footprints:
     """Index into `slices`."""
     row_group: npt.NDArray[np.int32]
     readings: npt.NDArray[np.int64]
+    """About how many readings of the group lie in the tile."""
     first_epoch_gps_ns: npt.NDArray[np.int64]
     last_epoch_gps_ns: npt.NDArray[np.int64]
     slices: tuple[RawSlice, ...]
     """Data files, whole, sorted by run, sensor and time."""
+
+
+@dataclass(frozen=True)
+class FootprintRanges:
+    """Footprints of data files: one row a tile and run of row groups that touch it; arrays are (n,)."""
+
+    tile_column: npt.NDArray[np.int32]
+    tile_row: npt.NDArray[np.int32]
+    slice_index: npt.NDArray[np.int32]
+    """Index into `slices`."""
+    first_group: npt.NDArray[np.int32]
+    last_group: npt.NDArray[np.int32]
+    readings: npt.NDArray[np.int64]
+    """About how many readings of the groups lie in the tile."""
+    first_epoch_gps_ns: npt.NDArray[np.int64]
+    last_epoch_gps_ns: npt.NDArray[np.int64]
+    slices: tuple[RawSlice, ...]
+    """Data files, whole, sorted by run, sensor and time."""
+
+    def expanded(self) -> Footprints:
+        """A row for each row group; the readings of a range shared out evenly."""
+        counts = (self.last_group - self.first_group + 1).astype(np.int64)
+        rows = np.repeat(np.arange(counts.size), counts)
+        place = np.arange(rows.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        group = (self.first_group[rows] + place).astype(np.int32)
+        share, rest = np.divmod(self.readings, counts)
+        sizes = [len(s.spans) for s in self.slices]
+        spans = np.array([span for s in self.slices for span in s.spans], dtype=np.int64).reshape(-1, 2)
+        at = np.concatenate([[0], np.cumsum(sizes)])[self.slice_index[rows]] + group
+        return Footprints(
+            tile_column=self.tile_column[rows],
+            tile_row=self.tile_row[rows],
+            slice_index=self.slice_index[rows],
+            row_group=group,
+            readings=share[rows] + (place < rest[rows]),
+            first_epoch_gps_ns=spans[at, 0],
+            last_epoch_gps_ns=spans[at, 1],
+            slices=self.slices,
+        )
 
 
 def index_footprints(
@@ -78,38 +131,72 @@ def index_footprints(
 
 
 def footprint_task(task: FootprintTask) -> OutputRecord:
-    """Index one data file (runs on a worker)."""
-    placer = Placer(task.store, task.ground, [task.slice])
-    columns: dict[str, list[npt.NDArray[np.int64]]] = {n: [] for n in ("column", "row", "count", "group")}
-    fates = np.zeros(len(FATE_NAMES), np.int64)
-    for group in task.slice.groups:
-        tiles, own = placer.touched(task.slice, group)
-        fates[: own.size] += own
-        column, row, count = count_tiles(tiles)
-        for name, values in (("column", column), ("row", row), ("count", count)):
-            columns[name].append(values)
-        columns["group"].append(np.full(column.size, group, np.int64))
+    """Index one data file (runs on a worker): by bounds; by placing all readings where there is no bound."""
+    one = task.slice
+    if one.source.table == "cloud":
+        pairs, fates = _placed(task, range(len(one.groups)))
+    else:
+        bounded = touched_tiles(task.store, task.ground, one)
+        pairs, fates = bounded, None
+        beyond = np.flatnonzero(bounded.unbounded).tolist()
+        if beyond:
+            pairs = joined([bounded, _placed(task, beyond)[0]])
+    rows = _ranges(pairs, one)
     schema = table_schema(PRODUCT)
-    group_of = np.concatenate(columns["group"])
-    spans = np.array(task.slice.spans, dtype=np.int64).reshape(-1, 2)[group_of]
-    rows = pa.table(
-        {
-            "tile_column": np.concatenate(columns["column"]).astype(np.int32),
-            "tile_row": np.concatenate(columns["row"]).astype(np.int32),
-            "file": pa.array([task.slice.file] * group_of.size, pa.string()),
-            "row_group": group_of.astype(np.int32),
-            "readings": np.concatenate(columns["count"]),
-            "first_epoch_gps_ns": spans[:, 0],
-            "last_epoch_gps_ns": spans[:, 1],
-        }
-    ).cast(schema.arrow())
     with task.store.scratch() as folder:
         path = folder / "footprints.parquet"
-        write_parquet(path, rows, schema)
+        write_parquet(path, rows.cast(schema.arrow()), schema)
         size, digest = path.stat().st_size, file_digest(path)
         task.store.publish(path, task.target)
-    detail = "{" + ", ".join(f'"{n}": {c}' for n, c in zip(FATE_NAMES, fates, strict=True)) + "}"
-    return OutputRecord(PRODUCT, task.slice.file, task.key, task.target, size, digest, detail)
+    return OutputRecord(PRODUCT, one.file, task.key, task.target, size, digest, _detail(rows, fates))
+
+
+def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.NDArray[np.int64]]:
+    """Tiles of some groups of a slice, by placing their readings, and the fates of these."""
+    one = task.slice
+    placer = Placer(task.store, task.ground, [one])
+    parts: list[Touched] = []
+    fates = np.zeros(len(FATE_NAMES), np.int64)
+    for number in numbers:
+        tiles, own = placer.touched(one, one.groups[number])
+        fates[: own.size] += own
+        column, row, count = count_tiles(tiles)
+        parts.append(Touched(np.full(column.size, number), column, row, count, np.zeros(0, dtype=bool)))
+    return joined(parts), fates
+
+
+def _ranges(pairs: Touched, one: RawSlice) -> pa.Table:
+    """Pairs of row group and tile as rows: runs of groups that touch one tile are one row."""
+    order = np.lexsort((pairs.group, pairs.row, pairs.column))
+    number, column, row = pairs.group[order], pairs.column[order], pairs.row[order]
+    breaks = (np.diff(column) != 0) | (np.diff(row) != 0) | (np.diff(number) != 1)
+    starts = np.flatnonzero(np.concatenate([[True], breaks])) if number.size else np.zeros(0, np.int64)
+    ends = np.append(starts[1:], number.size)[: starts.size] - 1
+    spans = np.array(one.spans, dtype=np.int64).reshape(-1, 2)[number]
+    groups = np.array(one.groups, dtype=np.int32)[number]
+    return pa.table(
+        {
+            "tile_column": column[starts].astype(np.int32),
+            "tile_row": row[starts].astype(np.int32),
+            "file": pa.array([one.file] * starts.size, pa.string()),
+            "first_group": groups[starts],
+            "last_group": groups[ends],
+            "readings": np.add.reduceat(pairs.readings[order], starts) if starts.size else np.zeros(0, np.int64),
+            "first_epoch_gps_ns": np.minimum.reduceat(spans[:, 0], starts) if starts.size else spans[:0, 0],
+            "last_epoch_gps_ns": np.maximum.reduceat(spans[:, 1], starts) if starts.size else spans[:0, 1],
+        }
+    )
+
+
+def _detail(rows: pa.Table, fates: npt.NDArray[np.int64] | None) -> str:
+    """Figures of a data file: the box of its tiles, and the fates of its readings where they were placed."""
+    figures: dict[str, Any] = {}
+    if rows.num_rows:
+        column, row = (rows.column(name).to_numpy() for name in ("tile_column", "tile_row"))
+        figures["window"] = [int(column.min()), int(row.min()), int(column.max()) + 1, int(row.max()) + 1]
+    if fates is not None:
+        figures["fates"] = dict(zip(FATE_NAMES, fates.tolist(), strict=True))
+    return json.dumps(figures)
 
 
 def count_tiles(tiles: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], ...]:
@@ -129,45 +216,58 @@ def count_tiles(tiles: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], ..
     return occupied % width + first[0], occupied // width + first[1], counts[occupied]
 
 
-def load_footprints(plan: SurveyPlan, manifest: Manifest) -> Footprints:
-    """All current footprints; a data file without any is left out (its indexing failed)."""
+def load_footprints(
+    plan: SurveyPlan, manifest: Manifest, files: Collection[str] | None = None, window: Window | None = None
+) -> Footprints:
+    """Current footprints, a row for each pair of row group and tile; choice as for :func:`load_ranges`."""
+    return load_ranges(plan, manifest, files, window).expanded()
+
+
+def load_ranges(
+    plan: SurveyPlan, manifest: Manifest, files: Collection[str] | None = None, window: Window | None = None
+) -> FootprintRanges:
+    """Current footprints of some data files, in some tiles; of all without a choice.
+
+    A data file without any is left out (its indexing failed); one that does not come near the window is not opened.
+    """
     slices = sorted(
         plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))
     )
-    tables: list[pa.Table] = []
-    numbers: list[npt.NDArray[np.int32]] = []
-    columns = ["tile_column", "tile_row", "row_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns"]
+    if not manifest.of(PRODUCT):
+        raise StoreError("the survey has no footprints", change="run `roadscan footprints` first")
+    wanted = None if window is None else _in_window(window)
+    tables: list[pa.Table] = [table_schema(PRODUCT).arrow().empty_table().select(_LOADED)]
+    numbers: list[npt.NDArray[np.int32]] = [np.zeros(0, np.int32)]
     for number, one in enumerate(slices):
         record = manifest.get(PRODUCT, one.file)
-        if record is None:
+        if record is None or (files is not None and one.file not in files) or _is_apart(record, window):
             continue
-        table = pq.read_table(io.BytesIO(plan.store.read_bytes(record.path)), columns=columns)
+        stream = io.BytesIO(plan.store.read_bytes(record.path))
+        table = pq.read_table(stream, columns=_LOADED, filters=wanted)
         tables.append(table)
         numbers.append(np.full(table.num_rows, number, np.int32))
-    if not tables:
-        raise StoreError("the survey has no footprints", change="run `roadscan footprints` first")
     rows = pa.concat_tables(tables)
-    column = {c: rows.column(c).to_numpy() for c in columns}
-    return Footprints(
-        tile_column=column["tile_column"],
-        tile_row=column["tile_row"],
-        slice_index=np.concatenate(numbers),
-        row_group=column["row_group"],
-        readings=column["readings"],
-        first_epoch_gps_ns=column["first_epoch_gps_ns"],
-        last_epoch_gps_ns=column["last_epoch_gps_ns"],
-        slices=tuple(slices),
-    )
+    column = {c: rows.column(c).to_numpy() for c in _LOADED}
+    return FootprintRanges(**column, slice_index=np.concatenate(numbers), slices=tuple(slices))
 
 
-def reading_fates(plan: SurveyPlan, manifest: Manifest) -> dict[str, int]:
-    """How many readings of the survey met which fate (kept, no pose, out of range …)."""
-    totals = dict.fromkeys(FATE_NAMES, 0)
-    for one in plan.slices():
-        record = manifest.get(PRODUCT, one.file)
-        for name, count in (record.figures() if record else {}).items():
-            totals[name] += count
-    return {name: count for name, count in totals.items() if count}
+def _in_window(window: Window) -> pc.Expression:
+    column, row = pc.field("tile_column"), pc.field("tile_row")
+    return (
+        (column >= window.first_column) & (column < window.end_column)
+        & (row >= window.first_row) & (row < window.end_row)
+    )  # fmt: skip
+
+
+def _is_apart(record: OutputRecord, window: Window | None) -> bool:
+    """True if a data file touches no tile of a window."""
+    own = record.figures().get("window") if window is not None else None
+    if window is None or own is None:
+        return window is not None
+    return bool(
+        own[0] >= window.end_column or own[2] <= window.first_column
+        or own[1] >= window.end_row or own[3] <= window.first_row
+    )  # fmt: skip
 
 
 def _digests(plan: SurveyPlan) -> Sequence[str]:

@@ -101,7 +101,12 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
         )
     passes = tuple(_passes(survey, sources))
     centre_lines = CentreLines.of(survey)
-    tile_key = key_of(code_version(), config.tiles.cell_m, None if centre_lines is None else centre_lines.key())
+    tile_key = key_of(
+        code_version(),
+        config.tiles.cell_m,
+        config.tiles.cell_table,
+        None if centre_lines is None else centre_lines.key(),
+    )
     return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key)
 
 

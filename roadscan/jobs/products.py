@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from roadscan.jobs.cell_files import read_cells, read_overview
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.tile_files import WantedProduct
-from roadscan.jobs.tiles import TILE, read_cells, summary_of
+from roadscan.jobs.tile_plan import OVERVIEWS, TILE
+from roadscan.jobs.tiles import summary_of
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
@@ -46,6 +48,8 @@ class OutputTask:
     summaries: tuple[TileSummary, ...]
     cells: tuple[OutputRecord, ...]
     """Records of the cells that the output may read."""
+    overviews: tuple[OutputRecord, ...] = ()
+    """Records of the overviews of the same tiles, where there are any."""
 
     @property
     def target(self) -> str:
@@ -83,12 +87,14 @@ def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask]
     """Files of survey products that are missing or stale, and records of those no longer due."""
     context = product_context(plan)
     records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
+    keys = {r.unit: r.key for r in records}
+    overviews = {unit: r for unit, r in manifest.of(OVERVIEWS).items() if r.path and keys.get(unit) == r.key}
     summaries = [s for s in map(summary_of, records) if s is not None]
     tasks = [
         task
         for product, options in wanted_products(plan.survey)
         if isinstance(product, SurveyProduct)
-        for task in _tasks(product, options, plan, context, records, summaries)
+        for task in _tasks(product, options, plan, context, records, overviews, summaries)
     ]
     due = {(t.product.name, t.output.name) for t in tasks}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
@@ -122,8 +128,8 @@ def write_output(task: OutputTask) -> OutputRecord:
     with task.store.scratch() as folder:
         path = folder / Path(task.output.name).name
         task.product.write(
-            task.output, task.summaries, StoredTiles(task.store, task.cells, task.context), task.options,
-            task.context, path,
+            task.output, task.summaries, StoredTiles(task.store, task.cells, task.overviews, task.context),
+            task.options, task.context, path,
         )  # fmt: skip
         size, digest = path.stat().st_size, file_digest(path)
         task.store.publish(path, task.target)
@@ -133,18 +139,28 @@ def write_output(task: OutputTask) -> OutputRecord:
 class StoredTiles:
     """Finished tiles of the store, as survey products ask for them."""
 
-    def __init__(self, store: Store, records: Sequence[OutputRecord], context: ProductContext) -> None:
+    def __init__(
+        self,
+        store: Store,
+        cells: Sequence[OutputRecord],
+        overviews: Sequence[OutputRecord],
+        context: ProductContext,
+    ) -> None:
         self._store = store
-        self._by_unit = {r.unit: r for r in records}
+        self._cells = {r.unit: r for r in cells}
+        self._overviews = {r.unit: r for r in overviews}
         self._edge = context.grid.cells_per_edge
 
     def __call__(self, tile: TileId) -> TileCells | None:
         """Cells of a tile; None where the survey has no such tile."""
-        record = self._by_unit.get(str(tile))
+        record = self._cells.get(str(tile))
         return None if record is None else read_cells(self._store, record, self._edge)
 
     def overview(self, tile: TileId, factor: int) -> Level | None:
-        """Overview of a tile, made from its cells."""
+        """Overview of a tile; made from its cells where none was stored with them."""
+        record = self._overviews.get(str(tile))
+        if record is not None:
+            return read_overview(self._store, record.path, factor)
         cells = self(tile)
         return None if cells is None else pyramid_of(cells, (factor,))[0]
 
@@ -155,6 +171,7 @@ def _tasks(
     plan: SurveyPlan,
     context: ProductContext,
     records: Sequence[OutputRecord],
+    overviews: Mapping[str, OutputRecord],
     summaries: Sequence[TileSummary],
 ) -> list[OutputTask]:
     by_tile = {TileId.parse(r.unit): r for r in records}
@@ -173,6 +190,7 @@ def _tasks(
                 key,
                 tuple(summary_by_tile[t] for t in sorted(output.tiles) if t in summary_by_tile),
                 own,
+                tuple(overviews[r.unit] for r in own if r.unit in overviews),
             )
         )
     return tasks

@@ -127,9 +127,11 @@ def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[st
         ) from error
 
 
-def read_rows(store: Store, source: ReadingSource, file: str, groups: Sequence[int]) -> pa.Table:
+def read_rows(
+    store: Store, source: ReadingSource, file: str, groups: Sequence[int], columns: list[str] | None = None
+) -> pa.Table:
     """Row groups of a source's data file, their epochs on time."""
-    rows = read_groups(store, file, groups)
+    rows = read_groups(store, file, groups, columns)
     if source.clock is None:
         return rows
     for name in _EPOCH_COLUMNS:
@@ -164,6 +166,10 @@ class Placer:
             rows = read_rows(self._store, one.source, one.file, groups).combine_chunks()
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
+
+    def placement(self, source: ReadingSource) -> Placement:
+        """How the readings of a source, which is no cloud, become points."""
+        return self._placements[source.key]
 
     def trajectory(self, source: ReadingSource) -> Trajectory | None:
         """Poses around the slices of a source; None for clouds."""

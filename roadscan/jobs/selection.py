@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadscan.jobs.footprints import Footprints
+from roadscan.jobs.footprints import FootprintRanges
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.tiles.grid import Bounds, TileGrid
@@ -23,7 +23,7 @@ class Selection:
     span_gps_ns: tuple[int, int] | None = None
     """Tiles that a reading of this span may have touched."""
 
-    def tiles(self, known: Iterable[TileId], footprints: Footprints, grid: TileGrid) -> list[TileId]:
+    def tiles(self, known: Iterable[TileId], footprints: FootprintRanges, grid: TileGrid) -> list[TileId]:
         """Chosen tiles among those with readings, by row and column."""
         with_readings = set(known)
         unknown = [t for t in self.named if t not in with_readings]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -10,18 +9,18 @@ from dataclasses import dataclass, field
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute
-from roadscan.jobs.footprints import Footprints, index_footprints, load_footprints
+from roadscan.jobs.footprints import index_footprints, load_ranges
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
-from roadscan.jobs.plan import SurveyPlan, plan_survey
+from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.tile_files import WantedProduct, tile_file_names
-from roadscan.jobs.tiles import TILE, BlockTask, block_tasks, plan_tiles, run_blocks, stale_tiles
+from roadscan.jobs.tile_files import tile_file_names
+from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, plan_tiles, stale_tiles
+from roadscan.jobs.tiles import run_tasks
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord, write_failures
 from roadscan.tables.store import Store
 
@@ -81,17 +80,16 @@ def run_footprints(run: Run) -> None:
 
 
 def run_tiles(run: Run) -> None:
-    """Readings → points → cells and tile products."""
+    """Readings → cells and tile products, by way of points where these are asked for."""
     manifest = Manifest(run.store)
     work = plan_tile_work(run, manifest)
     manifest.remove(work.gone)
-    tasks = work.tasks(work.chosen)
+    tasks = work.planned.tasks(work.chosen, run.compute.workers)
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
-    singly = functools.partial(work.tasks, edge_tiles=1)
-    failures = run_blocks(tasks, singly, manifest, run.compute, _bar(run, "tiles"))
+    failures = run_tasks(tasks, work.planned.singly, manifest, run.compute, _bar(run, "tiles"))
     manifest.forget(TILE, [unit for unit, _ in failures])
     empty = {unit for unit, r in manifest.of(TILE).items() if not r.path}
-    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in tile_file_names()])
+    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in {OVERVIEWS, *tile_file_names()}])
     run.failed("tiles", failures)
 
 
@@ -163,28 +161,19 @@ def close_run(run: Run) -> None:
 class TileWork:
     """What the tiles stage has to do."""
 
-    plan: SurveyPlan
-    footprints: Footprints
-    tiles: dict[TileId, tuple[str, int]]
-    """Key and expected readings of every tile of the survey."""
+    planned: TilePlan
     chosen: list[TileId]
     """Tiles to compute now."""
     gone: list[OutputRecord]
     """Files of tiles that no reading touches any more, and of products no longer wanted."""
-    products: list[WantedProduct]
-    context: ProductContext
-
-    def tasks(self, tiles: Sequence[TileId], edge_tiles: int | None = None) -> list[BlockTask]:
-        """Blocks of work over some tiles."""
-        return block_tasks(tiles, self.tiles, self.footprints, self.plan, self.products, self.context, edge_tiles)
 
 
 def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     """Compare what there is with what there should be."""
     plan = plan_survey(run.survey, run.store)
-    footprints = load_footprints(plan, manifest)
+    footprints = load_ranges(plan, manifest)
     context = product_context(plan)
-    wanted = wanted_tile_products(run.survey, context)
+    wanted = tuple(wanted_tile_products(run.survey, context))
     tiles = plan_tiles(footprints, plan)
     if run.selection is not None:
         chosen = run.selection.tiles(tiles, footprints, plan.ground.grid)
@@ -193,10 +182,9 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     per_tile = tile_file_names()
     dropped = per_tile - tile_file_names({w.product.name for w in wanted})
     units = {str(t) for t in tiles}
-    gone = [
-        r for r in manifest.all() if r.product in {TILE, *per_tile} and (r.unit not in units or r.product in dropped)
-    ]
-    return TileWork(plan, footprints, tiles, chosen, gone, wanted, context)
+    kinds = {TILE, OVERVIEWS, *per_tile}
+    gone = [r for r in manifest.all() if r.product in kinds and (r.unit not in units or r.product in dropped)]
+    return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone)
 
 
 def _bar(run: Run, stage: str) -> Callable[[int, int], None]:

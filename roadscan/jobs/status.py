@@ -13,19 +13,21 @@ import pyarrow.parquet as pq
 
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.footprints import PRODUCT, reading_fates
+from roadscan.jobs.footprints import PRODUCT
 from roadscan.jobs.navigate import known_keys
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.products import plan_outputs
 from roadscan.jobs.stages import Run, plan_tile_work
-from roadscan.jobs.tiles import TILE
+from roadscan.jobs.tile_fates import told
+from roadscan.jobs.tile_plan import TILE
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
 from roadscan.products.base import products
 from roadscan.tables.logs import has_log, read_log_records
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
 from roadscan.tables.store import Store, digest_holds
+from roadscan.tiles.accumulator import MOST_BYTES
 
 
 @dataclass
@@ -110,23 +112,23 @@ def survey_status(survey: Survey, store: Store) -> Status:
 def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifest) -> None:
     plan = plan_survey(survey, store)
     status.notes = outdated_calibrations(plan)
-    status.readings = reading_fates(plan, manifest)
+    status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
     if not any(manifest.of(PRODUCT)):
         status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}
         return
     work = plan_tile_work(Run(survey, store, Inline()), manifest)
-    tasks = work.tasks(work.chosen)
+    tasks = work.planned.tasks(work.chosen)
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)
-    status.products_stale = len(plan_outputs(work.plan, manifest)[0])
-    largest = max((t.readings for t in tasks), default=0)
+    status.products_stale = len(plan_outputs(work.planned.plan, manifest)[0])
+    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
     status.next_run = {
         "tasks": len(tasks),
         "tiles": len(stale),
         "products": status.products_stale,
         "raw_bytes": sum(t.raw_bytes for t in tasks),
-        "worker_memory_bytes": WORKER_BASE_BYTES + BYTES_PER_READING * largest if tasks else 0,
+        "worker_memory_bytes": WORKER_BASE_BYTES + largest if tasks else 0,
     }
 
 
@@ -179,7 +181,7 @@ def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | Non
     try:
         if record.product in products():
             products()[record.product].check(local)
-        else:
+        elif record.path.endswith(".parquet"):
             pq.read_table(local, partitioning=None)
     except (RoadscanError, OSError, pa.ArrowInvalid) as error:
         return f"{record.path}: {error}"

@@ -68,12 +68,12 @@ def find_runs(column, row, starts):
 
 
 @inlined
-def sum_up(intensity, sums):
-    """Sums of the intensities before each reading: (n + 1,) uint32, out."""
+def sum_up(intensity, gain, sums):
+    """Sums of the intensities, times `gain`, before each reading: (n + 1,) uint32, out."""
     total = np.uint32(0)
     for j in range(intensity.size):
         sums[j] = total
-        total += np.uint32(intensity[j])
+        total += gain * np.uint32(intensity[j])
     sums[intensity.size] = total
 
 
@@ -95,7 +95,7 @@ def store_run(heights, first, offset, slots, at):
 
 @kernel
 def accumulate(
-    column, row, heights, low, high, intensity, word, bit, starts, sums,
+    column, row, heights, low, high, intensity, gain, word, bit, starts, sums,
     tile_rows, groups, edge, slots, bases, chain, filled, light, marks, free, held, touched,
 ):  # fmt: skip
     """Count readings into the cells of active tiles.
@@ -106,7 +106,7 @@ def accumulate(
     filter leaves out.
     heights : (n + VECTOR,) int32, quanta of the map; what follows the n-th is read, but not counted.
     low, high : int, no height lies below or above.
-    intensity : (n,) unsigned, at most 16 bits.
+    intensity : (n,) unsigned; gain : uint32; their product takes at most 16 bits.
     word, bit : int, uint8; place of the readings' pass in `marks`.
     starts : (n + 1,) int32, sums : (n + 1,) uint32, work.
     tile_rows : (rows, columns) int32, row of each tile in `groups`; −1 for tiles that are not active.
@@ -126,7 +126,7 @@ def accumulate(
     lights, bits, words = light.reshape(-1), marks.reshape(-1), marks.shape[2]
     counted = 0
     west, south, tile = -(1 << 40), -(1 << 40), -1
-    sum_up(intensity, sums)
+    sum_up(intensity, gain, sums)
     for run in range(find_runs(column, row, starts)):
         first, end = starts[run], starts[run + 1]
         x, y = np.int64(column[first]), np.int64(row[first])
@@ -162,13 +162,32 @@ def accumulate(
             slots[e, lane, filled[e, lane]] = np.int16(heights[j] - bases[e])
             filled[e, lane] += 1
             marks[e, lane, word] |= bit
-            light[e, lane] += np.uint32(intensity[j])
+            light[e, lane] += gain * np.uint32(intensity[j])
     return counted
+
+
+@inlined
+def note(column, row, epochs, sigma, edge, tile_rows, spans, sigmas):
+    """Note epochs and σ of readings with the active tiles that they fall into."""
+    west, south, tile = -(1 << 40), -(1 << 40), -1
+    for j in range(column.size):
+        x, y = np.int64(column[j]), np.int64(row[j])
+        if not (west <= x < west + edge and south <= y < south + edge):
+            across, along = x // edge, y // edge
+            west, south, tile = across * edge, along * edge, -1
+            if 0 <= along < tile_rows.shape[0] and 0 <= across < tile_rows.shape[1]:
+                tile = tile_rows[along, across]
+                if tile >= 0:
+                    sigmas[tile, 0] = max(sigmas[tile, 0], sigma[0])
+                    sigmas[tile, 1] = max(sigmas[tile, 1], sigma[1])
+        if tile >= 0:
+            spans[tile, 0] = min(spans[tile, 0], epochs[j])
+            spans[tile, 1] = max(spans[tile, 1], epochs[j])
 
 
 @kernel
 def accumulate_placed(
-    east, north, height, classes, passes, intensity, epochs, intervals, corner, cell_quanta, edge,
+    east, north, height, classes, passes, intensity, gain, epochs, intervals, corner, cell_quanta, edge,
     tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, first,
 ):  # fmt: skip
     """Count readings that have their places into the cells of active tiles.
@@ -178,7 +197,7 @@ def accumulate_placed(
     east, north, height : (n,) float64, whole quanta of the map.
     classes : (n,) uint8, 0 for readings that are kept.
     passes : (n,) int32, number of the reading's pass among the accumulator's, −1 where it is in none.
-    intensity : (n,) unsigned, at most 16 bits; epochs : (n,) int64, GPS ns.
+    intensity : (n,) unsigned; gain : uint32, see :func:`accumulate`; epochs : (n,) int64, GPS ns.
     intervals : (n,) int32, interval of the trajectory that placed each reading, a row of `interval_sigmas`.
     corner : (2,) tuple of int64, south-west corner of tile_rows[0, 0] (quanta).
     cell_quanta, edge, tile_rows … held : see :func:`accumulate`.
@@ -224,17 +243,19 @@ def accumulate_placed(
                 low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
         if low <= high:
             counted += accumulate(
-                column[:n], row[:n], heights, low, high, intensity[start:end],
+                column[:n], row[:n], heights, low, high, intensity[start:end], gain,
                 passes[start] >> 3, np.uint8(1 << (passes[start] & 7)), starts, sums,
                 tile_rows, groups, edge, slots, bases, chain, filled, light, marks, free, held, touched,
             )  # fmt: skip
-            k = intervals[start]
-            for tile in range(touched.size):
-                if touched[tile]:
-                    touched[tile] = 0
-                    spans[tile, 0] = min(spans[tile, 0], epochs[start:end].min())
-                    spans[tile, 1] = max(spans[tile, 1], epochs[start:end].max())
-                    sigmas[tile, 0] = max(sigmas[tile, 0], interval_sigmas[k, 0])
-                    sigmas[tile, 1] = max(sigmas[tile, 1], interval_sigmas[k, 1])
+            note(
+                column[:n],
+                row[:n],
+                epochs[start:end],
+                interval_sigmas[intervals[start]],
+                edge,
+                tile_rows,
+                spans,
+                sigmas,
+            )
         start = end
     return start, counted

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding
 import numba
 
 Kernel = Callable[..., Any]
@@ -41,6 +42,15 @@ def _compiled(function: Kernel, *, forceinline: bool) -> Kernel:
     return compiled
 
 
+def _use_whole_registers() -> None:
+    """Let the compiler use all 512 bits of a register where there are that many; it prefers 256 for old machines."""
+    host = llvmlite.binding.get_host_cpu_features()
+    if host.get("avx512f") and "NUMBA_CPU_FEATURES" not in os.environ:
+        os.environ.setdefault("NUMBA_CPU_NAME", llvmlite.binding.get_host_cpu_name())
+        os.environ["NUMBA_CPU_FEATURES"] = host.flatten() + ",-prefer-256-bit"
+        numba.config.reload_config()
+
+
 def _cache_folder() -> str:
     digest = hashlib.blake2b(digest_size=6)
     for file in sorted(Path(__file__).parent.glob("*.py")):
@@ -49,4 +59,5 @@ def _cache_folder() -> str:
     return str(Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}")
 
 
+_use_whole_registers()
 _CACHE_FOLDER = _cache_folder()

@@ -132,6 +132,18 @@ class Trajectory:
         columns = [np.interp(since, knots, self.sigma_ned_m[:, a], left=np.nan, right=np.nan) for a in range(3)]
         return np.stack(columns, axis=-1)
 
+    def interval_sigmas_m(self) -> Float64:
+        """Largest 1 σ (n − 1, 2) of the poses of each interval between knots, horizontal and down; inf where not known.
+
+        Horizontal is √(σ_north² + σ_east²), the larger one of the interval's two knots.
+        """
+        intervals = max(self.epochs_gps_ns.size - 1, 0)
+        if self.sigma_ned_m is None:
+            return np.full((intervals, 2), np.inf)
+        sigma = np.column_stack([np.hypot(self.sigma_ned_m[:, 0], self.sigma_ned_m[:, 1]), self.sigma_ned_m[:, 2]])
+        known: Float64 = np.where(np.isnan(sigma), np.inf, sigma)
+        return np.maximum(known[:-1], known[1:])
+
     def poses(self, epochs_gps_ns: Int64, *, strict: bool = False) -> Poses:
         """Interpolate.
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.kernels.georeference import FATES, georeference_profiles, georeference_returns
+from roadscan.kernels.flat_profiles import georeference_flat_profiles
+from roadscan.kernels.georeference import FATES
+from roadscan.kernels.placed_points import georeference_mirror, georeference_returns
 from roadscan.model.crs import Geoid, MapFrame, world_frame_of
 from roadscan.model.errors import CrsError
 from roadscan.model.ids import LanePass
@@ -19,6 +22,7 @@ from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
 from roadscan.points.classes import KEPT, TOO_HIGH, TOO_LOW
 from roadscan.points.cloud import QUANTA_PER_M
+from roadscan.points.flat_profiles import EVERY_RAW_RANGE, flat_profiles
 from roadscan.points.readings import ScanGeometry
 
 Float64 = npt.NDArray[np.float64]
@@ -72,6 +76,7 @@ class Window:
 
 
 _NO_LIMITS: Final = (0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)
+_NO_MARKS: Final = np.empty(0, np.uint8)
 EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
 
 
@@ -105,21 +110,28 @@ class Placement:
     heights: HeightLimits
     tile_quanta: int
 
-    def _common(self, mounting: Mounting, limits: tuple[float, ...]) -> tuple[Any, ...]:
+    def poses(self, mounting: Mounting) -> tuple[Any, ...]:
+        """What the kernels need to place readings of a mounting: it, the trajectory, the charts of the map."""
         rotation, lever = mounting.arrays()
         coefficients, valid = self.trajectory.intervals
         return (
             (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
             tuple(self.charts.lattice.tolist()), self.charts.table, self.charts.centres, self.charts.coefficients,
-            limits, float(QUANTA_PER_M), self.tile_quanta,
         )  # fmt: skip
 
-    def _limits(self) -> tuple[float, ...]:
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Limits of ranges and heights, in the order of ``kernels.georeference.LIMITS``."""
         h = self.heights
         return (
             float(self.range_min_m), float(self.range_max_m), *h.absolute(),
             float(h.above_body_min_m), float(h.above_body_max_m),
         )  # fmt: skip
+
+    @cached_property
+    def interval_sigmas_m(self) -> Float64:
+        """(knots − 1, 2) largest horizontal and vertical 1 σ of the poses of each interval; inf where not known."""
+        return self.trajectory.interval_sigmas_m()
 
     def returns(self, batch: pa.RecordBatch, window: Window, *, marked: bool = False) -> Placed:
         """Place rows of the table ``returns``; `marked`: those too that a filter leaves out, with their classes."""
@@ -171,14 +183,14 @@ class Placement:
         lines are not looked at.
         """
         classes = np.zeros(_readings(batch, geometry), np.uint8)
-        self._place(batch, geometry, EVERYWHERE, self._limits(), classes)
+        self._place(batch, geometry, EVERYWHERE, self.limits, classes)
         return classes
 
     def _work(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, marked: bool) -> _Work:
         if not marked:
-            return self._place(batch, geometry, window, self._limits())
+            return self._place(batch, geometry, window, self.limits)
         classes = np.zeros(_readings(batch, geometry), np.uint8)
-        limited = self._place(batch, geometry, window, self._limits(), classes)
+        limited = self._place(batch, geometry, window, self.limits, classes)
         every = self._place(batch, geometry, window, _NO_LIMITS)
         return replace(every, fates=limited.fates, classes=classes)
 
@@ -194,24 +206,35 @@ class Placement:
         epochs = _numpy(batch, "pose_epoch_gps_ns" if geometry is None else "epoch_gps_ns")
         made = 0
         for rows, mounting in self.mountings.pieces(epochs):
-            common = (*self._common(mounting, limits), astuple(window))
+            poses = self.poses(mounting)
+            common = (*poses, limits, float(QUANTA_PER_M), self.tile_quanta, astuple(window))
             own = work.after(made)
             piece = batch.slice(rows.start, rows.stop - rows.start)
             if geometry is None:
-                xyz = np.stack([_numpy(piece, f"{a}_sensor_m") for a in "xyz"], axis=-1)
+                x, y, z = (_numpy(piece, f"{a}_sensor_m") for a in "xyz")
                 count = georeference_returns(
-                    epochs[rows], xyz, *common, own.rows, own.tiles, own.quanta, work.fates,
-                    None if classes is None else classes[rows],
+                    epochs[rows], x, y, z, *common, own.rows, own.tiles, own.quanta, work.fates,
+                    _NO_MARKS if classes is None else classes[rows],
                 )  # fmt: skip
             else:
-                origins, directions = geometry.rays()
                 readings = slice(rows.start * geometry.readings, rows.stop * geometry.readings)
-                count = georeference_profiles(
-                    epochs[rows], _lists(piece, "range", geometry.readings), origins, directions,
-                    (geometry.range_offset_m, geometry.range_step_m), geometry.reading_period_ns, *common,
+                ranges = _lists(piece, "range", geometry.readings)
+                out = (
                     own.rows, own.readings, own.tiles, own.quanta, work.fates,
-                    None if classes is None else classes[readings],
+                    _NO_MARKS if classes is None else classes[readings],
                 )  # fmt: skip
+                flat = flat_profiles(geometry, self.range_min_m, self.range_max_m)
+                if flat is None:
+                    count = georeference_mirror(
+                        epochs[rows], ranges, *geometry.rays(), (geometry.range_offset_m, geometry.range_step_m),
+                        geometry.reading_period_ns, *common, *out,
+                    )  # fmt: skip
+                else:
+                    count = georeference_flat_profiles(
+                        epochs[rows], ranges, flat.rays, flat.middle, flat.scale, poses,
+                        flat.raw_limits if limits is not _NO_LIMITS else EVERY_RAW_RANGE,
+                        *common[8:], *out,
+                    )  # fmt: skip
             own.rows[:count] += rows.start
             made += count
         return work.first(made)

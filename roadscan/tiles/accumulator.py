@@ -20,6 +20,9 @@ from roadscan.tiles.grid import TileGrid
 ROBUST_FLOOR_QUANTA: Final = 100
 """Heights within 1 mm of the median always count."""
 
+MOST_BYTES: Final = 800 << 20
+"""Memory that the cells of begun tiles may take."""
+
 _FIRST_ELEMENTS: Final = 4096
 _NEVER: Final = np.array([2**62, -(2**62)])
 
@@ -111,16 +114,29 @@ class Accumulator:
     """
 
     def __init__(
-        self, grid: TileGrid, tiles: Sequence[TileId], passes: Sequence[int], most_bytes: int = 1 << 30
+        self,
+        grid: TileGrid,
+        tiles: Sequence[TileId],
+        passes: Sequence[int],
+        pool: Pool | None = None,
+        most_bytes: int = MOST_BYTES,
     ) -> None:
-        """`tiles` that may become active, `passes` that readings may belong to, memory that cells may take."""
+        """Make ready.
+
+        Parameters
+        ----------
+        tiles : that may become active.
+        passes : ids of those that readings may belong to.
+        pool : memory for cells, unused and with room for the passes; a new one where left out.
+        most_bytes : memory that cells may take.
+        """
         self.grid = grid
         self.passes = np.array(sorted(set(passes)), np.uint16)
         self._most_bytes = most_bytes
         columns, rows = [t.column for t in tiles], [t.row for t in tiles]
         self._west, self._south = min(columns), min(rows)
         self.tile_rows = np.full((max(rows) + 1 - self._south, max(columns) + 1 - self._west), -1, np.int32)
-        self._pool = Pool(max(1, -(-self.passes.size // 8)))
+        self._pool = Pool(max(1, -(-self.passes.size // 8))) if pool is None else pool
         self._unused: list[int] = []
         self._groups = np.empty((0, self._groups_per_tile), np.int32)
         self._spans = np.empty((0, 2), np.int64)

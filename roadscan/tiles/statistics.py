@@ -33,7 +33,7 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
     def count(tile_rows: Any, groups: Any, pool: Any, spans: Any, sigmas: Any, first: int) -> int:
         done, _ = accumulate_placed(
             points.x_quanta + np.float64(east), points.y_quanta + np.float64(north),
-            points.height_quanta.astype(np.float64), zeros.astype(np.uint8), passes, points.intensity,
+            points.height_quanta.astype(np.float64), zeros.astype(np.uint8), passes, points.intensity, np.uint32(1),
             points.epoch_gps_ns, zeros, (east, north), grid.cell_quanta, grid.cells_per_edge,
             tile_rows, groups, *pool, spans, sigmas, np.zeros((1, 2)), first,
         )  # fmt: skip

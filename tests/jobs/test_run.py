@@ -23,7 +23,7 @@ from roadscan.jobs.ingest import ingest
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.status import survey_status, verify_store
-from roadscan.jobs.tiles import load_points
+from roadscan.jobs.tile_points import load_points
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -243,9 +243,10 @@ def test_a_halo_adds_neighbours_and_changes_no_core_tile(finished: Simulated) ->
     work = plan_tile_work(
         Run(Survey.load(finished.survey_file), finished.store(), Inline()), Manifest(finished.store())
     )
-    inner = next(t for t in work.tiles if TileId(t.column + 1, t.row) in work.tiles)
-    (alone,) = work.tasks([inner])
-    (whole,) = work.tasks(list(work.tiles), edge_tiles=64)
+    tiles = work.planned.tiles
+    inner = next(t for t in tiles if TileId(t.column + 1, t.row) in tiles)
+    (alone,) = work.planned.singly([inner])
+    whole = work.planned.task(Block(tuple(tiles)))
     with_halo = dataclasses.replace(whole, block=Block((inner,), halo_tiles=1), keys=alone.keys)
     a, b = dict(load_points(alone)), dict(load_points(with_halo))
     assert list(a) == [inner]

@@ -1,0 +1,127 @@
+"""What bounds the readings of a data file: poses, spans of ranges, statistics of row groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.jobs.readings import Ground, RawSlice, geometry_of, load_trajectory
+from roadscan.model.crs import add_grid_folder
+from roadscan.model.errors import NavigationError, StoreError
+from roadscan.points.charts import charts_along
+from roadscan.points.reach import RangeSpans, Reach, Touched, joined
+from roadscan.points.readings import ScanGeometry
+from roadscan.tables.store import Store
+
+_SPAN_COLUMNS = ["range_low", "range_high"]
+_CHUNK_READINGS = 1 << 22
+
+
+def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
+    """Tiles that the row groups of a slice of scans or returns may touch; groups by their place in the slice."""
+    reach = _reach(store, ground, one)
+    if reach is None:
+        return joined([])
+    geometry = geometry_of(one.source)
+    with _opened(store, one) as file:
+        if geometry is None:
+            return _of_returns(reach, one, file)
+        counts = [file.metadata.row_group(g).num_rows for g in one.groups]
+        stored = [c for c in _SPAN_COLUMNS if c in file.schema_arrow.names]
+        rows = file.read_row_groups(list(one.groups), columns=["epoch_gps_ns", *stored], use_threads=False)
+        spans = _stored_spans(rows, geometry)
+        if reach.is_loose(spans, geometry):
+            spans = _read_spans(file, one.groups, counts, geometry)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return reach.profiles(_on_time(one, rows.column("epoch_gps_ns").to_numpy()), spans, starts, geometry)
+
+
+def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
+    """Poses around a slice and how far its readings count; None without any pose."""
+    source = one.source
+    if source.trajectory is None:
+        raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
+    if ground.grids is not None:
+        add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
+    trajectory = load_trajectory(store, source.trajectory, one.spans, ground.max_gap_s)
+    if trajectory.epochs_gps_ns.size == 0:
+        return None
+    return Reach(
+        trajectory=trajectory,
+        charts=charts_along(ground.map, trajectory.world, trajectory.position_world_m),
+        mountings=source.mountings,
+        range_min_m=0.0 if ground.marks else source.range_min_m,
+        range_max_m=np.inf if ground.marks else source.range_max_m,
+        tile_quanta=ground.grid.size_quanta,
+    )
+
+
+@contextmanager
+def _opened(store: Store, one: RawSlice) -> Iterator[pq.ParquetFile]:
+    try:
+        with store.fs.open(store.path(one.file), "rb") as stream:
+            yield pq.ParquetFile(stream)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise StoreError(
+            f"ingested rows cannot be read ({error})",
+            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
+            file=one.file,
+        ) from error
+
+
+def _on_time(one: RawSlice, epochs_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    return epochs_gps_ns if one.source.clock is None else one.source.clock.applied(epochs_gps_ns)
+
+
+def _stored_spans(rows: pa.Table, geometry: ScanGeometry) -> RangeSpans:
+    """Spans of ranges as ingest wrote them; any range where it did not."""
+    if any(c not in rows.column_names for c in _SPAN_COLUMNS):
+        return RangeSpans.unknown(rows.num_rows, geometry)
+    low, high = (rows.column(c).fill_null(whole).to_numpy() for c, whole in zip(_SPAN_COLUMNS, (1, 65535), strict=True))
+    return RangeSpans.of_profiles(low, high, geometry)
+
+
+def _read_spans(
+    file: pq.ParquetFile, groups: Sequence[int], counts: Sequence[int], geometry: ScanGeometry
+) -> RangeSpans:
+    """Spans of ranges of the parts of each profile, from the readings."""
+    step = max(_CHUNK_READINGS // (max(counts) * geometry.readings), 1)
+    parts: list[RangeSpans] = []
+    for start in range(0, len(groups), step):
+        rows = file.read_row_groups(list(groups[start : start + step]), columns=["range"], use_threads=False)
+        flat = rows.column("range").combine_chunks().flatten().to_numpy()
+        parts.append(RangeSpans.of_ranges(flat.reshape(rows.num_rows, geometry.readings)))
+    low, high = (np.concatenate([getattr(p, name) for p in parts]) for name in ("low", "high"))
+    return RangeSpans(low, high, parts[0].block_readings)
+
+
+def _of_returns(reach: Reach, one: RawSlice, file: pq.ParquetFile) -> Touched:
+    metadata = file.metadata
+    index = {metadata.schema.column(i).name: i for i in range(metadata.num_columns)}
+    boxes = np.empty((len(one.groups), 3, 2))
+    spans = np.empty((len(one.groups), 2), np.int64)
+    readings = np.empty(len(one.groups), np.int64)
+    for number, group in enumerate(one.groups):
+        part = metadata.row_group(group)
+        readings[number] = part.num_rows
+        for axis, name in enumerate("xyz"):
+            boxes[number, axis] = _limits(part, index[f"{name}_sensor_m"]) or (-np.inf, np.inf)
+        spans[number] = _limits(part, index["pose_epoch_gps_ns"]) or _pose_span(file, group)
+    boxes[np.isnan(boxes).any(axis=2)] = (-np.inf, np.inf)
+    return reach.returns(_on_time(one, spans.ravel()).reshape(-1, 2), boxes, readings)
+
+
+def _limits(part: pq.RowGroupMetaData, column: int) -> tuple[float, float] | None:
+    """Least and greatest value of a column by the statistics of a row group, None without any."""
+    statistics = part.column(column).statistics
+    return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
+
+
+def _pose_span(file: pq.ParquetFile, group: int) -> tuple[int, int]:
+    epochs = file.read_row_groups([group], columns=["pose_epoch_gps_ns"], use_threads=False).column(0).to_numpy()
+    return int(epochs.min()), int(epochs.max())

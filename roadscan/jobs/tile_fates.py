@@ -1,0 +1,45 @@
+"""What became of readings, told with the tiles: each row group's readings with one of the tiles that it touches."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.georeference import FATES, KEPT, OUTSIDE
+from roadscan.model.ids import TileId
+from roadscan.points.place import FATE_NAMES
+from roadscan.tables.manifest import OutputRecord
+
+
+class Fates:
+    """Readings by fate of the row groups of a task, by the tile that tells them."""
+
+    def __init__(self) -> None:
+        self._counts: dict[TileId, npt.NDArray[np.int64]] = defaultdict(lambda: np.zeros(FATES, np.int64))
+
+    def add(self, tile: TileId, fates: npt.NDArray[np.int64]) -> None:
+        """Count (6,) readings by fate; those that were placed outside the task's tiles are kept ones, too."""
+        self._counts[tile] += fates
+
+    def of(self, tile: TileId) -> dict[str, int]:
+        """Figures for the tile's record."""
+        if tile not in self._counts:
+            return {}
+        counts = self._counts[tile].copy()
+        counts[KEPT] += counts[OUTSIDE]
+        counts[OUTSIDE] = 0
+        return {name: int(n) for name, n in zip(FATE_NAMES[:FATES], counts, strict=True) if n}
+
+
+def told(records: Iterable[OutputRecord]) -> dict[str, int]:
+    """Readings by fate over the records of tiles (and of the footprints of clouds, which are placed for these)."""
+    totals = dict.fromkeys(FATE_NAMES, 0)
+    for record in records:
+        figures: dict[str, Any] = record.figures()
+        for name, count in figures.get("fates", {}).items():
+            totals[name] += count
+    return {name: count for name, count in totals.items() if count}

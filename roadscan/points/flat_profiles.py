@@ -1,0 +1,57 @@
+"""Profiles that are measured at once and lie near the sensor: what ``kernels.flat_profiles`` needs of them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.points.readings import ScanGeometry
+
+REACH_M: Final = 8.0
+"""Farthest that a reading may lie from the middle of its profile. Over 8 m the map departs from a plane by
+s²/2R = 5 µm (R the Earth's radius), and a 32-bit float resolves 0.6 µm."""
+
+EVERY_RAW_RANGE: Final = (np.uint16(1), np.uint16(65_535))
+"""All raw ranges that are returns."""
+
+_RAWS: Final = np.arange(1 << 16)
+
+
+@dataclass(frozen=True)
+class FlatProfiles:
+    """Rays of a profile about its middle, in the numbers that the kernels take."""
+
+    rays: npt.NDArray[np.float32]
+    """(4, m): y and z of the rays' origins from the middle (m), y and z of their directions."""
+    middle: tuple[float, float]
+    """y and z in the sensor's frame (m)."""
+    scale: tuple[np.float32, np.float32]
+    """range_offset_m, range_step_m."""
+    raw_limits: tuple[np.uint16, np.uint16]
+    """Lowest and highest raw range that is kept."""
+
+
+@functools.lru_cache(maxsize=64)
+def flat_profiles(geometry: ScanGeometry, range_min_m: float, range_max_m: float) -> FlatProfiles | None:
+    """Flat profiles of a geometry between range limits; None where they have to be placed reading by reading."""
+    if geometry.reading_period_ns > 0.0:
+        return None
+    every = geometry.range_offset_m + geometry.range_step_m * _RAWS
+    kept = np.flatnonzero((every >= range_min_m) & (every <= range_max_m) & (_RAWS > 0))
+    low, high = (int(kept[0]), int(kept[-1])) if kept.size else (1, 0)
+    origins, directions = geometry.rays()
+    ends = np.concatenate([(origins + every[raw] * directions)[:, 1:] for raw in (low, high)])
+    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
+    if np.hypot(*(ends - middle).T).max() > REACH_M:
+        return None
+    rays = np.stack([*(origins[:, 1:] - middle).T, *directions[:, 1:].T]).astype(np.float32)
+    return FlatProfiles(
+        rays=np.ascontiguousarray(rays),
+        middle=(float(middle[0]), float(middle[1])),
+        scale=(np.float32(geometry.range_offset_m), np.float32(geometry.range_step_m)),
+        raw_limits=(np.uint16(low), np.uint16(high)),
+    )

@@ -196,9 +196,9 @@ def accumulate_profiles(
                         fates[fate_of(kind)] += 1
             if good > 0 and passes[i] >= 0:
                 counted += accumulate(
-                    column[:n], row[:n], height, np.int64(low) + base, np.int64(high) + base, intensity[i, start:end], gain,
-                    word, bit, starts, sums, tile_rows, groups, edge, slots, bases, chain, filled, light, marks,
-                    free, held, touched,
+                    column[:n], row[:n], height, np.int64(low) + base, np.int64(high) + base,
+                    intensity[i, start:end], gain, word, bit, starts, sums, tile_rows, groups, edge,
+                    slots, bases, chain, filled, light, marks, free, held, touched,
                 )  # fmt: skip
         fates[KEPT] += counted
         fates[OUTSIDE] += wanted - counted

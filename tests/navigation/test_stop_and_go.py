@@ -21,6 +21,7 @@ from roadscan.model.gpstime import NS_PER_S, WEEK_S
 from roadscan.model.imu import IMU_GRADES
 from roadscan.model.rig import Mounting, Rig
 from roadscan.navigation.calibration.estimator import Prior, calibrate
+from roadscan.navigation.calibration.orientations import joint_covariance
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.navigation.trajectory import Trajectory
@@ -194,6 +195,42 @@ def test_the_head_takes_the_orientation_of_its_imu(yards):
     expected = Rotation.from_matrix(found.body_from_imu) * turned
     assert evidence.body_from_sensor == pytest.approx(expected.as_matrix(), abs=1e-12)
     assert evidence.covariance_rad2 is found.covariance_rad2
+
+
+def test_an_error_of_the_trajectory_turns_the_head_as_its_influence_says(yards):
+    yard, head = yards[0], "profiler_left"
+    run = yard.head_runs(head)[2]
+    plain = yard.find(head, [run])
+    (influence,) = plain.attitude
+    seconds = (influence.epoch_gps_ns - influence.epoch_gps_ns[0]) / NS_PER_S
+    # Changes of roll and pitch would be noise of the turns besides.
+    error = 5e-5 * np.stack([np.ones_like(seconds), -np.ones_like(seconds), np.sin(seconds / 11.0)], axis=-1)
+    path = run.trajectory
+    at = [np.interp(path.epochs_gps_ns, influence.epoch_gps_ns, error[:, a]) for a in range(3)]
+    turned = Rotation.from_quat(path.quaternion_world_from_body, scalar_first=True) * Rotation.from_rotvec(
+        np.stack(at, axis=-1)
+    )
+    off = Trajectory.of(path.world, path.epochs_gps_ns, path.position_world_m, turned.as_quat(scalar_first=True))
+    found = yard.find(head, [replace(run, trajectory=off)])
+    change = Rotation.from_matrix(found.body_from_imu @ plain.body_from_imu.T).as_rotvec()
+    # An error of the stated attitude turns the head the other way.
+    expected = -np.einsum("ika,ka->i", influence.influence, error)
+    assert np.abs(expected).max() > 1e-5
+    assert change == pytest.approx(expected, abs=0.05 * np.abs(expected).max())
+
+
+def test_heads_share_the_error_of_the_trajectory(yards):
+    heads = [yards[0].find(head) for head in HEADS]
+    nominal = Mounting((0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3).tolist())))
+    members = [one.evidence(name, nominal, nominal) for name, one in zip(HEADS, heads, strict=True)]
+    covariance = joint_covariance(members)
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = (covariance / np.outer(sigma, sigma))[:3, 3:]
+    # Tilts are known as well as the trajectory's; the heading is not, and errs with the head's own accelerometers.
+    assert 0.5 < correlation[0, 0] < 0.99
+    assert 0.5 < correlation[1, 1] < 0.99
+    assert 0.0 < correlation[2, 2] < 0.7
 
 
 def test_gaps_and_damaged_samples_cost_their_windows(yards):

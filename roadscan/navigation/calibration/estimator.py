@@ -23,10 +23,12 @@ from roadscan.model.rig import Mounting
 from roadscan.navigation.calibration.evidence import Evidence, Traverse
 from roadscan.navigation.calibration.observability import Observability, observe
 from roadscan.navigation.calibration.observations import Observations, observations
+from roadscan.navigation.calibration.orientations import Contradiction, OrientationObservations
 from roadscan.navigation.calibration.robust import (
     Scales,
     Weighed,
     independent_share,
+    length_limit,
     loss,
     scales_of,
     variance_factor,
@@ -195,6 +197,8 @@ class _Adjustment:
     rounds: int = 0
     iterations: int = 0
     found: list[Observations] = field(default_factory=list)
+    rejected: set[tuple[str, str]] = field(default_factory=set)
+    """Kind and sensor of orientations that contradict all else."""
 
     def run(self) -> Calibration:
         """All stages: with all directions free, then with those held that the evidence does not determine."""
@@ -205,6 +209,28 @@ class _Adjustment:
         return self._result(z, seen, converged=converged and settled)
 
     def _free(self, z: Float64) -> tuple[Float64, bool]:
+        """Solve with all orientations, then without those that contradict all else, the worst first."""
+        z, settled = self._stay(z)
+        while (worst := self._contradicting(z)) is not None:
+            self.rejected.add((worst.kind, worst.sensor))
+            z, settled = self._stay(z)
+        return z, settled
+
+    def _contradicting(self, z: Float64) -> Contradiction | None:
+        """The orientation that lies farthest beyond the limit."""
+        system = self._linearised(z, reject=True)
+        derivative = system.now.derivative
+        covariance = derivative @ system.covariance @ derivative.T
+        tested = [
+            one
+            for observed in self.found
+            if isinstance(observed, OrientationObservations)
+            for one in observed.contradictions(system.now, covariance)
+            if one.rows and one.length > length_limit(self.settings.reject_limit, one.rows)
+        ]
+        return max(tested, key=lambda one: one.length, default=None)
+
+    def _stay(self, z: Float64) -> tuple[Float64, bool]:
         """Find the evidence and solve, until the mountings stay where they are."""
         self._find(z)
         # What is far off at first may come near: nothing is rejected before.
@@ -235,7 +261,7 @@ class _Adjustment:
 
     def _find(self, z: Float64) -> None:
         found = self.evidence(self.unknowns.estimate(z)) if callable(self.evidence) else self.evidence
-        self.found = observations(found, self.unknowns)
+        self.found = observations(found, self.unknowns, self.rejected)
         self.rounds += 1
 
     def _solve(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:

@@ -81,6 +81,20 @@ class Directions:
 
 
 @dataclass(frozen=True)
+class AttitudeInfluence:
+    """How much of an orientation's error comes from errors of the trajectory's attitude, over one piece of a run."""
+
+    epoch_gps_ns: Int64
+    """(k,) ascending."""
+    influence: Float64
+    """(3, k, 3) small rotation of the orientation by errors of roll, pitch, heading at these epochs."""
+    sigma_roll_pitch_heading_rad: tuple[float, float, float]
+    """1 σ of these errors."""
+    time_constant_s: float
+    """Errors are correlated by exp(−|Δt| / time constant)."""
+
+
+@dataclass(frozen=True)
 class Orientation:
     """The rotation of a sensor, found by itself."""
 
@@ -90,6 +104,9 @@ class Orientation:
     """(3, 3)."""
     covariance_rad2: Float64
     """(3, 3) of a small rotation about the body's axes that follows `body_from_sensor`."""
+    attitude: tuple[AttitudeInfluence, ...] = ()
+    """By run or piece: what of the covariance is the trajectory's attitude. Orientations of two sensors that were found
+    along the same drives share it, and do not average it out."""
 
 
 Evidence = Ties | Directions | Orientation

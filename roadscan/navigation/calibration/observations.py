@@ -11,7 +11,7 @@ scanning LIDAR systems", writes the same terms.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from roadscan.kernels.calibration import tie_residuals, tie_rows
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.evidence import Directions, Evidence, Known, Orientation, Seen, Ties
-from roadscan.navigation.calibration.rotations import left_jacobian, logarithm
+from roadscan.navigation.calibration.orientations import OrientationObservations
 from roadscan.navigation.calibration.unknowns import BODY, MOUNTING, Geometry, Unknowns
 
 Float64 = npt.NDArray[np.float64]
@@ -40,6 +40,8 @@ class Observations(Protocol):
     kind: str
     label: str
     """Sensors concerned, for the report."""
+    fixed_weight: float | None
+    """What each counts, where its residual does not decide on that."""
 
     @property
     def count(self) -> int:
@@ -66,8 +68,14 @@ class Observations(Protocol):
         """Add the part of the information (P, P) that errors of the weights' directions alone would give."""
 
 
-def observations(evidence: Iterable[Evidence], unknowns: Unknowns) -> list[Observations]:
-    """Prepare evidence for an adjustment.
+def observations(
+    evidence: Iterable[Evidence], unknowns: Unknowns, rejected: Collection[tuple[str, str]] = ()
+) -> list[Observations]:
+    """Prepare evidence for an adjustment; orientations of one kind are one observation, since they share errors.
+
+    Parameters
+    ----------
+    rejected : kinds and sensors of orientations that count for nothing.
 
     Raises
     ------
@@ -76,15 +84,19 @@ def observations(evidence: Iterable[Evidence], unknowns: Unknowns) -> list[Obser
     NavigationError
         where shapes do not fit.
     """
-    return [_prepared(one, unknowns) for one in evidence]
-
-
-def _prepared(one: Evidence, unknowns: Unknowns) -> Observations:
-    if isinstance(one, Ties):
-        return TieObservations(one, unknowns)
-    if isinstance(one, Directions):
-        return DirectionObservations(one, unknowns)
-    return OrientationObservation(one, unknowns)
+    found: list[Observations] = []
+    orientations: dict[tuple[str, bool], list[Orientation]] = {}
+    for one in evidence:
+        if isinstance(one, Ties):
+            found.append(TieObservations(one, unknowns))
+        elif isinstance(one, Directions):
+            found.append(DirectionObservations(one, unknowns))
+        else:
+            counts = (one.kind, one.sensor) not in rejected
+            orientations.setdefault((one.kind, counts), []).append(one)
+    for (_, counts), members in orientations.items():
+        found.append(OrientationObservations(members, unknowns, counts=counts))
+    return found
 
 
 @dataclass(frozen=True)
@@ -145,6 +157,8 @@ class _Side:
 
 class TieObservations:
     """Ties of one pair of sensors, sorted by their pair of traverses."""
+
+    fixed_weight: float | None = None
 
     def __init__(self, ties: Ties, unknowns: Unknowns) -> None:
         self.kind = ties.kind
@@ -306,6 +320,8 @@ def _check_shapes(ties: Ties) -> None:
 class DirectionObservations:
     """Directions: two numbers each, the angle across the direction in the body."""
 
+    fixed_weight: float | None = None
+
     def __init__(self, one: Directions, unknowns: Unknowns) -> None:
         self.kind, self.label = one.kind, one.sensor
         self._sensor = unknowns.find_sensor(one.sensor)
@@ -372,57 +388,3 @@ def _across(direction: Float64) -> Float64:
     first = np.cross(direction, np.eye(3)[least])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(direction, first)], axis=1)
-
-
-class OrientationObservation:
-    """A rotation with its covariance."""
-
-    def __init__(self, one: Orientation, unknowns: Unknowns) -> None:
-        self.kind, self.label = one.kind, one.sensor
-        self._sensor = unknowns.find_sensor(one.sensor)
-        try:
-            self._whitening = np.linalg.inv(np.linalg.cholesky(one.covariance_rad2))
-        except np.linalg.LinAlgError as error:
-            raise NavigationError(
-                f"orientation of '{one.sensor}' ({one.kind}): its covariance is not positive definite",
-                expected="a 3 × 3 covariance in rad²",
-            ) from error
-        self._observed = one.body_from_sensor
-
-    @property
-    def count(self) -> int:
-        """Observations."""
-        return 1
-
-    @property
-    def rows(self) -> int:
-        """Numbers that one observation gives."""
-        return 3
-
-    @property
-    def unusable(self) -> int:
-        """Observations that are not finite; they are left out."""
-        return 0
-
-    def residuals(self, now: Geometry) -> Float64:
-        """(count, rows), unit variance."""
-        return (self._whitening @ self._away(now))[None]
-
-    def metres(self, residuals: Float64) -> Float64 | None:
-        """Angles have no length."""
-        return None
-
-    def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
-        """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
-        away = self._away(now)
-        jacobian = self._whitening @ np.linalg.inv(left_jacobian(away))
-        begin = MOUNTING * self._sensor + 3
-        place = slice(begin, begin + 3)
-        information[place, place] += weight[0] * jacobian.T @ jacobian
-        gradient[place] += weight[0] * jacobian.T @ self._whitening @ away
-
-    def add_seeming(self, now: Geometry, weight: Float64, information: Float64) -> None:
-        """Add nothing: these have no normals."""
-
-    def _away(self, now: Geometry) -> Float64:
-        return logarithm(now.body_from_sensor[self._sensor] @ self._observed.T)

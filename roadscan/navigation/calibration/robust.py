@@ -1,5 +1,8 @@
 """How much each observation counts: Huber weights, rejection, variance factor by kind.
 
+All of it takes many observations of a kind, most of them right; orientations are not such
+(:mod:`roadscan.navigation.calibration.orientations`).
+
 The variance factor of a kind is that of an M-estimator (Huber 1981, eq. 7.6.5): mean square of the clipped residuals
 over the squared share of those that are not clipped. It is applied where it is significantly above 1, never below:
 residuals that are better than stated may have errors in common that they do not show.
@@ -45,7 +48,7 @@ class Scales:
     def limits(self, kind: str, rows: int) -> tuple[float, float]:
         """Robust and reject limit of the length of `rows` residuals: as rare as those of one."""
         spread = self.spread[kind]
-        return spread * _length(self.robust_limit, rows), spread * _length(self.reject_limit, rows)
+        return spread * length_limit(self.robust_limit, rows), spread * length_limit(self.reject_limit, rows)
 
     def with_factors(self, factors: Mapping[str, float], share: Mapping[str, float]) -> Scales:
         """The same limits with other weights of the kinds."""
@@ -88,6 +91,8 @@ def weigh(one: Observations, residuals: Float64, scales: Scales, *, reject: bool
     """Huber's weights; with `reject`, nothing beyond the reject limit."""
     robust, limit = scales.limits(one.kind, one.rows)
     length = np.linalg.norm(residuals, axis=1)
+    if one.fixed_weight is not None:
+        return Weighed(one, residuals, length, np.full(len(length), one.fixed_weight))
     weight = np.minimum(1.0, robust / np.maximum(length, 1e-300))
     if reject:
         weight[length > limit] = 0.0
@@ -96,6 +101,8 @@ def weigh(one: Observations, residuals: Float64, scales: Scales, *, reject: bool
 
 def loss(one: Weighed, scales: Scales, *, reject: bool) -> float:
     """Sum of Huber's function, constant beyond the reject limit with `reject`."""
+    if one.observations.fixed_weight is not None:
+        return float((one.weight * one.length**2).sum())
     robust, limit = scales.limits(one.kind, one.observations.rows)
     length = np.minimum(one.length, limit) if reject else one.length
     return float(np.where(length <= robust, length**2, 2 * robust * length - robust**2).sum())
@@ -119,6 +126,9 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
     """
     squares = rows = whole = used = total_weight = 0.0
     for one in weighed:
+        if one.observations.fixed_weight is not None:
+            # A handful of numbers that the solution mostly follows has no spread of its own to be told.
+            continue
         k = one.observations.rows
         kept = one.weight > 0
         robust, _ = scales.limits(one.kind, k)
@@ -138,7 +148,7 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
 
 
 @cache
-def _length(limit: float, rows: int) -> float:
+def length_limit(limit: float, rows: int) -> float:
     """Length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
     # Farther out probabilities have no number.
     usual = min(limit, 30.0)

@@ -31,7 +31,7 @@ from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.imu import ImuErrors
 from roadscan.model.rig import Mounting
-from roadscan.navigation.calibration.evidence import Orientation
+from roadscan.navigation.calibration.evidence import AttitudeInfluence, Orientation
 from roadscan.navigation.calibration.rotations import cross_matrix, exponential, logarithm
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
 from roadscan.navigation.inertial.readings import ImuReadings
@@ -112,6 +112,8 @@ class HeadOrientation:
     """(runs or pieces, 3) mean over each, IMU axes."""
     gyroscope_bias_rad_per_s: Float64
     """(runs or pieces, 3)"""
+    attitude: tuple[AttitudeInfluence, ...] = ()
+    """By run or piece: what of its error is that of the trajectory, which other heads share."""
 
     @property
     def sigma_rad(self) -> Float64:
@@ -123,7 +125,8 @@ class HeadOrientation:
         body_from_sensor, _ = sensor_nominal.arrays()
         body_from_imu, _ = imu_nominal.arrays()
         imu_from_sensor = body_from_imu.T @ body_from_sensor
-        return Orientation(KIND, sensor, self.body_from_imu @ imu_from_sensor, self.covariance_rad2)
+        body_from_sensor = self.body_from_imu @ imu_from_sensor
+        return Orientation(KIND, sensor, body_from_sensor, self.covariance_rad2, self.attitude)
 
 
 def find_orientation(
@@ -317,6 +320,13 @@ class _Run:
         knot = np.clip(np.floor(at), 0, self.knots - 2).astype(np.int64)
         return knot, np.clip(at - knot, 0.0, 1.0)
 
+    def attitude_influence(self, by_own: Float64) -> AttitudeInfluence:
+        """Of errors (3, 9 knots + 7) by its own unknowns, those by the trajectory's attitude."""
+        knots = by_own[:, : _SLOW * self.knots].reshape(3, self.knots, _SLOW)
+        epochs = self._origin + np.rint(np.arange(self.knots) * self._knot_s * NS_PER_S).astype(np.int64)
+        sigma = self._run.sigma_roll_pitch_heading_rad
+        return AttitudeInfluence(epochs, knots[:, :, 6:], sigma, self._run.time_constant_s)
+
     def rows(self, rotation: Float64) -> tuple[_Rows, _Rows]:
         """Residuals (n, 3), by shared unknowns (n, 3, 6) and own ones (3 n, 9 knots + 7): of forces, of rotations."""
         return self._force_rows(rotation), self._turn_rows(rotation)
@@ -401,6 +411,8 @@ class _Solution:
     force: tuple[Float64, ...]
     """By run: residuals (n, 3) after the adjustment."""
     turn: tuple[Float64, ...]
+    influence: tuple[Float64, ...]
+    """By run: (3, 9 knots + 7) error of the orientation by errors of its own unknowns from what they are held for."""
 
 
 @dataclass(frozen=True)
@@ -482,7 +494,13 @@ def _solved(runs: Sequence[_Run], rotation: Float64, lever_arm_sigma_m: Float64,
     step = covariance @ right
     owns = tuple(cho_solve(factor, own_right - mixed @ step) for factor, mixed, own_right in parts)
     left = [_left_over(run, rotation, step, own) for run, own in zip(runs, owns, strict=True)]
-    return _Solution(step[:3], covariance[:3, :3], owns, tuple(f for f, _ in left), tuple(t for _, t in left))
+    # x̂ = C Aᵀ V⁻¹ y with V = N + B P Bᵀ, and AᵀV⁻¹B = AᵀN⁻¹B (BᵀN⁻¹B + P⁻¹)⁻¹ P⁻¹ (Woodbury).
+    influence = tuple(
+        covariance[:3] @ cho_solve(factor, mixed).T @ run.prior
+        for run, (factor, mixed, _) in zip(runs, parts, strict=True)
+    )
+    force, turn = zip(*left, strict=True)
+    return _Solution(step[:3], covariance[:3, :3], owns, force, turn, influence)
 
 
 def _left_over(run: _Run, rotation: Float64, step: Float64, own: Float64) -> tuple[Float64, Float64]:
@@ -519,6 +537,7 @@ def _result(runs: Sequence[_Run], rotation: Float64, nominal: Mounting, solution
         late_s=tuple(float(own[-1]) for own in solution.own),
         accelerometer_bias_m_per_s2=np.array([s[:3] for s in slow]),
         gyroscope_bias_rad_per_s=np.array([s[3:6] for s in slow]),
+        attitude=tuple(run.attitude_influence(by) for run, by in zip(runs, solution.influence, strict=True)),
     )
 
 

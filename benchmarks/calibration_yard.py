@@ -41,6 +41,8 @@ HEADINGS_DEG = (0.0, 180.0, 90.0, 270.0)
 LIDAR_HEADINGS_DEG = (0.0, 0.0, 180.0, 90.0, 270.0)
 """A loop, back-through, right angles."""
 _POSES_PER_S = 200
+_OTHER_DRIVES = 10_000
+"""Runs of one number draw the same errors from one seed."""
 _EVERY = 6
 
 
@@ -136,14 +138,15 @@ def _arrays(mount: Mount) -> tuple[Float64, Float64]:
 def head_orientations(yard: Yard, folder: Path, rounds: int = 3) -> list[Orientation]:
     """Stop and go with the IMUs in the heads: the same mountings and errors of trajectories, in the shipped runs.
 
-    Loops, back-through and right angle, so many rounds of them, each run with a standstill before and after it.
+    Loops, back-through and right angle, so many rounds of them, each run with a standstill before and after it. They
+    are drives of their own, whose trajectories err independently of those over the object.
     """
     shipped = Scene.load("calibration_yard")
     passes = rounds * [one.model_dump() for one in shipped.passes]
     heads = {side: {"error": getattr(yard.scene.profilers, side).error.model_dump()} for side in ("left", "right")}
     noise = yard.scene.noise
     scene = shipped.changed(
-        seed=yard.scene.seed, passes=passes, profilers={"spacing_m": 2.0, "readings": 2, **heads},
+        seed=_OTHER_DRIVES + yard.scene.seed, passes=passes, profilers={"spacing_m": 2.0, "readings": 2, **heads},
         road={"texture": None}, noise={k: getattr(noise, k) for k in ("position_m", "attitude_deg", "time_constant_s")},
         lidar=_OFF, sick=_OFF, camera=_OFF, imu=_OFF, gnss=_OFF, encoder=_OFF,
     )  # fmt: skip

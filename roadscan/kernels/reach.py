@@ -28,6 +28,8 @@ CHART_SLACK = 4e-13
 STEP_M = 1.0
 """A box moves about so far between two poses looked at, if its way does not bend by more than BEND_M before."""
 BEND_M = 0.03
+FAR_STEP_M, FAR_BEND_M = 3.0, 0.05
+"""The same for boxes of returns, which are far larger."""
 LEAST_STEP_NS = 100_000
 """Time between two poses looked at, at least: poses that jump widen the margin, they do not stop the loop."""
 MOST_TILES = 8192
@@ -88,8 +90,11 @@ def motion_bounds(knots, coefficients, valid):
 
 
 @kernel
-def stretch(k, since, until, arm, knots, valid, motion):
+def stretch(k, since, until, arm, step_m, bend_m, knots, valid, motion):
     """How far to go from `since` (ns), in interval `k`, before the next pose is looked at; at most to `until`.
+
+    arm : m, of the farthest point from the body's origin; step_m, bend_m : how far that point may move, and depart from
+    a straight way; motion : from :func:`motion_bounds`.
 
     Returns
     -------
@@ -102,8 +107,8 @@ def stretch(k, since, until, arm, knots, valid, motion):
         own_speed, own_bend = motion[k, 0] + arm * motion[k, 2], motion[k, 1] + arm * motion[k, 3]
         speed, bend = max(speed, own_speed), max(bend, own_bend)
         limit = min(until, knots[k + 1])
-        by_way = end + np.int64(min((STEP_M - way) / max(own_speed, 1e-6), 1e6) * 1e9)
-        by_bend = since + np.int64(min(math.sqrt(8.0 * BEND_M / max(bend, 1e-9)), 1e6) * 1e9)
+        by_way = end + np.int64(min((step_m - way) / max(own_speed, 1e-6), 1e6) * 1e9)
+        by_bend = since + np.int64(min(math.sqrt(8.0 * bend_m / max(bend, 1e-9)), 1e6) * 1e9)
         stop = max(min(by_way, by_bend), since + LEAST_STEP_NS, end)
         if stop < limit:
             return k, stop, speed, bend
@@ -366,7 +371,7 @@ def reach_of_profiles(
             t0 = max(t0, knots[k])
             if not valid[k] or t0 > until:
                 break
-            k1, t1, speed, bend = stretch(k, t0, until, reach + lever, knots, valid, motion)
+            k1, t1, speed, bend = stretch(k, t0, until, reach + lever, STEP_M, BEND_M, knots, valid, motion)
             after = k1
             end = max(end, first)
             while end < stop and epochs[end] <= t1:
@@ -474,7 +479,7 @@ def reach_of_returns(
             t0 = max(t0, knots[k])
             if not valid[k] or t0 > until:
                 break
-            k1, t1, speed, bend = stretch(k, t0, until, reach + lever, knots, valid, motion)
+            k1, t1, speed, bend = stretch(k, t0, until, reach + lever, FAR_STEP_M, FAR_BEND_M, knots, valid, motion)
             found, middle, half, margin = frames_between(
                 k, t0, k1, t1, speed, bend, reach,
                 mounting, knots, coefficients, lattice, table, centres, charts,

@@ -360,6 +360,8 @@ def test_a_log_listed_twice_adds_nothing(finished: Simulated, tmp_path: Path) ->
 def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     runs = Survey.load(copy.survey_file).config.model_dump(mode="json")["runs"]
+    for run in runs:  # on so short a road every tile is within reach of both runs' lidars
+        run["logs"] = [log for log in run["logs"] if log["sensor"] != "lidar"]
     copy.run(runs=runs[:1], passes=[])
     before = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
     copy.run(runs=runs, passes=[])

@@ -41,7 +41,7 @@ def spread_of(heights, first, end, median, reach, sums):
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = total, squares, used, near, low, high
 
 
-@inlined
+@kernel
 def gather(head, slots, bases, chain, filled, heights, counts):
     """Heights of a group's chain as columns of a table, relative to the first base. Returns the largest count.
 
@@ -67,7 +67,7 @@ def gather(head, slots, bases, chain, filled, heights, counts):
     return most
 
 
-@inlined
+@kernel
 def middle_of(head, lane, slots, bases, chain, filled, size, work):
     """Lower median of a cell of any size, relative to the first base, and the lower median of the distances."""
     n = 0
@@ -86,7 +86,7 @@ def middle_of(head, lane, slots, bases, chain, filled, size, work):
     return median, own[(size - 1) // 2]
 
 
-@inlined
+@kernel
 def release(head, slots_chain, filled, light, marks, free, held):
     """Give a group's elements back."""
     e = head

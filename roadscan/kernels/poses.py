@@ -131,6 +131,12 @@ def _slopes(epochs, positions, quaternions, first, end, velocity, rate):
             rate[i, 2] += weights[j] * rz
 
 
+@inlined
+def cross(a, b):
+    """Cross product of two tuples."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
 @kernel
 def _interval(dt, k, positions, quaternions, velocity, rate, out):
     for a in range(3):
@@ -141,7 +147,7 @@ def _interval(dt, k, positions, quaternions, velocity, rate, out):
         out[4 * a + 2] = 3.0 * step - 2.0 * start - stop
         out[4 * a + 3] = start + stop - 2.0 * step
     w, x, y, z = relative(quaternions[k], quaternions[k + 1])
-    turn = np.array(rotation_vector(w, x, y, z))
+    turn = rotation_vector(w, x, y, z)
     # dφ/dt at the end: the inverse right Jacobian of SO(3) takes the body rate there (Solà 2018, eq. 144).
     angle2 = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
     if angle2 < 1e-8:
@@ -149,11 +155,11 @@ def _interval(dt, k, positions, quaternions, velocity, rate, out):
     else:
         angle = math.sqrt(angle2)
         factor = 1.0 / angle2 - (1.0 + math.cos(angle)) / (2.0 * angle * math.sin(angle))
-    end_rate = rate[k + 1]
-    cross = np.cross(turn, end_rate)
-    slope = end_rate + 0.5 * cross + factor * np.cross(turn, cross)
+    end_rate = (rate[k + 1, 0], rate[k + 1, 1], rate[k + 1, 2])
+    once = cross(turn, end_rate)
+    twice = cross(turn, once)
     for a in range(3):
-        start, stop = dt * rate[k, a], dt * slope[a]
+        start, stop = dt * rate[k, a], dt * (end_rate[a] + 0.5 * once[a] + factor * twice[a])
         out[12 + 3 * a] = start
         out[13 + 3 * a] = 3.0 * turn[a] - 2.0 * start - stop
         out[14 + 3 * a] = start + stop - 2.0 * turn[a]

@@ -30,6 +30,10 @@ class Settings:
     """From profile to profile of the drives whose length grows."""
     scaling_km: str = "1,2,4,8"
     """Their lengths."""
+    network_km: float = 20_000.0
+    """Length of the network whose scheduling is tried."""
+    network_region_km: float = 200.0
+    """Length of each of its surveys."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,8 +28,11 @@ TILE = "tile"
 OVERVIEWS = "overviews"
 """Manifest name of a tile's overviews; their record has the key of the tile's own."""
 
-STRETCH_M = 1000.0
-"""About as much road as one task computes, where no product needs points."""
+_SQUARE_M = 100.0
+"""Edge of the squares whose tiles stay together, where no product needs points."""
+
+_SQUARES = 15
+"""Squares that one task computes at most: a kilometre of road oblique to the grid, one and a half along it."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,8 @@ class TileTask:
     """Raw blocks that may touch the tiles, sorted by run, sensor and time."""
     touches: tuple[tuple[TileTouch, ...], ...]
     """Of each core tile."""
-    owned: tuple[tuple[int, int, TileId], ...]
-    """(slice, position of the group, tile): groups whose readings are told by fate with that tile."""
+    owned_runs: tuple[tuple[int, int, int, TileId], ...]
+    """(slice, first position, end, tile): groups whose readings are told by fate with that tile."""
     readings: int
     """Readings expected."""
     passes: tuple[LanePass, ...]
@@ -75,6 +78,11 @@ class TileTask:
     products: tuple[WantedProduct, ...]
     context: ProductContext
     cell_table: CellColumns = "full"
+
+    @property
+    def owned(self) -> Iterator[tuple[int, int, TileId]]:
+        """(slice, position of the group, tile), group by group."""
+        return ((s, k, tile) for s, first, end, tile in self.owned_runs for k in range(first, end))
 
     @property
     def raw_bytes(self) -> int:
@@ -101,15 +109,17 @@ def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> dict[TileId, Pl
     column, row = f.tile_column[order], f.tile_row[order]
     starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))
     digests = {one.path: one.digest for _, files in plan.sources for one in files}
-    names = [(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in f.slices]
+    names = [key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in f.slices]
+    ranges = list(
+        zip(f.slice_index[order].tolist(), f.first_group[order].tolist(), f.last_group[order].tolist(), strict=True)
+    )
+    readings = np.add.reduceat(f.readings[order], starts).tolist()
+    ends = [*starts[1:].tolist(), order.size]
+    places = zip(column[starts].tolist(), row[starts].tolist(), strict=True)
     tiles: dict[TileId, PlannedTile] = {}
-    for start, end in zip(starts, np.append(starts[1:], order.size), strict=True):
-        part = order[start:end]
-        ranges = zip(
-            f.slice_index[part].tolist(), f.first_group[part].tolist(), f.last_group[part].tolist(), strict=True
-        )
-        key = key_of(plan.tile_key, [(*names[s], a, b) for s, a, b in ranges])
-        tiles[TileId(int(column[start]), int(row[start]))] = PlannedTile(key, int(f.readings[part].sum()), part)
+    for place, start, end, expected in zip(places, starts.tolist(), ends, readings, strict=True):
+        key = key_of(plan.tile_key, [(names[s], a, b) for s, a, b in ranges[start:end]])
+        tiles[TileId(*place)] = PlannedTile(key, expected, order[start:end])
     return tiles
 
 
@@ -136,9 +146,12 @@ class TilePlan:
         Where products need points, a task is a block that fits into memory.
         """
         config = self.plan.survey.config.tiles
-        blocks = cut_blocks({t: self.tiles[t].readings for t in chosen}, config.block_tiles, config.max_block_readings)
-        probe = self.task(Block(()))
-        if blocks and not self._points_of(probe):
+        if not chosen:
+            return []
+        if self._points_of(self.task(Block(()))):
+            readings = {t: self.tiles[t].readings for t in chosen}
+            blocks = cut_blocks(readings, config.block_tiles, config.max_block_readings)
+        else:
             blocks = self._stretches(chosen, workers)
         return [self.task(block) for block in blocks]
 
@@ -152,47 +165,56 @@ class TilePlan:
     def _stretches(self, chosen: Sequence[TileId], workers: int) -> list[Block]:
         """Tiles in the order in which they were driven over, cut into stretches."""
         config = self.plan.survey.config.tiles
-        readings = {t: self.tiles[t].readings for t in chosen}
-        edge = max(1, round(STRETCH_M / 10 / config.size_m))
-        first = self.footprints.first_epoch_gps_ns
-        parts = sorted(
-            (b.tiles for b in cut_blocks(readings, edge, 1 << 62)),
-            key=lambda tiles: min(int(first[self.tiles[t].rows].min()) for t in tiles),
+        edge = max(1, round(_SQUARE_M / config.size_m))
+        epoch_gps_ns = self.footprints.first_epoch_gps_ns
+        first = {t: int(epoch_gps_ns[self.tiles[t].rows].min()) for t in chosen}
+        squares = sorted(
+            (b.tiles for b in cut_blocks({t: self.tiles[t].readings for t in chosen}, edge, 1 << 62)),
+            key=lambda tiles: min(first[t] for t in tiles),
         )
-        together = max(1, min(10, len(parts) // (4 * workers)))
+        together = max(1, min(_SQUARES, len(squares) // (4 * workers)))
         ordered: list[Block] = []
-        for start in range(0, len(parts), together):
-            tiles = [t for part in parts[start : start + together] for t in part]
-            tiles.sort(key=lambda t: (int(first[self.tiles[t].rows].min()), t.row, t.column))
+        for start in range(0, len(squares), together):
+            tiles = [t for square in squares[start : start + together] for t in square]
+            tiles.sort(key=lambda t: (first[t], t.row, t.column))
             ordered.append(Block(tuple(tiles)))
         return ordered
 
     def task(self, block: Block) -> TileTask:
         """A task over a block."""
         f = self.footprints
-        core = set(block.tiles)
+        core = {(t.column, t.row): t for t in block.tiles}
         rows = [self.tiles[t].rows for t in sorted(block.with_halo()) if t in self.tiles]
         every = np.concatenate([np.zeros(0, np.int64), *rows])
         slices: list[RawSlice] = []
         numbers: dict[int, int] = {}
-        places: dict[int, dict[int, int]] = {}
+        places: dict[int, npt.NDArray[np.int64]] = {}
+        owned: list[tuple[int, int, int, TileId]] = []
         for index in np.unique(f.slice_index[every]).tolist():
             own = every[f.slice_index[every] == index]
-            groups = _groups(f.first_group[own], f.last_group[own])
             whole = f.slices[index]
-            ordered = [g for _, g in sorted((whole.spans[g], g) for g in groups.tolist())]
-            share = whole.bytes * len(ordered) // max(len(whole.groups), 1)
+            groups = _groups(f.first_group[own], f.last_group[own])
+            groups = groups[np.argsort(self._ranks(index)[groups])]
+            share = whole.bytes * groups.size // max(len(whole.groups), 1)
             numbers[index] = len(slices)
-            places[index] = {g: k for k, g in enumerate(ordered)}
+            places[index] = np.full(len(whole.groups), -1)
+            places[index][groups] = np.arange(groups.size)
+            owners = self._owners[index][groups]
+            cuts = np.flatnonzero((np.diff(owners, axis=0) != 0).any(axis=1)) + 1
+            runs = zip([0, *cuts.tolist()], [*cuts.tolist(), groups.size], strict=True)
+            owned += [
+                (len(slices), start, end, tile)
+                for start, end in runs
+                if (tile := core.get((int(owners[start, 0]), int(owners[start, 1])))) is not None
+            ]
+            ordered = groups.tolist()
             spans = tuple(whole.spans[g] for g in ordered)
             slices.append(RawSlice(whole.source, whole.file, tuple(ordered), spans, share))
         touches = tuple(
             tuple(
                 touch
-                for r in self.tiles[tile].rows.tolist()
-                for touch in _touches(
-                    numbers[int(f.slice_index[r])], places[int(f.slice_index[r])], f.first_group[r], f.last_group[r]
-                )
+                for s, a, b in (self._ranges[r] for r in self.tiles[tile].rows.tolist())
+                for touch in _touches(numbers[s], places[s][a : b + 1])
             )
             for tile in block.tiles
         )
@@ -204,12 +226,7 @@ class TilePlan:
             keys=tuple(self.tiles[t].key for t in block.tiles),
             slices=tuple(slices),
             touches=touches,
-            owned=tuple(
-                (numbers[index], own[group], owner)
-                for index, own in places.items()
-                for group in own
-                if (owner := self._owner(index, group)) in core
-            ),
+            owned_runs=tuple(owned),
             readings=sum(self.tiles[t].readings for t in block.tiles),
             passes=self.plan.passes,
             centre_lines=self.plan.centre_lines,
@@ -217,6 +234,12 @@ class TilePlan:
             context=self.context,
             cell_table=config.cell_table,
         )
+
+    @cached_property
+    def _ranges(self) -> list[tuple[int, int, int]]:
+        """Slice, first and last group of each row of the footprints."""
+        f = self.footprints
+        return list(zip(f.slice_index.tolist(), f.first_group.tolist(), f.last_group.tolist(), strict=True))
 
     @cached_property
     def _owners(self) -> dict[int, npt.NDArray[np.int32]]:
@@ -228,23 +251,39 @@ class TilePlan:
         found = {
             s: np.full((len(f.slices[s].groups), 2), -(2**31), np.int32) for s in np.unique(f.slice_index).tolist()
         }
-        for r in np.lexsort((f.tile_column, f.tile_row))[::-1].tolist():
-            found[int(f.slice_index[r])][f.first_group[r] : f.last_group[r] + 1] = f.tile_column[r], f.tile_row[r]
+        order = np.lexsort((f.tile_column, f.tile_row))[::-1]
+        for r, place in zip(order.tolist(), np.column_stack([f.tile_column, f.tile_row])[order], strict=True):
+            index, first, last = self._ranges[r]
+            found[index][first : last + 1] = place
         return found
 
-    def _owner(self, index: int, group: int) -> TileId:
-        column, row = self._owners[index][group].tolist()
-        return TileId(column, row)
+    def _ranks(self, index: int) -> npt.NDArray[np.int64]:
+        """(groups,) place of each row group of a slice in the order of time."""
+        if index not in self._rank_of:
+            spans = np.array(self.footprints.slices[index].spans, dtype=np.int64).reshape(-1, 2)
+            ranks = np.empty(len(spans), np.int64)
+            ranks[np.lexsort((spans[:, 1], spans[:, 0]))] = np.arange(len(spans))
+            self._rank_of[index] = ranks
+        return self._rank_of[index]
+
+    @cached_property
+    def _rank_of(self) -> dict[int, npt.NDArray[np.int64]]:
+        return {}
 
 
 def _groups(first: npt.NDArray[np.int32], last: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    """Numbers of all row groups of some ranges."""
-    return np.unique(np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]))
+    """Numbers of all row groups of some ranges, ascending."""
+    end = int(last.max()) + 2
+    begun = np.bincount(first, minlength=end) - np.bincount(last + 1, minlength=end)
+    return np.flatnonzero(np.cumsum(begun))
 
 
-def _touches(index: int, places: dict[int, int], first: int, last: int) -> list[TileTouch]:
-    """Runs of positions of the row groups `first` to `last`."""
-    at = np.sort([places[g] for g in range(first, last + 1)])
+def _touches(index: int, places: npt.NDArray[np.int64]) -> list[TileTouch]:
+    """Runs of the positions of consecutive row groups."""
+    low, high = int(places.min()), int(places.max())
+    if high - low + 1 == places.size:  # in the order of time, as nearly always
+        return [TileTouch(index, low, high + 1)]
+    at = np.sort(places)
     breaks = np.flatnonzero(np.diff(at) != 1) + 1
     return [TileTouch(index, int(part[0]), int(part[-1]) + 1) for part in np.split(at, breaks)]
 

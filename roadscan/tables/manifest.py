@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import pyarrow as pa
@@ -129,7 +129,8 @@ class Manifest:
             number = _number(self._parts[-1]) + 1 if self._parts else 0
         path = f"{_FOLDER}/part-{number:08d}.parquet"
         buffer = io.BytesIO()
-        pq.write_table(pa.Table.from_pylist([asdict(r) for r in records], schema=_SCHEMA), buffer)
+        columns = [pa.array([getattr(r, field.name) for r in records], field.type) for field in _SCHEMA]
+        pq.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA), buffer)
         self._store.write_bytes(path, buffer.getvalue())
         self._parts.append(path)
         if len(self._parts) > _COMPACT_AT:

@@ -141,6 +141,9 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
         beyond = np.flatnonzero(bounded.unbounded).tolist()
         if beyond:
             pairs = joined([bounded, _placed(task, beyond)[0]])
+        apart = sorted(set(range(len(one.groups))) - set(pairs.group.tolist()))
+        if apart:  # no tile tells what became of their readings
+            fates = _placed(task, apart)[1]
     rows = _ranges(pairs, one)
     schema = table_schema(PRODUCT)
     with task.store.scratch() as folder:
@@ -189,7 +192,9 @@ def _ranges(pairs: Touched, one: RawSlice) -> pa.Table:
 
 
 def _detail(rows: pa.Table, fates: npt.NDArray[np.int64] | None) -> str:
-    """Figures of a data file: the box of its tiles, and the fates of its readings where they were placed."""
+    """Figures of a data file: the box of its tiles, and the fates of readings that no tile tells: those of clouds,
+    and of row groups that touch no tile.
+    """
     figures: dict[str, Any] = {}
     if rows.num_rows:
         column, row = (rows.column(name).to_numpy() for name in ("tile_column", "tile_row"))

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 POOL = "roadscan"
 TILE = "69100_533500"
-WAIT_S = 120.0
+WAIT_S = 240.0
 
 
 @pytest.fixture(scope="module")

@@ -56,10 +56,12 @@ def test_fates_are_those_of_points(finished: Simulated, counted: Store) -> None:
 
 def test_neither_blocks_nor_workers_change_a_byte(finished: Simulated, counted: Store) -> None:
     finished.run("store-counted-1", products__make=WITHOUT_POINTS, tiles__block_tiles=1)
+    assert outputs(finished.store("store-counted-1")) == outputs(counted)
     with compute_on(2) as compute:
         finished.run("store-counted-2", compute, products__make=WITHOUT_POINTS)
-    for name in ("store-counted-1", "store-counted-2"):
-        assert outputs(finished.store(name)) == outputs(counted)
+        finished.run("store-2", compute)
+    assert outputs(finished.store("store-counted-2")) == outputs(counted)
+    assert outputs(finished.store("store-2")) == outputs(finished.store())
 
 
 def test_cells_that_do_not_fit_are_made_in_parts(

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import rasterio
 
-from roadscan.jobs.compute import Inline, compute_on
+from roadscan.jobs.compute import Inline
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import Run, plan_tile_work
@@ -43,18 +43,11 @@ def assert_same_files(a: Store, b: Store) -> None:
     assert [p for p in one if one[p] != other[p]] == []
 
 
-@pytest.mark.parametrize(("edge", "limit"), [(1, 20_000_000), (3, 20_000_000), (16, 100_000)])
+@pytest.mark.parametrize(("edge", "limit"), [(1, 20_000_000), (16, 100_000)])
 def test_block_size_changes_no_byte(finished: Simulated, edge: int, limit: int) -> None:
     name = f"store-{edge}-{limit}"
     finished.run(name, tiles__block_tiles=edge, tiles__max_block_readings=limit)
     assert_same_files(finished.store(), finished.store(name))
-
-
-def test_number_of_workers_changes_no_byte(finished: Simulated) -> None:
-    for workers in (1, 2):
-        with compute_on(workers) as compute:
-            finished.run(f"store-w{workers}", compute)
-        assert_same_files(finished.store(), finished.store(f"store-w{workers}"))
 
 
 def test_shuffled_row_groups_change_no_byte(finished: Simulated, tmp_path: Path) -> None:

@@ -151,6 +151,10 @@ def accumulate(
         cell = head * np.uint64(LANES) + lane
         slot = np.uint64(fills[cell])
         near = (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+        if not near:  # a stray reading among the others is no reason to take them one by one
+            near = True
+            for j in range(first, end):
+                near &= abs(heights[j] - base) <= FARTHEST
         if near & (slot <= np.uint64(SLOTS - VECTOR)) & (end - first <= VECTOR):
             store_run(heights, np.uint64(first), -np.int32(base), flat, cell * np.uint64(SLOTS) + slot)
             fills[cell] = slot + np.uint64(end - first)

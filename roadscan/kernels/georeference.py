@@ -27,9 +27,8 @@ CLASS_KEPT, CLASS_NO_RETURN, CLASS_NO_POSE, CLASS_TOO_NEAR, CLASS_TOO_FAR, CLASS
 LIMITS = ("range_min", "range_max", "height_min", "height_max", "above_body_min", "above_body_max")
 """Order of the `limits` array (m)."""
 
-NO_CHART = ((0.0,) * 10,) * 3
 NO_FORMS = ((0.0,) * 6,) * 4
-"""Chart and forms of a reading without a pose."""
+"""Forms of a reading without a pose."""
 
 
 @inlined

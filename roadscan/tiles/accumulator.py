@@ -164,10 +164,6 @@ class Accumulator:
             self.tile_rows[tile.row - self._south, tile.column - self._west] = row
             self._spans[row], self._sigmas[row] = _NEVER, -1.0
 
-    def is_active(self, tile: TileId) -> bool:
-        """True between :meth:`activate` and :meth:`finish`."""
-        return self._row(tile) >= 0
-
     def run(self, kernel: Callable[..., int], items: int, elements: int) -> None:
         """Call `kernel` with the pool and the item to begin with until it has done all items.
 

@@ -3,14 +3,17 @@
 Kernels are serial and release the GIL: parallelism comes from Dask over blocks. `fastmath` stays off,
 so that the order of operations, and with it every bit of the result, is the same everywhere.
 
-Compiled code is cached on disk, in a folder named after the hash of all kernels' sources: Numba itself looks
-only at the file a function stands in, and would keep a kernel whose inlined parts have changed elsewhere.
+Compiled code is cached on disk, in a folder named after the hash of a module's source and of the kernels that it
+imports: Numba itself looks only at the file a function stands in, and would keep a kernel whose inlined parts have
+changed elsewhere.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,7 +36,7 @@ def inlined(function: Kernel) -> Kernel:
 
 def _compiled(function: Kernel, *, forceinline: bool) -> Kernel:
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_FOLDER  # read when the function is decorated
+    numba.config.CACHE_DIR = _cache_folder(function.__code__.co_filename)  # read when the function is decorated
     try:
         decorate = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=forceinline)
         compiled: Kernel = decorate(function)
@@ -51,13 +54,22 @@ def _use_whole_registers() -> None:
         numba.config.reload_config()
 
 
-def _cache_folder() -> str:
+@functools.cache
+def _cache_folder(source: str) -> str:
+    """Folder for the compiled kernels of a source file."""
+    here = Path(__file__).parent
+    unseen, seen = [Path(source), Path(__file__)], set[Path]()
+    while unseen:
+        file = unseen.pop()
+        if file not in seen:
+            seen.add(file)
+            unseen += [here / f"{name}.py" for name in _IMPORTED_KERNELS.findall(file.read_text(encoding="utf-8"))]
     digest = hashlib.blake2b(digest_size=6)
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    for file in sorted(seen, key=lambda file: file.name):
         digest.update(file.read_bytes())
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return str(Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}")
 
 
+_IMPORTED_KERNELS = re.compile(r"^from roadscan\.kernels\.(\w+) import", re.MULTILINE)
 _use_whole_registers()
-_CACHE_FOLDER = _cache_folder()

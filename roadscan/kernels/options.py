@@ -10,6 +10,7 @@ changed elsewhere.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -20,6 +21,8 @@ from typing import Any
 
 import llvmlite.binding
 import numba
+
+from roadscan.kernels.compiled_once import compile_once
 
 Kernel = Callable[..., Any]
 
@@ -36,12 +39,15 @@ def inlined(function: Kernel) -> Kernel:
 
 def _compiled(function: Kernel, *, forceinline: bool) -> Kernel:
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _cache_folder(function.__code__.co_filename)  # read when the function is decorated
+    folder = _cache_folder(function.__code__.co_filename)
+    numba.config.CACHE_DIR = folder  # read when the function is decorated
     try:
         decorate = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=forceinline)
         compiled: Kernel = decorate(function)
     finally:
         numba.config.CACHE_DIR = before
+    if not numba.config.DISABLE_JIT:
+        compile_once(compiled, folder)
     return compiled
 
 
@@ -68,7 +74,10 @@ def _cache_folder(source: str) -> str:
     for file in sorted(seen, key=lambda file: file.name):
         digest.update(file.read_bytes())
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return str(Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}")
+    folder = Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}"
+    with contextlib.suppress(OSError):  # not writable: Numba says so, or looks for another place
+        folder.mkdir(parents=True, exist_ok=True)
+    return str(folder)
 
 
 _IMPORTED_KERNELS = re.compile(r"^from roadscan\.kernels\.(\w+) import", re.MULTILINE)

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from roadscan.kernels.carriageway import CLASS_OFF_ROAD, CLASS_SCATTERED
 from roadscan.kernels.georeference import (
     CLASS_KEPT,
     CLASS_NO_POSE,
@@ -19,12 +20,15 @@ from roadscan.kernels.georeference import (
     CLASS_TOO_LOW,
     CLASS_TOO_NEAR,
 )
+from roadscan.kernels.segmentation import CLASS_ABOVE, CLASS_GRAZING
 
 KEPT: Final = CLASS_KEPT
 TOO_LOW: Final = CLASS_TOO_LOW
 TOO_HIGH: Final = CLASS_TOO_HIGH
 OUTSIDE_PASS: Final = 7
 OFF_CENTRE_LINE: Final = 8
+OVERLAPPING: Final = 13
+"""Beyond the crossing of successive profiles in a turn."""
 
 READING_CLASSES: Final[dict[int, str]] = {
     CLASS_KEPT: "kept",
@@ -36,14 +40,22 @@ READING_CLASSES: Final[dict[int, str]] = {
     CLASS_TOO_HIGH: "too_high",
     OUTSIDE_PASS: "outside_pass",
     OFF_CENTRE_LINE: "off_centre_line",
+    CLASS_ABOVE: "above_surface",
+    CLASS_SCATTERED: "scattered",
+    CLASS_GRAZING: "grazing",
+    CLASS_OFF_ROAD: "off_carriageway",
+    OVERLAPPING: "overlapping",
 }
-"""Name of each class of readings. Where a reading fails several tests, the first of this order counts, but that
+"""Name of each class of readings; the last five are those of the profile segmentation and of the range filter for
+turns. Where a reading fails several tests, the first of this order counts, but that
 range comes before pose."""
 
 LAS_CLASSES: Final = np.zeros(256, dtype=np.uint8)
 """Class in LAS (ASPRS LAS 1.4 R15, table 17) of points that are kept marked, by class of the reading: 7 low noise and
-18 high noise for unrealistic heights; of the classes free for users 64 too near, 65 too far, 66 off the centre line."""
+18 high noise for unrealistic heights; of the classes free for users 64 too near, 65 too far, 66 off the centre line,
+67 above the surface, 68 scattered, 69 grazing, 70 off the carriageway, 71 overlapping."""
 LAS_CLASSES[[CLASS_TOO_LOW, CLASS_TOO_HIGH, CLASS_TOO_NEAR, CLASS_TOO_FAR, OFF_CENTRE_LINE]] = [7, 18, 64, 65, 66]
+LAS_CLASSES[[CLASS_ABOVE, CLASS_SCATTERED, CLASS_GRAZING, CLASS_OFF_ROAD, OVERLAPPING]] = [67, 68, 69, 70, 71]
 
 WITHHELD_FLAG: Final = 16
 """Bit of the column ``flags`` that programs take as: not to be used."""

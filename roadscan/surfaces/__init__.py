@@ -1,0 +1,1 @@
+"""Coarse and detailed reconstruction of the road surface."""

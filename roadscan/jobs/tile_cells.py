@@ -56,9 +56,7 @@ class _Stretch:
         self._task, self._fates = task, fates
         self._placer = Placer(task.store, task.ground, task.slices)
         self._sources = [_Source.of(task, number) for number in range(len(task.slices))]
-        self._accumulator = Accumulator(
-            task.ground.grid, task.block.tiles, [p.pass_id for p in task.passes], _pool(task)
-        )
+        self._accumulator = Accumulator(task.ground.grid, task.block.tiles, [p.pass_id for p in task.passes], _pool())
         self._counting = [self._counting_of(one) for one in task.slices]
         self._told: set[tuple[int, int]] = set()
         self._owners = {(s, k): tile for s, k, tile in task.owned}
@@ -203,11 +201,10 @@ class _Source:
         return index
 
 
-def _pool(task: TileTask) -> Pool:
+def _pool() -> Pool:
     """The worker's memory for cells: fresh memory is dear, so it serves one task after another."""
-    words = max(1, -(-len(task.passes) // 8))
     pool: Pool | None = getattr(_KEPT, "pool", None)
-    if pool is None or pool.words != words:
-        pool = _KEPT.pool = Pool(words)
+    if pool is None:
+        pool = _KEPT.pool = Pool()
     pool.clear()
     return pool

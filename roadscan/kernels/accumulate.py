@@ -1,10 +1,11 @@
 """Readings → cells in one pass: of each reading its height is kept until the tile is finished, and nothing else.
 
-The cells of a tile are taken sixteen at a time, side by side along a row: a *group*. When the first reading falls
-into a group, it gets an *element* of the pool: `SLOTS` heights for each of its cells, as differences from the
-element's base. A cell with more readings, or with heights too far from the base for 16 bits, makes the group's
-chain of elements longer. What is kept depends on the order of the readings only until it is sorted
-(``kernels.cells``).
+The heights of a cell stand in *lines* of 64 bytes, as long as a line of the cache: `SLOTS` differences from the line's
+base, and a header with their number, the sum of their intensities and the passes they are from. The cells of a tile
+are taken sixteen at a time, side by side along a row: a *group*. When the first reading falls into a group, it gets
+an *element* of the pool: a line for each of its cells. A cell with more readings, or with heights too far from the
+base for 16 bits, or of more passes than a header has bits for, chains spare lines behind its own. What is kept depends
+on the order of the readings only until it is sorted (``kernels.cells``).
 
 Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *runs*: what has to be looked
 up is looked up once a run, and the heights of a run are stored as one vector.
@@ -13,90 +14,174 @@ up is looked up once a run, and the heights of a run are stored as one vector.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.line_access import VECTOR, fetch_line, store_heights
+from roadscan.kernels.options import bare, inlined
+from roadscan.kernels.runs import find_runs, sum_up
 
 LANES = 16
 """Cells of a group."""
-SLOTS = 40
-"""Heights that an element holds of each cell: 64 bytes, a line of the cache."""
+LINE = 32
+"""Numbers of 16 bits in a line: the heights, then the header."""
+SLOTS = 28
+"""Heights of a line."""
+HEADERS = 8
+"""Numbers of 64 bits in a line; the last one is its header."""
 FARTHEST = 32_000
-"""Largest difference (quanta) between a height and the base of its element."""
+"""Largest difference (quanta) between a height and the base of its line."""
 NOWHERE = -(1 << 30)
 """Column of a reading that is not to be counted: outside every tile."""
-VECTOR = 8
-"""Heights of a run that are stored at once."""
-PIECE = 512
+PIECE = 1024
 """Readings worked on together: their working arrays stay in the first cache."""
 
+COUNTS = 31
+LIGHT_SHIFT, LIGHTS = 5, (1 << 21) - 1
+WORD_SHIFT, WORDS = 26, (1 << 14) - 1
+MARK_SHIFT = 40
+PASSES = 24
+"""A header, from its lowest bit: number of heights (5), sum of intensities (21), word (14), passes (24).
+
+Pass number p has the bit p mod 24 in lines of the word p div 24; a line has one word."""
+
+
+def work_arrays(tiles: int) -> tuple[Any, ...]:
+    """Arrays that readings are worked on in, a piece at a time, and a mark for each of so many active tiles."""
+    return (
+        np.empty(PIECE, np.int32),
+        np.empty(PIECE, np.int32),
+        np.zeros(PIECE + VECTOR, np.int32),
+        np.empty(PIECE + 1, np.uint32),
+        np.empty(PIECE + 1, np.uint32),
+        np.empty(PIECE + 1, np.int32),
+        np.zeros(tiles, np.uint8),
+    )
+
 
 @inlined
-def new_element(bases, chain, free, held, height):
-    """Take an element from the stack of free ones; `held` (1,) counts those in use."""
+def header_of_pass(number):
+    """What a pass sets in a header, its bit and its word (uint64)."""
+    word, bit = np.uint64(number // PASSES), np.uint64(number % PASSES)
+    return (word << np.uint64(WORD_SHIFT)) | (np.uint64(1) << (bit + np.uint64(MARK_SHIFT)))
+
+
+@inlined
+def new_group(heads, bases, chain, free, held, height):
+    """Take an element from the stack of free ones, its lines empty; `held` counts those in use."""
     e = free[held[0]]
     held[0] += 1
-    bases[e] = height
-    chain[e] = -1
+    for line in range(np.uint64(e) * np.uint64(LANES), np.uint64(e + 1) * np.uint64(LANES)):
+        heads[line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)] = 0
+        bases[line] = height
+        chain[line] = -1
     return e
 
 
 @inlined
-def element_with_room(bases, chain, filled, free, held, head, lane, height):
-    """Element of the chain from `head` with room for one more height of a cell; a new one where there is none."""
-    e = head
-    while not (filled[e, lane] < SLOTS and abs(height - bases[e]) <= FARTHEST):
-        if chain[e] < 0:
-            chain[e] = new_element(bases, chain, free, held, height)
-        e = chain[e]
-    return e
+def new_line(heads, bases, chain, free, spare, held, height):
+    """Take an empty line from the spare ones; where there is none, an element becomes spare lines."""
+    if held[1] == 0:
+        e = new_group(heads, bases, chain, free, held, height)
+        for lane in range(LANES):
+            spare[lane] = e * LANES + LANES - 1 - lane
+        held[1] = LANES
+    held[1] -= 1
+    line = spare[held[1]]
+    heads[line * HEADERS + HEADERS - 1] = 0
+    bases[line] = height
+    chain[line] = -1
+    return line
 
 
 @inlined
-def find_runs(column, row, starts):
-    """Where readings of another cell begin: (n + 1,) int32, out, the last one n. Returns how many runs there are."""
-    runs = 0
-    last_column, last_row = column[0] + np.int32(1), row[0]
-    for j in range(column.size):
-        new = (column[j] != last_column) | (row[j] != last_row)
-        last_column, last_row = column[j], row[j]
-        starts[runs] = j
-        runs += new
-    starts[runs] = column.size
-    return runs
+def line_with_room(own, size, low, high, word, heads, bases, chain):
+    """Line of the chain from `own` that takes `size` more heights from `low` to `high`; −1 where none does."""
+    line = np.int64(own)
+    while line >= 0:
+        header = heads[line * HEADERS + HEADERS - 1]
+        used = np.int64(header & np.uint64(COUNTS))
+        base = np.int64(bases[line])
+        fits = (used + size <= SLOTS) & (used <= LINE - VECTOR) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+        if fits & ((used == 0) | (header & np.uint64(WORDS << WORD_SHIFT) == word)):
+            return line
+        line = np.int64(chain[line])
+    return line
 
 
 @inlined
-def sum_up(intensity, gain, sums):
-    """Sums of the intensities, times `gain`, before each reading: (n + 1,) uint32, out."""
-    total = np.uint32(0)
-    for j in range(intensity.size):
-        sums[j] = total
-        total += gain * np.uint32(intensity[j])
-    sums[intensity.size] = total
+def longer_chain(own, height, heads, bases, chain, free, spare, held):
+    """A new line behind `own`: before the older ones, which are full."""
+    line = np.int64(new_line(heads, bases, chain, free, spare, held, height))
+    chain[line] = chain[own]
+    chain[own] = line
+    return line
+
+
+@bare
+def count_slowly(
+    own, heights, intensity, gain, first, end, mark, lines, heads, bases, chain, free, spare, held
+):  # fmt: skip
+    """Count readings `first` to `end` − 1 into the cell that begins with the line `own`, one by one."""
+    for j in range(first, end):
+        height = np.int64(heights[j])
+        word = mark & np.uint64(WORDS << WORD_SHIFT)
+        line = line_with_room(own, 1, height, height, word, heads, bases, chain)
+        if line < 0:
+            line = longer_chain(own, height, heads, bases, chain, free, spare, held)
+        at = line * HEADERS + HEADERS - 1
+        lines[line * LINE + np.int64(heads[at] & np.uint64(COUNTS))] = np.int16(height - bases[line])
+        shine = np.uint64(gain) * np.uint64(intensity[j])
+        heads[at] = (heads[at] + np.uint64(1) + (shine << np.uint64(LIGHT_SHIFT))) | mark
 
 
 @inlined
-def store_run(heights, first, offset, slots, at):
-    """Store VECTOR heights, moved by `offset`; all are read before one is written, so that they are one vector."""
-    h = heights
-    a, b, c, d = h[first], h[first + np.uint64(1)], h[first + np.uint64(2)], h[first + np.uint64(3)]
-    e, f, g, k = h[first + np.uint64(4)], h[first + np.uint64(5)], h[first + np.uint64(6)], h[first + np.uint64(7)]
-    slots[at] = np.int16(a + offset)
-    slots[at + np.uint64(1)] = np.int16(b + offset)
-    slots[at + np.uint64(2)] = np.int16(c + offset)
-    slots[at + np.uint64(3)] = np.int16(d + offset)
-    slots[at + np.uint64(4)] = np.int16(e + offset)
-    slots[at + np.uint64(5)] = np.int16(f + offset)
-    slots[at + np.uint64(6)] = np.int16(g + offset)
-    slots[at + np.uint64(7)] = np.int16(k + offset)
+def line_of_run(own, heights, first, end, word, heads, bases, chain, free, spare, held):
+    """Line of the cell that begins with `own` with room for a run; −1 where its heights are too far apart for one."""
+    low, high = np.int64(heights[first]), np.int64(heights[first])
+    for j in range(first, end):
+        low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
+    line = line_with_room(own, np.int64(end - first), low, high, word, heads, bases, chain)
+    if line < 0 and high - low <= FARTHEST:
+        line = longer_chain(own, low, heads, bases, chain, free, spare, held)
+    return line
 
 
-@kernel
+@bare
+def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells):
+    """First line of each run's cell, −1 outside the active tiles; cells : (n + 1,) int32, out. Takes new groups."""
+    lines, heads, bases, chain, free, _, held = pool
+    per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
+    table = groups.reshape(-1)
+    west, south, tile = -(1 << 40), -(1 << 40), -1
+    for run in range(runs):
+        first = np.uint64(starts[run])
+        x, y = np.int64(column[first]), np.int64(row[first])
+        if not (west <= x < west + edge and south <= y < south + edge):
+            across, along = x // edge, y // edge
+            west, south, tile = across * edge, along * edge, -1
+            if 0 <= along < tile_rows.shape[0] and 0 <= across < tile_rows.shape[1]:
+                tile = tile_rows[along, across]
+                if tile >= 0:
+                    touched[tile] = 1
+        if tile < 0:
+            cells[run] = -1
+            continue
+        place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
+        found = table[place]
+        if found < 0:
+            found = new_group(heads, bases, chain, free, held, heights[first])
+            table[place] = found
+        line = np.uint64(found) * np.uint64(LANES) + np.uint64((x - west) & 15)
+        fetch_line(lines, line * np.uint64(LINE))
+        cells[run] = line
+
+
+@bare
 def accumulate(
-    column, row, heights, low, high, intensity, gain, word, bit, starts, sums,
-    tile_rows, groups, edge, slots, bases, chain, filled, light, marks, free, held, touched,
+    column, row, heights, low, high, intensity, gain, number, starts, sums, cells, tile_rows, groups, edge, pool,
+    touched,
 ):  # fmt: skip
     """Count readings into the cells of active tiles.
 
@@ -107,66 +192,60 @@ def accumulate(
     heights : (n + VECTOR,) int32, quanta of the map; what follows the n-th is read, but not counted.
     low, high : int, no height lies below or above.
     intensity : (n,) unsigned; gain : uint32; their product takes at most 16 bits.
-    word, bit : int, uint8; place of the readings' pass in `marks`.
-    starts : (n + 1,) int32, sums : (n + 1,) uint32, work.
+    number : int, of the readings' pass among the accumulator's.
+    starts, sums : (n + 1,) uint32, cells : (n + 1,) int32, work.
     tile_rows : (rows, columns) int32, row of each tile in `groups`; −1 for tiles that are not active.
-    groups : (a, edge · ⌈edge / 16⌉) int32, first element of each group of a tile, −1 where it has none.
+    groups : (a, edge · ⌈edge / 16⌉) int32, element of each group of a tile, −1 where it has none.
     edge : int64, cells along a tile's edge.
-    slots : (c, LANES, SLOTS) int16; bases, chain : (c,) int32; filled : (c, LANES) uint8.
-    light : (c, LANES) uint32, sum of intensities; marks : (c, LANES, w) uint8, bits of passes.
-    free : (c,) int32, stack of free elements; held : (1,) int64, how many are in use. At least 2 n have to be free.
+    pool : tuple of lines : (c · LANES · LINE,) int16; heads : the same memory as (c · LANES · HEADERS,) uint64;
+    bases : (c · LANES,) int32, of each line; chain : (c · LANES,) int32, next line of the cell, −1 for none;
+    free : (c,) int32, stack of free elements; spare : (c · LANES,) int32, stack of spare lines;
+    held : (2,) int64, elements in use, spare lines. At least 2 n elements have to be free.
     touched : (a,) uint8, out, 1 for each active tile that got a reading.
 
     Returns
     -------
     int, how many readings were counted; the other wanted ones lie outside the active tiles.
     """
-    per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
-    table, flat, fills = groups.reshape(-1), slots.reshape(-1), filled.reshape(-1)
-    lights, bits, words = light.reshape(-1), marks.reshape(-1), marks.shape[2]
-    counted = 0
-    west, south, tile = -(1 << 40), -(1 << 40), -1
+    lines, heads, bases, chain, free, spare, held = pool
+    mark = header_of_pass(number)
+    word = mark & np.uint64(WORDS << WORD_SHIFT)
     sum_up(intensity, gain, sums)
-    for run in range(find_runs(column, row, starts)):
-        first, end = starts[run], starts[run + 1]
-        x, y = np.int64(column[first]), np.int64(row[first])
-        if not (west <= x < west + edge and south <= y < south + edge):
-            across, along = x // edge, y // edge
-            west, south, tile = across * edge, along * edge, -1
-            if 0 <= along < tile_rows.shape[0] and 0 <= across < tile_rows.shape[1]:
-                tile = tile_rows[along, across]
-                if tile >= 0:
-                    touched[tile] = 1
-        if tile < 0:
+    runs = find_runs(column, row, starts)
+    find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells)
+    counted = np.int64(0)
+    for run in range(runs):
+        if cells[run] < 0:
             continue
-        place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
-        lane = np.uint64((x - west) & 15)
-        found = table[place]
-        if found < 0:
-            found = new_element(bases, chain, free, held, heights[first])
-            table[place] = found
-        head = np.uint64(found)
-        base = np.int64(bases[head])
-        counted += end - first
-        cell = head * np.uint64(LANES) + lane
-        slot = np.uint64(fills[cell])
-        near = (low - base >= -FARTHEST) & (high - base <= FARTHEST)
-        if not near:  # a stray reading among the others is no reason to take them one by one
-            near = True
-            for j in range(first, end):
-                near &= abs(heights[j] - base) <= FARTHEST
-        if near & (slot <= np.uint64(SLOTS - VECTOR)) & (end - first <= VECTOR):
-            store_run(heights, np.uint64(first), -np.int32(base), flat, cell * np.uint64(SLOTS) + slot)
-            fills[cell] = slot + np.uint64(end - first)
-            lights[cell] += sums[end] - sums[first]
-            bits[cell * np.uint64(words) + np.uint64(word)] |= bit
-            continue
-        for j in range(first, end):
-            e = element_with_room(bases, chain, filled, free, held, np.int64(head), np.int64(lane), heights[j])
-            slots[e, lane, filled[e, lane]] = np.int16(heights[j] - bases[e])
-            filled[e, lane] += 1
-            marks[e, lane, word] |= bit
-            light[e, lane] += gain * np.uint32(intensity[j])
+        own = np.uint64(cells[run])
+        first, end = np.uint64(starts[run]), np.uint64(starts[run + np.uint64(1)])
+        counted += np.int64(end - first)
+        while first < end:
+            size = min(end - first, np.uint64(VECTOR))
+            line, base = own, np.int64(bases[own])
+            at = line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
+            header = heads[at]
+            used = header & np.uint64(COUNTS)
+            fits = (used + size <= np.uint64(SLOTS)) & (used <= np.uint64(LINE - VECTOR))
+            fits &= (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+            if not (fits & (header & np.uint64(WORDS << WORD_SHIFT) == word)):
+                other = line_of_run(own, heights, first, first + size, word, heads, bases, chain, free, spare, held)
+                if other < 0:
+                    count_slowly(
+                        own, heights, intensity, gain, first, first + size, mark,
+                        lines, heads, bases, chain, free, spare, held,
+                    )  # fmt: skip
+                    first += size
+                    continue
+                line = np.uint64(other)
+                base, at = np.int64(bases[line]), line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
+                header = heads[at]
+                used = header & np.uint64(COUNTS)
+            # What is stored beyond the run's heights is overwritten by the next run, or by the header.
+            store_heights(heights, first, np.int32(base), lines, line * np.uint64(LINE) + used)
+            shine = np.uint64(sums[first + size] - sums[first])
+            heads[at] = (header + size + (shine << np.uint64(LIGHT_SHIFT))) | mark
+            first += size
     return counted
 
 
@@ -189,10 +268,10 @@ def note(column, row, epochs, sigma, edge, tile_rows, spans, sigmas):
             spans[tile, 1] = max(spans[tile, 1], epochs[j])
 
 
-@kernel
+@bare
 def accumulate_placed(
     east, north, height, classes, passes, intensity, gain, epochs, intervals, corner, cell_quanta, edge,
-    tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, first,
+    tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, first,
 ):  # fmt: skip
     """Count readings that have their places into the cells of active tiles.
 
@@ -204,7 +283,7 @@ def accumulate_placed(
     intensity : (n,) unsigned; gain : uint32, see :func:`accumulate`; epochs : (n,) int64, GPS ns.
     intervals : (n,) int32, interval of the trajectory that placed each reading, a row of `interval_sigmas`.
     corner : (2,) tuple of int64, south-west corner of tile_rows[0, 0] (quanta).
-    cell_quanta, edge, tile_rows … held : see :func:`accumulate`.
+    cell_quanta, edge, tile_rows, groups, pool : see :func:`accumulate`; work : as :func:`work_arrays` makes them.
     spans : (a, 2) int64, in/out, first and last epoch of each active tile.
     sigmas : (a, 2) float64, in/out, largest σ of the poses; interval_sigmas : (k, 2) float64.
     first : int, reading to begin with.
@@ -214,10 +293,8 @@ def accumulate_placed(
     done : int, the reading before which the pool ran short of free elements; n at the end.
     counted : int, readings that fell into active tiles.
     """
-    column, row = np.empty(PIECE, np.int32), np.empty(PIECE, np.int32)
-    heights = np.zeros(PIECE + VECTOR, np.int32)
-    starts, sums = np.empty(PIECE + 1, np.int32), np.empty(PIECE + 1, np.uint32)
-    touched = np.zeros(groups.shape[0], np.uint8)
+    free, held = pool[4], pool[6]
+    column, row, heights, starts, sums, cells, touched = work
     per_cell = 1.0 / cell_quanta
     counted = 0
     start = first
@@ -247,19 +324,10 @@ def accumulate_placed(
                 low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
         if low <= high:
             counted += accumulate(
-                column[:n], row[:n], heights, low, high, intensity[start:end], gain,
-                passes[start] >> 3, np.uint8(1 << (passes[start] & 7)), starts, sums,
-                tile_rows, groups, edge, slots, bases, chain, filled, light, marks, free, held, touched,
+                column[:n], row[:n], heights, low, high, intensity[start:end], gain, passes[start], starts, sums,
+                cells, tile_rows, groups, edge, pool, touched,
             )  # fmt: skip
-            note(
-                column[:n],
-                row[:n],
-                epochs[start:end],
-                interval_sigmas[intervals[start]],
-                edge,
-                tile_rows,
-                spans,
-                sigmas,
-            )
+            sigma = interval_sigmas[intervals[start]]
+            note(column[:n], row[:n], epochs[start:end], sigma, edge, tile_rows, spans, sigmas)
         start = end
     return start, counted

@@ -3,201 +3,264 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.accumulate import LANES
-from roadscan.kernels.lanes import medians_of_8, medians_of_16, medians_of_32, medians_of_64
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.accumulate import (
+    COUNTS,
+    HEADERS,
+    LANES,
+    LIGHT_SHIFT,
+    LIGHTS,
+    LINE,
+    MARK_SHIFT,
+    PASSES,
+    WORD_SHIFT,
+    WORDS,
+)
+from roadscan.kernels.lanes import REACH, statistics_of_8, statistics_of_32, statistics_of_64
+from roadscan.kernels.line_access import fetch_line
+from roadscan.kernels.open_group import open_group
+from roadscan.kernels.options import bare, inlined
 
-MAD_TO_SIGMA = 1.4826
-OUTLIER_SIGMAS = 3.0
+AHEAD = 2
+"""Groups whose lines are fetched before their turn comes."""
+STATISTICS = 6
+"""Mean, robust, lowest and highest height, standard deviation, mean intensity."""
 AT_ONCE = 64
 """Heights a cell of which sixteen cells are worked on together; fuller cells are taken one by one."""
 
 
-@inlined
-def reach_of(deviation, floor_quanta):
-    """Farthest from the median (quanta) that a height counts, by the median of the distances from it."""
-    return np.int64(math.floor(max(OUTLIER_SIGMAS * MAD_TO_SIGMA * deviation, floor_quanta)))
+def work_arrays(most: int) -> tuple[Any, ...]:
+    """Arrays that `finish_cells` works in; `most` : heights that a cell may have."""
+    table, rows = np.zeros((AT_ONCE, LANES), np.int32), np.zeros((4, LANES), np.int32)
+    return table, *rows, np.zeros((STATISTICS, LANES)), np.empty(most, np.int64)
 
 
 @inlined
-def spread_of(heights, first, end, median, reach, sums):
-    """Sums over heights [first, end) of their distances d from the median.
+def is_chained(first_line, chain):
+    """True if a cell of the group has more than one line."""
+    longest = np.int32(-1)
+    for lane in range(LANES):
+        longest = max(longest, chain[first_line + lane])
+    return longest >= 0
 
-    sums : (6,) int64, in/out: Σ d, Σ d², number and Σ d of those within reach, lowest d, highest d.
+
+@bare
+def find_groups(groups, chain, found):
+    """Groups of a tile that have an element, in order, and the largest number of lines that a cell has.
+
+    groups : (g,) int32; found : (g + AHEAD,) int32, out, the numbers of these groups.
+
+    Returns
+    -------
+    count, most : int.
     """
-    total, squares, used, near, low, high = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    for k in range(first, end):
-        d = np.int64(heights[k]) - median
+    count, most = np.uint64(0), 1
+    for group in range(np.uint64(groups.size)):
+        found[count] = group
+        count += np.uint64(groups[group] >= 0)
+    for k in range(count):
+        first_line = np.int64(groups[found[k]]) * LANES
+        if is_chained(first_line, chain):
+            for lane in range(LANES):
+                lines, line = 0, first_line + lane
+                while line >= 0:
+                    lines += 1
+                    line = np.int64(chain[line])
+                most = max(most, lines)
+    for k in range(np.uint64(AHEAD)):
+        found[count + k] = found[count - np.uint64(1)] if count > 0 else 0
+    return np.int64(count), most
+
+
+@inlined
+def add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks):
+    """Heights of the further lines of a group's cells, relative to the base of the cell's first line.
+
+    heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out.
+    """
+    for lane in range(LANES):
+        line = np.int64(chain[first_line + lane])
+        while line >= 0:
+            header = heads[line * HEADERS + HEADERS - 1]
+            size = np.int32(header & np.uint64(COUNTS))
+            shift = bases[line] - bases[first_line + lane]
+            for k in range(min(size, AT_ONCE - counts[lane])):
+                heights[counts[lane] + k, lane] = np.int32(lines[line * LINE + k]) + shift
+            counts[lane] += size
+            light[lane] += np.int32((header >> np.uint64(LIGHT_SHIFT)) & np.uint64(LIGHTS))
+            marks[lane] |= np.int32(header >> np.uint64(MARK_SHIFT))
+            line = np.int64(chain[line])
+
+
+@inlined
+def sift_down(heights, root, end):
+    """Let a height sink to its place in the heap below it."""
+    while 2 * root + 1 < end:
+        child = 2 * root + 1
+        if child + 1 < end and heights[child] < heights[child + 1]:
+            child += 1
+        if heights[root] >= heights[child]:
+            return
+        heights[root], heights[child] = heights[child], heights[root]
+        root = child
+
+
+@bare
+def sort_heights(heights, n):
+    """Sort the first n heights in place (heap sort, Williams 1964): it needs no memory, and compiles in no time."""
+    for root in range(n // 2 - 1, -1, -1):
+        sift_down(heights, root, n)
+    for end in range(n - 1, 0, -1):
+        heights[0], heights[end] = heights[end], heights[0]
+        sift_down(heights, 0, end)
+
+
+@inlined
+def gather_many(first_line, lines, heads, bases, chain, work):
+    """All heights of a cell, relative to the base of its first line → work. Returns how many there are."""
+    n, line = 0, first_line
+    while line >= 0:
+        shift = np.int64(bases[line]) - np.int64(bases[first_line])
+        for k in range(np.int64(heads[line * HEADERS + HEADERS - 1] & np.uint64(COUNTS))):
+            work[n] = np.int64(lines[line * LINE + k]) + shift
+            n += 1
+        line = np.int64(chain[line])
+    return n
+
+
+@bare
+def statistics_of_many(first_line, light, lines, heads, bases, chain, floor, quantum_m, work, out, lane):
+    """Statistics of one cell of any size, as ``lanes.statistics_of``, into out[:, lane]."""
+    n = gather_many(first_line, lines, heads, bases, chain, work)
+    sort_heights(work, n)
+    median = work[(n - 1) // 2]
+    total, squares = np.int64(0), np.int64(0)
+    low, high = work[0] - median, work[n - 1] - median
+    for k in range(n):
+        d = work[k] - median
         total += d
         squares += d * d
+        work[k] = abs(d)
+    sort_heights(work, n)
+    reach = np.int64(math.floor(max(REACH * work[(n - 1) // 2], floor)))
+    used, near = 0, np.int64(0)
+    for k in range(gather_many(first_line, lines, heads, bases, chain, work)):
+        d = work[k] - median
         inside = (d <= reach) & (d >= -reach)
         used += inside
         near += d * inside
-        low = min(low, d)
-        high = max(high, d)
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = total, squares, used, near, low, high
+    middle, average = median + np.int64(bases[first_line]), total / n
+    out[0, lane] = (middle + average) * quantum_m
+    out[1, lane] = (middle + near / used) * quantum_m
+    out[2, lane] = (middle + low) * quantum_m
+    out[3, lane] = (middle + high) * quantum_m
+    out[4, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
+    out[5, lane] = light / n
 
 
-@kernel
-def gather(head, slots, bases, chain, filled, heights, counts):
-    """Heights of a group's chain as columns of a table, relative to the first base. Returns the largest count.
+@inlined
+def write_passes(first_line, marks, numbers, heads, chain, written, pass_ids):
+    """Ids of the passes of a cell, ascending. Returns the end of what is written."""
+    if numbers.size <= PASSES:
+        for p in range(numbers.size):
+            if (marks >> p) & 1:
+                pass_ids[written] = numbers[p]
+                written += 1
+        return written
+    for p in range(numbers.size):
+        line, seen = first_line, False
+        while line >= 0:
+            header = heads[line * HEADERS + HEADERS - 1]
+            word = np.int64((header >> np.uint64(WORD_SHIFT)) & np.uint64(WORDS))
+            own = np.int64(header >> np.uint64(MARK_SHIFT))
+            seen |= (word == p // PASSES) & ((own >> (p % PASSES)) & 1 == 1)
+            line = np.int64(chain[line])
+        if seen:
+            pass_ids[written] = numbers[p]
+            written += 1
+    return written
 
-    heights : (AT_ONCE, 16) int32, out, as far as it reaches; counts : (16,) int32, out, all heights there are.
-    """
-    most = 0
+
+@inlined
+def release(element, chain, free, spare, held):
+    """Give a group's element and the further lines of its cells back."""
     for lane in range(LANES):
-        counts[lane] = filled[head, lane]
-    for lane in range(LANES):
-        for k in range(counts[lane]):
-            heights[k, lane] = slots[head, lane, k]
-        most = max(most, counts[lane])
-    e = chain[head]
-    while e >= 0:
-        shift = bases[e] - bases[head]
-        for lane in range(LANES):
-            size = np.int32(filled[e, lane])
-            for k in range(min(size, AT_ONCE - counts[lane])):
-                heights[counts[lane] + k, lane] = slots[e, lane, k] + shift
-            counts[lane] += size
-            most = max(most, counts[lane])
-        e = chain[e]
-    return most
+        line = np.int64(chain[element * LANES + lane])
+        while line >= 0:
+            spare[held[1]] = line
+            held[1] += 1
+            line = np.int64(chain[line])
+    held[0] -= 1
+    free[held[0]] = element
 
 
-@kernel
-def middle_of(head, lane, slots, bases, chain, filled, size, work):
-    """Lower median of a cell of any size, relative to the first base, and the lower median of the distances."""
-    n = 0
-    e = head
-    while e >= 0:
-        for k in range(filled[e, lane]):
-            work[n] = np.int64(slots[e, lane, k]) + bases[e] - bases[head]
-            n += 1
-        e = chain[e]
-    own = work[:size]
-    own.sort()
-    median = own[(size - 1) // 2]
-    for k in range(size):
-        own[k] = abs(own[k] - median)
-    own.sort()
-    return median, own[(size - 1) // 2]
-
-
-@kernel
-def release(head, slots_chain, filled, light, marks, free, held):
-    """Give a group's elements back."""
-    e = head
-    while e >= 0:
-        for lane in range(LANES):
-            filled[e, lane] = 0
-            light[e, lane] = 0
-            for word in range(marks.shape[2]):
-                marks[e, lane, word] = 0
-        held[0] -= 1
-        free[held[0]] = e
-        e = slots_chain[e]
-
-
-@kernel
-def count_cells(groups, chain, filled):
-    """Cells of a tile that hold a reading, and how many the fullest holds; groups : (g,) int32, first elements."""
-    cells, most = 0, 0
-    for group in range(groups.size):
-        if groups[group] < 0:
-            continue
-        for lane in range(LANES):
-            count = 0
-            e = groups[group]
-            while e >= 0:
-                count += filled[e, lane]
-                e = chain[e]
-            cells += count > 0
-            most = max(most, count)
-    return cells, most
-
-
-@kernel
+@bare
 def finish_cells(
-    groups, edge, slots, bases, chain, filled, light, marks, free, held, floor_quanta, numbers, heights, work,
+    groups, found, taken, edge, pool, floor, quantum_m, numbers, work,
     column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
 ):  # fmt: skip
     """Statistics of all cells of a tile that hold a reading, in order of row and column; its groups are given back.
 
     Parameters
     ----------
-    groups … held : see ``kernels.accumulate``; groups is the tile's own row, in/out, −1 everywhere when done.
-    floor_quanta : int64, distance from the median up to which heights always count.
-    numbers : (p,) uint16, ascending, ids of the passes that the bits of `marks` stand for.
-    heights : (AT_ONCE, 16) int32, work; work : int64, work, as many as the fullest cell holds.
-    column, row, count, mean, robust, low, high, deviation, bright : (c,) out; heights in quanta, float64.
+    groups, pool : see ``kernels.accumulate``; groups is the tile's own row, in/out, −1 everywhere when done.
+    found, taken : from :func:`find_groups`.
+    edge : int64, cells along a tile's edge.
+    floor : float64, distance from the median (quanta) up to which heights always count; quantum_m : float64, m.
+    numbers : (p,) uint16, ascending, ids of the passes by their numbers.
+    work : as :func:`work_arrays` makes them, for all heights of the fullest cell.
+    column, row : (c,) uint16, out; count : (c,) uint32, out; mean, robust, low, high : (c,) float64, out, heights (m).
+    deviation, bright : (c,) float32, out, standard deviation (m), mean intensity. c : all cells of the tile's groups.
     pass_offsets : (c + 1,) int32, out; pass_ids : (c · p,) uint16, out.
 
     Returns
     -------
-    int, how many pass ids were written.
+    cells, ids : int, how many cells and pass ids were written.
     """
+    lines, heads, bases, chain, free, spare, held = pool
+    heights, counts, light, marks, own_bases, out, many = work
     per_row = (edge + LANES - 1) // LANES
-    counts = np.zeros(LANES, np.int32)
-    medians = np.zeros(LANES, np.int32)
-    deviations = np.zeros(LANES, np.int32)
-    sums = np.zeros(6, np.int64)
     cell, written = 0, 0
-    for group in range(groups.size):
-        head = groups[group]
-        if head < 0:
-            continue
-        most = gather(head, slots, bases, chain, filled, heights, counts)
-        if most <= 8:
-            medians_of_8(heights, counts, medians, deviations)
-        elif most <= 16:
-            medians_of_16(heights, counts, medians, deviations)
-        elif most <= 32:
-            medians_of_32(heights, counts, medians, deviations)
-        elif most <= AT_ONCE:
-            medians_of_64(heights, counts, medians, deviations)
-        first_column = (group % per_row) * LANES
+    for k in range(taken):
+        group = np.int64(found[k])
+        element = np.int64(groups[group])
+        later = np.uint64(groups[found[k + AHEAD]]) * np.uint64(LANES * LINE)
         for lane in range(LANES):
-            size = np.int64(counts[lane])
-            if size == 0:
-                continue
-            middle, away = np.int64(medians[lane]), np.int64(deviations[lane])
-            if most > AT_ONCE:
-                middle, away = middle_of(head, lane, slots, bases, chain, filled, size, work)
-            median = middle + bases[head]
-            reach = reach_of(away, floor_quanta)
-            sums[:4] = 0
-            sums[4], sums[5] = np.int64(1) << 40, -(np.int64(1) << 40)
-            shine = np.int64(0)
-            e = head
-            while e >= 0:
-                spread_of(slots[e, lane], 0, np.int64(filled[e, lane]), median - bases[e], reach, sums)
-                shine += light[e, lane]
-                e = chain[e]
-            total = sums[0]
-            column[cell] = first_column + lane
-            row[cell] = group // per_row
-            count[cell] = size
-            low[cell] = median + sums[4]
-            high[cell] = median + sums[5]
-            mean[cell] = median + total / size
-            robust[cell] = median + sums[3] / sums[2]
-            deviation[cell] = math.sqrt(max(sums[1] / size - (total / size) * (total / size), 0.0))
-            bright[cell] = shine / size
-            pass_offsets[cell] = written
-            for p in range(numbers.size):
-                seen = False
-                e = head
-                while e >= 0:
-                    seen |= (marks[e, lane, p >> 3] >> (p & 7)) & 1 == 1
-                    e = chain[e]
-                if seen:
-                    pass_ids[written] = numbers[p]
-                    written += 1
-            cell += 1
-        release(head, chain, filled, light, marks, free, held)
+            fetch_line(lines, later + np.uint64(lane * LINE))
+        first_line = element * LANES
+        open_group(lines, np.uint64(first_line * LINE), heights, counts, light, marks)
+        if is_chained(first_line, chain):
+            add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks)
+        most = np.int32(0)
+        for lane in range(LANES):
+            most = max(most, counts[lane])
+            own_bases[lane] = bases[first_line + lane]
+        if most <= 8:
+            statistics_of_8(heights, counts, light, own_bases, floor, quantum_m, out)
+        elif most <= 32:
+            statistics_of_32(heights, counts, light, own_bases, floor, quantum_m, out)
+        elif most <= AT_ONCE:
+            statistics_of_64(heights, counts, light, own_bases, floor, quantum_m, out)
+        else:
+            for lane in range(LANES):
+                if counts[lane] > 0:
+                    statistics_of_many(
+                        first_line + lane, light[lane], lines, heads, bases, chain, floor, quantum_m, many, out, lane
+                    )
+        for lane in range(LANES):
+            if counts[lane] > 0:
+                column[cell] = (group % per_row) * LANES + lane
+                row[cell] = group // per_row
+                count[cell] = counts[lane]
+                mean[cell], robust[cell], low[cell], high[cell] = out[0, lane], out[1, lane], out[2, lane], out[3, lane]
+                deviation[cell], bright[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])
+                pass_offsets[cell] = written
+                written = write_passes(first_line + lane, marks[lane], numbers, heads, chain, written, pass_ids)
+                cell += 1
+        release(element, chain, free, spare, held)
         groups[group] = -1
     pass_offsets[cell] = written
-    return written
+    return cell, written

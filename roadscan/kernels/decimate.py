@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.cells import MAD_TO_SIGMA, OUTLIER_SIGMAS
-from roadscan.kernels.lanes import LANES, medians_of_16
+from roadscan.kernels.lanes import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
 from roadscan.kernels.options import inlined, kernel
 
 ABSENT = np.int32(2**31 - 1)

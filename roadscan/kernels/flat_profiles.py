@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.accumulate import NOWHERE, PIECE, VECTOR, accumulate
+from roadscan.kernels.accumulate import NOWHERE, PIECE, accumulate
 from roadscan.kernels.georeference import (
     CLASS_NO_POSE,
     CLASS_NO_RETURN,
@@ -34,7 +34,7 @@ from roadscan.kernels.georeference import (
     profile_forms,
     tile_and_rest,
 )
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import bare, inlined
 from roadscan.kernels.poses import find_interval
 
 HALF = np.float32(0.5)
@@ -113,11 +113,59 @@ def fate_of(kind):
     return RANGE if kind in (CLASS_TOO_NEAR, CLASS_TOO_FAR) else HEIGHT
 
 
-@kernel
+@bare
+def place_profile(
+    raw, y0, z0, dy, dz, scale, planes, rests, per_cell, first, raw_limits, heights, column, row, height
+):  # fmt: skip
+    """Cells and heights of readings of a profile. A function of its own: inside a larger one it stays scalar.
+
+    Parameters
+    ----------
+    raw : (n,) uint16; y0, z0, dy, dz : (n,) float32, rays, see :func:`accumulate_profiles`; planes : three (p, q, r).
+    rests : (2,) tuple of float32, easting and northing left over from :func:`whole_cells`; per_cell : float32.
+    first : (3,) tuple of int32, cells to the anchors, east and north, and the anchor of the heights (quanta).
+    column, row, height : (n,) int32, out; column NOWHERE for readings that a filter leaves out.
+    """
+    east, north, up = planes
+    for j in range(raw.size):
+        distance = scale[0] + scale[1] * np.float32(raw[j])
+        y = y0[j] + distance * dy[j]
+        z = z0[j] + distance * dz[j]
+        h = on_plane(up, y, z)
+        keep = (raw[j] >= raw_limits[0]) & (raw[j] <= raw_limits[1]) & (h >= heights[0]) & (h <= heights[1])
+        e = np.int32(np.floor((np.floor(on_plane(east, y, z) + HALF) + rests[0]) * per_cell))
+        s = np.int32(np.floor((np.floor(on_plane(north, y, z) + HALF) + rests[1]) * per_cell))
+        column[j] = e + first[0] if keep else np.int32(NOWHERE)
+        row[j] = s + first[1]
+        height[j] = np.int32(np.floor(h + HALF)) + first[2]
+
+
+@bare
+def count_out_of_range(raw, raw_limits):
+    """How many readings have no return, and how many have one that is too near or too far."""
+    silent, within = 0, 0
+    for j in range(raw.size):
+        silent += raw[j] == 0
+        within += (raw[j] != 0) & (raw[j] >= raw_limits[0]) & (raw[j] <= raw_limits[1])
+    return silent, raw.size - silent - within
+
+
+@bare
+def reach_of_kept(column, height):
+    """How many readings are kept, and their lowest and highest height (int64)."""
+    good, low, high = 0, np.int32(2**31 - 1), np.int32(-(2**31))
+    for j in range(column.size):
+        keep = column[j] != NOWHERE
+        good += keep
+        low = min(low, height[j] if keep else low)
+        high = max(high, height[j] if keep else high)
+    return good, np.int64(low), np.int64(high)
+
+
+@bare
 def accumulate_profiles(
     epochs, ranges, intensity, gain, passes, rays, middle, scale, poses, raw_limits, limits, quanta_per_m,
-    corner, cell_quanta, edge, tile_rows, groups, slots, bases, chain, filled, light, marks, free, held,
-    spans, sigmas, interval_sigmas, fates, first,
+    corner, cell_quanta, edge, tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, fates, first,
 ):  # fmt: skip
     """Count the readings of profiles into the cells of active tiles.
 
@@ -133,7 +181,7 @@ def accumulate_profiles(
     quanta_per_m : float64; corner : (2,) tuple of int64, south-west corner of
     tile_rows[0, 0] (quanta).
     cell_quanta, edge : int64, edge of a cell; cells along a tile's edge.
-    tile_rows … held : see ``kernels.accumulate``.
+    tile_rows, groups, pool, work : see ``kernels.accumulate``.
     spans : (a, 2) int64, in/out, first and last epoch of each active tile.
     sigmas : (a, 2) float64, in/out, largest σ of the poses; interval_sigmas : (knots − 1, 2) float64.
     fates : (6,) int64, in/out, counts of readings by fate.
@@ -145,19 +193,21 @@ def accumulate_profiles(
     """
     count = ranges.shape[1]
     per_cell = np.float32(1.0 / cell_quanta)
-    column, row = np.empty(PIECE, np.int32), np.empty(PIECE, np.int32)
-    height = np.zeros(PIECE + VECTOR, np.int32)
-    starts, sums = np.empty(PIECE + 1, np.int32), np.empty(PIECE + 1, np.uint32)
-    touched = np.zeros(groups.shape[0], np.uint8)
-    knots = poses[1]
+    column, row, height, starts, sums, cells, touched = work
+    knots, free, held = poses[1], pool[4], pool[6]
+    for tile in range(touched.size):
+        touched[tile] = 0
     k = 0
     for i in range(first, epochs.size):
         if free.size - held[0] < 2 * count:
             return i
         k = find_interval(epochs[i], knots, k)
         placed, anchors, planes, heights = planes_of(epochs[i], k, middle, quanta_per_m, limits, poses)
-        word, bit = max(passes[i], 0) >> 3, np.uint8(1 << (passes[i] & 7))
-        east, north, up = planes
+        if not placed:
+            silent, _ = count_out_of_range(ranges[i], raw_limits)
+            fates[NO_RETURN] += silent
+            fates[NO_POSE] += count - silent
+            continue
         first_column, east_rest = whole_cells(anchors[0] - corner[0], cell_quanta)
         first_row, north_rest = whole_cells(anchors[1] - corner[1], cell_quanta)
         base = np.int32(anchors[2])
@@ -167,38 +217,22 @@ def accumulate_profiles(
             n = end - start
             raw = ranges[i, start:end]
             y0, z0, dy, dz = rays[0, start:end], rays[1, start:end], rays[2, start:end], rays[3, start:end]
-            good, low, high = 0, np.int32(2**31 - 1), np.int32(-(2**31))
-            for j in range(n):
-                distance = scale[0] + scale[1] * np.float32(raw[j])
-                y = y0[j] + distance * dy[j]
-                z = z0[j] + distance * dz[j]
-                h = on_plane(up, y, z)
-                keep = (
-                    (raw[j] >= raw_limits[0]) & (raw[j] <= raw_limits[1]) & (h >= heights[0]) & (h <= heights[1])
-                    & placed
-                )  # fmt: skip
-                e = np.int32(np.floor((np.floor(on_plane(east, y, z) + HALF) + east_rest) * per_cell))
-                s = np.int32(np.floor((np.floor(on_plane(north, y, z) + HALF) + north_rest) * per_cell))
-                q = np.int32(np.floor(h + HALF))
-                column[j] = e + first_column if keep else np.int32(NOWHERE)
-                row[j] = s + first_row
-                height[j] = q + base
-                good += keep
-                low = min(low, q if keep else low)
-                high = max(high, q if keep else high)
+            place_profile(
+                raw, y0, z0, dy, dz, scale, planes, (east_rest, north_rest),
+                per_cell, (first_column, first_row, base), raw_limits, heights, column, row, height,
+            )  # fmt: skip
+            silent, apart = count_out_of_range(raw, raw_limits)
+            good, low, high = reach_of_kept(column[:n], height)
             wanted += good
-            if good < n:
-                for j in range(n):
-                    if column[j] == NOWHERE:
-                        distance = scale[0] + scale[1] * np.float32(raw[j])
-                        h = on_plane(up, y0[j] + distance * dy[j], z0[j] + distance * dz[j])
-                        kind = class_of(raw[j], h, raw_limits, heights) if placed or raw[j] == 0 else CLASS_NO_POSE
-                        fates[fate_of(kind)] += 1
+            within = n - silent - apart
+            fates[NO_RETURN] += silent
+            fates[RANGE] += apart
+            fates[HEIGHT] += within - good
             if good > 0 and passes[i] >= 0:
                 counted += accumulate(
-                    column[:n], row[:n], height, np.int64(low) + base, np.int64(high) + base,
-                    intensity[i, start:end], gain, word, bit, starts, sums, tile_rows, groups, edge,
-                    slots, bases, chain, filled, light, marks, free, held, touched,
+                    column[:n], row[:n], height, low, high,
+                    intensity[i, start:end], gain, passes[i], starts, sums, cells, tile_rows, groups, edge, pool,
+                    touched,
                 )  # fmt: skip
         fates[KEPT] += counted
         fates[OUTSIDE] += wanted - counted
@@ -212,7 +246,7 @@ def accumulate_profiles(
     return epochs.size
 
 
-@kernel
+@bare
 def georeference_flat_profiles(
     epochs, ranges, rays, middle, scale, poses, raw_limits, limits, quanta_per_m, tile_quanta, window,
     rows, readings, tiles, quanta, fates, classes,

@@ -1,8 +1,8 @@
-"""Sixteen cells at a time: medians of columns of a small table, by sorting networks on vector registers.
+"""Sixteen cells at a time: statistics of the columns of a small table, on vector registers.
 
-Numba's own loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the
-rows are loaded into registers here, and the network (Batcher 1968, "Sorting networks and their applications",
-odd-even mergesort) is written out as instructions. Without the compiler NumPy does the same.
+Numba's own loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the rows are
+loaded into registers here and everything is written out as instructions: medians by a sorting network (Batcher 1968,
+"Sorting networks and their applications", odd-even mergesort). Without the compiler NumPy does the same.
 """
 
 from __future__ import annotations
@@ -13,10 +13,18 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from roadscan.kernels.options import Kernel, kernel
+from roadscan.kernels.options import Kernel, bare
 
 LANES = 16
 LARGEST = np.int32(2**31 - 1)
+
+MAD_TO_SIGMA = 1.4826
+OUTLIER_SIGMAS = 3.0
+REACH = OUTLIER_SIGMAS * MAD_TO_SIGMA
+"""Heights count as far from the median as this many times the median distance (MAD)."""
+
+_I32, _I64, _F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
+_ROW = ir.VectorType(_I32, LANES)
 
 
 def exchanges(n):
@@ -37,83 +45,190 @@ def exchanges(n):
     return pairs
 
 
-def _sorted(builder, rows, pairs):
-    for i, j in pairs:
-        less = builder.icmp_signed("<", rows[i], rows[j])
-        rows[i], rows[j] = builder.select(less, rows[i], rows[j]), builder.select(less, rows[j], rows[i])
-    return rows
+class Lanes:
+    """Writes instructions on rows of sixteen lanes; arguments are contiguous arrays."""
+
+    def __init__(self, context, builder, signature, arguments):
+        self.b = builder
+        self.data = [
+            context.make_array(t)(context, builder, a).data if isinstance(t, types.Array) else a
+            for t, a in zip(signature.args, arguments, strict=True)
+        ]
+
+    def load(self, which, k=0):
+        """Row k of an array of int32."""
+        value = self.b.load(self._place(which, k, _ROW))
+        value.align = 4
+        return value
+
+    def store(self, which, value, k=0):
+        """Store a vector; k counts vectors of its type."""
+        self.b.store(value, self._place(which, k, value.type)).align = 4
+
+    def _place(self, which, k, kind):
+        start = self.b.bitcast(self.data[which], kind.as_pointer())
+        return self.b.gep(start, [ir.Constant(_I64, k)])
+
+    def all(self, value, kind=_ROW):
+        """The same number in every lane."""
+        number = float(value) if isinstance(kind.element, ir.DoubleType) else int(value)
+        return ir.Constant(kind, [number] * kind.count)
+
+    def spread(self, value, kind):
+        """A scalar in every lane."""
+        one = self.b.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_I32, 0))
+        zeros = ir.Constant(ir.VectorType(_I32, kind.count), [0] * kind.count)
+        return self.b.shuffle_vector(one, ir.Constant(kind, ir.Undefined), zeros)
+
+    def least(self, a, b):
+        """The smaller of two, lane by lane."""
+        return self.b.select(self.b.icmp_signed("<", a, b), a, b)
+
+    def most(self, a, b):
+        """The larger of two, lane by lane."""
+        return self.b.select(self.b.icmp_signed(">", a, b), a, b)
+
+    def size(self, a):
+        """Absolute value."""
+        return self.b.select(self.b.icmp_signed("<", a, self.all(0)), self.b.neg(a), a)
+
+    def ordered(self, rows, pairs):
+        """Rows sorted within each lane."""
+        rows = list(rows)
+        for i, j in pairs:
+            rows[i], rows[j] = self.least(rows[i], rows[j]), self.most(rows[i], rows[j])
+        return rows
+
+    def picked(self, rows, index):
+        """Of each lane the row of its own index."""
+        found = rows[0]
+        for k, row in enumerate(rows[1:], start=1):
+            found = self.b.select(self.b.icmp_signed("==", index, self.all(k)), row, found)
+        return found
+
+    def halves(self, row, kind=_I64):
+        """Both halves of a row of int32 as wider numbers."""
+        wide = ir.VectorType(kind, LANES // 2)
+        parts = []
+        for first in (0, LANES // 2):
+            which = ir.Constant(ir.VectorType(_I32, LANES // 2), list(range(first, first + LANES // 2)))
+            half = self.b.shuffle_vector(row, ir.Constant(_ROW, ir.Undefined), which)
+            parts.append(self.b.sitofp(half, wide) if kind is _F64 else self.b.sext(half, wide))
+        return parts
+
+    def medians(self, n, heights, counts):
+        """Rows of `heights`, which of them each lane has, its lower median, and that of the distances from it."""
+        count = self.load(counts)
+        there = [self.b.icmp_signed(">", count, self.all(k)) for k in range(n)]
+        middle = self.b.ashr(self.b.sub(count, self.all(1)), self.all(1))
+        pairs = exchanges(n)
+        raw = [self.load(heights, k) for k in range(n)]
+        rows = [self.b.select(t, r, self.all(LARGEST)) for t, r in zip(there, raw, strict=True)]
+        centre = self.picked(self.ordered(rows, pairs), middle)
+        away = [self.size(self.b.sub(row, centre)) for row in rows]
+        away = [self.b.select(t, a, self.all(LARGEST)) for t, a in zip(there, away, strict=True)]
+        return raw, there, centre, self.picked(self.ordered(away, pairs), middle)
 
 
-def _picked(builder, rows, index):
-    """Of each lane the row of its own index."""
-    found = rows[0]
-    for k, row in enumerate(rows[1:], start=1):
-        found = builder.select(builder.icmp_signed("==", index, _all(k)), row, found)
-    return found
+def generator(write):
+    """The code of an intrinsic whose instructions `write` (Lanes) writes; it returns nothing."""
+
+    def generate(context, builder, signature, arguments):
+        write(Lanes(context, builder, signature, arguments))
+        return context.get_dummy_value()
+
+    return generate
 
 
-def _all(value):
-    vector = ir.VectorType(ir.IntType(32), LANES)
-    return ir.Constant(vector, [int(value)] * LANES)
-
-
-def _compiled(n):
-    pairs = exchanges(n)
-    vector = ir.VectorType(ir.IntType(32), LANES)
+def _medians(n):
+    def write(lanes):
+        _, _, centre, away = lanes.medians(n, 0, 1)
+        lanes.store(2, centre)
+        lanes.store(3, away)
 
     @intrinsic
-    def medians_of(typingctx, heights, counts, median, deviation):
-        def write(context, builder, signature, arguments):
-            data = [
-                context.make_array(t)(context, builder, a).data for t, a in zip(signature.args, arguments, strict=True)
-            ]
-
-            def place(which, k=0):
-                return builder.bitcast(
-                    builder.gep(data[which], [ir.Constant(ir.IntType(64), LANES * k)]), vector.as_pointer()
-                )
-
-            def load(which, k=0):
-                value = builder.load(place(which, k))
-                value.align = 4
-                return value
-
-            def store(which, value):
-                builder.store(value, place(which)).align = 4
-
-            count = load(1)
-            there = [builder.icmp_signed(">", count, _all(k)) for k in range(n)]
-            middle = builder.ashr(builder.sub(count, _all(1)), _all(1))
-            rows = [builder.select(there[k], load(0, k), _all(LARGEST)) for k in range(n)]
-            rows = _sorted(builder, rows, pairs)
-            centre = _picked(builder, rows, middle)
-            away = []
-            for k, row in enumerate(rows):
-                above = builder.sub(row, centre)
-                size = builder.select(builder.icmp_signed("<", above, _all(0)), builder.neg(above), above)
-                away.append(builder.select(there[k], size, _all(LARGEST)))
-            store(2, centre)
-            store(3, _picked(builder, _sorted(builder, away, pairs), middle))
-            return context.get_dummy_value()
-
-        return types.void(heights, counts, median, deviation), write
+    def written(typingctx, heights, counts, median, deviation):
+        return types.void(heights, counts, median, deviation), generator(write)
 
     def medians(heights, counts, median, deviation):
-        medians_of(heights, counts, median, deviation)
+        written(heights, counts, median, deviation)
 
-    return kernel(medians)
+    return bare(medians)
 
 
-def _interpreted(n):
-    def medians(heights, counts, median, deviation):
-        for lane in range(LANES):
-            count = counts[lane]
-            if count > 0:
-                own = np.sort(heights[:count, lane])
-                median[lane] = own[(count - 1) // 2]
-                deviation[lane] = np.sort(np.abs(own - median[lane]))[(count - 1) // 2]
+def _statistics(n):
+    def write(lanes):
+        b = lanes.b
+        raw, there, centre, away = lanes.medians(n, 0, 1)
+        double, wide = (ir.VectorType(kind, LANES // 2) for kind in (_F64, _I64))
+        floor, root = (
+            b.module.declare_intrinsic(f"llvm.{name}.v8f64", fnty=ir.FunctionType(double, [double]))
+            for name in ("floor", "sqrt")
+        )
+        least, quantum = (lanes.spread(lanes.data[k], double) for k in (4, 5))
+        reach = []
+        for half in lanes.halves(away, _F64):
+            far = b.fmul(lanes.all(REACH, double), half)
+            far = b.call(floor, [b.select(b.fcmp_ordered(">", far, least), far, least)])
+            reach.append(b.fptosi(far, ir.VectorType(_I32, LANES // 2)))
+        farthest = b.shuffle_vector(reach[0], reach[1], ir.Constant(_ROW, list(range(LANES))))
+        total, squares, near = ([lanes.all(0, wide)] * 2 for _ in range(3))
+        used, low, high = lanes.all(0), lanes.all(LARGEST), lanes.all(-int(LARGEST))
+        for row, own in zip(raw, there, strict=True):
+            d = b.sub(row, centre)
+            low, high = b.select(own, lanes.least(low, d), low), b.select(own, lanes.most(high, d), high)
+            d = b.select(own, d, lanes.all(0))
+            inside = b.and_(own, b.icmp_signed("<=", lanes.size(d), farthest))
+            used = b.add(used, b.zext(inside, _ROW))
+            close = b.select(inside, d, lanes.all(0))
+            parts = lanes.halves(d)
+            total = [b.add(t, p) for t, p in zip(total, parts, strict=True)]
+            squares = [b.add(t, b.mul(p, p)) for t, p in zip(squares, parts, strict=True)]
+            near = [b.add(t, p) for t, p in zip(near, lanes.halves(close), strict=True)]
+        medians, lows, highs = (lanes.halves(row) for row in (b.add(centre, lanes.load(3)), low, high))
+        sizes, useds, lights = (lanes.halves(row, _F64) for row in (lanes.load(1), used, lanes.load(2)))
+        for k in range(2):
+            middle, sums, square, close = (b.sitofp(v[k], double) for v in (medians, total, squares, near))
+            average = b.fdiv(sums, sizes[k])
+            lanes.store(6, b.fmul(b.fadd(middle, average), quantum), k)
+            lanes.store(6, b.fmul(b.fadd(middle, b.fdiv(close, useds[k])), quantum), 2 + k)
+            lanes.store(6, b.fmul(b.sitofp(b.add(medians[k], lows[k]), double), quantum), 4 + k)
+            lanes.store(6, b.fmul(b.sitofp(b.add(medians[k], highs[k]), double), quantum), 6 + k)
+            variance = b.fsub(b.fdiv(square, sizes[k]), b.fmul(average, average))
+            variance = b.select(b.fcmp_ordered(">", variance, lanes.all(0, double)), variance, lanes.all(0, double))
+            lanes.store(6, b.fmul(b.call(root, [variance]), quantum), 8 + k)
+            lanes.store(6, b.fdiv(lights[k], sizes[k]), 10 + k)
 
-    return medians
+    @intrinsic
+    def written(typingctx, heights, counts, light, bases, floor, quantum_m, out):
+        arguments = heights, counts, light, bases, floor, quantum_m, out
+        return types.void(*arguments), generator(write)
+
+    def statistics(heights, counts, light, bases, floor, quantum_m, out):
+        written(heights, counts, light, bases, floor, quantum_m, out)
+
+    return bare(statistics)
+
+
+def _medians_by_numpy(heights, counts, median, deviation):
+    for lane in np.flatnonzero(counts):
+        own = np.sort(heights[: counts[lane], lane])
+        median[lane] = own[(own.size - 1) // 2]
+        deviation[lane] = np.sort(np.abs(own - median[lane]))[(own.size - 1) // 2]
+
+
+def _statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
+    median, away = np.zeros(LANES, np.int32), np.zeros(LANES, np.int32)
+    _medians_by_numpy(heights, counts, median, away)
+    for lane in np.flatnonzero(counts):
+        n, middle = int(counts[lane]), int(median[lane]) + int(bases[lane])
+        d = heights[:n, lane].astype(np.int64) - median[lane]
+        near = d[np.abs(d) <= np.floor(max(REACH * away[lane], floor))]
+        average = d.sum() / n
+        deviation = np.sqrt(max((d * d).sum() / n - average * average, 0.0))
+        heights_of = middle + average, middle + near.sum() / near.size, middle + d.min(), middle + d.max(), deviation
+        out[:5, lane] = np.array(heights_of) * quantum_m
+        out[5, lane] = light[lane] / n
 
 
 def medians_of(n: int) -> Kernel:
@@ -123,7 +238,19 @@ def medians_of(n: int) -> Kernel:
     no more than 2³¹; median (16,) int32, out, the lower one for an even count; deviation (16,) int32, out, the lower
     median of the distances from it (MAD). Lanes without a height get any value.
     """
-    return _interpreted(n) if numba.config.DISABLE_JIT else _compiled(n)
+    return _medians_by_numpy if numba.config.DISABLE_JIT else _medians(n)
 
 
-medians_of_8, medians_of_16, medians_of_32, medians_of_64 = (medians_of(n) for n in (8, 16, 32, 64))
+def statistics_of(n: int) -> Kernel:
+    """The kernel that finds the statistics of up to `n` heights a lane.
+
+    Its arguments: heights, counts as for :func:`medians_of`, relative to bases (16,) int32, quanta; light (16,) int32,
+    sums of intensities; floor, float64, distance from the median (quanta) up to which heights always count, else it is
+    3 · 1.4826 · MAD; quantum_m, float64; out (6, 16) float64: mean, robust, lowest and highest height, standard
+    deviation of the heights (m), mean intensity. The robust height is the mean of those within reach of the median.
+    """
+    return _statistics_by_numpy if numba.config.DISABLE_JIT else _statistics(n)
+
+
+medians_of_16 = medians_of(16)
+statistics_of_8, statistics_of_32, statistics_of_64 = (statistics_of(n) for n in (8, 32, 64))

@@ -23,7 +23,7 @@ def count_kept(classes, counted, fates):
 @kernel
 def accumulate_returns(
     epochs, pose_epochs, x, y, z, intensity, gain, passes, poses, limits, quanta_per_m, corner, cell_quanta, edge,
-    tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, fates,
+    tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, fates,
     first,
 ):  # fmt: skip
     """Count returns into the cells of active tiles.
@@ -43,6 +43,7 @@ def accumulate_returns(
     int, the return before which the pool ran short of free elements; n at the end.
     """
     mounting, knots, coefficients, valid, lattice, table, centres, charts = poses
+    free, held = pool[4], pool[6]
     east, north, height = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
     classes, intervals = np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32)
     for start in range(first, epochs.size, CHUNK):
@@ -57,7 +58,7 @@ def accumulate_returns(
         _, counted = accumulate_placed(
             east[:n], north[:n], height[:n], classes[:n], passes[start:end], intensity[start:end], gain,
             epochs[start:end], intervals[:n], corner, cell_quanta, edge,
-            tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, 0,
+            tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, 0,
         )  # fmt: skip
         count_kept(classes[:n], counted, fates)
     return epochs.size
@@ -67,7 +68,7 @@ def accumulate_returns(
 def accumulate_mirror(
     profile_epochs, epochs, ranges, intensity, gain, passes, origins, directions, scale, reading_period_ns,
     poses, limits, quanta_per_m, corner, cell_quanta, edge,
-    tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, fates,
+    tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, fates,
     first,
 ):  # fmt: skip
     """Count the readings of profiles that a mirror measures one after another into the cells of active tiles.
@@ -83,6 +84,7 @@ def accumulate_mirror(
     int, the profile before which the pool ran short of free elements; n at the end.
     """
     mounting, knots, coefficients, valid, lattice, table, centres, charts = poses
+    free, held = pool[4], pool[6]
     m = ranges.shape[1]
     profiles = max(CHUNK // m, 1)
     size = profiles * m
@@ -102,7 +104,7 @@ def accumulate_mirror(
         _, counted = accumulate_placed(
             east[:n], north[:n], height[:n], classes[:n], passes[a:b], intensity[a:b], gain,
             epochs[a:b], intervals[:n], corner, cell_quanta, edge,
-            tile_rows, groups, slots, bases, chain, filled, light, marks, free, held, spans, sigmas, interval_sigmas, 0,
+            tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, 0,
         )  # fmt: skip
         count_kept(classes[:n], counted, fates)
     return profile_epochs.size

@@ -9,15 +9,16 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.accumulate import LANES, SLOTS
-from roadscan.kernels.cells import AT_ONCE, count_cells, finish_cells
+from roadscan.kernels import cells as finishing
+from roadscan.kernels.accumulate import LANES, LINE, SLOTS, work_arrays
+from roadscan.kernels.cells import AHEAD, find_groups, finish_cells
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import QUANTUM_M
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
 
-ROBUST_FLOOR_QUANTA: Final = 100
+ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""
 
 MOST_BYTES: Final = 800 << 20
@@ -41,9 +42,8 @@ class TileEvidence:
 class Pool:
     """Elements that hold the heights of cells (``kernels.accumulate``); it grows, and is never given back."""
 
-    def __init__(self, words: int) -> None:
-        self.words = words
-        self.held = np.zeros(1, np.int64)
+    def __init__(self) -> None:
+        self.held = np.zeros(2, np.int64)
         self._make(_FIRST_ELEMENTS)
 
     @property
@@ -54,12 +54,13 @@ class Pool:
     @property
     def bytes(self) -> int:
         """Memory of the elements."""
-        return sum(a.nbytes for a in self.arrays)
+        return sum(a.nbytes for a in self.arrays) - self.lines.nbytes  # the headers are the lines
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """slots, bases, chain, filled, light, marks, free, held, as the kernels take them."""
-        return self.slots, self.bases, self.chain, self.filled, self.light, self.marks, self.free, self.held
+        """lines, heads, bases, chain, free, spare, held, as the kernels take them."""
+        heads = self.lines.view(np.uint64)
+        return self.lines, heads, self.bases, self.chain, self.free, self.spare, self.held
 
     def make_room(self, elements: int, most_bytes: int) -> bool:
         """Grow until so many elements are free; False where that would take more than `most_bytes`."""
@@ -72,38 +73,29 @@ class Pool:
             size = most_bytes // each
         if size < needed:
             return False
-        old = self.arrays[:-1]
-        before = self.size
+        kept = (self.lines, self.bases, self.chain, self.free, self.spare)
         self._make(size)
-        for new, kept in zip(self.arrays[:-2], old[:-1], strict=True):
-            new[:before] = kept
-        self.free[:before] = old[-1]
+        for new, old in zip((self.lines, self.bases, self.chain, self.free, self.spare), kept, strict=True):
+            new[: old.size] = old
         return True
 
     def clear(self) -> None:
         """Take all elements back."""
-        self.filled[:] = 0
-        self.light[:] = 0
-        self.marks[:] = 0
-        self.held[0] = 0
+        self.held[:] = 0
         self.free[:] = np.arange(self.size, dtype=np.int32)
 
     def _make(self, size: int) -> None:
-        self.slots = _aligned((size, LANES, SLOTS), np.int16)
-        self.bases = np.zeros(size, np.int32)
-        self.chain = np.zeros(size, np.int32)
-        self.filled = np.zeros((size, LANES), np.uint8)
-        self.light = np.zeros((size, LANES), np.uint32)
-        self.marks = np.zeros((size, LANES, self.words), np.uint8)
+        self.lines = _aligned(size * LANES * LINE, np.int16)
+        self.bases, self.chain, self.spare = (np.empty(size * LANES, np.int32) for _ in range(3))
         self.free = np.arange(size, dtype=np.int32)
 
 
-def _aligned(shape: tuple[int, ...], kind: type[np.generic]) -> npt.NDArray[Any]:
+def _aligned(size: int, kind: type[np.generic]) -> npt.NDArray[Any]:
     """An array that starts with a line of the cache; memory that is never written takes none."""
-    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    size *= np.dtype(kind).itemsize
     raw = np.empty(size + 64, np.uint8)
     start = -raw.ctypes.data % 64
-    return raw[start : start + size].view(kind).reshape(shape)
+    return raw[start : start + size].view(kind)
 
 
 class Accumulator:
@@ -127,7 +119,7 @@ class Accumulator:
         ----------
         tiles : that may become active.
         passes : ids of those that readings may belong to.
-        pool : memory for cells, unused and with room for the passes; a new one where left out.
+        pool : memory for cells, unused; a new one where left out.
         most_bytes : memory that cells may take.
         """
         self.grid = grid
@@ -136,12 +128,13 @@ class Accumulator:
         columns, rows = [t.column for t in tiles], [t.row for t in tiles]
         self._west, self._south = min(columns), min(rows)
         self.tile_rows = np.full((max(rows) + 1 - self._south, max(columns) + 1 - self._west), -1, np.int32)
-        self._pool = Pool(max(1, -(-self.passes.size // 8))) if pool is None else pool
+        self._pool = Pool() if pool is None else pool
         self._unused: list[int] = []
         self._groups = np.empty((0, self._groups_per_tile), np.int32)
         self._spans = np.empty((0, 2), np.int64)
         self._sigmas = np.empty((0, 2), np.float64)
-        self._heights = np.empty((AT_ONCE, LANES), np.int32)
+        self._work = work_arrays(0)
+        self._found = np.empty(self._groups_per_tile + AHEAD, np.int32)
 
     @property
     def corner_quanta(self) -> tuple[int, int]:
@@ -171,7 +164,9 @@ class Accumulator:
         """
         done = 0
         while True:
-            done = kernel(self.tile_rows, self._groups, self._pool.arrays, self._spans, self._sigmas, done)
+            done = kernel(
+                self.tile_rows, self._groups, self._pool.arrays, self._work, self._spans, self._sigmas, done
+            )  # fmt: skip
             if done >= items:
                 return
             if not self._pool.make_room(elements, self._most_bytes):
@@ -182,11 +177,10 @@ class Accumulator:
         row = self._row(tile)
         self.tile_rows[tile.row - self._south, tile.column - self._west] = -1
         self._unused.append(row)
-        groups, pool = self._groups[row], self._pool
-        count, most = count_cells(groups, pool.chain, pool.filled)
-        if count == 0:
+        taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
+        if taken == 0:
             return None
-        cells = self._cells(tile, groups, count, most)
+        cells = self._cells(tile, self._groups[row], taken, most_lines * SLOTS)
         (first, last), (horizontal, down) = self._spans[row].tolist(), self._sigmas[row].tolist()
         return cells, TileEvidence(first, last, horizontal, down)
 
@@ -206,32 +200,35 @@ class Accumulator:
         self._spans = np.concatenate([self._spans, np.zeros((more, 2), np.int64)])
         self._sigmas = np.concatenate([self._sigmas, np.zeros((more, 2))])
         self._unused += range(before, before + more)
+        self._work = work_arrays(before + more)
 
-    def _cells(self, tile: TileId, groups: npt.NDArray[np.int32], c: int, most: int) -> TileCells:
-        pool, edge = self._pool, self.grid.cells_per_edge
-        work = np.empty(most, np.int64)
-        column, row, count = np.empty(c, np.uint16), np.empty(c, np.uint16), np.empty(c, np.uint32)
-        mean, robust, low, high, deviation, bright = np.empty((6, c))
-        offsets, ids = np.empty(c + 1, np.int32), np.empty(c * self.passes.size, np.uint16)
-        written = finish_cells(
-            groups, edge, *pool.arrays, ROBUST_FLOOR_QUANTA, self.passes, self._heights, work,
+    def _cells(self, tile: TileId, groups: npt.NDArray[np.int32], taken: int, most: int) -> TileCells:
+        room = taken * LANES
+        column, row, count = np.empty(room, np.uint16), np.empty(room, np.uint16), np.empty(room, np.uint32)
+        mean, robust, low, high = (np.empty(room) for _ in range(4))
+        deviation, bright = np.empty(room, np.float32), np.empty(room, np.float32)
+        offsets, ids = np.empty(room + 1, np.int32), np.empty(room * self.passes.size, np.uint16)
+        cells, written = finish_cells(
+            groups, self._found, taken, self.grid.cells_per_edge, self._pool.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M,
+            self.passes, finishing.work_arrays(most),
             column, row, count, mean, robust, low, high, deviation, bright, offsets, ids,
         )  # fmt: skip
+        offsets = offsets[: cells + 1]
         return TileCells(
             tile=tile,
-            cells_per_edge=edge,
-            column=column,
-            row=row,
-            count=count,
-            height_mean_m=mean * QUANTUM_M,
-            height_robust_m=robust * QUANTUM_M,
-            height_min_m=low * QUANTUM_M,
-            height_max_m=high * QUANTUM_M,
-            height_std_m=(deviation * QUANTUM_M).astype(np.float32),
-            intensity_mean=bright.astype(np.float32),
+            cells_per_edge=self.grid.cells_per_edge,
+            column=column[:cells],
+            row=row[:cells],
+            count=count[:cells],
+            height_mean_m=mean[:cells],
+            height_robust_m=robust[:cells],
+            height_min_m=low[:cells],
+            height_max_m=high[:cells],
+            height_std_m=deviation[:cells],
+            intensity_mean=bright[:cells],
             pass_count=np.diff(offsets).astype(np.uint16),
             pass_offsets=offsets,
-            pass_ids=ids[:written].copy(),
+            pass_ids=ids[:written],
         )
 
 

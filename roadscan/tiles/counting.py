@@ -89,10 +89,10 @@ class Counting:
             )
             poses = self.placement.poses(mounting)
 
-            def count(tile_rows: Any, groups: Any, pool: Any, spans: Any, sigmas: Any, first: int) -> int:
+            def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
                 done: int = accumulate_returns(
                     *arrays, poses, self.placement.limits, float(QUANTA_PER_M), *self._cells, tile_rows, groups,  # noqa: B023
-                    *pool, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
+                    pool, work, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
                 )  # fmt: skip
                 return done
 
@@ -104,10 +104,10 @@ class Counting:
         return self.accumulator.corner_quanta, grid.cell_quanta, grid.cells_per_edge
 
     def _flat(self, flat: FlatProfiles, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
-        def count(tile_rows: Any, groups: Any, pool: Any, spans: Any, sigmas: Any, first: int) -> int:
+        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
             done: int = accumulate_profiles(
                 epochs, raw, bright, _EIGHT_BITS, passes, flat.rays, flat.middle, flat.scale, poses, flat.raw_limits,
-                self.placement.limits, float(QUANTA_PER_M), *self._cells, tile_rows, groups, *pool,
+                self.placement.limits, float(QUANTA_PER_M), *self._cells, tile_rows, groups, pool, work,
                 spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
             )  # fmt: skip
             return done
@@ -120,11 +120,11 @@ class Counting:
         own_epochs = geometry.reading_epochs(epochs[readings // m], readings % m)
         scale = (geometry.range_offset_m, geometry.range_step_m)
 
-        def count(tile_rows: Any, groups: Any, pool: Any, spans: Any, sigmas: Any, first: int) -> int:
+        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
             done: int = accumulate_mirror(
                 epochs, own_epochs, raw, bright.reshape(-1), _EIGHT_BITS, passes, *geometry.rays(), scale,
                 geometry.reading_period_ns, poses, self.placement.limits, float(QUANTA_PER_M), *self._cells,
-                tile_rows, groups, *pool, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
+                tile_rows, groups, pool, work, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
             )  # fmt: skip
             return done
 

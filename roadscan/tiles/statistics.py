@@ -30,12 +30,12 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
     zeros = np.zeros(n, np.int32)
     passes = np.searchsorted(accumulator.passes, points.pass_id).astype(np.int32)
 
-    def count(tile_rows: Any, groups: Any, pool: Any, spans: Any, sigmas: Any, first: int) -> int:
+    def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
         done, _ = accumulate_placed(
             points.x_quanta + np.float64(east), points.y_quanta + np.float64(north),
             points.height_quanta.astype(np.float64), zeros.astype(np.uint8), passes, points.intensity, np.uint32(1),
             points.epoch_gps_ns, zeros, (east, north), grid.cell_quanta, grid.cells_per_edge,
-            tile_rows, groups, *pool, spans, sigmas, np.zeros((1, 2)), first,
+            tile_rows, groups, pool, work, spans, sigmas, np.zeros((1, 2)), first,
         )  # fmt: skip
         return int(done)
 

@@ -78,7 +78,7 @@ def test_cells_that_do_not_fit_are_made_in_parts(
             super().drop()
 
     monkeypatch.setattr(tile_cells, "Accumulator", Tight)
-    monkeypatch.setattr(tile_cells, "_pool", lambda _task: None)
+    monkeypatch.setattr(tile_cells, "_pool", lambda: None)
     finished.run("store-counted-tight", products__make=WITHOUT_POINTS)
     assert dropped
     assert outputs(finished.store("store-counted-tight")) == outputs(counted)

@@ -210,7 +210,7 @@ def accumulate(
     lines, heads, bases, chain, free, spare, held = pool
     mark = header_of_pass(number)
     word = mark & np.uint64(WORDS << WORD_SHIFT)
-    sum_up(intensity, gain, sums)
+    sum_up(intensity, sums)
     runs = find_runs(column, row, starts)
     find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells)
     counted = np.int64(0)
@@ -243,7 +243,7 @@ def accumulate(
                 used = header & np.uint64(COUNTS)
             # What is stored beyond the run's heights is overwritten by the next run, or by the header.
             store_heights(heights, first, np.int32(base), lines, line * np.uint64(LINE) + used)
-            shine = np.uint64(sums[first + size] - sums[first])
+            shine = np.uint64(gain) * np.uint64(sums[first + size] - sums[first])
             heads[at] = (header + size + (shine << np.uint64(LIGHT_SHIFT))) | mark
             first += size
     return counted

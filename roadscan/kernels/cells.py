@@ -23,6 +23,7 @@ from roadscan.kernels.lanes import REACH, statistics_of_8, statistics_of_32, sta
 from roadscan.kernels.line_access import fetch_line
 from roadscan.kernels.open_group import open_group
 from roadscan.kernels.options import bare, inlined
+from roadscan.kernels.store_group import store_group
 
 AHEAD = 2
 """Groups whose lines are fetched before their turn comes."""
@@ -230,13 +231,15 @@ def finish_cells(
         later = np.uint64(groups[found[k + AHEAD]]) * np.uint64(LANES * LINE)
         for lane in range(LANES):
             fetch_line(lines, later + np.uint64(lane * LINE))
+        fetch_line(chain, later // np.uint64(LINE))
+        fetch_line(bases, later // np.uint64(LINE))
         first_line = element * LANES
         open_group(lines, np.uint64(first_line * LINE), heights, counts, light, marks)
         if is_chained(first_line, chain):
             add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks)
-        most = np.int32(0)
+        most, least = np.int32(0), counts[0]
         for lane in range(LANES):
-            most = max(most, counts[lane])
+            most, least = max(most, counts[lane]), min(least, counts[lane])
             own_bases[lane] = bases[first_line + lane]
         if most <= 8:
             statistics_of_8(heights, counts, light, own_bases, floor, quantum_m, out)
@@ -250,6 +253,17 @@ def finish_cells(
                     statistics_of_many(
                         first_line + lane, light[lane], lines, heads, bases, chain, floor, quantum_m, many, out, lane
                     )
+        if least > 0 and numbers.size == 1:
+            store_group(
+                out, counts, np.uint16((group % per_row) * LANES), np.uint16(group // per_row), np.uint64(cell),
+                np.int32(written), numbers[0], column, row, count, mean, robust, low, high, deviation, bright,
+                pass_offsets, pass_ids,
+            )  # fmt: skip
+            cell += LANES
+            written += LANES
+            release(element, chain, free, spare, held)
+            groups[group] = -1
+            continue
         for lane in range(LANES):
             if counts[lane] > 0:
                 column[cell] = (group % per_row) * LANES + lane

@@ -25,6 +25,10 @@ MOST_BYTES: Final = 800 << 20
 """Memory that the cells of begun tiles may take."""
 
 _FIRST_ELEMENTS: Final = 4096
+_COLUMNS: Final = (
+    np.uint16, np.uint16, np.uint32, np.float64, np.float64, np.float64, np.float64, np.float32, np.float32,
+)  # fmt: skip
+"""column, row, count, mean, robust, lowest, highest height, their deviation, intensity."""
 _NEVER: Final = np.array([2**62, -(2**62)])
 
 
@@ -44,6 +48,7 @@ class Pool:
 
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
+        self._columns: list[npt.NDArray[Any]] = []
         self._make(_FIRST_ELEMENTS)
 
     @property
@@ -78,6 +83,17 @@ class Pool:
         for new, old in zip((self.lines, self.bases, self.chain, self.free, self.spare), kept, strict=True):
             new[: old.size] = old
         return True
+
+    def columns(self, cells: int, passes: int) -> tuple[npt.NDArray[Any], ...]:
+        """Arrays for the statistics of so many cells, as `finish_cells` takes them: the same ones every time."""
+        sizes = [cells] * len(_COLUMNS) + [cells + 1, cells * passes]
+        kinds = (*_COLUMNS, np.int32, np.uint16)
+        for k, (size, kind) in enumerate(zip(sizes, kinds, strict=True)):
+            if k == len(self._columns):
+                self._columns.append(np.empty(0, kind))
+            if self._columns[k].size < size:
+                self._columns[k] = np.empty(size * 5 // 4, kind)
+        return tuple(array[:size] for array, size in zip(self._columns, sizes, strict=True))
 
     def clear(self) -> None:
         """Take all elements back."""
@@ -173,7 +189,10 @@ class Accumulator:
                 raise PoolExhaustedError(f"the cells of the tiles in work take more than {self._most_bytes >> 20} MB")
 
     def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
-        """Cells of a tile, which becomes inactive; None where no reading fell into it."""
+        """Cells of a tile, which becomes inactive; None where no reading fell into it.
+
+        The next tile that is finished overwrites them: fresh memory would cost as much as the statistics.
+        """
         row = self._row(tile)
         self.tile_rows[tile.row - self._south, tile.column - self._west] = -1
         self._unused.append(row)
@@ -203,15 +222,12 @@ class Accumulator:
         self._work = work_arrays(before + more)
 
     def _cells(self, tile: TileId, groups: npt.NDArray[np.int32], taken: int, most: int) -> TileCells:
-        room = taken * LANES
-        column, row, count = np.empty(room, np.uint16), np.empty(room, np.uint16), np.empty(room, np.uint32)
-        mean, robust, low, high = (np.empty(room) for _ in range(4))
-        deviation, bright = np.empty(room, np.float32), np.empty(room, np.float32)
-        offsets, ids = np.empty(room + 1, np.int32), np.empty(room * self.passes.size, np.uint16)
+        columns = self._pool.columns(taken * LANES, self.passes.size)
+        column, row, count, mean, robust, low, high, deviation, bright, offsets, ids = columns
         cells, written = finish_cells(
             groups, self._found, taken, self.grid.cells_per_edge, self._pool.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M,
             self.passes, finishing.work_arrays(most),
-            column, row, count, mean, robust, low, high, deviation, bright, offsets, ids,
+            *columns,
         )  # fmt: skip
         offsets = offsets[: cells + 1]
         return TileCells(

@@ -21,7 +21,9 @@ help:  ## Show the targets.
 demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with its truth (into demo/).
 	$(BIN)/roadscan demo --out demo
 
-test: check pytest  ## All that CI runs: check, then the tests.
+test: $(VENV)/.installed-dev  ## All that CI runs: check, its parts side by side, then the tests.
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target check
+	@$(MAKE) --no-print-directory pytest
 
 check: lint types contracts docs-check  ## Lint, types, import contracts, documentation.
 

@@ -331,3 +331,58 @@ def accumulate_placed(
             note(column[:n], row[:n], epochs[start:end], sigma, edge, tile_rows, spans, sigmas)
         start = end
     return start, counted
+
+
+@bare
+def accumulate_points(
+    x, y, height, passes, intensity, cell_quanta, edge, tile_rows, groups, pool, work, first
+):  # fmt: skip
+    """Count the points of one tile into its cells.
+
+    Parameters
+    ----------
+    x, y, height : (n,) int32, quanta, x and y from the tile's south-west corner, not negative.
+    passes : (n,) int32, number of each point's pass among the accumulator's; intensity : (n,) uint16.
+    cell_quanta, edge, tile_rows, groups, pool : see :func:`accumulate`; work : as :func:`work_arrays` makes them.
+    first : int, point to begin with.
+
+    Returns
+    -------
+    int, the point before which the pool ran short of free elements; n at the end.
+    """
+    free, held = pool[4], pool[6]
+    column, row, heights, starts, sums, cells, touched = work
+    start = first
+    while start < x.size:
+        if free.size - held[0] < 2 * PIECE:
+            return start
+        end, last = start, min(start + PIECE, x.size)
+        while end < last and passes[end] == passes[start]:
+            end += 1
+        n = end - start
+        find_cells(x[start:end], y[start:end], height[start:end], 1.0 / cell_quanta, column, row, heights)
+        low, high = reach_of(heights[:n])
+        accumulate(
+            column[:n], row[:n], heights, low, high, intensity[start:end], np.uint32(1), passes[start], starts, sums,
+            cells, tile_rows, groups, edge, pool, touched,
+        )  # fmt: skip
+        start = end
+    return start
+
+
+@bare
+def find_cells(x, y, height, per_cell, column, row, heights):
+    """Cells of points, and their heights; x, y, height : (n,) int32, see :func:`accumulate_points`."""
+    for j in range(x.size):
+        column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
+        row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))
+        heights[j] = height[j]
+
+
+@bare
+def reach_of(heights):
+    """Lowest and highest height (int64)."""
+    low, high = heights[0], heights[0]
+    for j in range(heights.size):
+        low, high = min(low, heights[j]), max(high, heights[j])
+    return np.int64(low), np.int64(high)

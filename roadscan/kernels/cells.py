@@ -96,27 +96,23 @@ def add_chains(first_line, lines, heads, bases, chain, heights, counts, light, m
             line = np.int64(chain[line])
 
 
-@inlined
-def sift_down(heights, root, end):
-    """Let a height sink to its place in the heap below it."""
-    while 2 * root + 1 < end:
-        child = 2 * root + 1
-        if child + 1 < end and heights[child] < heights[child + 1]:
-            child += 1
-        if heights[root] >= heights[child]:
-            return
-        heights[root], heights[child] = heights[child], heights[root]
-        root = child
-
-
 @bare
-def sort_heights(heights, n):
-    """Sort the first n heights in place (heap sort, Williams 1964): it needs no memory, and compiles in no time."""
-    for root in range(n // 2 - 1, -1, -1):
-        sift_down(heights, root, n)
-    for end in range(n - 1, 0, -1):
-        heights[0], heights[end] = heights[end], heights[0]
-        sift_down(heights, 0, end)
+def kth_smallest(heights, n, k):
+    """The k-th smallest (from 0) of the first n heights, which change places (Hoare 1961, Algorithm 65: FIND)."""
+    left, right = 0, n - 1
+    while left < right:
+        pivot, i, j = heights[k], left, right
+        while i <= j:
+            while heights[i] < pivot:
+                i += 1
+            while pivot < heights[j]:
+                j -= 1
+            if i <= j:
+                heights[i], heights[j] = heights[j], heights[i]
+                i += 1
+                j -= 1
+        left, right = (i if j < k else left), (j if k < i else right)
+    return heights[k]
 
 
 @inlined
@@ -136,17 +132,15 @@ def gather_many(first_line, lines, heads, bases, chain, work):
 def statistics_of_many(first_line, light, lines, heads, bases, chain, floor, quantum_m, work, out, lane):
     """Statistics of one cell of any size, as ``lanes.statistics_of``, into out[:, lane]."""
     n = gather_many(first_line, lines, heads, bases, chain, work)
-    sort_heights(work, n)
-    median = work[(n - 1) // 2]
-    total, squares = np.int64(0), np.int64(0)
-    low, high = work[0] - median, work[n - 1] - median
+    median = kth_smallest(work, n, (n - 1) // 2)
+    total, squares, low, high = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(n):
         d = work[k] - median
+        low, high = min(low, d), max(high, d)
         total += d
         squares += d * d
         work[k] = abs(d)
-    sort_heights(work, n)
-    reach = np.int64(math.floor(max(REACH * work[(n - 1) // 2], floor)))
+    reach = np.int64(math.floor(max(REACH * kth_smallest(work, n, (n - 1) // 2), floor)))
     used, near = 0, np.int64(0)
     for k in range(gather_many(first_line, lines, heads, bases, chain, work)):
         d = work[k] - median

@@ -125,7 +125,7 @@ class Accumulator:
         self,
         grid: TileGrid,
         tiles: Sequence[TileId],
-        passes: Sequence[int],
+        passes: Sequence[int] | npt.NDArray[np.uint16],
         pool: Pool | None = None,
         most_bytes: int = MOST_BYTES,
     ) -> None:
@@ -139,7 +139,7 @@ class Accumulator:
         most_bytes : memory that cells may take.
         """
         self.grid = grid
-        self.passes = np.array(sorted(set(passes)), np.uint16)
+        self.passes = np.unique(np.asarray(passes, np.uint16))
         self._most_bytes = most_bytes
         columns, rows = [t.column for t in tiles], [t.row for t in tiles]
         self._west, self._south = min(columns), min(rows)

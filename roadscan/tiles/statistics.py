@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.accumulate import PIECE, accumulate_placed
+from roadscan.kernels.accumulate import PIECE, accumulate_points
 from roadscan.points.cloud import TilePoints
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
@@ -24,20 +24,20 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
     points : at least one.
     """
     tile, n = points.tile, len(points)
-    accumulator = Accumulator(grid, [tile], np.unique(points.pass_id).tolist(), most_bytes=1 << 40)
+    ids = points.pass_id
+    one = bool((ids == ids[0]).all())
+    accumulator = Accumulator(grid, [tile], ids[:1] if one else np.unique(ids), most_bytes=1 << 40)
     accumulator.activate([tile])
-    east, north = accumulator.corner_quanta
-    zeros = np.zeros(n, np.int32)
-    passes = np.searchsorted(accumulator.passes, points.pass_id).astype(np.int32)
+    passes = np.zeros(n, np.int32) if one else np.searchsorted(accumulator.passes, ids).astype(np.int32)
+    x, y, height = (np.ascontiguousarray(a) for a in (points.x_quanta, points.y_quanta, points.height_quanta))
+    intensity = np.ascontiguousarray(points.intensity)
 
-    def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
-        done, _ = accumulate_placed(
-            points.x_quanta + np.float64(east), points.y_quanta + np.float64(north),
-            points.height_quanta.astype(np.float64), zeros.astype(np.uint8), passes, points.intensity, np.uint32(1),
-            points.epoch_gps_ns, zeros, (east, north), grid.cell_quanta, grid.cells_per_edge,
-            tile_rows, groups, pool, work, spans, sigmas, np.zeros((1, 2)), first,
+    def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
+        done: int = accumulate_points(
+            x, y, height, passes, intensity, grid.cell_quanta, grid.cells_per_edge,
+            tile_rows, groups, pool, work, first,
         )  # fmt: skip
-        return int(done)
+        return done
 
     accumulator.run(count, n, 2 * PIECE)
     finished = accumulator.finish(tile)

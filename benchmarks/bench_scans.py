@@ -5,14 +5,17 @@ Nanoseconds are those of a reading: a range of 16 bits and an intensity of 8.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 import duckdb
+import fsspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from fsspec.implementations.local import LocalFileSystem
 
 from benchmarks.timing import Figure, best_seconds
 from roadscan.tables.profiles import ProfileReader
@@ -41,6 +44,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     Path(store.root).mkdir(parents=True)
     for name, rows in {"a road's surface": profiles(0.001), "a third without return": profiles(0.1, 600)}.items():
         yield from _figures(store, name, rows)
+    yield from _ahead(folder)
 
 
 def profiles(lost: float, stripe: int = 0) -> pa.Table:
@@ -98,3 +102,76 @@ def _duckdb(path: Path) -> None:
     with duckdb.connect(config={"threads": 1}) as connection:
         statement = f"SELECT sum(list_sum(range)), sum(list_sum(intensity)) FROM read_parquet('{path}')"
         connection.execute(statement).fetchall()
+
+
+# --- reading ahead ----------------------------------------------------------------------------------
+
+ANSWER_S, BYTES_PER_S = 0.03, 150e6
+COMPUTING_S = 0.018
+"""Of a piece of two row groups at line rate."""
+PIECES_AHEAD = 4
+
+
+class DistantFile:
+    """A file whose every read is a request."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.seek, self.close = stream.seek, stream.close
+
+    def __enter__(self) -> DistantFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def readinto(self, room: memoryview) -> int:
+        """Fill `room`, late."""
+        count: int = self._stream.readinto(room)
+        time.sleep(ANSWER_S + count / BYTES_PER_S)
+        return count
+
+    def read(self, size: int = -1) -> bytes:
+        """Bytes, late."""
+        content: bytes = self._stream.read(size)
+        time.sleep(ANSWER_S + len(content) / BYTES_PER_S)
+        return content
+
+
+class DistantStore(LocalFileSystem):
+    """A folder as far away as an object store."""
+
+    protocol = "distant"
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return str(LocalFileSystem._strip_protocol(str(path).removeprefix("distant://")))
+
+    def open(self, path: str, mode: str = "rb", **kwargs: Any) -> Any:
+        """A file of it."""
+        return DistantFile(super().open(path, mode, **kwargs))
+
+    def cat_file(self, path: str, start: int | None = None, end: int | None = None, **kwargs: Any) -> bytes:
+        """A part of a file: one request."""
+        with self.open(path) as file:
+            file.seek(start or 0)
+            return file.read(-1 if end is None else end - (start or 0))
+
+
+def _ahead(folder: Path) -> Iterator[Figure]:
+    fsspec.register_implementation("distant", DistantStore, clobber=True)
+    store = Store(f"distant://{folder}", "bench")
+    pieces = PROFILES // SCHEMA.row_group_rows // 2
+    with_it, without = (best_seconds(lambda ahead=ahead: _compute(store, pieces, ahead)) for ahead in (PIECES_AHEAD, 0))
+    what = f"{pieces} times 2 row groups, answered after 30 ms, and {COMPUTING_S * 1e3:g} ms of computing"
+    yield Figure(what, with_it, "s", without, "without reading ahead")
+
+
+def _compute(store: Store, pieces: int, ahead: int) -> None:
+    reader = ProfileReader(store, OURS)
+    for k in range(-ahead, pieces):
+        if ahead and k + ahead < pieces:
+            reader.expect([2 * (k + ahead), 2 * (k + ahead) + 1])
+        if k >= 0:
+            reader.read([2 * k, 2 * k + 1])
+            time.sleep(COMPUTING_S)

@@ -30,6 +30,8 @@ from roadscan.tiles.counting import Counting
 _RETURN_COLUMNS = ["epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity"]
 _RETURNS_AT_ONCE = 1 << 18
 _READINGS_AT_ONCE = 1 << 20
+_PIECES_AHEAD = 4
+"""Pieces of 2 to 3 MB that are on their way while one is counted; several, because requests wait for a network."""
 _KEPT = threading.local()
 
 
@@ -81,6 +83,7 @@ class _Stretch:
         damaged: dict[TileId, str] = {}
         begun: set[TileId] = set()
         touched = self._tiles_by_group(wanted)
+        announced = self._announced(numbers)
         for number in numbers:
             tile = self._task.block.tiles[number]
             self._accumulator.activate([tile])
@@ -91,8 +94,8 @@ class _Stretch:
                         near = touched[touch.slice_index, group]
                         self._accumulator.activate([t for t in near if t not in begun])
                         begun.update(near)
-                    for first in range(start, end, self._sources[touch.slice_index].at_once):
-                        last = min(first + self._sources[touch.slice_index].at_once, end)
+                    for first, last in self._sources[touch.slice_index].pieces(start, end):
+                        next(announced, None)
                         try:
                             self._count(touch.slice_index, first, last)
                         except StoreError as error:
@@ -103,6 +106,21 @@ class _Stretch:
                 yield CountedTile(tile, None, None, damaged[tile])
             else:
                 yield CountedTile(tile, *(finished or (None, None)))
+
+    def _announced(self, numbers: Sequence[int]) -> Iterator[None]:
+        """Goes on once a piece that is counted, and lets those that follow be on their way."""
+        done: set[tuple[int, int]] = set()
+        pieces = (
+            (touch.slice_index, *piece)
+            for number in numbers
+            for touch in self._task.touches[number]
+            for run in _unread(touch.slice_index, touch.first, touch.end, done)
+            for piece in self._sources[touch.slice_index].pieces(*run)
+        )
+        for k, (index, first, last) in enumerate(pieces):
+            self._sources[index].expect(self._task.slices[index].groups[first:last])
+            if k >= _PIECES_AHEAD:
+                yield
 
     def _tiles_by_group(self, wanted: set[int]) -> dict[tuple[int, int], list[TileId]]:
         """Wanted tiles that each group of a slice may touch."""
@@ -168,6 +186,16 @@ class _Source:
         most = _RETURNS_AT_ONCE // rows if geometry is None else _READINGS_AT_ONCE // (rows * geometry.readings)
         reader = None if geometry is None else ProfileReader(task.store, one.file)
         return cls(task, one, tuple(p for p in task.passes if p.run == one.source.run), reader, max(1, most))
+
+    def pieces(self, first: int, end: int) -> Iterator[tuple[int, int]]:
+        """Positions `first` to `end` − 1 in pieces that are read together."""
+        for start in range(first, end, self.at_once):
+            yield start, min(start + self.at_once, end)
+
+    def expect(self, groups: Sequence[int]) -> None:
+        """Let row groups be on their way that will be counted soon."""
+        if self.reader is not None:
+            self.reader.expect(groups)
 
     def count(self, counting: Counting, accumulator: Accumulator, groups: Sequence[int]) -> None:
         """Read row groups and count their readings."""

@@ -7,6 +7,8 @@ Boytsov, 2015, *Decoding billions of integers per second through vectorization*)
 
 Arithmetic is that of unsigned 64-bit numbers, wrapping. Values come out modulo the type of the array they are written
 to: a page whose values do not fit gives wrong values, but touches nothing outside its arrays.
+Pages in the layout of the common writers go through `wide_unpacking` where the processor is made for it, all others
+through `_miniblocks` and `_unpack`.
 Arrays are not handed to functions inside the innermost loops: counting their references takes longer than the work.
 """
 
@@ -17,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
 BLOCK = 128
 MINIBLOCKS = 4
 MINIBLOCK = 32
 """Layout of the pages written here, which is that of the common writers."""
-SLACK_BYTES = 16
+SLACK_BYTES = READ_AHEAD_BYTES
 """Bytes that have to follow a page in its buffer; they may hold anything."""
 
 WHOLE, NO_BUFFER, BAD_HEADER, OTHER_COUNT, CUT_SHORT, BAD_WIDTH, LEFT_OVER = range(7)
@@ -169,6 +172,10 @@ def decode(data: Any, words: Any, start: int, end: int, values: Any) -> int:
         return BAD_HEADER
     if count != values.size:
         return OTHER_COUNT
+    common = count > 0 and (block, miniblocks) == (BLOCK, MINIBLOCKS)
+    last = unpack_blocks(data, at, end, header[3], values) if common else NOT_KNOWN
+    if last != NOT_KNOWN:
+        return WHOLE if last == end else LEFT_OVER
     per_miniblock = block // miniblocks
     listed = max(count + per_miniblock - 2, 0) // per_miniblock
     offsets, widths, steps = np.empty(listed, np.int64), np.empty(listed, np.uint8), np.empty(listed, np.uint64)
@@ -227,7 +234,7 @@ def _pack(above, widths, words, to, word, used):
 
 
 @kernel
-def _widths(above):
+def widths_of(above):
     """Bit widths of a block's miniblocks, one a byte, the first one lowest."""
     widths = _U(0)
     for k in range(MINIBLOCKS):
@@ -268,7 +275,7 @@ def encode(values, words):
         above[n:] = least
         for i in range(BLOCK):
             above[i] -= least
-        widths = _widths(above)
+        widths = widths_of(above)
         for number, size in (_varint(_U(np.int64((least << 1) ^ (least >> 31)))), (widths, _U(8 * MINIBLOCKS))):
             words[to], word, used, full = _appended(word, used, number, size)
             to += full

@@ -8,6 +8,7 @@ Any reader of Parquet reads the file: lists are DELTA_BINARY_PACKED, the rest is
 from __future__ import annotations
 
 import base64
+import functools
 import re
 import zlib
 from collections.abc import Iterator
@@ -16,11 +17,11 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from roadscan.kernels.delta_packing import encode, room_words
+from roadscan.kernels import delta_packing, wide_packing
+from roadscan.kernels.delta_packing import room_words
 from roadscan.tables import pages
-from roadscan.tables.checksum import Checksum
+from roadscan.tables.checksum import checksum
 from roadscan.tables.thrift import Value, binary, boolean, i8, i16, i32, i64, listed, struct
 
 MAGIC: Final = b"PAR1"
@@ -35,6 +36,7 @@ _LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10
 _UNCOMPRESSED: Final = 0
 _SEAL: Final = b"roadscan.footer_crc32"
 _SEAL_DIGITS: Final = 8
+_ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
 _SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
 
 
@@ -104,7 +106,7 @@ class _Writer:
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._at = stream.write(MAGIC)
-        self._checksum = Checksum()
+        self._checksum = checksum()
         self._words = np.empty(0, np.uint64)
 
     def group(self, rows: pa.Table, number: int) -> Value:
@@ -141,27 +143,24 @@ class _Writer:
 
     def _flat(self, field: pa.Field, column: pa.Array) -> Value:
         kind = _KINDS[field.type]
-        valid = np.asarray(column.is_valid()) if field.nullable else None
-        values = column.drop_null().to_numpy().astype(kind.stored)
-        levels = pages.flat_levels(valid)
+        values = (column.drop_null() if column.null_count else column).to_numpy().astype(kind.stored)
+        levels = pages.flat_levels(_valid(field, column))
         at, size = self._page(levels, values.view(np.uint8), len(column), pages.PLAIN)
         statistics = {3: i64(column.null_count)}
         if values.size:
-            ends = pc.min_max(column)
-            low, high = (np.array(ends[end].as_py(), kind.stored).tobytes() for end in ("min", "max"))
+            low, high = values.min().tobytes(), values.max().tobytes()
             statistics |= {5: binary(high), 6: binary(low)}
-        return _chunk(kind, [field.name], pages.PLAIN, len(column), at, size, {12: struct(statistics)})
+        return _chunk(kind, (field.name,), pages.PLAIN, len(column), at, size, {12: struct(statistics)})
 
     def _lists(self, field: pa.Field, column: pa.Array) -> Value:
         values = column.flatten().to_numpy()
-        valid = np.asarray(column.is_valid()) if field.nullable else None
-        levels = pages.list_levels(len(column), field.type.list_size, valid)
+        levels = pages.list_levels(len(column), field.type.list_size, _valid(field, column))
         if self._words.size < room_words(values.size):
             self._words = np.empty(room_words(values.size), np.uint64)
-        packed = self._words.view(np.uint8)[: encode(values, self._words)]
+        packed = self._words.view(np.uint8)[: _ENCODE(values, self._words)]
         count = values.size + column.null_count
         at, size = self._page(levels, packed, count, pages.DELTA_BINARY_PACKED)
-        path = [field.name, "list", "element"]
+        path = (field.name, "list", "element")
         return _chunk(_KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, at, size, {})
 
     def _page(self, levels: bytes, values: Any, count: int, encoding: int) -> tuple[int, int]:
@@ -173,25 +172,35 @@ class _Writer:
         return start, self._at - start
 
 
+def _valid(field: pa.Field, column: pa.Array) -> pages.Bools | None:
+    """Which values are there; None for a column that has no nulls ever."""
+    if not field.nullable:
+        return None
+    return np.asarray(column.is_valid()) if column.null_count else np.ones(len(column), np.bool_)
+
+
 def _whole(column: pa.ChunkedArray) -> pa.Array:
     """The column in one piece, without a copy where it is that already."""
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def _chunk(
-    kind: _Kind, path: list[str], encoding: int, count: int, at: int, size: int, more: dict[int, Value]
+    kind: _Kind, path: tuple[str, ...], encoding: int, count: int, at: int, size: int, more: dict[int, Value]
 ) -> Value:
-    metadata = {
+    start, length = i64(at), i64(size)
+    metadata = _about(kind, path, encoding) | {5: i64(count), 6: length, 7: length, 9: start}
+    return struct({2: start, 3: struct(metadata | more)})
+
+
+@functools.lru_cache(maxsize=64)
+def _about(kind: _Kind, path: tuple[str, ...], encoding: int) -> dict[int, Value]:
+    """What all chunks of a column say."""
+    return {
         1: i32(kind.physical),
         2: listed([i32(pages.RLE), i32(encoding)]),
         3: listed([binary(name) for name in path]),
         4: i32(_UNCOMPRESSED),
-        5: i64(count),
-        6: i64(size),
-        7: i64(size),
-        9: i64(at),
     }
-    return struct({2: i64(at), 3: struct(metadata | more)})
 
 
 def _elements(schema: pa.Schema) -> Iterator[Value]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,8 @@ import pyarrow.parquet as pq
 
 from roadscan.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
 from roadscan.tables import pages
-from roadscan.tables.checksum import Checksum
+from roadscan.tables.byte_source import LocalBytes, RemoteBytes
+from roadscan.tables.checksum import checksum
 from roadscan.tables.list_table import MAGIC, sealed
 
 TAIL_BYTES: Final = 8
@@ -65,33 +67,32 @@ class ListTableFile:
     Bytes are read at once for all columns wanted; each page is held against its CRC-32 before it is looked at.
     """
 
-    def __init__(self, stream: Any, metadata: pq.FileMetaData) -> None:
-        self._stream = stream
-        self._size = stream.seek(0, os.SEEK_END)
+    def __init__(self, source: LocalBytes | RemoteBytes, metadata: pq.FileMetaData) -> None:
+        self._source = source
+        self._size = source.stream.seek(0, os.SEEK_END)
         self._metadata = metadata
-        self._checksum = Checksum()
+        self._checksum = checksum()
         self._words = np.empty(0, np.uint64)
-        self._known: dict[int, dict[str, _Chunk]] = {}
+        self._columns = _columns(metadata)
+        self._known: dict[tuple[int, str], _Chunk] = {}
         self._chunks: dict[str, _Chunk] = {}
         self._origin = 0
 
     def load(self, group: int, names: Sequence[str]) -> None:
         """Bring columns of a row group into the buffer."""
-        if group not in self._known:
-            self._known[group] = self._located(group)
-        self._chunks = {name: self._known[group][name] for name in names}
-        self._origin = min(c.start for c in self._chunks.values())
-        end = max(c.start + c.size for c in self._chunks.values())
+        self._chunks = {name: self._located(group, name) for name in names}
+        self._origin, end = _span(self._chunks.values())
         words = -(-(end - self._origin + SLACK_BYTES) // _WORD)
         if self._words.size < words:
             self._words = np.empty(words, np.uint64)
-        self._stream.seek(self._origin)
-        left = self._words.view(np.uint8).data[: end - self._origin]
-        while left:
-            count = self._stream.readinto(left)
-            if not count:
-                raise DamageError("it is cut short")
-            left = left[count:]
+        room = self._words.view(np.uint8).data[: end - self._origin]
+        if not self._source.read_into(self._origin, room):
+            raise DamageError("it is cut short")
+
+    def expect(self, groups: Sequence[int], names: Sequence[str]) -> None:
+        """Let the bytes of row groups be on their way that will be loaded soon; groups in a row in one piece."""
+        for _, run in groupby(enumerate(groups), lambda pair: pair[1] - pair[0]):
+            self._source.expect(*_span([self._located(group, name) for _, group in run for name in names]))
 
     def flat(self, name: str, values: Array) -> None:
         """Write a loaded column of int64 that is never null to (n,) `values`."""
@@ -129,17 +130,30 @@ class ListTableFile:
             raise DamageError(f"column '{name}': a page does not have its checksum")
         return data, start, end
 
-    def _located(self, group: int) -> dict[str, _Chunk]:
-        found, about = {}, self._metadata.row_group(group)
-        for k in range(self._metadata.num_columns):
-            column = about.column(k)
-            chunk = _Chunk(
-                start=column.data_page_offset,
-                size=column.total_compressed_size,
-                values=column.num_values,
-                nullable=self._metadata.schema.column(k).max_definition_level > column.path_in_schema.endswith(_LISTED),
-            )
-            if not 0 <= chunk.start <= chunk.start + chunk.size <= self._size:
-                raise DamageError("its footer speaks of pages outside of it")
-            found[column.path_in_schema.removesuffix(_LISTED)] = chunk
-        return found
+    def _located(self, group: int, name: str) -> _Chunk:
+        known = self._known.get((group, name))
+        if known is not None:
+            return known
+        number, nullable = self._columns[name]
+        column = self._metadata.row_group(group).column(number)
+        chunk = _Chunk(column.data_page_offset, column.total_compressed_size, column.num_values, nullable)
+        if not 0 <= chunk.start <= chunk.start + chunk.size <= self._size:
+            raise DamageError("its footer speaks of pages outside of it")
+        self._known[group, name] = chunk
+        return chunk
+
+
+def _span(chunks: Iterable[_Chunk]) -> tuple[int, int]:
+    """First byte of some chunks, and the one behind the last."""
+    ends = [(c.start, c.start + c.size) for c in chunks]
+    return min(start for start, _ in ends), max(end for _, end in ends)
+
+
+def _columns(metadata: pq.FileMetaData) -> dict[str, tuple[int, bool]]:
+    """Number of each column by its name, and whether it may hold nulls."""
+    found = {}
+    for k in range(metadata.num_columns):
+        column = metadata.schema.column(k)
+        listed = column.path.endswith(_LISTED)
+        found[column.path.removesuffix(_LISTED)] = k, column.max_definition_level > listed
+    return found

@@ -9,6 +9,8 @@ values, so a page's levels are compared with those that it has to have, instead 
 
 from __future__ import annotations
 
+import functools
+import re
 from itertools import groupby
 from typing import Any, Final
 
@@ -18,10 +20,11 @@ import numpy.typing as npt
 from roadscan.tables import thrift
 
 PLAIN, RLE, DELTA_BINARY_PACKED = 0, 3, 5
-_DATA_PAGE: Final = 0
+_TYPE: Final = thrift.i32(0)
+"""Of a data page."""
 _LENGTH_BYTES: Final = 4
-_CRC_FIELD: Final = 4
-"""The field that stands after two numbers and the page's type."""
+_SIZE_AND_CRC: Final = re.compile(rb".{3}([\x80-\xFF]{0,4}.).(?:[\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.)", re.DOTALL)
+"""A page's type, its bytes twice and its CRC, each behind the byte that names the field."""
 _LONGEST_HEADER: Final = 64
 
 Bools = np.ndarray[Any, np.dtype[np.bool_]]
@@ -31,6 +34,8 @@ def flat_levels(valid: npt.NDArray[np.bool_] | None) -> bytes:
     """Levels of (n,) values; None for a column without nulls, which has none."""
     if valid is None:
         return b""
+    if valid.all():
+        return _section(_run(valid.size, 1) if valid.size else b"")
     return _section(b"".join(_run(len(list(same)), int(there)) for there, same in groupby(valid.tolist())))
 
 
@@ -47,41 +52,41 @@ def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> by
 
 def page_header(size: int, crc: int, values: int, encoding: int) -> bytes:
     """Header of a page of `size` bytes and of `values` levels; the CRC-32 is over levels and values."""
-    about = {1: values, 2: encoding, 3: RLE, 4: RLE}
+    bytes_both = thrift.i32(size)
     fields = {
-        1: thrift.i32(_DATA_PAGE),
-        2: thrift.i32(size),
-        3: thrift.i32(size),
-        _CRC_FIELD: thrift.i32(crc - (1 << 32) if crc >> 31 else crc),
-        5: thrift.struct({k: thrift.i32(v) for k, v in about.items()}),
+        1: _TYPE,
+        2: bytes_both,
+        3: bytes_both,
+        4: thrift.i32(crc - (1 << 32) if crc >> 31 else crc),
+        5: _about(values, encoding),
     }
     return thrift.struct(fields).content
+
+
+@functools.lru_cache(maxsize=64)
+def _about(values: int, encoding: int) -> thrift.Value:
+    return thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
 
 
 def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> tuple[int, int] | None:
     """Bytes of the header, and CRC, of the one page of a column chunk; None if it is not as `page_header` writes it."""
     head = chunk[:_LONGEST_HEADER].tobytes()
-    at, numbers = 0, []
-    for _ in range(_CRC_FIELD):
-        number, at = _numbered(head, at + 1)
-        numbers.append(number)
-    size, crc = numbers[1], numbers[3] % (1 << 32)
+    found = _SIZE_AND_CRC.match(head)
+    if found is None:
+        return None
+    size, crc = _number(found[1]), _number(found[2]) % (1 << 32)
     length = chunk.size - size
     if size < 0 or not 0 < length <= len(head) or head[:length] != page_header(size, crc, values, encoding):
         return None
     return length, crc
 
 
-def _numbered(data: bytes, at: int) -> tuple[int, int]:
-    """A signed number, and where it ends; at damage, any."""
+def _number(varint: bytes) -> int:
+    """A signed number of its varint."""
     value = 0
-    for shift in range(0, 35, 7):
-        byte = data[at] if at < len(data) else 0
-        value |= (byte & 127) << shift
-        at += 1
-        if byte < 128:
-            break
-    return (value >> 1) ^ -(value & 1), at
+    for byte in reversed(varint):
+        value = value << 7 | byte & 127
+    return (value >> 1) ^ -(value & 1)
 
 
 def _section(runs: bytes) -> bytes:

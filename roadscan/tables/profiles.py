@@ -5,10 +5,9 @@ Files as `list_table` writes them are decoded here; those of other writers, and 
 
 from __future__ import annotations
 
-import weakref
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.model.errors import StoreError
+from roadscan.tables.byte_source import opened
 from roadscan.tables.list_table_reader import DamageError, ListTableFile, read_footer
 from roadscan.tables.store import Store
 
@@ -56,14 +56,19 @@ class ProfileReader:
         self._intensities: UInt8 = np.empty(0, np.uint8)
         self._packed: ListTableFile | None = None
         try:
-            self._stream = _opened(store, store.path(file))
-            weakref.finalize(self, self._stream.close)
-            self._metadata, ours = read_footer(self._stream)
+            self._source = opened(store, store.path(file))
+            self._metadata, ours = read_footer(self._source.stream)
             self._list_size = _list_size(self._metadata.schema.to_arrow_schema())
         except _DAMAGE as error:
             raise self._error(error) from error
         if ours and self._list_size is not None:
-            self._packed = ListTableFile(self._stream, self._metadata)
+            self._packed = ListTableFile(self._source, self._metadata)
+
+    def expect(self, groups: Sequence[int]) -> None:
+        """Let row groups be on their way that will be read soon; what is wrong with them is said when they are read."""
+        if self._packed is not None:
+            with contextlib.suppress(*_DAMAGE):
+                self._packed.expect([k for k in groups if 0 <= k < self._metadata.num_row_groups], _COLUMNS)
 
     def read(self, groups: Sequence[int]) -> Profiles:
         """Profiles of row groups, in the order given; the arrays are valid until the next read of this reader."""
@@ -98,7 +103,7 @@ class ProfileReader:
         return Profiles(epochs, ranges, intensities if bright else None)
 
     def _arrow(self, groups: list[int]) -> Profiles:
-        file = pq.ParquetFile(self._stream, metadata=self._metadata, page_checksum_verification=True)
+        file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)
         rows = file.read_row_groups(groups, columns=_COLUMNS, use_threads=False)
         epochs, ranges, intensities = (rows.column(name) for name in _COLUMNS)
         if epochs.null_count or ranges.null_count:
@@ -116,10 +121,6 @@ class ProfileReader:
             file=self._file,
             record=f"row groups {', '.join(map(str, groups))}" if groups else None,
         )
-
-
-def _opened(store: Store, path: str) -> Any:
-    return Path(path).open("rb", buffering=0) if store.is_folder else store.fs.open(path, "rb")
 
 
 def _list_size(schema: pa.Schema) -> int | None:

@@ -11,6 +11,7 @@ from typing import Final
 
 _TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _BINARY, _LIST, _STRUCT = 1, 2, 3, 4, 5, 6, 8, 9, 12
 _LONGEST_DELTA: Final = 15
+_SHORT: Final = [bytes([number]) for number in range(128)]
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class Value:
 
 def varint(number: int) -> bytes:
     """A number of 0 or more, seven bits a byte."""
+    if number <= 127:
+        return _SHORT[number]
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

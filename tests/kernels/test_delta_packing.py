@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from roadscan.kernels import wide_packing
 from roadscan.kernels.delta_packing import (
     BAD_HEADER,
     CUT_SHORT,
@@ -26,6 +27,7 @@ from roadscan.kernels.delta_packing import (
 )
 
 HEADER = bytes([0x80, 1, 4])  # 128 values a block, 4 miniblocks
+WAYS = [encode] + [wide_packing.encode] * wide_packing.THERE
 
 
 @pytest.fixture(autouse=True)
@@ -57,8 +59,12 @@ def arrow_page(values: np.ndarray) -> bytes:
 def encoded(values: np.ndarray) -> bytes:
     values = values.copy()
     values.flags.writeable = False  # as Arrow's are, for which the kernel is compiled
-    words = np.full(room_words(values.size), 0xA5A5A5A5A5A5A5A5, np.uint64)
-    return words.view(np.uint8)[: encode(values, words)].tobytes()
+    pages = set()
+    for way in WAYS:
+        words = np.full(room_words(values.size), 0xA5A5A5A5A5A5A5A5, np.uint64)
+        pages.add(words.view(np.uint8)[: way(values, words)].tobytes())
+    (page,) = pages
+    return page
 
 
 def decoded(page: bytes, count: int, kind: Any, lead: int = 5, fill: int = 0) -> tuple[int, np.ndarray]:
@@ -101,6 +107,17 @@ def test_pages_are_those_of_arrow(name: str) -> None:
         assert page == arrow_page(values)
     for fill in (0, 0xFFFFFFFFFFFFFFFF):
         fault, back = decoded(page, values.size, values.dtype, fill=fill)
+        assert fault == WHOLE
+        assert np.array_equal(back, values)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.uint8])
+def test_every_width_comes_back_by_either_way(kind: Any) -> None:
+    """Blocks of each width, whole ones and a last one."""
+    for bits in range(18):
+        values = series(kind, 391, (1 << bits) // 2, bits)
+        page = encoded(values)
+        fault, back = decoded(page, values.size, kind)
         assert fault == WHOLE
         assert np.array_equal(back, values)
 

@@ -145,7 +145,7 @@ def test_row_groups_come_in_the_order_asked_for_into_one_buffer(folder: Store) -
 def test_file_is_closed_with_its_reader(folder: Store) -> None:
     put(folder, TABLES["a row"])
     reader = ProfileReader(folder, FILE)
-    stream = reader._stream
+    stream = reader._source.stream
     del reader
     gc.collect()
     assert stream.closed

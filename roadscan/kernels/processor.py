@@ -1,0 +1,15 @@
+"""The processor that kernels are compiled for."""
+
+from __future__ import annotations
+
+import llvmlite.binding
+import numba
+
+
+def compiles_for(*features: str) -> bool:
+    """True if kernels are compiled, and for a processor that has all these features (LLVM's names)."""
+    stated = numba.config.CPU_FEATURES
+    if numba.config.DISABLE_JIT or (stated is None and numba.config.CPU_NAME is not None):
+        return False
+    known = llvmlite.binding.get_host_cpu_features().flatten() if stated is None else stated
+    return {f"+{feature}" for feature in features} <= set(known.split(","))

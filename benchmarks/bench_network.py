@@ -1,9 +1,8 @@
 """A network of 20,000 km in blocks: planning, the scheduler and the manifest at work; the kernels do nothing.
 
 Everything but the readings is real: plans and tasks of :mod:`roadscan.jobs`, a Dask scheduler with two workers in
-processes of their own, and the loop that hands tasks out and keeps the records. A survey is a day's drive: the epochs
-of a survey's row groups are held in memory while it is planned (2 MB a kilometre), which 20,000 km in one would not
-fit into.
+processes of their own, and the loops that hand tasks out and keep the records. A survey is a day's drive; footprints
+and tiles of all are scheduled as in a run, products of one.
 """
 
 from __future__ import annotations
@@ -11,7 +10,8 @@ from __future__ import annotations
 import importlib
 import pickle
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,83 +22,127 @@ from benchmarks.network import Region
 from benchmarks.scheduler import running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.jobs.compute import Done, OnDask
-from roadscan.jobs.products import product_context, wanted_tile_products
-from roadscan.jobs.tile_plan import TILE, TilePlan, TileTask, plan_tiles
+from roadscan.jobs.bundles import Bundle, Ended
+from roadscan.jobs.compute import OnDask
+from roadscan.jobs.footprints import PRODUCT, FootprintTask, index_footprints
+from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
+from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.jobs.tiles import TaskResult, run_tasks
 from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.store import Store
 
 _BAR_S = 120.0
+_DIGEST = "blake3:" + 32 * "0"
+_TILE_FIGURES = (
+    '{"points": 40000000, "cells": 1600000, "height_min_m": 86.123456, "height_mean_m": 87.1, "height_max_m": 88.2,'
+    ' "height_std_median_m": 0.0004, "intensity_mean": 90.2, "passes": [1], "first_epoch_gps_ns": '
+    '1454644800000000000, "last_epoch_gps_ns": 1454644800360000000, "sigma_horizontal_m": null, "sigma_down_m": '
+    "null}"
+)
+
+
+@dataclass
+class _Stage:
+    """What the surveys took together, in one stage."""
+
+    km: float = 0.0
+    tasks: int = 0
+    bytes: int = 0
+    plan_s: float = 0.0
+    submit_s: float = 0.0
+    whole_s: float = 0.0
 
 
 @dataclass
 class _Seen:
-    """What the regions took together."""
+    """What the surveys took together."""
 
-    tasks: int = 0
-    tiles: int = 0
-    task_bytes: int = 0
-    plan_s: float = 0.0
-    submit_s: float = 0.0
-    run_s: float = 0.0
+    footprints: _Stage = field(default_factory=_Stage)
+    tiles: _Stage = field(default_factory=_Stage)
+    products: _Stage = field(default_factory=_Stage)
+    tiles_touched: int = 0
     manifest_s: float = 0.0
-    held: list[int] = field(default_factory=list)
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """The whole network, a survey after another."""
+    """The whole network, a survey after another; the products of the first."""
     size = Settings.current()
-    length_km, region_km = size.network_km, size.network_region_km
-    first = Region.of(1000 * region_km, folder)
+    regions = max(1, round(size.network_km / size.network_region_km))
+    first = Region.of(1000 * size.network_region_km, folder)
     seen, me = _Seen(), psutil.Process()
-    before = me.memory_info().rss
     with running_scheduler(workers=2) as (client, scheduler):
-        compute = _NoKernels(client, seen)
         client.run(_imports)
-        _one_region(first.moved(0, folder / "warm"), compute, _Seen())  # the scheduler imports what tasks name
-        warm, seen.submit_s = scheduler.rss_bytes(), 0.0
-        for number in range(max(1, round(length_km / region_km))):
-            _one_region(first.moved(number, folder), compute, seen)
+        _network(first.moved(0, folder / "warm"), client, _Seen()).compact()
+        before, warm = me.memory_info().rss, scheduler.rss_bytes()
+        mine, its = time.process_time(), scheduler.cpu_s()
+        for number in range(regions):
+            _network(first.moved(number, folder / f"{number}"), client, seen).compact()
+        mine, its = time.process_time() - mine, scheduler.cpu_s() - its
         end, peak, most = scheduler.rss_bytes(), scheduler.peak_bytes(), scheduler.most_tasks()
-    km = region_km * max(1, round(length_km / region_km))
-    name = f"{km:,.0f} km"
-    yield Figure(f"{name}: tiles stage, tasks", seen.tasks / km, "/km", 1.0, "bar")
-    yield Figure(f"{name}: tiles", seen.tiles / km, "/km")
-    yield Figure(f"{name}: a task on its way", seen.task_bytes / seen.tasks / 1e3, "kB")
-    yield Figure(f"{name}: planning (keys of tiles, tasks)", seen.plan_s, "s")
-    yield Figure(f"{name}: handing {seen.tasks:,} tasks out", seen.submit_s, "s")
-    yield Figure(f"{name}: handing out, no-op, results, manifest", seen.run_s, "s")
-    yield Figure(f"{name}: planned and run", seen.plan_s + seen.run_s, "s", _BAR_S, "bar")
-    yield Figure(f"{name}: throughput of the scheduler", seen.tasks / (seen.run_s - seen.manifest_s), "tasks/s")
-    yield Figure(f"{name}: manifest, {seen.tiles:,} records", seen.manifest_s, "s")
+        grown = me.memory_info().rss - before
+        region = first.moved(0, folder / "products")
+        _products(region, _network(region, client, _Seen()), client, seen)
+    name = f"{seen.tiles.km:,.0f} km"
+    yield Figure(f"{name}: tiles", seen.tiles_touched / seen.tiles.km, "/km")
+    yield from _of_stage("footprints", seen.footprints)
+    yield from _of_stage("tiles", seen.tiles)
+    yield Figure(f"{name}: of this, records in the manifest", seen.manifest_s, "s")
+    whole = seen.footprints.whole_s + seen.tiles.whole_s
+    yield Figure(f"{name}: footprints and tiles, planned and run", whole, "s", _BAR_S, "bar")
+    yield Figure(f"{name}: the same, processor time of the planning process", mine, "s")
+    yield Figure(f"{name}: the same, processor time of the scheduler", its, "s")
+    tasks, planning = seen.tiles.tasks + seen.footprints.tasks, seen.tiles.plan_s + seen.footprints.plan_s
+    yield Figure(f"{name}: throughput", tasks / (whole - planning), "tasks/s")
     yield Figure(f"{name}: tasks that the scheduler holds, at most", most, "")
     yield Figure(f"{name}: memory of the scheduler at the end", end / 2**20, "MiB", warm / 2**20, "after one survey")
     yield Figure(f"{name}: peak memory of the scheduler", peak / 2**20, "MiB")
-    yield Figure(f"{name}: growth of the planning process", (me.memory_info().rss - before) / 2**20, "MiB")
+    yield Figure(f"{name}: growth of the planning process", grown / 2**20, "MiB")
+    yield from _of_stage("products", seen.products)
 
 
-def _one_region(region: Region, compute: _NoKernels, seen: _Seen) -> None:
-    """Plan a survey, run its tasks, keep its records."""
-    started = time.perf_counter()
-    plan = region.plan
-    context = product_context(plan)
-    wanted = tuple(wanted_tile_products(plan.survey, context))
-    tiles = plan_tiles(region.footprints, plan)
-    planned = TilePlan(plan, region.footprints, tiles, wanted, context)
-    tasks = planned.tasks(list(tiles), compute.workers)
-    seen.plan_s += time.perf_counter() - started
-    seen.task_bytes += len(pickle.dumps(tasks[len(tasks) // 2])) * len(tasks)
-    seen.tasks += len(tasks)
-    seen.tiles += len(tiles)
-    started = time.perf_counter()
-    manifest = _Timed(Manifest(plan.store), seen)
-    failures = run_tasks(tasks, planned.singly, manifest, compute)  # type: ignore[arg-type]
+def _of_stage(name: str, stage: _Stage) -> Iterator[Figure]:
+    length = f"{stage.km:,.0f} km: {name}"
+    yield Figure(f"{length}, tasks", stage.tasks / stage.km, "/km", 1.0, "bar")
+    yield Figure(f"{length}, a task on its way", stage.bytes / stage.tasks / 1e3, "kB")
+    yield Figure(f"{length}, planning", stage.plan_s, "s")
+    yield Figure(f"{length}, handing {stage.tasks:,} tasks out", stage.submit_s, "s")
+    yield Figure(f"{length}, planned and run", stage.whole_s, "s")
+
+
+def _network(region: Region, client: Any, seen: _Seen) -> Manifest:
+    """Plan the footprints and tiles of a survey, run their tasks, keep their records."""
+    plan, manifest = region.plan, _Timed(region.plan.store, seen)
+    with _timed(seen.footprints, region, client) as compute:
+        _check(index_footprints(plan, manifest, compute))
+    with _timed(seen.tiles, region, client) as compute:
+        context = product_context(plan)
+        wanted = tuple(wanted_tile_products(plan.survey, context))
+        tiles = plan_tiles(region.footprints, plan)
+        planned = TilePlan(plan, region.footprints, tiles, wanted, context)
+        tasks = planned.tasks(stale_tiles(tiles, wanted, manifest), compute.workers)
+        _check(run_tasks(tasks, planned.singly, manifest, compute))
+        seen.tiles_touched += len(tiles)
+    return manifest
+
+
+def _products(region: Region, manifest: Manifest, client: Any, seen: _Seen) -> None:
+    """The same for its sheets, pictures and tables."""
+    with _timed(seen.products, region, client) as compute:
+        _check(make_products(region.plan, manifest, compute))
+
+
+def _check(failures: Sequence[object]) -> None:
     if failures:
-        raise RuntimeError(f"{len(failures)} tiles failed, the first: {failures[0]}")
-    started_compact = time.perf_counter()
-    manifest.compact()
-    seen.manifest_s += time.perf_counter() - started_compact
-    seen.run_s += time.perf_counter() - started
+        raise RuntimeError(f"{len(failures)} units failed, the first: {failures[0]}")
+
+
+@contextmanager
+def _timed(stage: _Stage, region: Region, client: Any) -> Iterator[_NoKernels]:
+    """Where the tasks of a stage go; what they and the stage take is added to what was seen."""
+    started = time.perf_counter()
+    yield _NoKernels(client, stage)
+    stage.km += region.length_m / 1000
+    stage.whole_s += time.perf_counter() - started
 
 
 def _imports() -> None:
@@ -106,61 +150,66 @@ def _imports() -> None:
     importlib.import_module("roadscan.jobs.stages")
 
 
-def no_kernels(task: TileTask) -> TaskResult:
-    """What a worker returns, without the work: a record a tile, with the figures of a tile."""
-    detail = (
-        '{"points": 40000000, "cells": 1600000, "height_min_m": 86.123456, "height_mean_m": 87.1, "height_max_m": 88.2,'
-        ' "height_std_median_m": 0.0004, "intensity_mean": 90.2, "passes": [1], "first_epoch_gps_ns": '
-        '1454644800000000000, "last_epoch_gps_ns": 1454644800360000000, "sigma_horizontal_m": null, "sigma_down_m": '
-        'null}'
-    )  # fmt: skip
-    digest = "blake3:" + 32 * "0"
-    return TaskResult(
-        tuple(
-            OutputRecord(TILE, str(t), key, f"tiles/cells/{t}.parquet", 12_345_678, digest, detail)
-            for t, key in zip(task.block.tiles, task.keys, strict=True)
-        ),
-        (),
-    )
+class _NoKernels(OnDask):
+    """The real way to Dask, with :func:`stand_in` for what workers do."""
 
+    def __init__(self, client: Any, stage: _Stage) -> None:
+        super().__init__(client)
+        self._stage, self._begun = stage, time.perf_counter()
 
-class _NoKernels:
-    """The real way to Dask, with :func:`no_kernels` for what workers do; submitting is timed."""
-
-    def __init__(self, client: Any, seen: _Seen) -> None:
-        self._on_dask = OnDask(client)
-        submit = client.submit
-
-        def timed(*arguments: Any, **options: Any) -> Any:
-            started = time.perf_counter()
-            future = submit(*arguments, **options)
-            seen.submit_s += time.perf_counter() - started
-            return future
-
-        client.submit = timed
-
-    @property
-    def workers(self) -> int:
-        """Threads of all workers."""
-        return self._on_dask.workers
-
-    def map(self, _: Callable[..., Any], tasks: Sequence[Any]) -> Iterator[Done[Any, Any]]:
+    def map(self, _: Callable[..., Any], tasks: Sequence[Any]) -> Iterator[Any]:
         """Run the tasks without kernels, whatever function is asked for."""
-        return self._on_dask.map(no_kernels, tasks)
+        self._stage.tasks += len(tasks)
+        self._stage.plan_s += time.perf_counter() - self._begun
+        self._stage.bytes += len(tasks) * len(pickle.dumps(tasks[len(tasks) // 2])) if tasks else 0
+        return super().map(stand_in, tasks)
+
+    def send(self, function: Callable[..., Any], tasks: Sequence[Any]) -> list[Any]:
+        """As the way to Dask, timed."""
+        started = time.perf_counter()
+        futures = super().send(function, tasks)
+        self._stage.submit_s += time.perf_counter() - started
+        return futures
 
 
-class _Timed:
+def stand_in(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
+    """What a worker returns, without the work: records with the figures of a tile, a data file or a sheet."""
+    if isinstance(task, TileTask):
+        return TaskResult(tuple(_tile_records(task)), ())
+    return [Ended(_piece_record(piece)) for piece in task.pieces]
+
+
+def _tile_records(task: TileTask) -> Iterator[OutputRecord]:
+    for tile, key in zip(map(str, task.block.tiles), task.keys, strict=True):
+        for wanted in task.products:
+            for name, suffix in wanted.files.items():
+                yield OutputRecord(name, tile, key, f"tiles/{name}/{tile}{suffix}", 12_345_678, _DIGEST)
+        yield OutputRecord(OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", 1_234_567, _DIGEST)
+        yield OutputRecord(TILE, tile, key, f"tiles/cells/{tile}.parquet", 12_345_678, _DIGEST, _TILE_FIGURES)
+
+
+def _piece_record(piece: FootprintTask | OutputTask) -> OutputRecord:
+    if isinstance(piece, FootprintTask):
+        detail = '{"window": [56321, 593487, 56350, 593512]}'
+        return OutputRecord(PRODUCT, piece.slice.file, piece.key, piece.target, 12_345, _DIGEST, detail)
+    return OutputRecord(piece.product.name, piece.output.name, piece.key, piece.target, 12_345_678, _DIGEST)
+
+
+class _Timed(Manifest):
     """A manifest whose writing is timed."""
 
-    def __init__(self, manifest: Manifest, seen: _Seen) -> None:
-        self._manifest, self._seen = manifest, seen
+    def __init__(self, store: Store, seen: _Seen) -> None:
+        super().__init__(store)
+        self._seen = seen
 
-    def add(self, records: Sequence[OutputRecord]) -> None:
+    def add(self, records: Iterable[OutputRecord]) -> None:
         """As the manifest underneath."""
         started = time.perf_counter()
-        self._manifest.add(records)
+        super().add(records)
         self._seen.manifest_s += time.perf_counter() - started
 
     def compact(self) -> None:
         """As the manifest underneath."""
-        self._manifest.compact()
+        started = time.perf_counter()
+        super().compact()
+        self._seen.manifest_s += time.perf_counter() - started

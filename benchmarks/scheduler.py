@@ -48,6 +48,11 @@ class Watched:
                     return int(line.split()[1]) * 1024
         return self.rss_bytes()
 
+    def cpu_s(self) -> float:
+        """Processor time so far."""
+        times = psutil.Process(self._pid).cpu_times()
+        return float(times.user + times.system)
+
     def most_tasks(self) -> int:
         """Most tasks held at a time."""
         return int(self._client.run_on_scheduler(_most))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -22,6 +24,13 @@ class Done(Generic[T, R]):
     task: T
     result: R | None
     error: Exception | None
+
+
+def reason_of(error: Exception | None) -> str:
+    """Why a task gave nothing, for the list of failures."""
+    if error is None:
+        return "the worker gave no result"
+    return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
 
 
 class Compute(Protocol):
@@ -63,30 +72,47 @@ class OnDask:
         return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
-        """Run all tasks, most of them at the same time; a task is tried once more if its worker dies."""
+        """Run all tasks, most of them at the same time; a task is tried once more if its worker dies.
+
+        Tasks travel as bytes: the scheduler hands them on without importing or holding what they name.
+        """
         from distributed import as_completed  # slow to import
 
-        threads = sum(self._client.nthreads().values())
         waiting = iter(tasks)
-        running: dict[Any, T] = {}
-        queue = as_completed()
+        running: dict[str, T] = {}
+        queue = as_completed(with_results=True, raise_errors=False)
 
-        def hand_out() -> None:
-            with contextlib.suppress(StopIteration):
-                task = next(waiting)
-                future = self._client.submit(function, task, pure=False, retries=0)
-                running[future.key] = task
-                queue.add(future)
+        def hand_out(count: int) -> None:
+            chosen = list(itertools.islice(waiting, count))
+            if not chosen:
+                return
+            futures = self.send(function, chosen)
+            running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
+            queue.update(futures)
 
-        for _ in range(2 * max(threads, 1)):
-            hand_out()
-        for future in queue:
-            task = running.pop(future.key)
-            error = future.exception()
-            result = None if error is not None else future.result()
-            future.release()
-            hand_out()
-            yield Done(task, result, error)
+        hand_out(2 * max(sum(self._client.nthreads().values()), 1))
+        for batch in queue.batches():
+            hand_out(len(batch))
+            for future, result in batch:
+                error = future.exception() if future.status != "finished" else None
+                future.release()
+                yield Done(running.pop(future.key), None if error is not None else result, error)
+
+    def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
+        """Hand some tasks to the scheduler; returns their futures."""
+        from distributed.protocol import pickle  # slow to import
+
+        keys = [f"{function.__name__}-{uuid.uuid4().hex}" for _ in tasks]
+        sent = [pickle.dumps((function, task)) for task in tasks]
+        return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
+
+
+def _called(sent: bytes) -> Any:
+    """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker)."""
+    from distributed.protocol import pickle  # slow to import
+
+    function, task = pickle.loads(sent)
+    return function(task)
 
 
 class WhenNeeded:

@@ -1,4 +1,4 @@
-"""Footprints: which raw block touches which tile. One task a data file.
+"""Footprints: which raw block touches which tile. One task some data files, about two kilometres at line rate.
 
 Profiles and returns are not placed for it: bounds (``points/reach.py``) name every tile that a row group may touch.
 Clouds, whose points are placed already, are read.
@@ -18,10 +18,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.reach import touched_tiles
+from roadscan.jobs.reach import group_spans, touched_tiles
 from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
 from roadscan.points.place import FATE_NAMES, Window
@@ -32,6 +33,11 @@ from roadscan.tables.store import Store, file_digest
 from roadscan.tables.writer import write_parquet
 
 PRODUCT = "footprints"
+
+_ROW_GROUPS = 16_384
+"""Row groups that one task bounds: two kilometres of a pair of profilers at line rate."""
+_CLOUD_GROUPS = 8
+"""How many of them cost as much as a row group of a cloud."""
 
 _LOADED: Final = [
     "tile_column", "tile_row", "first_group", "last_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns",
@@ -51,6 +57,11 @@ class FootprintTask:
     def target(self) -> str:
         """Where its footprints go, relative to the survey's root."""
         return "tables/footprints/" + self.slice.file.removeprefix("tables/")
+
+    @property
+    def work(self) -> int:
+        """In row groups that have a bound; the readings of clouds are looked at one by one."""
+        return len(self.slice.groups) * (_CLOUD_GROUPS if self.slice.source.table == "cloud" else 1)
 
 
 @dataclass(frozen=True)
@@ -87,15 +98,18 @@ class FootprintRanges:
     slices: tuple[RawSlice, ...]
     """Data files, whole, sorted by run, sensor and time."""
 
-    def expanded(self) -> Footprints:
-        """A row for each row group; the readings of a range shared out evenly."""
+    def expanded(self, group_spans_ns: Sequence[npt.NDArray[np.int64]]) -> Footprints:
+        """A row for each row group; the readings of a range shared out evenly.
+
+        `group_spans_ns` holds the first and last epoch (groups, 2) of the row groups of each slice.
+        """
         counts = (self.last_group - self.first_group + 1).astype(np.int64)
         rows = np.repeat(np.arange(counts.size), counts)
         place = np.arange(rows.size) - np.repeat(np.cumsum(counts) - counts, counts)
         group = (self.first_group[rows] + place).astype(np.int32)
         share, rest = np.divmod(self.readings, counts)
-        sizes = [len(s.spans) for s in self.slices]
-        spans = np.array([span for s in self.slices for span in s.spans], dtype=np.int64).reshape(-1, 2)
+        sizes = [len(spans) for spans in group_spans_ns]
+        spans = np.concatenate([np.zeros((0, 2), np.int64), *group_spans_ns])
         at = np.concatenate([[0], np.cumsum(sizes)])[self.slice_index[rows]] + group
         return Footprints(
             tile_column=self.tile_column[rows],
@@ -111,7 +125,7 @@ class FootprintRanges:
 
 def index_footprints(
     plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None] = lambda _a, _b: None
-) -> list[tuple[str, Exception]]:
+) -> list[tuple[str, str]]:
     """Index the data files whose footprints are missing or stale; returns what failed."""
     tasks = [
         FootprintTask(plan.store, plan.ground, one, key_of(one.source.key, one.file, digest))
@@ -119,15 +133,8 @@ def index_footprints(
     ]
     stale = [t for t in tasks if not manifest.is_current(PRODUCT, t.slice.file, t.key)]
     manifest.remove(r for unit, r in manifest.of(PRODUCT).items() if unit not in {t.slice.file for t in tasks})
-    failures: list[tuple[str, Exception]] = []
-    report(0, len(stale))
-    for number, done in enumerate(compute.map(footprint_task, stale), 1):
-        if done.error is not None or done.result is None:
-            failures.append((done.task.slice.file, done.error or StoreError("no result")))
-        else:
-            manifest.add([done.result])
-        report(number, len(stale))
-    return failures
+    failed = run_bundles(footprint_task, stale, lambda t: t.work, _ROW_GROUPS, manifest, compute, report)
+    return [(task.slice.file, reason) for task, reason in failed]
 
 
 def footprint_task(task: FootprintTask) -> OutputRecord:
@@ -144,7 +151,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
         apart = sorted(set(range(len(one.groups))) - set(pairs.group.tolist()))
         if apart:  # no tile tells what became of their readings
             fates = _placed(task, apart)[1]
-    rows = _ranges(pairs, one)
+    rows = _ranges(pairs, one, group_spans(task.store, one))
     schema = table_schema(PRODUCT)
     with task.store.scratch() as folder:
         path = folder / "footprints.parquet"
@@ -168,14 +175,14 @@ def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.N
     return joined(parts), fates
 
 
-def _ranges(pairs: Touched, one: RawSlice) -> pa.Table:
+def _ranges(pairs: Touched, one: RawSlice, group_spans_ns: npt.NDArray[np.int64]) -> pa.Table:
     """Pairs of row group and tile as rows: runs of groups that touch one tile are one row."""
     order = np.lexsort((pairs.group, pairs.row, pairs.column))
     number, column, row = pairs.group[order], pairs.column[order], pairs.row[order]
     breaks = (np.diff(column) != 0) | (np.diff(row) != 0) | (np.diff(number) != 1)
     starts = np.flatnonzero(np.concatenate([[True], breaks])) if number.size else np.zeros(0, np.int64)
     ends = np.append(starts[1:], number.size)[: starts.size] - 1
-    spans = np.array(one.spans, dtype=np.int64).reshape(-1, 2)[number]
+    spans = group_spans_ns[number]
     groups = np.array(one.groups, dtype=np.int32)[number]
     return pa.table(
         {
@@ -225,7 +232,9 @@ def load_footprints(
     plan: SurveyPlan, manifest: Manifest, files: Collection[str] | None = None, window: Window | None = None
 ) -> Footprints:
     """Current footprints, a row for each pair of row group and tile; choice as for :func:`load_ranges`."""
-    return load_ranges(plan, manifest, files, window).expanded()
+    ranges = load_ranges(plan, manifest, files, window)
+    spans = {f.path: source.spans(f.group_spans) for source, files in plan.sources for f in files}
+    return ranges.expanded([np.array(spans[s.file], dtype=np.int64).reshape(-1, 2) for s in ranges.slices])
 
 
 def load_ranges(

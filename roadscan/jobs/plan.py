@@ -67,11 +67,7 @@ class SurveyPlan:
 
     def slices(self) -> list[RawSlice]:
         """All data files, whole."""
-        return [
-            RawSlice(source, f.path, tuple(range(len(f.group_rows))), source.spans(f.group_spans), f.bytes)
-            for source, files in self.sources
-            for f in files
-        ]
+        return [RawSlice.whole(source, f) for source, files in self.sources for f in files]
 
 
 def plan_survey(survey: Survey, store: Store) -> SurveyPlan:

@@ -1,4 +1,4 @@
-"""Products over many tiles, made from the tiles' cells. One task a file."""
+"""Products over many tiles, made from the tiles' cells. One task some files that draw the same tiles."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.cell_files import read_cells, read_overview
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
@@ -13,7 +14,6 @@ from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.tile_files import WantedProduct
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE
 from roadscan.jobs.tiles import summary_of
-from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.model.survey import Survey
@@ -33,6 +33,10 @@ from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store, file_digest
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level, pyramid_of
+
+_TILES_DRAWN = 2000
+"""Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
+_NOWHERE = TileId(0, 0)
 
 
 @dataclass(frozen=True)
@@ -89,12 +93,13 @@ def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask]
     records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
     keys = {r.unit: r.key for r in records}
     overviews = {unit: r for unit, r in manifest.of(OVERVIEWS).items() if r.path and keys.get(unit) == r.key}
-    summaries = [s for s in map(summary_of, records) if s is not None]
+    by_tile = {TileId.parse(r.unit): r for r in records}
+    summaries = {s.tile: s for s in map(summary_of, records) if s is not None}
     tasks = [
         task
         for product, options in wanted_products(plan.survey)
         if isinstance(product, SurveyProduct)
-        for task in _tasks(product, options, plan, context, records, overviews, summaries)
+        for task in _tasks(product, options, plan, context, by_tile, overviews, summaries)
     ]
     due = {(t.product.name, t.output.name) for t in tasks}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
@@ -111,16 +116,9 @@ def make_products(
     """Make the survey products that are missing or stale; remove those no longer due. Returns the failures."""
     stale, gone = plan_outputs(plan, manifest)
     manifest.remove(gone)
-    failures: list[tuple[str, str]] = []
-    report(0, len(stale))
-    for number, done in enumerate(compute.map(write_output, stale), 1):
-        if done.result is not None:
-            manifest.add([done.result])
-        else:
-            reason = str(done.error) if isinstance(done.error, RoadscanError) else repr(done.error)
-            failures.append((f"{done.task.product.name}/{done.task.output.name}", reason))
-        report(number, len(stale))
-    return failures
+    stale.sort(key=lambda t: (t.product.name, min(t.output.tiles, default=_NOWHERE)))  # what draws the same tiles
+    failed = run_bundles(write_output, stale, lambda t: len(t.output.tiles), _TILES_DRAWN, manifest, compute, report)
+    return [(f"{task.product.name}/{task.output.name}", reason) for task, reason in failed]
 
 
 def write_output(task: OutputTask) -> OutputRecord:
@@ -170,14 +168,12 @@ def _tasks(
     options: Strict,
     plan: SurveyPlan,
     context: ProductContext,
-    records: Sequence[OutputRecord],
+    by_tile: Mapping[TileId, OutputRecord],
     overviews: Mapping[str, OutputRecord],
-    summaries: Sequence[TileSummary],
+    summaries: Mapping[TileId, TileSummary],
 ) -> list[OutputTask]:
-    by_tile = {TileId.parse(r.unit): r for r in records}
-    summary_by_tile = {s.tile: s for s in summaries}
     tasks: list[OutputTask] = []
-    for output in product.outputs(summaries, options, context) if summaries else []:
+    for output in product.outputs(list(summaries.values()), options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         key = key_of(_product_key(product, options, context), output.name, [(r.unit, r.digest, r.detail) for r in own])
         tasks.append(
@@ -188,7 +184,7 @@ def _tasks(
                 context,
                 output,
                 key,
-                tuple(summary_by_tile[t] for t in sorted(output.tiles) if t in summary_by_tile),
+                tuple(summaries[t] for t in sorted(output.tiles) if t in summaries),
                 own,
                 tuple(overviews[r.unit] for r in own if r.unit in overviews),
             )

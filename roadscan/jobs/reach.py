@@ -41,6 +41,15 @@ def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
     return reach.profiles(_on_time(one, rows.column("epoch_gps_ns").to_numpy()), spans, starts, geometry)
 
 
+def group_spans(store: Store, one: RawSlice) -> npt.NDArray[np.int64]:
+    """First and last epoch (groups, 2), on time (GPS ns), of the row groups of a slice, from the file's own footer."""
+    with _opened(store, one) as file:
+        metadata = file.metadata
+        column = metadata.schema.names.index("epoch_gps_ns")
+        spans = [_limits(metadata.row_group(g), column) or _span(file, g, "epoch_gps_ns") for g in one.groups]
+    return _on_time(one, np.array(spans, dtype=np.int64).ravel()).reshape(-1, 2)
+
+
 def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
     """Poses around a slice and how far its readings count; None without any pose."""
     source = one.source
@@ -111,7 +120,7 @@ def _of_returns(reach: Reach, one: RawSlice, file: pq.ParquetFile) -> Touched:
         readings[number] = part.num_rows
         for axis, name in enumerate("xyz"):
             boxes[number, axis] = _limits(part, index[f"{name}_sensor_m"]) or (-np.inf, np.inf)
-        spans[number] = _limits(part, index["pose_epoch_gps_ns"]) or _pose_span(file, group)
+        spans[number] = _limits(part, index["pose_epoch_gps_ns"]) or _span(file, group, "pose_epoch_gps_ns")
     boxes[np.isnan(boxes).any(axis=2)] = (-np.inf, np.inf)
     return reach.returns(_on_time(one, spans.ravel()).reshape(-1, 2), boxes, readings)
 
@@ -122,6 +131,6 @@ def _limits(part: pq.RowGroupMetaData, column: int) -> tuple[float, float] | Non
     return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
 
 
-def _pose_span(file: pq.ParquetFile, group: int) -> tuple[int, int]:
-    epochs = file.read_row_groups([group], columns=["pose_epoch_gps_ns"], use_threads=False).column(0).to_numpy()
+def _span(file: pq.ParquetFile, group: int, column: str) -> tuple[int, int]:
+    epochs = file.read_row_groups([group], columns=[column], use_threads=False).column(0).to_numpy()
     return int(epochs.min()), int(epochs.max())

@@ -102,27 +102,22 @@ class Ground:
 
 @dataclass(frozen=True)
 class RawSlice:
-    """Row groups of one data file."""
+    """Row groups of one data file. Sent to workers: the epochs of single row groups stay in the store."""
 
     source: ReadingSource
     file: str
-    groups: tuple[int, ...]
+    groups: Sequence[int]
+    """Ascending, and so in the order of time; a range where they are consecutive."""
     spans: tuple[tuple[int, int], ...]
-    """First and last epoch (GPS ns) of each group."""
+    """First and last epoch (GPS ns), on time, of each run of consecutive groups."""
     bytes: int
     """Compressed bytes of the groups, about."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """As arrays: thousands of small tuples take longer to send than the rest of a task."""
-        packed = np.array(self.groups, np.int32), np.array(self.spans, np.int64).reshape(-1, 2)
-        return _unpacked, (self.source, self.file, *packed, self.bytes)
-
-
-def _unpacked(
-    source: ReadingSource, file: str, groups: npt.NDArray[np.int32], spans: npt.NDArray[np.int64], size: int
-) -> RawSlice:
-    pairs = tuple((a, b) for a, b in spans.tolist())
-    return RawSlice(source, file, tuple(groups.tolist()), pairs, size)
+    @classmethod
+    def whole(cls, source: ReadingSource, file: DataFile) -> RawSlice:
+        """All row groups of a data file."""
+        spans = () if file.span is None else source.spans([file.span])
+        return cls(source, file.path, range(len(file.group_rows)), spans, file.bytes)
 
 
 def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[str] | None = None) -> pa.Table:
@@ -244,10 +239,12 @@ def load_trajectory(
     As much is read beyond each span as interpolation looks at, so poses do not depend on what was asked for.
     """
     pad = round(STENCIL_KNOTS * max_gap_s * NS_PER_S)
-    wanted = [(a - pad, b + pad) for a, b in spans]
+    wanted = np.array(spans, dtype=np.int64).reshape(-1, 2) + np.array([-pad, pad])
     parts: list[pa.Table] = []
     for file in source.files:
-        groups = [k for k, span in enumerate(file.group_spans) if any(span[0] <= b and span[1] >= a for a, b in wanted)]
+        held = np.array(file.group_spans, dtype=np.int64).reshape(-1, 1, 2)
+        is_near = (held[:, :, 0] <= wanted[:, 1]) & (held[:, :, 1] >= wanted[:, 0])
+        groups = np.flatnonzero(is_near.any(axis=1)).tolist()
         if groups:
             parts.append(read_groups(store, file.path, groups, _POSE_COLUMNS))
     if not parts:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.jobs.centre_line import CentreLines
-from roadscan.jobs.fingerprint import key_of
+from roadscan.jobs.fingerprint import key_of, keys_of
 from roadscan.jobs.footprints import FootprintRanges
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, RawSlice
+from roadscan.jobs.row_groups import GroupsByTile
 from roadscan.jobs.tile_files import WantedProduct
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.survey import CellColumns
@@ -36,14 +38,40 @@ _SQUARES = 15
 
 
 @dataclass(frozen=True)
-class PlannedTile:
-    """A tile that readings may touch."""
+class PlannedTiles:
+    """Every tile that readings may touch, by row and column; arrays are (n,)."""
 
-    key: str
-    readings: int
+    column: npt.NDArray[np.int32]
+    row: npt.NDArray[np.int32]
+    keys: tuple[str, ...]
+    readings: npt.NDArray[np.int64]
     """About how many."""
-    rows: npt.NDArray[np.int64]
-    """Its rows in the footprints."""
+    first_epoch_gps_ns: npt.NDArray[np.int64]
+    groups: GroupsByTile
+    """Row groups that may touch them."""
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __iter__(self) -> Iterator[TileId]:
+        return iter(self.ids)
+
+    def __contains__(self, tile: object) -> bool:
+        return tile in self.number
+
+    @cached_property
+    def ids(self) -> tuple[TileId, ...]:
+        """All tiles."""
+        return tuple(map(TileId, self.column.tolist(), self.row.tolist()))
+
+    @cached_property
+    def number(self) -> dict[TileId, int]:
+        """Place of each tile in the arrays."""
+        return {tile: number for number, tile in enumerate(self.ids)}
+
+    def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
+        """Places of some tiles."""
+        return np.array([self.number[tile] for tile in tiles], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -57,7 +85,7 @@ class TileTouch:
 
 @dataclass(frozen=True)
 class TileTask:
-    """Everything a worker needs to compute some tiles; it holds no data."""
+    """Everything a worker needs to compute some tiles; it holds no data, and no epoch of single row groups."""
 
     store: Store
     ground: Ground
@@ -67,10 +95,10 @@ class TileTask:
     """Key of each core tile."""
     slices: tuple[RawSlice, ...]
     """Raw blocks that may touch the tiles, sorted by run, sensor and time."""
-    touches: tuple[tuple[TileTouch, ...], ...]
-    """Of each core tile."""
-    owned_runs: tuple[tuple[int, int, int, TileId], ...]
-    """(slice, first position, end, tile): groups whose readings are told by fate with that tile."""
+    touched: npt.NDArray[np.int32]
+    """(n, 4) core tile by its place in the block, slice, first position and end in its groups."""
+    owned_runs: npt.NDArray[np.int32]
+    """(n, 4) slice, first position, end, core tile: groups whose readings are told by fate with that tile."""
     readings: int
     """Readings expected."""
     passes: tuple[LanePass, ...]
@@ -79,10 +107,19 @@ class TileTask:
     context: ProductContext
     cell_table: CellColumns = "full"
 
+    @cached_property
+    def touches(self) -> tuple[tuple[TileTouch, ...], ...]:
+        """What may touch each core tile."""
+        found: list[list[TileTouch]] = [[] for _ in self.block.tiles]
+        for place, index, first, end in self.touched.tolist():
+            found[place].append(TileTouch(index, first, end))
+        return tuple(map(tuple, found))
+
     @property
     def owned(self) -> Iterator[tuple[int, int, TileId]]:
         """(slice, position of the group, tile), group by group."""
-        return ((s, k, tile) for s, first, end, tile in self.owned_runs for k in range(first, end))
+        tiles = self.block.tiles
+        return ((s, k, tiles[place]) for s, first, end, place in self.owned_runs.tolist() for k in range(first, end))
 
     @property
     def raw_bytes(self) -> int:
@@ -100,34 +137,37 @@ class TileTask:
         )
 
 
-def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> dict[TileId, PlannedTile]:
+def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
     """Every tile that a raw block may touch."""
-    if not footprints.tile_column.size:
-        return {}
     f = footprints
     order = np.lexsort((f.first_group, f.slice_index, f.tile_column, f.tile_row))
     column, row = f.tile_column[order], f.tile_row[order]
-    starts = np.flatnonzero(np.concatenate([[True], (np.diff(column) != 0) | (np.diff(row) != 0)]))
+    is_first = np.concatenate([np.ones(min(order.size, 1), bool), (np.diff(column) != 0) | (np.diff(row) != 0)])
+    starts = np.flatnonzero(is_first)
+    ends = np.append(starts[1:], order.size)[: starts.size]
     digests = {one.path: one.digest for _, files in plan.sources for one in files}
-    names = [key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in f.slices]
-    ranges = list(
-        zip(f.slice_index[order].tolist(), f.first_group[order].tolist(), f.last_group[order].tolist(), strict=True)
+    names = np.array([key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in f.slices], "S16")
+    content = np.empty(order.size, dtype=[("name", "S16"), ("first", "<i4"), ("last", "<i4")])
+    content["name"] = names[f.slice_index[order]]
+    content["first"], content["last"] = f.first_group[order], f.last_group[order]
+    return PlannedTiles(
+        column=column[starts],
+        row=row[starts],
+        keys=tuple(keys_of(plan.tile_key, content, ends)),
+        readings=np.add.reduceat(f.readings[order], starts) if starts.size else f.readings[:0],
+        first_epoch_gps_ns=np.minimum.reduceat(f.first_epoch_gps_ns[order], starts)
+        if starts.size
+        else f.first_epoch_gps_ns[:0],
+        groups=GroupsByTile(f, order, np.append(starts, order.size)),
     )
-    readings = np.add.reduceat(f.readings[order], starts).tolist()
-    ends = [*starts[1:].tolist(), order.size]
-    places = zip(column[starts].tolist(), row[starts].tolist(), strict=True)
-    tiles: dict[TileId, PlannedTile] = {}
-    for place, start, end, expected in zip(places, starts.tolist(), ends, readings, strict=True):
-        key = key_of(plan.tile_key, [(names[s], a, b) for s, a, b in ranges[start:end]])
-        tiles[TileId(*place)] = PlannedTile(key, expected, order[start:end])
-    return tiles
 
 
-def stale_tiles(
-    tiles: dict[TileId, PlannedTile], products: Sequence[WantedProduct], manifest: Manifest
-) -> list[TileId]:
+def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> list[TileId]:
     """Tiles that are missing, changed, or lack a wanted product."""
-    return [tile for tile, planned in tiles.items() if not _is_current(tile, planned.key, products, manifest)]
+    if not manifest.of(TILE):
+        return list(tiles)
+    pairs = zip(tiles.ids, tiles.keys, strict=True)
+    return [tile for tile, key in pairs if not _is_current(tile, key, products, manifest)]
 
 
 @dataclass(frozen=True)
@@ -136,7 +176,7 @@ class TilePlan:
 
     plan: SurveyPlan
     footprints: FootprintRanges
-    tiles: dict[TileId, PlannedTile]
+    tiles: PlannedTiles
     products: tuple[WantedProduct, ...]
     context: ProductContext
 
@@ -148,12 +188,15 @@ class TilePlan:
         config = self.plan.survey.config.tiles
         if not chosen:
             return []
+        numbers = self.tiles.numbers(chosen)
         if self._points_of(self.task(Block(()))):
-            readings = {t: self.tiles[t].readings for t in chosen}
-            blocks = cut_blocks(readings, config.block_tiles, config.max_block_readings)
-        else:
-            blocks = self._stretches(chosen, workers)
-        return [self.task(block) for block in blocks]
+            readings = dict(zip(chosen, self.tiles.readings[numbers].tolist(), strict=True))
+            return [self.task(b) for b in cut_blocks(readings, config.block_tiles, config.max_block_readings)]
+        ids = self.tiles.ids
+        return [
+            self._task(Block(tuple(ids[n] for n in own.tolist())), own, own)
+            for own in self._stretches(numbers, workers)
+        ]
 
     def singly(self, chosen: Sequence[TileId]) -> list[TileTask]:
         """A task for each tile."""
@@ -162,130 +205,54 @@ class TilePlan:
     def _points_of(self, task: TileTask) -> bool:
         return task.needs_points or any(s.source.table == "cloud" for s in self.footprints.slices)
 
-    def _stretches(self, chosen: Sequence[TileId], workers: int) -> list[Block]:
-        """Tiles in the order in which they were driven over, cut into stretches."""
-        config = self.plan.survey.config.tiles
-        edge = max(1, round(_SQUARE_M / config.size_m))
-        epoch_gps_ns = self.footprints.first_epoch_gps_ns
-        first = {t: int(epoch_gps_ns[self.tiles[t].rows].min()) for t in chosen}
-        squares = sorted(
-            (b.tiles for b in cut_blocks({t: self.tiles[t].readings for t in chosen}, edge, 1 << 62)),
-            key=lambda tiles: min(first[t] for t in tiles),
-        )
-        together = max(1, min(_SQUARES, len(squares) // (4 * workers)))
-        ordered: list[Block] = []
-        for start in range(0, len(squares), together):
-            tiles = [t for square in squares[start : start + together] for t in square]
-            tiles.sort(key=lambda t: (first[t], t.row, t.column))
-            ordered.append(Block(tuple(tiles)))
-        return ordered
+    def _stretches(self, numbers: npt.NDArray[np.int64], workers: int) -> list[npt.NDArray[np.int64]]:
+        """Tiles in the order in which they were driven over, cut into stretches of some squares each."""
+        edge = max(1, round(_SQUARE_M / self.plan.survey.config.tiles.size_m))
+        numbers = np.sort(numbers)
+        first = self.tiles.first_epoch_gps_ns[numbers]
+        east, north = (part[numbers].astype(np.int64) // edge for part in (self.tiles.column, self.tiles.row))
+        _, square = np.unique((north << 32) + east, return_inverse=True)
+        begun = np.full(int(square.max()) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(begun, square, first)
+        turn = np.empty(begun.size, np.int64)
+        turn[np.argsort(begun, kind="stable")] = np.arange(begun.size)
+        together = max(1, min(_SQUARES, begun.size // (4 * workers)))
+        stretch = turn[square] // together
+        order = np.lexsort((numbers, first, stretch))
+        return np.split(numbers[order], np.flatnonzero(np.diff(stretch[order])) + 1)
 
     def task(self, block: Block) -> TileTask:
         """A task over a block."""
-        f = self.footprints
-        core = {(t.column, t.row): t for t in block.tiles}
-        rows = [self.tiles[t].rows for t in sorted(block.with_halo()) if t in self.tiles]
-        every = np.concatenate([np.zeros(0, np.int64), *rows])
+        near = self.tiles.numbers(t for t in block.with_halo() if t in self.tiles)
+        return self._task(block, self.tiles.numbers(block.tiles), near)
+
+    def _task(self, block: Block, core: npt.NDArray[np.int64], near: npt.NDArray[np.int64]) -> TileTask:
+        """A task over the tiles numbered `core`, with the row groups of those numbered `near`."""
+        tiles = self.tiles
+        runs = tiles.groups.runs(near)
+        cuts = np.flatnonzero(np.diff(runs.slice, prepend=-1))
+        spans = list(zip(runs.first_epoch_gps_ns.tolist(), runs.last_epoch_gps_ns.tolist(), strict=True))
         slices: list[RawSlice] = []
-        numbers: dict[int, int] = {}
-        places: dict[int, npt.NDArray[np.int64]] = {}
-        owned: list[tuple[int, int, int, TileId]] = []
-        for index in np.unique(f.slice_index[every]).tolist():
-            own = every[f.slice_index[every] == index]
-            whole = f.slices[index]
-            groups = _groups(f.first_group[own], f.last_group[own])
-            groups = groups[np.argsort(self._ranks(index)[groups])]
-            share = whole.bytes * groups.size // max(len(whole.groups), 1)
-            numbers[index] = len(slices)
-            places[index] = np.full(len(whole.groups), -1)
-            places[index][groups] = np.arange(groups.size)
-            owners = self._owners[index][groups]
-            cuts = np.flatnonzero((np.diff(owners, axis=0) != 0).any(axis=1)) + 1
-            runs = zip([0, *cuts.tolist()], [*cuts.tolist(), groups.size], strict=True)
-            owned += [
-                (len(slices), start, end, tile)
-                for start, end in runs
-                if (tile := core.get((int(owners[start, 0]), int(owners[start, 1])))) is not None
-            ]
-            ordered = groups.tolist()
-            spans = tuple(whole.spans[g] for g in ordered)
-            slices.append(RawSlice(whole.source, whole.file, tuple(ordered), spans, share))
-        touches = tuple(
-            tuple(
-                touch
-                for s, a, b in (self._ranges[r] for r in self.tiles[tile].rows.tolist())
-                for touch in _touches(numbers[s], places[s][a : b + 1])
-            )
-            for tile in block.tiles
-        )
-        config = self.plan.survey.config.tiles
+        for number, (start, end) in enumerate(itertools.pairwise([*cuts.tolist(), len(spans)])):
+            whole = self.footprints.slices[int(runs.source[start])]
+            groups = tiles.groups.groups(runs, number)
+            share = whole.bytes * len(groups) // max(len(whole.groups), 1)
+            slices.append(RawSlice(whole.source, whole.file, groups, tuple(spans[start:end]), share))
         return TileTask(
             store=self.plan.store,
             ground=self.plan.ground,
             block=block,
-            keys=tuple(self.tiles[t].key for t in block.tiles),
+            keys=tuple(tiles.keys[n] for n in core.tolist()),
             slices=tuple(slices),
-            touches=touches,
-            owned_runs=tuple(owned),
-            readings=sum(self.tiles[t].readings for t in block.tiles),
+            touched=tiles.groups.touched(runs, core),
+            owned_runs=tiles.groups.owned(runs, core),
+            readings=int(tiles.readings[core].sum()),
             passes=self.plan.passes,
             centre_lines=self.plan.centre_lines,
             products=self.products,
             context=self.context,
-            cell_table=config.cell_table,
+            cell_table=self.plan.survey.config.tiles.cell_table,
         )
-
-    @cached_property
-    def _ranges(self) -> list[tuple[int, int, int]]:
-        """Slice, first and last group of each row of the footprints."""
-        f = self.footprints
-        return list(zip(f.slice_index.tolist(), f.first_group.tolist(), f.last_group.tolist(), strict=True))
-
-    @cached_property
-    def _owners(self) -> dict[int, npt.NDArray[np.int32]]:
-        """(groups, 2) column and row of the tile that tells the fates of a group's readings, by slice.
-
-        It is the first of those that the group touches, by row and column; −1 −1 … where it touches none.
-        """
-        f = self.footprints
-        found = {
-            s: np.full((len(f.slices[s].groups), 2), -(2**31), np.int32) for s in np.unique(f.slice_index).tolist()
-        }
-        order = np.lexsort((f.tile_column, f.tile_row))[::-1]
-        for r, place in zip(order.tolist(), np.column_stack([f.tile_column, f.tile_row])[order], strict=True):
-            index, first, last = self._ranges[r]
-            found[index][first : last + 1] = place
-        return found
-
-    def _ranks(self, index: int) -> npt.NDArray[np.int64]:
-        """(groups,) place of each row group of a slice in the order of time."""
-        if index not in self._rank_of:
-            spans = np.array(self.footprints.slices[index].spans, dtype=np.int64).reshape(-1, 2)
-            ranks = np.empty(len(spans), np.int64)
-            ranks[np.lexsort((spans[:, 1], spans[:, 0]))] = np.arange(len(spans))
-            self._rank_of[index] = ranks
-        return self._rank_of[index]
-
-    @cached_property
-    def _rank_of(self) -> dict[int, npt.NDArray[np.int64]]:
-        return {}
-
-
-def _groups(first: npt.NDArray[np.int32], last: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    """Numbers of all row groups of some ranges, ascending."""
-    end = int(last.max()) + 2
-    begun = np.bincount(first, minlength=end) - np.bincount(last + 1, minlength=end)
-    return np.flatnonzero(np.cumsum(begun))
-
-
-def _touches(index: int, places: npt.NDArray[np.int64]) -> list[TileTouch]:
-    """Runs of the positions of consecutive row groups."""
-    low, high = int(places.min()), int(places.max())
-    if high - low + 1 == places.size:  # in the order of time, as nearly always
-        return [TileTouch(index, low, high + 1)]
-    at = np.sort(places)
-    breaks = np.flatnonzero(np.diff(at) != 1) + 1
-    return [TileTouch(index, int(part[0]), int(part[-1]) + 1) for part in np.split(at, breaks)]
 
 
 def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> bool:

@@ -81,7 +81,7 @@ def _by_owner(one: RawSlice, owners: Sequence[TileId | None]) -> Iterator[tuple[
     for end in range(1, len(owners) + 1):
         if end == len(owners) or owners[end] != owners[start]:
             share = one.bytes * (end - start) // len(owners)
-            yield owners[start], RawSlice(one.source, one.file, one.groups[start:end], one.spans[start:end], share)
+            yield owners[start], RawSlice(one.source, one.file, one.groups[start:end], one.spans, share)
             start = end
 
 

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from roadscan.jobs.cell_files import write_cells, write_overviews
-from roadscan.jobs.compute import Compute
+from roadscan.jobs.compute import Compute, reason_of
 from roadscan.jobs.tile_cells import count_tiles
 from roadscan.jobs.tile_fates import Fates
 from roadscan.jobs.tile_files import publish_file, write_product
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.jobs.tile_points import load_tiles
-from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.products.base import Tile, TileSummary
@@ -35,6 +34,14 @@ class TaskResult:
     records: tuple[OutputRecord, ...]
     failures: tuple[tuple[str, str], ...]
     """Tiles that failed, with the reason."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By columns: hundreds of records take longer to send one by one."""
+        return _unpacked, (tuple(zip(*self.records, strict=True)), self.failures)
+
+
+def _unpacked(columns: tuple[tuple[Any, ...], ...], failures: tuple[tuple[str, str], ...]) -> TaskResult:
+    return TaskResult(tuple(map(OutputRecord, *columns)) if columns else (), failures)
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ def run_tasks(
                 again.extend(tiles)
                 continue
             else:
-                failures.append((str(tiles[0]), _reason(done.error)))
+                failures.append((str(tiles[0]), reason_of(done.error)))
             finished += len(tiles)
             report(finished, total)
     return failures
@@ -107,7 +114,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
         try:
             records += _write_tile(task, key, computed.content, computed.evidence)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
-            failures.append((str(computed.tile), _reason(error)))
+            failures.append((str(computed.tile), reason_of(error)))
     for tile, key in [*empty, *waiting.items()]:
         records.append(OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0})))
     return TaskResult(tuple(_with_fates(r, fates) for r in records), tuple(failures))
@@ -185,10 +192,4 @@ def _with_fates(record: OutputRecord, fates: Fates) -> OutputRecord:
     told = fates.of(TileId.parse(record.unit)) if record.product == TILE else {}
     if not told:
         return record
-    return dataclasses.replace(record, detail=json.dumps({**record.figures(), "fates": told}))
-
-
-def _reason(error: Exception | None) -> str:
-    if error is None:
-        return "the worker gave no result"
-    return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
+    return record._replace(detail=json.dumps({**record.figures(), "fates": told}))

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 from roadscan.model.errors import StoreError
@@ -29,7 +30,7 @@ class DataFile:
     group_spans: tuple[tuple[int, int], ...]
     """First and last epoch (GPS ns) of each row group; empty for tables without epochs."""
 
-    @property
+    @cached_property
     def span(self) -> tuple[int, int] | None:
         """First and last epoch (GPS ns)."""
         if not self.group_spans:

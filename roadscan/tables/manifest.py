@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 from roadscan.tables.store import Store
 
 _FOLDER: Final = "manifest/outputs"
-_COMPACT_AT: Final = 64
+_MOST_PARTS: Final = 64
+"""More parts than that are merged: a long run would begin with thousands of files to read."""
 _SCHEMA: Final = pa.schema(
     [
         ("product", pa.string()),
@@ -28,9 +29,8 @@ _SCHEMA: Final = pa.schema(
 )
 
 
-@dataclass(frozen=True)
-class OutputRecord:
-    """One finished file (or a finished unit without a file, where `path` is empty)."""
+class OutputRecord(NamedTuple):
+    """One finished file (or a finished unit without a file, where `path` is empty). A network has millions."""
 
     product: str
     """Product, or 'footprints', or 'tile' for the tile as a whole."""
@@ -51,16 +51,37 @@ class OutputRecord:
         return dict(json.loads(self.detail)) if self.detail else {}
 
 
+@dataclass(frozen=True)
+class _Part:
+    """A file of records, written once. Parts hold what changed, in the order of their numbers."""
+
+    path: str
+    rows: int
+    table: pa.Table | None = None
+    """Its rows, where they were written a moment ago and are soon merged."""
+
+    @property
+    def number(self) -> int:
+        """Its place among the parts."""
+        return int(self.path.rsplit("-", 1)[1].removesuffix(".parquet"))
+
+
 class Manifest:
-    """All output records; one writer at a time (the run that holds the store's lock)."""
+    """All output records; one writer at a time (the run that holds the store's lock).
+
+    What changes is written as a part of its own. Parts are merged with those before them that are no more than twice
+    as large, so a record is written again as often as the survey doubles, not each time that some tasks end.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._parts = store.files(_FOLDER, ".parquet")
+        self._parts: list[_Part] = []
         self._records: dict[tuple[str, str], OutputRecord] = {}
-        for part in self._parts:
-            for row in pq.read_table(io.BytesIO(store.read_bytes(part))).to_pylist():
-                record = OutputRecord(**row)
+        for path in store.files(_FOLDER, ".parquet"):
+            table = self._read(path)
+            self._parts.append(_Part(path, table.num_rows))
+            columns = (table.column(field.name).to_pylist() for field in _SCHEMA)
+            for record in map(OutputRecord, *columns):
                 if record.key:
                     self._records[(record.product, record.unit)] = record
                 else:
@@ -117,28 +138,46 @@ class Manifest:
             self._append([OutputRecord(product, u, "", "", 0, "") for u in known])
 
     def compact(self) -> None:
-        """Bring all parts into one."""
-        old = self._parts
-        self._parts = []
-        self._append(self.all(), number=_number(old[-1]) + 1 if old else 0)
+        """Bring all parts into one, without what is no more."""
+        old, self._parts = self._parts, []
+        self._write(_table(self.all()), old[-1].number + 1 if old else 0)
         for part in old:
-            self._store.remove(part)
+            self._store.remove(part.path)
 
-    def _append(self, records: list[OutputRecord], number: int | None = None) -> None:
-        if number is None:
-            number = _number(self._parts[-1]) + 1 if self._parts else 0
+    def _append(self, records: list[OutputRecord]) -> None:
+        table = _table(records)
+        self._write(table, self._parts[-1].number + 1 if self._parts else 0, keep=True)
+        if len(self._parts) > _MOST_PARTS:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Bring the last parts into one, which says the same as these in their order."""
+        rows = self._parts[-1].rows
+        first = len(self._parts) - 1
+        while first and (first > _MOST_PARTS // 2 or self._parts[first - 1].rows <= 2 * rows):
+            first -= 1
+            rows += self._parts[first].rows
+        old = self._parts[first:]
+        self._parts = self._parts[:first]
+        tables = [self._read(part.path) if part.table is None else part.table for part in old]
+        self._write(pa.concat_tables(tables), old[-1].number + 1)
+        for part in old:  # where these stay, the new part says once more what they say
+            self._store.remove(part.path)
+
+    def _read(self, path: str) -> pa.Table:
+        return pq.read_table(io.BytesIO(self._store.read_bytes(path)))
+
+    def _write(self, table: pa.Table, number: int, keep: bool = False) -> None:
         path = f"{_FOLDER}/part-{number:08d}.parquet"
         buffer = io.BytesIO()
-        columns = [pa.array([getattr(r, field.name) for r in records], field.type) for field in _SCHEMA]
-        pq.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA), buffer)
+        pq.write_table(table, buffer, use_dictionary=["product"], write_statistics=False)
         self._store.write_bytes(path, buffer.getvalue())
-        self._parts.append(path)
-        if len(self._parts) > _COMPACT_AT:
-            self.compact()
+        self._parts.append(_Part(path, table.num_rows, table if keep else None))
 
 
-def _number(part: str) -> int:
-    return int(part.rsplit("-", 1)[1].removesuffix(".parquet"))
+def _table(records: Sequence[OutputRecord]) -> pa.Table:
+    columns = list(zip(*records, strict=True)) or [()] * len(_SCHEMA)
+    return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, _SCHEMA, strict=True)], schema=_SCHEMA)
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:

@@ -103,10 +103,19 @@ class Store:
 
     def write_bytes(self, relative: str, content: bytes) -> None:
         """Write a small file at once."""
-        with self.scratch() as folder:
-            temporary = folder / "content"
+        if not self.is_folder:
+            with self.scratch() as folder:
+                temporary = folder / "content"
+                temporary.write_bytes(content)
+                self.publish(temporary, relative)
+            return
+        temporary = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        try:
             temporary.write_bytes(content)
             self.publish(temporary, relative)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:

@@ -201,3 +201,39 @@ def test_publishing_a_folder_replaces_it_at_once(store: Store) -> None:
 def test_missing_file_is_named(store: Store) -> None:
     with pytest.raises(StoreError, match=r"manifest/none.json: the file is missing"):
         store.read_bytes("manifest/none.json")
+
+
+@pytest.mark.parametrize("dies_at", [None, 3, 40])
+def test_manifest_of_a_long_run_is_merged_and_says_the_same(
+    tmp_path: Path, dies_at: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against a dictionary; where the process dies while merged parts are removed, too."""
+    store, known, written = Store(str(tmp_path), "long"), {}, []
+    manifest, write, remove = Manifest(store), store.write_bytes, store.remove
+    monkeypatch.setattr(store, "write_bytes", lambda path, content: (written.append(path), write(path, content)))
+    removals = itertools.count()
+
+    def dying(path: str) -> None:
+        if path.startswith("manifest/") and next(removals) == dies_at:
+            raise KeyboardInterrupt
+        remove(path)
+
+    monkeypatch.setattr(store, "remove", dying)
+    for k in range(150):
+        record = OutputRecord("las", f"{k % 90}_0", f"key{k}", "", k, "d")
+        try:
+            if k % 7 == 6 and f"{k % 50}_0" in manifest.of("las"):
+                known.pop(f"{k % 50}_0", None)
+                manifest.remove([manifest.of("las")[f"{k % 50}_0"]])
+            else:
+                known[record.unit] = record
+                manifest.add([record])
+        except KeyboardInterrupt:
+            manifest = Manifest(store)
+        assert manifest.of("las") == known
+    assert Manifest(store).of("las") == known
+    assert len(store.files("manifest/outputs")) <= 65
+    assert len(written) < 156  # a part each, and few of several
+    manifest.compact()
+    assert len(store.files("manifest/outputs")) == 1
+    assert Manifest(store).of("las") == known

@@ -68,8 +68,9 @@ def _overlap(seed: int, drives: int, level: tuple[float, float]) -> tuple[Yard, 
 
 
 def _with_stop_and_go(seed: int, folder: Path) -> tuple[Yard, Calibration]:
-    yard = profiler_yard(seed, 8, *TRAJECTORIES[TACTICAL], length_m=3.5)
-    return yard, solved(yard, head_orientations(yard, folder / f"heads-{seed}"))
+    drives, rounds = (int(os.environ.get(f"ROADSCAN_{name}", n)) for name, n in (("DRIVES", "16"), ("ROUNDS", "6")))
+    yard = profiler_yard(seed, drives, *TRAJECTORIES[TACTICAL], length_m=3.5)
+    return yard, solved(yard, head_orientations(yard, folder / f"heads-{seed}", rounds))
 
 
 def _lidar(seed: int) -> tuple[Yard, Calibration]:

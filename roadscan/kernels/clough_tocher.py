@@ -23,6 +23,11 @@ from roadscan.kernels.options import inlined, kernel
 
 CORNER, EDGE, BY_CORNER, BY_EDGE, INNER, CENTRE, POINTS = 0, 3, 9, 12, 15, 18, 19
 ALONG, ACROSS, SLOPE = 0, 1, 2
+THIN = 0.25
+"""A triangle is thin beside another if its corner lies nearer to their edge by this factor."""
+LEAST_SHARE = 0.05
+"""Of the slope across the middle of an edge in what a thin triangle's corner says (1.5 above the middle, 0 at an end).
+"""
 
 
 @inlined
@@ -58,6 +63,53 @@ def cross_slopes(x, y, z, gradients, triangles, halves):
             halves[t, k, SLOPE] = (seen - known) / (2.0 * across) - ends
 
 
+@inlined
+def misfits(x, y, z, gradients, lo, hi, a):
+    """Where corner a lies along and across an edge, and what its height and slopes say beyond what the edge knows.
+
+    Returns
+    -------
+    along, across; then, of the cubic less its edge and its slopes across the ends of it: height over `across`, slope
+    along over `across`, slope across (lengths of the edge).
+    """
+    ex, ey, ax, ay = x[hi] - x[lo], y[hi] - y[lo], x[a] - x[lo], y[a] - y[lo]
+    square = ex * ex + ey * ey
+    s, t = (ex * ax + ey * ay) / square, (ex * ay - ey * ax) / square
+    r = 1.0 - s
+    z3 = z[hi] - z[lo]
+    z1, z2 = third_of_slope(gradients, lo, ex, ey), z3 - third_of_slope(gradients, hi, ex, ey)
+    n0, n1 = third_of_slope(gradients, lo, -ey, ex), third_of_slope(gradients, hi, -ey, ex)
+    edge = 3.0 * s * r * (r * z1 + s * z2) + s * s * s * z3
+    rise = 3.0 * (r * r * z1 + 2.0 * s * r * (z2 - z1) + s * s * (z3 - z2))
+    ends = 3.0 * (r * r * n0 + s * s * n1)
+    height = (z[a] - z[lo] - edge) / t - ends
+    along = (3.0 * third_of_slope(gradients, a, ex, ey) - rise) / t + 6.0 * (r * n0 - s * n1)
+    return s, t, height, along, 3.0 * third_of_slope(gradients, a, -ey, ex) - ends
+
+
+@kernel
+def slope_beside_thin(x, y, z, gradients, lo, hi, wide, thin, seen_wide, seen_thin):
+    """Slope across the middle of an edge beside a thin triangle, from what the cubic through the wide one has to meet.
+
+    Two equations for it: the slope at the thin corner, and the rule of Foley & Opitz times the small distance of that
+    corner (`seen_wide`, `seen_thin`: the slopes of :func:`cross_slopes`). They are solved by least squares; where the
+    thin corner lies at an end of the edge it tells nothing of the middle, and the mean of the ends is taken.
+    """
+    s, t, height, along, across = misfits(x, y, z, gradients, lo, hi, wide)
+    thin_s, thin_t, _, _, thin_across = misfits(x, y, z, gradients, lo, hi, thin)
+    ratio = thin_t / t
+    bulge, thin_bulge = 6.0 * s * (1.0 - s), 6.0 * thin_s * (1.0 - thin_s)
+    share = thin_bulge + ratio * ((3.0 * ratio - 4.0) * bulge - 12.0 * (1.0 - 2.0 * s) * (thin_s - s))
+    known = 2.0 * (3.0 * height - across + along * (thin_s - s)) + 3.0 * ratio * (across - 2.0 * height)
+    near = 2.0 * thin_t
+    square = share * share + (near * (1.0 - ratio)) ** 2
+    if square < LEAST_SHARE * LEAST_SHARE:
+        ex, ey = x[hi] - x[lo], y[hi] - y[lo]
+        return 0.5 * (third_of_slope(gradients, lo, -ey, ex) + third_of_slope(gradients, hi, -ey, ex))
+    total = share * (thin_across - ratio * known) + near * (1.0 - ratio) * near * (seen_thin - ratio * seen_wide)
+    return total / square
+
+
 @kernel
 def control_points(x, y, z, gradients, triangles, opposite, halves, patches):
     """Control points of each triangle.
@@ -81,7 +133,14 @@ def control_points(x, y, z, gradients, triangles, opposite, halves, patches):
             other = opposite[t, k]
             if other >= 0:
                 mine, theirs = halves[t, k, ACROSS], flat[other, ACROSS]
-                slope = (halves[t, k, SLOPE] * theirs - flat[other, SLOPE] * mine) / (theirs - mine)
+                a, b, lo, hi = triangles[t, k], triangles[other // 3, other % 3], min(i, j), max(i, j)
+                mine_seen, theirs_seen = halves[t, k, SLOPE], flat[other, SLOPE]
+                if abs(theirs) < THIN * abs(mine):
+                    slope = slope_beside_thin(x, y, z, gradients, lo, hi, a, b, mine_seen, theirs_seen)
+                elif abs(mine) < THIN * abs(theirs):
+                    slope = slope_beside_thin(x, y, z, gradients, lo, hi, b, a, theirs_seen, mine_seen)
+                else:
+                    slope = (mine_seen * theirs - theirs_seen * mine) / (theirs - mine)
                 along = halves[t, k, ALONG] if i < j else 1.0 - halves[t, k, ALONG]
                 patch[BY_EDGE + k] = (1.0 - along) * near + along * far + mine * slope
                 inner += patch[BY_EDGE + k]

@@ -11,12 +11,14 @@ from roadscan.kernels.options import kernel
 FITTED, PLANE, LEVEL = 0, 1, 2
 """What a gradient was taken from: the polynomial asked for, a plane, or nothing."""
 LINEAR_TERMS, QUADRATIC_TERMS, CUBIC_TERMS = 2, 5, 9
-MOST_RINGS = 3
+MOST_RINGS = 4
+NARROWEST = 1.0 / 8.0**2
+"""Squared ratio of the spreads of a ring across and along, below which it is not wide enough to tell a slope."""
 SOFTNESS = 0.1
 """Squared distance (of 1 as the neighbours' mean) below which points do not gain weight any more."""
 DAMPING = 0.3**2
 """Of the cubic terms, over the points' weights (a point at distance 1 counts 0.7)."""
-LEAST_PIVOT = 1e-6
+LEAST_PIVOT = 1e-2
 """Of a normal matrix with unit diagonal: one over the variance inflation of a term."""
 
 
@@ -32,6 +34,18 @@ def grow(starts, neighbours, ring, first, count, seen, centre):
                 ring[total] = j
                 total += 1
     return total
+
+
+@kernel
+def is_narrow(x, y, i, ring, count):
+    """Whether points lie so nearly on a line with a vertex that their scatter would pass for the slope across."""
+    xx, xy, yy = 0.0, 0.0, 0.0
+    for k in range(count):
+        dx, dy = x[ring[k]] - x[i], y[ring[k]] - y[i]
+        xx += dx * dx
+        xy += dx * dy
+        yy += dy * dy
+    return xx * yy - xy * xy < NARROWEST * (xx + yy) ** 2
 
 
 @kernel
@@ -136,7 +150,8 @@ def vertex_gradients(x, y, z, starts, neighbours, terms, rings, least, gradients
     x, y, z : (m,) float64 (m), differences of x and y exact.
     starts, neighbours : (m + 1,), (e,) int64: neighbours of i from ``starts[i]`` to ``starts[i + 1]``, ascending.
     terms : QUADRATIC_TERMS or CUBIC_TERMS.
-    rings, least : rings of neighbours that are taken, and more (up to MOST_RINGS) until there are `least`.
+    rings, least : rings of neighbours that are taken, and one more at a time (up to MOST_RINGS) while there are fewer
+        than `least`, while they are narrow, or while they do not bear the polynomial.
     gradients : (m, 2) float64, out.
     sources : (m,) uint8, out: FITTED, PLANE or LEVEL.
     """
@@ -147,15 +162,17 @@ def vertex_gradients(x, y, z, starts, neighbours, terms, rings, least, gradients
         seen[i] = i
         ring[0] = i
         first, count, taken = 0, 1, 0
-        while taken < rings or (count <= least and taken < MOST_RINGS):
+        gradients[i, 0], gradients[i, 1] = 0.0, 0.0
+        sources[i] = LEVEL
+        while taken < MOST_RINGS and sources[i] != FITTED:
             before = count
             count = grow(starts, neighbours, ring, first, count, seen, i)
             first = before
             taken += 1
-        others = ring[1:count]
-        gradients[i, 0], gradients[i, 1] = 0.0, 0.0
-        sources[i] = LEVEL
-        if count > QUADRATIC_TERMS and fit(x, y, z, i, others, count - 1, terms, work, gradients[i]):
-            sources[i] = FITTED
-        elif count > LINEAR_TERMS and fit(x, y, z, i, others, count - 1, of_plane, work, gradients[i]):
+            enough = taken >= rings and count > least and not is_narrow(x, y, i, ring, count)
+            enough = enough or (taken == MOST_RINGS and count > QUADRATIC_TERMS)
+            if enough and fit(x, y, z, i, ring[1:count], count - 1, terms, work, gradients[i]):
+                sources[i] = FITTED
+        unknown = sources[i] != FITTED and count > LINEAR_TERMS
+        if unknown and fit(x, y, z, i, ring[1:count], count - 1, of_plane, work, gradients[i]):
             sources[i] = PLANE

@@ -17,7 +17,16 @@ corners, at y and y' on either side, give
     M = (r y' - r' y) / (y' - y),
 
 the two values interpolated to the edge. That is the condition of Foley & Opitz, freed of the choice of side: it
-reproduces cubic polynomials, and since both triangles use the same M to the bit, the surface is C¹. An edge on the rim
+reproduces cubic polynomials, and since both triangles use the same M to the bit, the surface is C¹.
+
+Where a corner lies much nearer to the edge than the other (four times), its r is a small difference over a small y:
+noise in heights would be multiplied by 1 / 2y, and by the wide triangle's y once more. There M is solved, by least
+squares, from two equations that a cubic through the wide triangle's corner meets exactly: the slope across the edge
+given at the thin corner, and the condition above times the small y. Where the thin corner lies over an end of the edge
+(on random points, beside one node in some hundred or fewer), it tells nothing of the middle, and M is the mean of the
+ends, exact for quadratics only.
+
+An edge on the rim
 has no other side; its triangle's inner control point is then the mean of those that its other edges ask for (which
 keeps cubic precision), or that of a quadratic where it has no neighbour at all.
 """

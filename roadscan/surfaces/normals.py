@@ -6,19 +6,22 @@ multi-sensory approach*, Optics and Lasers in Engineering 45 (2007), eq. 5 and 6
 of kept triangles, so a slope never looks across a hole. Two kinds:
 
 ``quadratic``
-    The paper's: five terms, all neighbours alike. One ring of neighbours, a second and a third where there are fewer
-    than six. Calm where heights are noisy: noise of σ gives slopes of about 1.0 σ over the spacing of points.
+    The paper's: five terms, all neighbours alike; one ring of neighbours, at least six. Calm where heights are noisy:
+    noise of σ gives slopes of about 1.0 σ over the spacing of points.
 ``cubic``
-    Nine terms, of which the four cubic ones are damped; two rings, a third where there are fewer than 15; near
-    neighbours count most. Follows the ground several times more closely (on Franke's function with 1,000 points, the
-    error is a quarter of the quadratic's), and gives slopes of about 3.7 σ over the spacing.
+    Nine terms, of which the four cubic ones are damped; two rings, at least 15 neighbours, near ones count most.
+    Follows the ground several times more closely (on Franke's function with 1,000 points, the error is a quarter of the
+    quadratic's), and gives slopes of about 3.7 σ over the spacing. Not for noisy profiles that lie more than ten times
+    farther apart than their points.
 
 Both are exact where the heights are a quadratic polynomial.
 
-Conditioning: offsets are counted from the site and whitened by their own mean square, so profiles that lie ten times
-farther apart than their points are as well conditioned as a square mesh; the normal matrix is scaled to a unit diagonal
-and refused where a pivot falls below 10⁻⁶. Then a plane is fitted to the same neighbours, and where they lie on a line
-(or there are none) the slope is zero.
+Conditioning: offsets are counted from the site and whitened by their own mean square, so stretched meshes are as well
+conditioned as square ones; the normal matrix is scaled to a unit diagonal and refused where a pivot falls below 0.01.
+Another ring is taken, up to the fourth, while neighbours are too few, refused, or *narrow*: spread eight times less
+across than along, so that the scatter of one profile would pass for the slope across it. After the fourth ring narrow
+neighbours have to do. Where they are refused still, a plane is fitted to them; where they lie on a line (or there are
+none) the slope is zero.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Files of a tile's cells and of their overviews: Parquet, in the encodings that measured best.
 
-Measured on 1.6 million cells of 5 mm, ns of one core and bytes a cell (the machine was shared; plain bytes: 4.5 ns):
-rows and columns as plain numbers under ZSTD 4 and 6 (delta packing 8 and 8, dictionary 8 and 14); counts split into
-byte planes under ZSTD 8 ns, 0.6 B (delta packing 11, 0.7; plain 24, 0.9); heights in byte planes 16 ns, 5.0 B, and
-rounded to 2⁻²⁰ m 12 ns, 2.0 B (plain 34, 2.1).
+Surfaces and overviews go through `roadscan/tables/plane_table.py`: byte planes under LZ4 take 17 ns of one core and
+5.8 bytes a cell of the line-rate pair (Parquet's general writer and ZSTD: 42 ns, 5.2 bytes). Of full tables, measured
+on 1.6 million cells of 5 mm (plain bytes: 4.5 ns): rows and columns as plain numbers under ZSTD 4 and 6 ns (delta
+packing 8 and 8, dictionary 8 and 14); counts split into byte planes under ZSTD 8 ns, 0.6 B (delta packing 11, 0.7;
+plain 24, 0.9); heights in byte planes 16 ns, 5.0 B (plain 34, 2.1 when rounded).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import CellColumns
 from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.plane_table import write_plane_table
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 from roadscan.tiles.cells import TileCells
@@ -70,6 +72,14 @@ def overviews_table(levels: Sequence[Level]) -> pa.Table:
 
 def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> None:
     """Write a tile's cells; same cells, same bytes."""
+    if columns == "surface":
+        schema, n = _stored("cells", columns), len(cells)
+        held = {name: getattr(cells, name) for name in schema.names}
+        groups = [
+            {name: values[k : k + _GROUP_ROWS] for name, values in held.items()} for k in range(0, n, _GROUP_ROWS)
+        ]
+        write_plane_table(path, schema, groups, _ROUNDED, _PLACES)
+        return
     rows = cells_table(cells, columns)
     with pq.ParquetWriter(path, rows.schema, **_settings(rows.schema)) as writer:
         writer.write_table(rows, row_group_size=_GROUP_ROWS)
@@ -78,9 +88,11 @@ def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> 
 def write_overviews(path: Path, levels: Sequence[Level]) -> None:
     """Write a tile's overviews, a row group a level, so that one is read without the others."""
     schema = _stored("overviews", "full")
-    with pq.ParquetWriter(path, schema, **_settings(schema)) as writer:
-        for level in levels:
-            writer.write_table(overviews_table([level]), row_group_size=max(len(level), 1))
+    groups = (
+        {n: getattr(one, n) for n in schema.names[1:]} | {"factor": np.full(len(one), one.factor, np.uint16)}
+        for one in levels
+    )
+    write_plane_table(path, schema, groups, _ROUNDED, _PLACES)
 
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:

@@ -17,13 +17,13 @@ from roadscan.jobs.tile_fates import Fates
 from roadscan.jobs.tile_files import publish_file, write_product
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.jobs.tile_points import load_tiles
+from roadscan.kernels.cell_figures import median, totals
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.products.base import Tile, TileSummary
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.pyramid import overview_factors, pyramid_of
 from roadscan.tiles.statistics import cells_of
 
 
@@ -150,9 +150,8 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence)
     with task.store.scratch() as folder:
         for wanted in task.products:
             records += write_product(wanted, content, context, key, task.store, folder)
-        factors = overview_factors(cells.cells_per_edge)
         path = folder / "overviews.parquet"
-        write_overviews(path, pyramid_of(cells, factors))
+        write_overviews(path, content.overviews)
         target = f"tiles/overviews/{unit}.parquet"
         records.append(publish_file(task.store, path, target, OVERVIEWS, unit, key))
         path = folder / "cells.parquet"
@@ -165,17 +164,17 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence)
 
 
 def _figures(cells: TileCells, evidence: TileEvidence) -> dict[str, Any]:
-    points = int(cells.count.sum(dtype=np.int64))
-    bright = cells.intensity_mean.astype(np.float64) * cells.count
+    points, light, heights_m = totals(cells.count, cells.intensity_mean, cells.height_robust_m)
+    lone = cells.pass_ids.size > 0 and cells.pass_ids.min() == cells.pass_ids.max()
     return {
-        "points": points,
+        "points": int(points),
         "cells": len(cells),
         "height_min_m": float(cells.height_min_m.min()),
-        "height_mean_m": float(cells.height_robust_m.mean()),
+        "height_mean_m": heights_m / len(cells),
         "height_max_m": float(cells.height_max_m.max()),
-        "height_std_median_m": float(np.median(cells.height_std_m)),
-        "intensity_mean": float(bright.sum() / points),
-        "passes": np.unique(cells.pass_ids).tolist(),
+        "height_std_median_m": median(cells.height_std_m),
+        "intensity_mean": light / points,
+        "passes": [int(cells.pass_ids[0])] if lone else np.unique(cells.pass_ids).tolist(),
         "first_epoch_gps_ns": evidence.first_epoch_gps_ns,
         "last_epoch_gps_ns": evidence.last_epoch_gps_ns,
         "sigma_horizontal_m": _known(evidence.sigma_horizontal_m),

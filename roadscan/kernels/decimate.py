@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.kernels.cell_runs import run_end
 from roadscan.kernels.lanes import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
 from roadscan.kernels.options import inlined, kernel
 
@@ -88,6 +89,19 @@ def slopes_of(heights, corner, edge, side, steps):
 
 
 @kernel
+def _micrometres(height, base, out):
+    for k in range(out.size):
+        above = np.floor((height[k] - base) * 1e6 + 0.5)
+        out[k] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
+
+
+@kernel
+def _light_steps(intensity, out):
+    for k in range(out.size):
+        out[k] = np.int32(intensity[k] * LIGHT_STEPS + 0.5)
+
+
+@kernel
 def fill_strip(column, row, height, intensity, count, start, base, first_row, heights, lights, counts):
     """Lay the cells from `start` on out in a strip, as far as its rows reach.
 
@@ -110,19 +124,14 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, he
     first, last = edge, np.int64(-1)
     i = start
     while i < row.size and row[i] < first_row + rows:
-        run = 1  # cells side by side are copied together
-        while i + run < row.size and row[i + run] == row[i] and column[i + run] == column[i] + run:
-            run += 1
-        first, last = min(first, np.int64(column[i])), max(last, np.int64(column[i]) + run - 1)
-        at = (np.int64(row[i]) - first_row) * edge + column[i]
-        for k in range(run):
-            above = np.floor((height[i + k] - base) * 1e6 + 0.5)
-            flat_heights[at + k] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
-        for k in range(run):
-            flat_lights[at + k] = np.int32(intensity[i + k] * LIGHT_STEPS + 0.5)
-        for k in range(run):
-            flat_counts[at + k] = np.int32(count[i + k])
-        i += run
+        end = run_end(column, row, i, row.size)
+        west, at = np.int64(column[i]), (np.int64(row[i]) - first_row) * edge + np.int64(column[i])
+        to = at + end - i
+        first, last = min(first, west), max(last, west + end - i - 1)
+        _micrometres(height[i:end], base, flat_heights[at:to])
+        _light_steps(intensity[i:end], flat_lights[at:to])
+        flat_counts[at:to] = count[i:end]
+        i = end
     return i, first, last
 
 

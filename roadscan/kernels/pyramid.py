@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.kernels.cell_runs import run_end
 from roadscan.kernels.options import kernel
 
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
@@ -14,8 +15,50 @@ TO_WHOLE = 1.5 * 2.0**52
 
 
 @kernel
+def _add_run(count, height, intensity, base, cells, points, above, light):
+    """Add cells side by side to the sums of their columns."""
+    for i in range(count.size):
+        cells[i] += 1.0
+    for i in range(count.size):
+        points[i] += np.float64(count[i])
+    for i in range(count.size):
+        above[i] += ((height[i] - base) + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT
+    for i in range(count.size):
+        light[i] += (np.float64(intensity[i]) * np.float64(count[i]) + TO_WHOLE) - TO_WHOLE
+
+
+@kernel
+def _fold(line, factor, pixels):
+    """Add `factor` columns to each pixel, and leave zeros. Usual factors are spelled out for the compiler."""
+    if factor == 2:
+        for p in range(pixels.size):
+            pixels[p] += line[2 * p] + line[2 * p + 1]
+    elif factor == 4:
+        for p in range(pixels.size):
+            pixels[p] += (line[4 * p] + line[4 * p + 1]) + (line[4 * p + 2] + line[4 * p + 3])
+    else:
+        for p in range(pixels.size):
+            for j in range(factor):
+                pixels[p] += line[factor * p + j]
+    line[:] = 0.0
+
+
+@kernel
+def _means(cells, points, above, light, base, out_count, out_cells, out_height, out_intensity):
+    """Write pixels side by side that all hold a cell."""
+    for p in range(cells.size):
+        out_cells[p] = np.uint32(cells[p])
+    for p in range(cells.size):
+        out_count[p] = np.uint32(points[p])
+    for p in range(cells.size):
+        out_height[p] = base + above[p] / cells[p]
+    for p in range(cells.size):
+        out_intensity[p] = light[p] / points[p]
+
+
+@kernel
 def reduce_cells(
-    column, row, count, height, intensity, base, factors, edges, starts, pixel_of, sums,
+    column, row, count, height, intensity, base, factors, edges, starts, sums,
     out_column, out_row, out_count, out_cells, out_height, out_intensity, written,
 ):  # fmt: skip
     """Pixels of all levels in one pass over the cells, strip by strip; the sums of a strip feed the next level.
@@ -27,9 +70,8 @@ def reduce_cells(
     base : float64, whole metres near the heights: sums are of heights above it.
     factors : (levels,) int64, ascending, each a multiple of the one before.
     edges, starts : (levels,) int64, pixels along an edge; first place of each level in the outputs.
-    pixel_of : (edge,) uint16, a cell's column or row divided by the first factor.
-    sums : (levels, pixels along an edge of the first, 4) float64, zeros; zeros again at the end.
-        Cells, points, height above `base`, intensity of a strip's pixels.
+    sums : (levels + 1, 4, edge) float64, zeros; zeros again at the end. Cells, points, height above `base`, intensity:
+        first of the columns of a strip, then of the pixels of each level.
     out_column, out_row : (…,) uint16, out; out_count, out_cells : uint32; out_height : float64, m;
         out_intensity : float32.
     written : (levels,) int64, out: pixels of each level.
@@ -37,44 +79,43 @@ def reduce_cells(
     n = row.size
     levels = factors.size
     written[:] = 0
-    first = sums[0]
     i = 0
     while i < n:
-        strip = pixel_of[row[i]]
-        while i < n and pixel_of[row[i]] == strip:
-            pixel = np.int64(pixel_of[column[i]])
-            points = np.float64(count[i])
-            first[pixel, 0] += 1.0
-            first[pixel, 1] += points
-            first[pixel, 2] += ((height[i] - base) + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT
-            first[pixel, 3] += (np.float64(intensity[i]) * points + TO_WHOLE) - TO_WHOLE
-            i += 1
-        line = np.int64(strip)
-        following = np.int64(pixel_of[row[i]]) if i < n else np.int64(-1)
+        strip = row[i] // factors[0]
+        while i < n and row[i] // factors[0] == strip:
+            end = run_end(column, row, i, n)
+            own = slice(np.int64(column[i]), np.int64(column[i]) + end - i)
+            _add_run(
+                count[i:end], height[i:end], intensity[i:end], base,
+                sums[0, 0, own], sums[0, 1, own], sums[0, 2, own], sums[0, 3, own],
+            )  # fmt: skip
+            i = end
+        line, following = np.int64(row[i - 1]), np.int64(row[i]) if i < n else np.int64(-1)
         for level in range(levels):
-            ratio = factors[level + 1] // factors[level] if level + 1 < levels else 1
-            here = sums[level]
-            at = starts[level] + written[level]
-            for pixel in range(edges[level]):
-                cells = here[pixel, 0]
-                if cells == 0.0:
-                    continue
-                points = here[pixel, 1]
-                out_column[at] = pixel
-                out_row[at] = line
-                out_count[at] = np.uint32(points)
-                out_cells[at] = np.uint32(cells)
-                out_height[at] = base + here[pixel, 2] / cells
-                out_intensity[at] = here[pixel, 3] / points
-                at += 1
-                if level + 1 < levels:
-                    parent = pixel // ratio
-                    for k in range(4):
-                        sums[level + 1, parent, k] += here[pixel, k]
-                for k in range(4):
-                    here[pixel, k] = 0.0
-            written[level] = at - starts[level]
-            if following >= 0 and following // ratio == line // ratio:
-                break
+            ratio = factors[level] // factors[level - 1] if level > 0 else factors[0]
+            for k in range(4):
+                _fold(sums[level, k, : ratio * edges[level]], ratio, sums[level + 1, k, : edges[level]])
             line //= ratio
-            following = following // ratio if following >= 0 else following
+            following //= ratio
+            if following == line:
+                break  # more of this line of pixels is to come
+            at = starts[level] + written[level]
+            here, end = sums[level + 1], 0
+            while end < edges[level]:
+                pixel = end
+                while pixel < edges[level] and here[0, pixel] == 0.0:
+                    pixel += 1
+                end = pixel
+                while end < edges[level] and here[0, end] > 0.0:
+                    out_column[at + end - pixel] = end
+                    end += 1
+                to = at + end - pixel
+                out_row[at:to] = line
+                _means(
+                    here[0, pixel:end], here[1, pixel:end], here[2, pixel:end], here[3, pixel:end],
+                    base, out_count[at:to], out_cells[at:to], out_height[at:to], out_intensity[at:to],
+                )  # fmt: skip
+                at = to
+            written[level] = at - starts[level]
+            if level + 1 == levels:
+                sums[levels, :, : edges[level]] = 0.0

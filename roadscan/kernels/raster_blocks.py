@@ -4,11 +4,58 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.kernels.cell_runs import run_end
 from roadscan.kernels.options import kernel
+
+EMPTY_LINE = (0x7F, 0xC0 - 0x7F, 0x100 - 0xC0, 0)
+"""Where the planes of a line of NaN begin; all else in it is 0."""
 
 
 @kernel
-def encode_block(column, values, per_step, step, first, last, west, out, line, whole, shuffled):
+def cut_lines(column, starts, width, cuts):
+    """Find the first cell of each line at or beyond the west of each block of `width` columns.
+
+    Parameters
+    ----------
+    column : (n,) uint16, ascending within a line; starts : (lines + 1,) int64, first cell of each line.
+    cuts : (blocks + 1, lines) int64, out.
+    """
+    for line in range(starts.size - 1):
+        start, end = starts[line], starts[line + 1]
+        cuts[0, line] = start
+        for block in range(1, cuts.shape[0]):
+            low, high = start, end
+            while low < high:
+                middle = (low + high) >> 1
+                if column[middle] < block * width:
+                    low = middle + 1
+                else:
+                    high = middle
+            cuts[block, line] = start = low
+
+
+@kernel
+def round_values(values, per_step, step, rounded):
+    """Round (n,) values of any kind to multiples of `step`; rounded (n,) float32, out."""
+    for k in range(rounded.size):
+        rounded[k] = np.rint(values[k] * per_step) * step
+
+
+@kernel
+def _subtract(bytes_, before, differences):
+    for i in range(differences.size):
+        differences[i] = bytes_[i] - before[i]
+
+
+@kernel
+def _pick(words, shift, plane):
+    """One byte of each word."""
+    for x in range(plane.size):
+        plane[x] = np.uint8((words[x] >> shift) & np.uint32(255))
+
+
+@kernel
+def encode_block(column, row, values, first, last, west, out, line, differences):
     """Write one block of float32 pixels as TIFF's floating-point predictor wants it (TIFF Technical Note 3).
 
     Of each line of pixels the most significant bytes come first, then the next, down to the least; then every
@@ -16,50 +63,40 @@ def encode_block(column, values, per_step, step, first, last, west, out, line, w
 
     Parameters
     ----------
-    column : (n,) uint16, cells of a raster, ascending within a line; values : (n,) of any kind.
-    per_step, step : float64; a pixel is round(value · per_step) · step.
-    first, last : (lines,) int64, the cells of each line of the block, from the north; those before `west` are left
-        out already. `first` moves on to the cells of the block to the east.
+    column, row : (n,) uint16, cells of a raster, sorted by row, column; values : (n,) float32.
+    first, last : (lines,) int64, the first cell of each line of the block, from the north, and the first beyond it.
     west : int, column of the block's first pixel.
     out : (lines · width · 4,) uint8, out.
-    line, whole : (width,) float32 and shuffled : (width · 4,) uint8, scratch.
+    line : (width,) float32 and differences : (width,) uint32, scratch.
 
     Returns
     -------
     int, cells in the block; all other pixels are NaN.
     """
     width = line.size
-    bits = line.view(np.uint32)
-    corner = np.uint64(west)
+    pixels = line.view(np.uint8)
+    by_byte = differences.view(np.uint8)
     filled = 0
+    line[:] = np.nan
     for y in range(first.size):
         start, end = first[y], last[y]
-        while start < end:  # the first cell beyond the block
-            middle = (start + end) >> 1
-            if column[middle] < west + width:
-                start = middle + 1
-            else:
-                end = middle
-        start = first[y]
-        first[y] = end
-        for x in range(width):
-            line[x] = np.nan
-        n = end - start
-        if n:
-            filled += n
-            own, places = values[start:end], column[start:end]
-            for k in range(n):
-                whole[k] = np.rint(own[k] * per_step) * step
-            for k in range(n):
-                line[np.uint64(places[k]) - corner] = whole[k]
-        for plane in range(4):
-            part = shuffled[plane * width : (plane + 1) * width]
-            shift = np.uint32(24 - 8 * plane)
-            for x in range(width):
-                part[x] = np.uint8((bits[x] >> shift) & np.uint32(255))
         coded = out[y * 4 * width : (y + 1) * 4 * width]
-        after, before, rest = shuffled[1:], shuffled[:-1], coded[1:]
-        coded[0] = shuffled[0]
-        for x in range(before.size):
-            rest[x] = after[x] - before[x]
+        n = end - start
+        if n == 0:
+            coded[:] = 0
+            for plane in range(4):
+                coded[plane * width] = EMPTY_LINE[plane]
+            continue
+        filled += n
+        while start < end:
+            following = end if column[end - 1] - column[start] == end - 1 - start else run_end(column, row, start, end)
+            at = np.int64(column[start]) - west
+            line[at : at + following - start] = values[start:following]
+            start = following
+        _subtract(pixels[4:], pixels[:-4], by_byte[4:])
+        for plane in range(4):
+            _pick(differences, np.uint32(24 - 8 * plane), coded[plane * width : (plane + 1) * width])
+            before = pixels[4 * width - 1 - (plane - 1)] if plane > 0 else np.uint8(0)
+            coded[plane * width] = pixels[3 - plane] - before
+        line[np.int64(column[end - n]) - west : np.int64(column[end - 1]) - west + 1] = np.nan
     return filled

@@ -27,7 +27,7 @@ from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
-from roadscan.tiles.pyramid import Level
+from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 
 ENTRY_POINT_GROUP: Final = "roadscan.products"
 """Entry-point group through which a third party's package adds a product."""
@@ -65,6 +65,11 @@ class Tile:
     cells: TileCells
     marked: TilePoints | None = None
     """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
+
+    @functools.cached_property
+    def overviews(self) -> list[Level]:
+        """The cells in larger pixels, ascending; made once for all who want them."""
+        return pyramid_of(self.cells, overview_factors(self.cells.cells_per_edge))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +13,21 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 from pydantic import Field
 from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
-from roadscan.kernels.raster_blocks import encode_block
+from roadscan.kernels.raster_blocks import cut_lines, encode_block, round_values
 from roadscan.model.crs import MapFrame
 from roadscan.model.strict import Strict
 from roadscan.products import raster
 from roadscan.products.base import ProductContext, Tile, TileProduct
+from roadscan.products.packer import Packer
 from roadscan.products.quantities import Quantity, band_of
 from roadscan.products.raster import CellBox
 from roadscan.products.tiff import Page, Tag, check_tiff, digest_item, tiff_parts
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
+from roadscan.tiles.pyramid import Level, pyramid_of
 
 STEPS: Final[dict[Quantity, float]] = {
     "height": 2.0**-15,
@@ -43,7 +42,6 @@ BLOCK: Final = 512
 """Largest edge of a block (pixels)."""
 
 _SMALLEST_OVERVIEW: Final = 32
-_COMPRESSIONS: Final = {"ZSTD": 50000, "DEFLATE": 8}
 
 
 class GeoTiffOptions(Strict):
@@ -67,14 +65,15 @@ class GeoTiff(TileProduct):
     name: ClassVar[str] = "geotiff"
     title: ClassVar[str] = "cells of a tile as a GeoTIFF (height, intensity, count) with overviews, for GIS"
     suffix: ClassVar[str] = ".tif"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     options: ClassVar[type[Strict]] = GeoTiffOptions
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
         """Write the tile's bands; only blocks that hold a cell are made."""
         bands = cast(GeoTiffOptions, options).bands
-        images = [_image(tile.cells, bands, context), *_overviews(tile.cells, bands, context)]
-        pages = [_page(image, bands, number > 0) for number, image in enumerate(images)]
+        images = [_image(tile.cells, bands, context), *_overviews(tile, bands, context)]
+        packer = Packer()
+        pages = [_page(image, bands, number > 0, packer) for number, image in enumerate(images)]
         first = dataclasses.replace(pages[0], tags=(*pages[0].tags, *_description(tile.cells, bands, context)))
         with path.open("wb") as stream:
             stream.writelines(tiff_parts([first, *pages[1:]]))
@@ -100,19 +99,20 @@ def _image(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContex
     sources: dict[Quantity, tuple[npt.NDArray[Any], float]] = {
         "height": (cells.height_robust_m, 1 / unit_m),
         "intensity": (cells.intensity_mean, 1.0),
-        "count": (cells.count.astype(np.float32), 1.0),
+        "count": (cells.count, 1.0),
         "height_std": (cells.height_std_m, 1 / unit_m),
     }
     return _Image(cells.cells_per_edge, cells.column, cells.row, tuple(sources[b] for b in bands))
 
 
-def _overviews(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContext) -> list[_Image]:
-    edge, unit_m = cells.cells_per_edge, context.map.vertical_unit_m
-    factors = [f for f in overview_factors(edge) if edge // f >= _SMALLEST_OVERVIEW]
-    levels = pyramid_of(cells, factors)
+def _overviews(tile: Tile, bands: tuple[Quantity, ...], context: ProductContext) -> list[_Image]:
+    cells, unit_m = tile.cells, context.map.vertical_unit_m
+    edge = cells.cells_per_edge
+    levels = [level for level in tile.overviews if edge // level.factor >= _SMALLEST_OVERVIEW]
     spread = levels
     if "height_std" in bands:
         deviations = cells.height_std_m.astype(np.float64)
+        factors = [level.factor for level in levels]
         spread = pyramid_of(dataclasses.replace(cells, height_robust_m=deviations), factors)
     sources: dict[Quantity, Callable[[Level, Level], tuple[npt.NDArray[Any], float]]] = {
         "height": lambda level, _: (level.height_m, 1 / unit_m),
@@ -126,43 +126,42 @@ def _overviews(cells: TileCells, bands: tuple[Quantity, ...], context: ProductCo
     ]
 
 
-def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool) -> Page:
+def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Packer) -> Page:
     """Encode and compress the blocks of an image, band by band."""
     edge = min(BLOCK, -(-image.edge // 16) * 16)
     across = -(-image.edge // edge)
-    compress = _compressor()
-    starts = np.searchsorted(image.row, np.arange(image.edge + 1, dtype=np.int32)).astype(np.int64)
-    out, shuffled = np.empty(edge * edge * 4, np.uint8), np.empty(edge * 4, np.uint8)
-    line, whole = np.empty((2, edge), np.float32)
+    starts = np.append(np.searchsorted(image.row, np.arange(image.edge, dtype=np.uint16)), len(image.row))
+    out, differences = np.empty(edge * edge * 4, np.uint8), np.empty(edge, np.uint32)
+    line = np.empty(edge, np.float32)
+    cuts = np.empty((across + 1, across * edge), np.int64)
+    cuts[:, image.edge :] = 0
+    cut_lines(image.column, starts, edge, cuts[:, : image.edge])
+    cuts[:, : image.edge] = cuts[:, : image.edge][:, ::-1].copy()  # from the north
+    rounded = np.empty(len(image.row), np.float32)
     blocks: list[Any] = []
     for (values, factor), quantity in zip(image.bands, bands, strict=True):
         step = STEPS[quantity]
+        round_values(values, factor / step, step, rounded)
         for strip in range(across):
-            rows = image.edge - 1 - np.arange(strip * edge, (strip + 1) * edge)
-            first, last = (np.where(rows >= 0, starts[np.maximum(rows, 0) + k], 0) for k in (0, 1))
-            for west in range(0, across * edge, edge):
-                filled = encode_block(
-                    image.column, values, factor / step, step, first, last, west, out, line, whole, shuffled
-                )
-                blocks.append(compress(out) if filled else None)
-    return Page(_layout(image.edge, edge, len(bands), reduced, raster.compression()), blocks)
-
-
-def _compressor() -> Callable[[Any], Any]:
-    if raster.compression() == "ZSTD":
-        codec = pa.Codec("zstd", compression_level=1)
-        return lambda block: codec.compress(block).to_pybytes()  # the codec's buffer is as large as the block
-    return lambda block: zlib.compress(block, 6)
+            own = slice(strip * edge, (strip + 1) * edge)
+            for block in range(across):
+                first, last = cuts[block, own], cuts[block + 1, own]
+                if (first == last).all():
+                    blocks.append(None)
+                    continue
+                encode_block(image.column, image.row, rounded, first, last, block * edge, out, line, differences)
+                blocks.append(packer.pack(out))
+    return Page(_layout(image.edge, edge, len(bands), reduced), blocks)
 
 
 @functools.lru_cache(maxsize=64)
-def _layout(edge: int, block: int, bands: int, reduced: bool, compression: str) -> tuple[Tag, ...]:
+def _layout(edge: int, block: int, bands: int, reduced: bool) -> tuple[Tag, ...]:
     return (
         Tag(254, "I", [1 if reduced else 0]),
         Tag(256, "I", [edge]),
         Tag(257, "I", [edge]),
         Tag(258, "H", [32] * bands),
-        Tag(259, "H", [_COMPRESSIONS[compression]]),
+        Tag(259, "H", [8]),
         Tag(262, "H", [1]),
         Tag(277, "H", [bands]),
         Tag(284, "H", [2]),  # each band in blocks of its own

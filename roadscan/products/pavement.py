@@ -59,6 +59,7 @@ class _Picture(TileProduct):
     """A picture of the part of a tile that holds cells, with a world file beside it."""
 
     suffix: ClassVar[str] = ".png"
+    version: ClassVar[int] = 2
     default: ClassVar[bool] = False
     smooth: ClassVar[bool]
     """True where lines of pixels resemble the line above them."""

@@ -29,7 +29,7 @@ _MOST_VALUES: Final = 1 << 28
 """Of a page, whose size is stated in 32 bits."""
 _VERSION: Final = 2
 _WRITER: Final = "roadscan"
-_INT32, _INT64 = 1, 2
+_INT32, _INT64, _FLOAT, _DOUBLE = 1, 2, 4, 5
 _REQUIRED, _OPTIONAL, _REPEATED = 0, 1, 2
 _CONVERTED_LIST: Final = 3
 _LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10
@@ -40,28 +40,33 @@ _ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.en
 _SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
 
 
-class _Kind(NamedTuple):
+class Kind(NamedTuple):
     """How Parquet holds a type of numbers."""
 
     physical: int
     stored: str
     """NumPy type of a PLAIN value."""
-    bits: int
-    signed: bool
-    converted: int
+    bits: int = 0
+    """Of an integer."""
+    signed: bool = True
+    converted: int = 0
 
     def fields(self) -> dict[int, Value]:
-        """What a schema element says of it."""
+        """What a schema element says of it beside its physical type."""
+        if not self.bits:
+            return {}
         integer = struct({1: i8(self.bits), 2: boolean(self.signed)})
         return {6: i32(self.converted), 10: struct({_LOGICAL_INTEGER: integer})}
 
 
-_KINDS: Final = {
-    pa.uint8(): _Kind(_INT32, "<u4", 8, False, 11),
-    pa.uint16(): _Kind(_INT32, "<u4", 16, False, 12),
-    pa.uint32(): _Kind(_INT32, "<u4", 32, False, 13),
-    pa.int32(): _Kind(_INT32, "<i4", 32, True, 17),
-    pa.int64(): _Kind(_INT64, "<i8", 64, True, 18),
+KINDS: Final = {
+    pa.uint8(): Kind(_INT32, "<u4", 8, False, 11),
+    pa.uint16(): Kind(_INT32, "<u4", 16, False, 12),
+    pa.uint32(): Kind(_INT32, "<u4", 32, False, 13),
+    pa.int32(): Kind(_INT32, "<i4", 32, True, 17),
+    pa.int64(): Kind(_INT64, "<i8", 64, True, 18),
+    pa.float32(): Kind(_FLOAT, "<f4"),
+    pa.float64(): Kind(_DOUBLE, "<f8"),
 }
 _LIST_TYPES: Final = (pa.uint8(), pa.uint16())
 
@@ -71,7 +76,7 @@ def is_list_table(schema: pa.Schema) -> bool:
     lists = [f.type for f in schema if pa.types.is_fixed_size_list(f.type)]
     flat = [f.type for f in schema if not pa.types.is_fixed_size_list(f.type)]
     known = all(t.value_type in _LIST_TYPES and not t.value_field.nullable and t.list_size for t in lists)
-    return bool(lists) and known and all(t in _KINDS for t in flat)
+    return bool(lists) and known and all(t in KINDS and pa.types.is_integer(t) for t in flat)
 
 
 def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
@@ -79,9 +84,9 @@ def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
     longest = max(f.type.list_size for f in rows.schema if pa.types.is_fixed_size_list(f.type))
     step = max(min(group_rows, _MOST_VALUES // longest), 1)
     with path.open("wb") as stream:
-        writer = _Writer(stream)
+        writer = Writer(stream)
         groups = [writer.group(rows.slice(first, step), k) for k, first in enumerate(range(0, rows.num_rows, step))]
-        writer.finish(rows, groups)
+        writer.finish(rows.schema, rows.num_rows, groups)
 
 
 def sealed(footer: bytes) -> bool | None:
@@ -100,41 +105,45 @@ def _with_digits(footer: bytes, at: int, digits: bytes) -> bytes:
     return footer[:at] + digits + footer[at + _SEAL_DIGITS :]
 
 
-class _Writer:
+class Writer:
     """Writes pages one behind the other, and the footer that says where they are."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
-        self._at = stream.write(MAGIC)
+        self._at = self._group = stream.write(MAGIC)
         self._checksum = checksum()
         self._words = np.empty(0, np.uint64)
 
     def group(self, rows: pa.Table, number: int) -> Value:
         """Write a row group; returns its part of the footer."""
-        start = self._at
         columns = [
             self._lists(field, _whole(rows.column(k)))
             if pa.types.is_fixed_size_list(field.type)
             else self._flat(field, _whole(rows.column(k)))
             for k, field in enumerate(rows.schema)
         ]
-        size = self._at - start
-        about = {1: listed(columns), 2: i64(size), 3: i64(rows.num_rows), 5: i64(start), 6: i64(size)}
+        return self.row_group(columns, rows.num_rows, number)
+
+    def row_group(self, columns: list[Value], rows: int, number: int) -> Value:
+        """What the footer says of the row group whose columns were written last."""
+        start, size = self._group, self._at - self._group
+        self._group = self._at
+        about = {1: listed(columns), 2: i64(size), 3: i64(rows), 5: i64(start), 6: i64(size)}
         return struct(about | ({7: i16(number)} if number < 1 << 15 else {}))
 
-    def finish(self, rows: pa.Table, groups: list[Value]) -> None:
+    def finish(self, schema: pa.Schema, rows: int, groups: list[Value]) -> None:
         """Write the footer."""
-        arrow = base64.b64encode(rows.schema.serialize().to_pybytes())
-        own = (rows.schema.metadata or {}).items()
+        arrow = base64.b64encode(schema.serialize().to_pybytes())
+        own = (schema.metadata or {}).items()
         entries = [*own, (b"ARROW:schema", arrow), (_SEAL, b"0" * _SEAL_DIGITS)]
         fields = {
             1: i32(_VERSION),
-            2: listed(list(_elements(rows.schema))),
-            3: i64(rows.num_rows),
+            2: listed(list(_elements(schema))),
+            3: i64(rows),
             4: listed(groups),
             5: listed([struct({1: binary(k), 2: binary(v)}) for k, v in entries]),
             6: binary(_WRITER),
-            7: listed([struct({1: struct({})})] * len(rows.schema)),  # order of values: that of their type
+            7: listed([struct({1: struct({})})] * len(schema)),  # order of values: that of their type
         }
         footer = struct(fields).content
         at = footer.rindex(_SEAL) + len(_SEAL) + 2
@@ -142,15 +151,15 @@ class _Writer:
         self._stream.write(footer + len(footer).to_bytes(4, "little") + MAGIC)
 
     def _flat(self, field: pa.Field, column: pa.Array) -> Value:
-        kind = _KINDS[field.type]
+        kind = KINDS[field.type]
         values = (column.drop_null() if column.null_count else column).to_numpy().astype(kind.stored)
         levels = pages.flat_levels(_valid(field, column))
-        at, size = self._page(levels, values.view(np.uint8), len(column), pages.PLAIN)
+        at, size = self.page(levels, values.view(np.uint8), len(column), pages.PLAIN)
         statistics = {3: i64(column.null_count)}
         if values.size:
             low, high = values.min().tobytes(), values.max().tobytes()
             statistics |= {5: binary(high), 6: binary(low)}
-        return _chunk(kind, (field.name,), pages.PLAIN, len(column), at, size, {12: struct(statistics)})
+        return chunk(kind, (field.name,), pages.PLAIN, len(column), at, size, {12: struct(statistics)})
 
     def _lists(self, field: pa.Field, column: pa.Array) -> Value:
         values = column.flatten().to_numpy()
@@ -159,15 +168,15 @@ class _Writer:
             self._words = np.empty(room_words(values.size), np.uint64)
         packed = self._words.view(np.uint8)[: _ENCODE(values, self._words)]
         count = values.size + column.null_count
-        at, size = self._page(levels, packed, count, pages.DELTA_BINARY_PACKED)
+        at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
         path = (field.name, "list", "element")
-        return _chunk(_KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, at, size, {})
+        return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, at, size, {})
 
-    def _page(self, levels: bytes, values: Any, count: int, encoding: int) -> tuple[int, int]:
-        """Write a page; returns where it starts, and its bytes with the header."""
+    def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
+        """Write a page, of `raw` bytes before it was compressed; returns where it starts, and its whole size."""
         start = self._at
         crc = self._checksum.of(values, zlib.crc32(levels))
-        self._at += self._stream.write(pages.page_header(len(levels) + values.size, crc, count, encoding) + levels)
+        self._at += self._stream.write(pages.page_header(len(levels) + values.size, crc, count, encoding, raw) + levels)
         self._at += self._stream.write(values)
         return start, self._at - start
 
@@ -184,22 +193,33 @@ def _whole(column: pa.ChunkedArray) -> pa.Array:
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
-def _chunk(
-    kind: _Kind, path: tuple[str, ...], encoding: int, count: int, at: int, size: int, more: dict[int, Value]
+def chunk(
+    kind: Kind,
+    path: tuple[str, ...],
+    encoding: int,
+    count: int,
+    at: int,
+    size: int,
+    more: dict[int, Value],
+    *,
+    codec: int = _UNCOMPRESSED,
+    raw: int | None = None,
 ) -> Value:
+    """What the footer says of a column chunk of one page; `raw` are its bytes before it was compressed."""
     start, length = i64(at), i64(size)
-    metadata = _about(kind, path, encoding) | {5: i64(count), 6: length, 7: length, 9: start}
+    before = length if raw is None else i64(raw)
+    metadata = _about(kind, path, encoding, codec) | {5: i64(count), 6: before, 7: length, 9: start}
     return struct({2: start, 3: struct(metadata | more)})
 
 
 @functools.lru_cache(maxsize=64)
-def _about(kind: _Kind, path: tuple[str, ...], encoding: int) -> dict[int, Value]:
+def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict[int, Value]:
     """What all chunks of a column say."""
     return {
         1: i32(kind.physical),
         2: listed([i32(pages.RLE), i32(encoding)]),
         3: listed([binary(name) for name in path]),
-        4: i32(_UNCOMPRESSED),
+        4: i32(codec),
     }
 
 
@@ -209,10 +229,10 @@ def _elements(schema: pa.Schema) -> Iterator[Value]:
     for field in schema:
         own = {3: i32(_OPTIONAL if field.nullable else _REQUIRED), 4: binary(field.name)}
         if not pa.types.is_fixed_size_list(field.type):
-            kind = _KINDS[field.type]
+            kind = KINDS[field.type]
             yield struct({1: i32(kind.physical)} | own | kind.fields())
             continue
-        kind = _KINDS[field.type.value_type]
+        kind = KINDS[field.type.value_type]
         logical = struct({_LOGICAL_LIST: struct({})})
         yield struct(own | {5: i32(1), 6: i32(_CONVERTED_LIST), 10: logical})
         yield struct({3: i32(_REPEATED), 4: binary("list"), 5: i32(1)})

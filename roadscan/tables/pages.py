@@ -1,4 +1,4 @@
-"""Data pages (version 1, not compressed) of whole numbers and of fixed-size lists of them.
+"""Data pages (version 1) of whole numbers and of fixed-size lists of them.
 
 A page is a header, then repetition levels (0 begins a list, 1 goes on with it), then definition levels (how much of
 the value's path is there), then the values. Lists of a fixed size have levels that can be stated without looking at the
@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from roadscan.tables import thrift
 
-PLAIN, RLE, DELTA_BINARY_PACKED = 0, 3, 5
+PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
 _TYPE: Final = thrift.i32(0)
 """Of a data page."""
 _LENGTH_BYTES: Final = 4
@@ -50,13 +50,16 @@ def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> by
     return _section(repetition) + _section(b"".join(_run(n * size, 2) if there else _run(n, 0) for there, n in runs))
 
 
-def page_header(size: int, crc: int, values: int, encoding: int) -> bytes:
-    """Header of a page of `size` bytes and of `values` levels; the CRC-32 is over levels and values."""
-    bytes_both = thrift.i32(size)
+def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None = None) -> bytes:
+    """Header of a page of `size` bytes, `raw` ones before they were compressed, and of `values` levels.
+
+    The CRC-32 is over levels and values as they are stored.
+    """
+    stored = thrift.i32(size)
     fields = {
         1: _TYPE,
-        2: bytes_both,
-        3: bytes_both,
+        2: stored if raw is None else thrift.i32(raw),
+        3: stored,
         4: thrift.i32(crc - (1 << 32) if crc >> 31 else crc),
         5: _about(values, encoding),
     }

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import random
-import signal
 import subprocess
 import sys
 import time
@@ -32,8 +30,12 @@ from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.grid import Bounds
+from tests.conftest import REPOSITORY
 
 from .conftest import Simulated, outputs
+
+LONGEST_S = 5.0
+"""Processor time within which a run is killed: one that has nothing to do takes 2 s, a whole one 9 s."""
 
 
 def assert_same_files(a: Store, b: Store) -> None:
@@ -89,25 +91,22 @@ def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, t
 
 def test_killed_and_resumed_at_random_points(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
-    command = [sys.executable, "-m", "roadscan", "run", str(copy.survey_file), "--workers", "0"]
+    command = [sys.executable, "-m", "tests.jobs.killed_run", "run", str(copy.survey_file), "--workers", "0"]
     chance = random.Random(11)
-    kills = 0
-    for _ in range(40):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
-        try:
-            process.wait(timeout=chance.uniform(1.0, 3.5))
-        except subprocess.TimeoutExpired:
-            os.kill(process.pid, signal.SIGKILL)
-            process.communicate()
-            kills += 1
-            _nothing_half_written(copy.store())
-            continue
-        assert process.communicate()[1] is not None and process.returncode == 0
-        if kills >= 10:
-            break
-        copy.store().remove("manifest/outputs")  # finished too soon: begin again, to be killed ten times in all
-    assert kills >= 10
-    copy.run()
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY) as runs:
+        assert runs.stdin is not None and runs.stdout is not None
+        kills = 0
+        while kills < 10:
+            print(chance.uniform(0.0, LONGEST_S), file=runs.stdin, flush=True)
+            if (ended := runs.stdout.readline().strip()) == "killed":
+                kills += 1
+                _nothing_half_written(copy.store())
+                continue
+            assert ended == "0"
+            copy.store().remove("manifest/outputs")  # finished too soon: begin again, to be killed ten times in all
+        print(1e9, file=runs.stdin, flush=True)
+        assert runs.stdout.readline().strip() == "0"
+        runs.stdin.close()
     assert_same_files(finished.store(), copy.store())
     assert verify_store(copy.store()) == []
 

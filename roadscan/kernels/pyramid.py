@@ -15,25 +15,56 @@ TO_WHOLE = 1.5 * 2.0**52
 
 
 @kernel
-def _add_run(count, height, intensity, base, cells, points, above, light):
-    """Add cells side by side to the sums of their columns."""
-    for i in range(count.size):
-        cells[i] += 1.0
-    for i in range(count.size):
-        points[i] += np.float64(count[i])
-    for i in range(count.size):
-        above[i] += ((height[i] - base) + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT
-    for i in range(count.size):
-        light[i] += (np.float64(intensity[i]) * np.float64(count[i]) + TO_WHOLE) - TO_WHOLE
+def _add_pairs(count, height, intensity, base, cells, points, above, light):
+    """Add two cells side by side to each pixel."""
+    for p in range(cells.size):
+        cells[p] += 2.0
+    for p in range(cells.size):
+        points[p] += np.float64(count[2 * p]) + np.float64(count[2 * p + 1])
+    for p in range(cells.size):
+        west, east = height[2 * p] - base, height[2 * p + 1] - base
+        above[p] += ((west + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT) + ((east + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT)
+    for p in range(cells.size):
+        west = np.float64(intensity[2 * p]) * np.float64(count[2 * p])
+        east = np.float64(intensity[2 * p + 1]) * np.float64(count[2 * p + 1])
+        light[p] += ((west + TO_WHOLE) - TO_WHOLE) + ((east + TO_WHOLE) - TO_WHOLE)
+
+
+@kernel
+def _add_run(first, factor, count, height, intensity, base, sums):
+    """Add cells side by side, from column `first` on, to the sums (4, …) of their pixels."""
+    end, pairs = count.size, 0
+    if factor == 2:
+        start = first & 1
+        pairs = (end - start) >> 1
+        own = slice((first + start) >> 1, ((first + start) >> 1) + pairs)
+        _add_pairs(
+            count[start:],
+            height[start:],
+            intensity[start:],
+            base,
+            sums[0, own],
+            sums[1, own],
+            sums[2, own],
+            sums[3, own],
+        )
+    i = 0
+    while i < end:
+        if pairs > 0 and i == first & 1:
+            i += 2 * pairs
+            continue
+        pixel, points = (first + i) // factor, np.float64(count[i])
+        sums[0, pixel] += 1.0
+        sums[1, pixel] += points
+        sums[2, pixel] += ((height[i] - base) + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT
+        sums[3, pixel] += (np.float64(intensity[i]) * points + TO_WHOLE) - TO_WHOLE
+        i += 1
 
 
 @kernel
 def _fold(line, factor, pixels):
-    """Add `factor` columns to each pixel, and leave zeros. Usual factors are spelled out for the compiler."""
-    if factor == 2:
-        for p in range(pixels.size):
-            pixels[p] += line[2 * p] + line[2 * p + 1]
-    elif factor == 4:
+    """Add `factor` pixels to each of the next level, and leave zeros. The usual four are spelled out."""
+    if factor == 4:
         for p in range(pixels.size):
             pixels[p] += (line[4 * p] + line[4 * p + 1]) + (line[4 * p + 2] + line[4 * p + 3])
     else:
@@ -70,8 +101,8 @@ def reduce_cells(
     base : float64, whole metres near the heights: sums are of heights above it.
     factors : (levels,) int64, ascending, each a multiple of the one before.
     edges, starts : (levels,) int64, pixels along an edge; first place of each level in the outputs.
-    sums : (levels + 1, 4, edge) float64, zeros; zeros again at the end. Cells, points, height above `base`, intensity:
-        first of the columns of a strip, then of the pixels of each level.
+    sums : (levels, 4, pixels along an edge of the first) float64, zeros; zeros again at the end. Cells, points, height
+        above `base`, intensity of a strip's pixels.
     out_column, out_row : (…,) uint16, out; out_count, out_cells : uint32; out_height : float64, m;
         out_intensity : float32.
     written : (levels,) int64, out: pixels of each level.
@@ -79,34 +110,26 @@ def reduce_cells(
     n = row.size
     levels = factors.size
     written[:] = 0
+    west, east = np.full(levels, edges[0]), np.zeros(levels, np.int64)
     i = 0
     while i < n:
         strip = row[i] // factors[0]
         while i < n and row[i] // factors[0] == strip:
-            end = run_end(column, row, i, n)
-            own = slice(np.int64(column[i]), np.int64(column[i]) + end - i)
-            _add_run(
-                count[i:end], height[i:end], intensity[i:end], base,
-                sums[0, 0, own], sums[0, 1, own], sums[0, 2, own], sums[0, 3, own],
-            )  # fmt: skip
+            end, first = run_end(column, row, i, n), np.int64(column[i])
+            _add_run(first, factors[0], count[i:end], height[i:end], intensity[i:end], base, sums[0])
+            west[0] = min(west[0], first // factors[0])
+            east[0] = max(east[0], (first + end - i - 1) // factors[0] + 1)
             i = end
-        line, following = np.int64(row[i - 1]), np.int64(row[i]) if i < n else np.int64(-1)
+        line, following = np.int64(strip), row[i] // factors[0] if i < n else np.int64(-1)
         for level in range(levels):
-            ratio = factors[level] // factors[level - 1] if level > 0 else factors[0]
-            for k in range(4):
-                _fold(sums[level, k, : ratio * edges[level]], ratio, sums[level + 1, k, : edges[level]])
-            line //= ratio
-            following //= ratio
-            if following == line:
-                break  # more of this line of pixels is to come
             at = starts[level] + written[level]
-            here, end = sums[level + 1], 0
-            while end < edges[level]:
+            here, end = sums[level], west[level]
+            while end < east[level]:
                 pixel = end
-                while pixel < edges[level] and here[0, pixel] == 0.0:
+                while pixel < east[level] and here[0, pixel] == 0.0:
                     pixel += 1
                 end = pixel
-                while end < edges[level] and here[0, end] > 0.0:
+                while end < east[level] and here[0, end] > 0.0:
                     out_column[at + end - pixel] = end
                     end += 1
                 to = at + end - pixel
@@ -118,4 +141,16 @@ def reduce_cells(
                 at = to
             written[level] = at - starts[level]
             if level + 1 == levels:
-                sums[levels, :, : edges[level]] = 0.0
+                here[:, west[level] : east[level]] = 0.0
+                west[level], east[level] = edges[0], 0
+                break
+            ratio = factors[level + 1] // factors[level]
+            low, high = west[level] // ratio, -(-east[level] // ratio)
+            for k in range(4):
+                _fold(here[k, ratio * low : ratio * high], ratio, sums[level + 1, k, low:high])
+            west[level + 1], east[level + 1] = min(west[level + 1], low), max(east[level + 1], high)
+            west[level], east[level] = edges[0], 0
+            line //= ratio
+            following //= ratio
+            if following == line:
+                break  # more of this line of pixels is to come

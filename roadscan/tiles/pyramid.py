@@ -91,7 +91,7 @@ def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
     base = float(np.rint(cells.height_robust_m[0])) if len(cells) else 0.0
     reduce_cells(
         cells.column, cells.row, cells.count, cells.height_robust_m, cells.intensity_mean, base,
-        steps, edges, starts, np.zeros((len(factors) + 1, 4, edge)),
+        steps, edges, starts, np.zeros((len(factors), 4, edges[0])),
         column, row, count, covered, height, intensity, written,
     )  # fmt: skip
     levels: list[Level] = []

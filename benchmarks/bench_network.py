@@ -23,7 +23,7 @@ from benchmarks.scheduler import running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.jobs.bundles import Bundle, Ended
-from roadscan.jobs.compute import OnDask
+from roadscan.jobs.compute import OnDask, rare_collections
 from roadscan.jobs.footprints import PRODUCT, FootprintTask, index_footprints
 from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
@@ -70,7 +70,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     regions = max(1, round(size.network_km / size.network_region_km))
     first = Region.of(1000 * size.network_region_km, folder)
     seen, me = _Seen(), psutil.Process()
-    with running_scheduler(workers=2) as (client, scheduler):
+    with running_scheduler(workers=2) as (client, scheduler), rare_collections():
         client.run(_imports)
         _network(first.moved(0, folder / "warm"), client, _Seen()).compact()
         before, warm = me.memory_info().rss, scheduler.rss_bytes()

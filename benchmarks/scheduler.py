@@ -12,9 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import psutil
 from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
+
+from roadscan.jobs.compute import FEW_MESSAGES_KEPT
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]
@@ -78,9 +81,12 @@ def running_scheduler(workers: int) -> Iterator[tuple[Any, Watched]]:
 
 def main() -> None:
     """Run until the standard input ends."""
-    with LocalCluster(
-        n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
-    ) as cluster:
+    with (
+        dask.config.set(FEW_MESSAGES_KEPT),
+        LocalCluster(
+            n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
+        ) as cluster,
+    ):
         cluster.scheduler.add_plugin(Held(cluster.scheduler))
         print(cluster.scheduler_address, flush=True)
         sys.stdin.read()

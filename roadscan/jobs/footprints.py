@@ -1,4 +1,4 @@
-"""Footprints: which raw block touches which tile. One task some data files, about two kilometres at line rate.
+"""Footprints: which raw block touches which tile. One task some data files, about eight kilometres at line rate.
 
 Profiles and returns are not placed for it: bounds (``points/reach.py``) name every tile that a row group may touch.
 Clouds, whose points are placed already, are read.
@@ -34,8 +34,8 @@ from roadscan.tables.writer import write_parquet
 
 PRODUCT = "footprints"
 
-_ROW_GROUPS = 16_384
-"""Row groups that one task bounds: two kilometres of a pair of profilers at line rate."""
+_ROW_GROUPS = 65_536
+"""Row groups that one task bounds: eight kilometres of a pair of profilers at line rate."""
 _CLOUD_GROUPS = 8
 """How many of them cost as much as a row group of a cloud."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
-from roadscan.jobs.compute import Compute
+from roadscan.jobs.compute import Compute, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
@@ -127,7 +127,7 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
     RunError
         at the end, if any unit failed; all others are finished and kept.
     """
-    with run.store.lock():
+    with run.store.lock(), rare_collections():
         for stage in stages:
             started = time.perf_counter()
             run_stage(run, stage)

@@ -6,7 +6,7 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -51,6 +51,9 @@ class OutputRecord(NamedTuple):
         return dict(json.loads(self.detail)) if self.detail else {}
 
 
+_Row: TypeAlias = tuple[str, str, str, str, int, str, str]
+
+
 @dataclass(frozen=True)
 class _Part:
     """A file of records, written once. Parts hold what changed, in the order of their numbers."""
@@ -76,28 +79,29 @@ class Manifest:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._parts: list[_Part] = []
-        self._records: dict[tuple[str, str], OutputRecord] = {}
+        # Bare tuples by product and unit: Python's collector walks over every named one again and again.
+        self._rows: dict[str, dict[str, _Row]] = {}
         for path in store.files(_FOLDER, ".parquet"):
             table = self._read(path)
             self._parts.append(_Part(path, table.num_rows))
-            columns = (table.column(field.name).to_pylist() for field in _SCHEMA)
-            for record in map(OutputRecord, *columns):
-                if record.key:
-                    self._records[(record.product, record.unit)] = record
+            for row in zip(*(table.column(field.name).to_pylist() for field in _SCHEMA), strict=True):
+                if row[2]:
+                    self._keep(row)
                 else:
-                    self._records.pop((record.product, record.unit), None)
+                    self._drop(row[0], row[1])
 
     def get(self, product: str, unit: str) -> OutputRecord | None:
         """Record of an output, None where it was never finished."""
-        return self._records.get((product, unit))
+        row = self._rows.get(product, {}).get(unit)
+        return None if row is None else OutputRecord._make(row)
 
     def of(self, product: str) -> dict[str, OutputRecord]:
         """Records of one product by unit."""
-        return {unit: r for (name, unit), r in self._records.items() if name == product}
+        return {unit: OutputRecord._make(row) for unit, row in self._rows.get(product, {}).items()}
 
     def all(self) -> list[OutputRecord]:
         """All records, by product and unit."""
-        return [self._records[k] for k in sorted(self._records)]
+        return list(map(OutputRecord._make, self._sorted()))
 
     def is_current(self, product: str, unit: str, key: str) -> bool:
         """True if the output has this key and its file is there in its recorded size."""
@@ -111,13 +115,13 @@ class Manifest:
         added = list(records)
         if not added:
             return
-        known = [self.get(r.product, r.unit) for r in added]
+        known = [self._rows.get(r.product, {}).get(r.unit) for r in added]
         for r in added:
-            self._records[(r.product, r.unit)] = r
+            self._keep((*r,))
         self._append(added)
         for old, new in zip(known, added, strict=True):
-            if old is not None and old.path not in ("", new.path):
-                self._store.remove(old.path)
+            if old is not None and old[3] not in ("", new.path):
+                self._store.remove(old[3])
 
     def remove(self, records: Iterable[OutputRecord]) -> None:
         """Forget outputs and remove their files."""
@@ -125,7 +129,7 @@ class Manifest:
         if not gone:
             return
         for r in gone:
-            self._records.pop((r.product, r.unit), None)
+            self._drop(r.product, r.unit)
         self._append([OutputRecord(r.product, r.unit, "", "", 0, "") for r in gone])
         for r in gone:
             if r.path:
@@ -133,14 +137,23 @@ class Manifest:
 
     def forget(self, product: str, units: Iterable[str]) -> None:
         """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
-        known = [u for u in units if self._records.pop((product, u), None) is not None]
+        known = [u for u in units if self._drop(product, u) is not None]
         if known:
             self._append([OutputRecord(product, u, "", "", 0, "") for u in known])
+
+    def _keep(self, row: _Row) -> None:
+        self._rows.setdefault(row[0], {})[row[1]] = row
+
+    def _drop(self, product: str, unit: str) -> _Row | None:
+        return self._rows.get(product, {}).pop(unit, None)
+
+    def _sorted(self) -> list[_Row]:
+        return [own[unit] for _, own in sorted(self._rows.items()) for unit in sorted(own)]
 
     def compact(self) -> None:
         """Bring all parts into one, without what is no more."""
         old, self._parts = self._parts, []
-        self._write(_table(self.all()), old[-1].number + 1 if old else 0)
+        self._write(_table(self._sorted()), old[-1].number + 1 if old else 0)
         for part in old:
             self._store.remove(part.path)
 
@@ -175,8 +188,8 @@ class Manifest:
         self._parts.append(_Part(path, table.num_rows, table if keep else None))
 
 
-def _table(records: Sequence[OutputRecord]) -> pa.Table:
-    columns = list(zip(*records, strict=True)) or [()] * len(_SCHEMA)
+def _table(rows: Sequence[_Row]) -> pa.Table:
+    columns = list(zip(*rows, strict=True)) or [()] * len(_SCHEMA)
     return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, _SCHEMA, strict=True)], schema=_SCHEMA)
 
 

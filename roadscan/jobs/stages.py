@@ -127,7 +127,7 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
     RunError
         at the end, if any unit failed; all others are finished and kept.
     """
-    with run.store.lock(), rare_collections():
+    with run.store.lock():
         for stage in stages:
             started = time.perf_counter()
             run_stage(run, stage)
@@ -138,7 +138,8 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
 def run_stage(run: Run, stage: Stage) -> None:
     """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
     try:
-        stage.run(run)
+        with rare_collections():
+            stage.run(run)
     except RoadscanError as error:
         if not run.failures:
             raise

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.line_access import VECTOR, fetch_line, store_heights
-from roadscan.kernels.options import bare, inlined
+from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.runs import find_runs, sum_up
 
 LANES = 16
@@ -60,14 +60,14 @@ def work_arrays(tiles: int) -> tuple[Any, ...]:
     )
 
 
-@inlined
+@bare_inlined
 def header_of_pass(number):
     """What a pass sets in a header, its bit and its word (uint64)."""
     word, bit = np.uint64(number // PASSES), np.uint64(number % PASSES)
     return (word << np.uint64(WORD_SHIFT)) | (np.uint64(1) << (bit + np.uint64(MARK_SHIFT)))
 
 
-@inlined
+@bare_inlined
 def new_group(heads, bases, chain, free, held, height):
     """Take an element from the stack of free ones, its lines empty; `held` counts those in use."""
     e = free[held[0]]
@@ -79,7 +79,7 @@ def new_group(heads, bases, chain, free, held, height):
     return e
 
 
-@inlined
+@bare_inlined
 def new_line(heads, bases, chain, free, spare, held, height):
     """Take an empty line from the spare ones; where there is none, an element becomes spare lines."""
     if held[1] == 0:
@@ -95,7 +95,7 @@ def new_line(heads, bases, chain, free, spare, held, height):
     return line
 
 
-@inlined
+@bare_inlined
 def line_with_room(own, size, low, high, word, heads, bases, chain):
     """Line of the chain from `own` that takes `size` more heights from `low` to `high`; −1 where none does."""
     line = np.int64(own)
@@ -110,7 +110,7 @@ def line_with_room(own, size, low, high, word, heads, bases, chain):
     return line
 
 
-@inlined
+@bare_inlined
 def longer_chain(own, height, heads, bases, chain, free, spare, held):
     """A new line behind `own`: before the older ones, which are full."""
     line = np.int64(new_line(heads, bases, chain, free, spare, held, height))
@@ -136,7 +136,7 @@ def count_slowly(
         heads[at] = (heads[at] + np.uint64(1) + (shine << np.uint64(LIGHT_SHIFT))) | mark
 
 
-@inlined
+@bare_inlined
 def line_of_run(own, heights, first, end, word, heads, bases, chain, free, spare, held):
     """Line of the cell that begins with `own` with room for a run; −1 where its heights are too far apart for one."""
     low, high = np.int64(heights[first]), np.int64(heights[first])
@@ -249,7 +249,7 @@ def accumulate(
     return counted
 
 
-@inlined
+@bare_inlined
 def note(column, row, epochs, sigma, edge, tile_rows, spans, sigmas):
     """Note epochs and σ of readings with the active tiles that they fall into."""
     west, south, tile = -(1 << 40), -(1 << 40), -1

@@ -22,7 +22,7 @@ from roadscan.kernels.accumulate import (
 from roadscan.kernels.lanes import REACH, statistics_of_8, statistics_of_32, statistics_of_64
 from roadscan.kernels.line_access import fetch_line
 from roadscan.kernels.open_group import open_group
-from roadscan.kernels.options import bare, inlined
+from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.store_group import store_group
 
 AHEAD = 2
@@ -39,7 +39,7 @@ def work_arrays(most: int) -> tuple[Any, ...]:
     return table, *rows, np.zeros((STATISTICS, LANES)), np.empty(most, np.int64)
 
 
-@inlined
+@bare_inlined
 def is_chained(first_line, chain):
     """True if a cell of the group has more than one line."""
     longest = np.int32(-1)
@@ -76,7 +76,7 @@ def find_groups(groups, chain, found):
     return np.int64(count), most
 
 
-@inlined
+@bare_inlined
 def add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks):
     """Heights of the further lines of a group's cells, relative to the base of the cell's first line.
 
@@ -115,7 +115,7 @@ def kth_smallest(heights, n, k):
     return heights[k]
 
 
-@inlined
+@bare_inlined
 def gather_many(first_line, lines, heads, bases, chain, work):
     """All heights of a cell, relative to the base of its first line → work. Returns how many there are."""
     n, line = 0, first_line
@@ -156,7 +156,7 @@ def statistics_of_many(first_line, light, lines, heads, bases, chain, floor, qua
     out[5, lane] = light / n
 
 
-@inlined
+@bare_inlined
 def write_passes(first_line, marks, numbers, heads, chain, written, pass_ids):
     """Ids of the passes of a cell, ascending. Returns the end of what is written."""
     if numbers.size <= PASSES:
@@ -179,7 +179,7 @@ def write_passes(first_line, marks, numbers, heads, chain, written, pass_ids):
     return written
 
 
-@inlined
+@bare_inlined
 def release(element, chain, free, spare, held):
     """Give a group's element and the further lines of its cells back."""
     for lane in range(LANES):

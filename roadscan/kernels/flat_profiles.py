@@ -34,13 +34,13 @@ from roadscan.kernels.georeference import (
     profile_forms,
     tile_and_rest,
 )
-from roadscan.kernels.options import bare, inlined
+from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.poses import find_interval
 
 HALF = np.float32(0.5)
 
 
-@inlined
+@bare_inlined
 def anchored(form, middle, quanta_per_m):
     """A form of ``profile_forms`` about the profile's middle (y, z): anchor in whole quanta, and (p, q, r)."""
     y, z = middle
@@ -53,13 +53,13 @@ def anchored(form, middle, quanta_per_m):
     )
 
 
-@inlined
+@bare_inlined
 def on_plane(plane, y, z):
     """Value of a plane (p, q, r)."""
     return plane[0] + plane[1] * y + plane[2] * z
 
 
-@inlined
+@bare_inlined
 def planes_of(epoch, k, middle, quanta_per_m, limits, poses):
     """Planes of a profile's easting, northing and height, with the lowest and highest height kept above the anchor.
 
@@ -84,14 +84,14 @@ def planes_of(epoch, k, middle, quanta_per_m, limits, poses):
     )
 
 
-@inlined
+@bare_inlined
 def whole_cells(anchor, cell_quanta):
     """Cells up to an anchor (int32), and half a quantum more than what is left of it (float32, exact)."""
     cells = math.floor((anchor + 0.5) / cell_quanta)
     return np.int32(cells), np.float32(anchor - np.int64(cells) * cell_quanta + 0.5)
 
 
-@inlined
+@bare_inlined
 def class_of(raw, height, raw_limits, heights):
     """Class of a reading that a filter leaves out; `height` above the anchor."""
     if raw == 0:
@@ -103,7 +103,7 @@ def class_of(raw, height, raw_limits, heights):
     return CLASS_TOO_LOW if height < heights[0] else CLASS_TOO_HIGH
 
 
-@inlined
+@bare_inlined
 def fate_of(kind):
     """Fate of a class other than kept."""
     if kind == CLASS_NO_RETURN:

@@ -42,7 +42,12 @@ def bare(function: Kernel) -> Kernel:
 
 
 def inlined(function: Kernel) -> Kernel:
-    """Compile a piece of a kernel into its callers; it makes no array."""
+    """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
+    return _compiled(function, forceinline=True)
+
+
+def bare_inlined(function: Kernel) -> Kernel:
+    """Compile a piece of a `bare` kernel into it; it makes no array either."""
     return _compiled(function, forceinline=True, counted=False)
 
 

@@ -8,12 +8,12 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from roadscan.kernels.options import Kernel, bare, compiles_for, inlined
+from roadscan.kernels.options import Kernel, bare, bare_inlined, compiles_for
 
 AT_ONCE = 16
 
 
-@inlined
+@bare_inlined
 def _starts_one_by_one(column, row, first, end, starts, runs):
     """Note the readings from `first` to `end` − 1 whose cell is not that of the reading before."""
     for j in range(first, end):

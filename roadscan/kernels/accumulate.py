@@ -148,23 +148,28 @@ def line_of_run(own, heights, first, end, word, heads, bases, chain, free, spare
     return line
 
 
+@bare_inlined
+def tile_at(x, y, edge, tile_rows):
+    """South-west cell of the tile that holds cell (x, y), and its row in `groups`, −1 where it is not active."""
+    across, along = x // edge, y // edge
+    inside = (along >= 0) & (along < tile_rows.shape[0]) & (across >= 0) & (across < tile_rows.shape[1])
+    return across * edge, along * edge, np.int64(tile_rows[along, across]) if inside else np.int64(-1)
+
+
 @bare
 def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells):
     """First line of each run's cell, −1 outside the active tiles; cells : (n + 1,) int32, out. Takes new groups."""
     lines, heads, bases, chain, free, _, held = pool
     per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
     table = groups.reshape(-1)
-    west, south, tile = -(1 << 40), -(1 << 40), -1
+    west, south, tile = np.int64(-(1 << 40)), np.int64(-(1 << 40)), np.int64(-1)
     for run in range(runs):
         first = np.uint64(starts[run])
         x, y = np.int64(column[first]), np.int64(row[first])
         if not (west <= x < west + edge and south <= y < south + edge):
-            across, along = x // edge, y // edge
-            west, south, tile = across * edge, along * edge, -1
-            if 0 <= along < tile_rows.shape[0] and 0 <= across < tile_rows.shape[1]:
-                tile = tile_rows[along, across]
-                if tile >= 0:
-                    touched[tile] = 1
+            west, south, tile = tile_at(x, y, edge, tile_rows)
+            if tile >= 0:
+                touched[tile] = 1
         if tile < 0:
             cells[run] = -1
             continue
@@ -252,17 +257,14 @@ def accumulate(
 @bare_inlined
 def note(column, row, epochs, sigma, edge, tile_rows, spans, sigmas):
     """Note epochs and σ of readings with the active tiles that they fall into."""
-    west, south, tile = -(1 << 40), -(1 << 40), -1
+    west, south, tile = np.int64(-(1 << 40)), np.int64(-(1 << 40)), np.int64(-1)
     for j in range(column.size):
         x, y = np.int64(column[j]), np.int64(row[j])
         if not (west <= x < west + edge and south <= y < south + edge):
-            across, along = x // edge, y // edge
-            west, south, tile = across * edge, along * edge, -1
-            if 0 <= along < tile_rows.shape[0] and 0 <= across < tile_rows.shape[1]:
-                tile = tile_rows[along, across]
-                if tile >= 0:
-                    sigmas[tile, 0] = max(sigmas[tile, 0], sigma[0])
-                    sigmas[tile, 1] = max(sigmas[tile, 1], sigma[1])
+            west, south, tile = tile_at(x, y, edge, tile_rows)
+            if tile >= 0:
+                sigmas[tile, 0] = max(sigmas[tile, 0], sigma[0])
+                sigmas[tile, 1] = max(sigmas[tile, 1], sigma[1])
         if tile >= 0:
             spans[tile, 0] = min(spans[tile, 0], epochs[j])
             spans[tile, 1] = max(spans[tile, 1], epochs[j])

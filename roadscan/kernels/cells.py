@@ -80,7 +80,8 @@ def find_groups(groups, chain, found):
 def add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks):
     """Heights of the further lines of a group's cells, relative to the base of the cell's first line.
 
-    heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out.
+    heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out; light
+    only serves cells of up to AT_ONCE heights: that of fuller ones may not fit.
     """
     for lane in range(LANES):
         line = np.int64(chain[first_line + lane])
@@ -117,21 +118,23 @@ def kth_smallest(heights, n, k):
 
 @bare_inlined
 def gather_many(first_line, lines, heads, bases, chain, work):
-    """All heights of a cell, relative to the base of its first line → work. Returns how many there are."""
-    n, line = 0, first_line
+    """All heights of a cell, relative to the base of its first line → work. Returns their number and their light."""
+    n, light, line = 0, np.int64(0), first_line
     while line >= 0:
         shift = np.int64(bases[line]) - np.int64(bases[first_line])
-        for k in range(np.int64(heads[line * HEADERS + HEADERS - 1] & np.uint64(COUNTS))):
+        header = heads[line * HEADERS + HEADERS - 1]
+        light += np.int64((header >> np.uint64(LIGHT_SHIFT)) & np.uint64(LIGHTS))
+        for k in range(np.int64(header & np.uint64(COUNTS))):
             work[n] = np.int64(lines[line * LINE + k]) + shift
             n += 1
         line = np.int64(chain[line])
-    return n
+    return n, light
 
 
 @bare
-def statistics_of_many(first_line, light, lines, heads, bases, chain, floor, quantum_m, work, out, lane):
+def statistics_of_many(first_line, lines, heads, bases, chain, floor, quantum_m, work, out, lane):
     """Statistics of one cell of any size, as ``lanes.statistics_of``, into out[:, lane]."""
-    n = gather_many(first_line, lines, heads, bases, chain, work)
+    n, light = gather_many(first_line, lines, heads, bases, chain, work)
     median = kth_smallest(work, n, (n - 1) // 2)
     total, squares, low, high = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(n):
@@ -142,7 +145,8 @@ def statistics_of_many(first_line, light, lines, heads, bases, chain, floor, qua
         work[k] = abs(d)
     reach = np.int64(math.floor(max(REACH * kth_smallest(work, n, (n - 1) // 2), floor)))
     used, near = 0, np.int64(0)
-    for k in range(gather_many(first_line, lines, heads, bases, chain, work)):
+    gather_many(first_line, lines, heads, bases, chain, work)
+    for k in range(n):
         d = work[k] - median
         inside = (d <= reach) & (d >= -reach)
         used += inside
@@ -244,9 +248,7 @@ def finish_cells(
         else:
             for lane in range(LANES):
                 if counts[lane] > 0:
-                    statistics_of_many(
-                        first_line + lane, light[lane], lines, heads, bases, chain, floor, quantum_m, many, out, lane
-                    )
+                    statistics_of_many(first_line + lane, lines, heads, bases, chain, floor, quantum_m, many, out, lane)
         if least > 0 and numbers.size == 1:
             store_group(
                 out, counts, np.uint16((group % per_row) * LANES), np.uint16(group // per_row), np.uint64(cell),

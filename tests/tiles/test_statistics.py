@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -112,3 +114,13 @@ def test_sums_stay_exact_where_heights_spread_over_sixty_metres() -> None:
     zero, ones = np.zeros(n, np.int32), np.ones(n, np.uint16)
     p = TilePoints(TileId(0, 0), zero, zero, heights, np.zeros(n, np.int64), ones, np.ones(n, np.uint8), ones)
     assert cells_of(p, GRID).height_std_m[0] == pytest.approx(heights.std() * 1e-5, rel=1e-6)
+
+
+def test_a_full_cell_keeps_the_intensity_of_its_readings() -> None:
+    n = 40_000  # of 65,535 each: the sum takes more than 31 bits
+    zeros = np.zeros(n, np.int32)
+    p = dataclasses.replace(points(5, n), x_quanta=zeros, y_quanta=zeros, intensity=np.full(n, 65_535, np.uint16))
+    cells = cells_of(p, GRID)
+    assert cells.count.tolist() == [n]
+    assert cells.intensity_mean.tolist() == [65_535.0]
+    assert cells.height_robust_m[0] == pytest.approx(robust(pd.Series(p.height_quanta * 1e-5)), abs=1e-9)

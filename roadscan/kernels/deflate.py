@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from roadscan.kernels.bit_words import appended
 from roadscan.kernels.options import inlined, kernel
 
 SEGMENT = 16
@@ -155,16 +156,6 @@ def _code(counts, entries):
                 following += 1
 
 
-@inlined
-def _appended(word, used, bits, count):
-    """Put `count` bits behind the `used` ones of a word: that word, the next one, its bits, 1 if a word is full."""
-    now = word | (bits << used)
-    total = used + count
-    full = total >> _U(6)
-    following = (bits >> _U(1)) >> (_U(63) - used)
-    return now, following if full else now, total & _U(63), full
-
-
 @kernel
 def _head(entries, words):
     """Write zlib's header and the block's code: (word to go on with, its index, its bits)."""
@@ -196,7 +187,7 @@ def _head(entries, words):
                 | (length >> _U(3))
             )
             count = _U(4)
-        words[to], word, used, full = _appended(word, used, bits, count)
+        words[to], word, used, full = appended(word, used, bits, count)
         to += full
     return word, to, used
 
@@ -228,11 +219,11 @@ def _run(run, entries, words, word, to, used):
         run -= piece
         symbol, more, count = _length_symbol(piece)
         bits, size = _one(entries, symbol)
-        words[to], word, used, full = _appended(word, used, bits | (_U(more) << size), size + _U(count) + _U(1))
+        words[to], word, used, full = appended(word, used, bits | (_U(more) << size), size + _U(count) + _U(1))
         to += full  # the distance of 1 is a single bit, 0
     for _ in range(run):
         bits, size = _one(entries, 0)
-        words[to], word, used, full = _appended(word, used, bits, size)
+        words[to], word, used, full = appended(word, used, bits, size)
         to += full
     return word, to, used
 
@@ -254,14 +245,14 @@ def _pack(data, pixels, literals, entries, pairs, words):
                 eight >>= _U(32)
                 size = _U(one >> np.uint32(_PAIR_BITS))
                 bits = _U(one & _PAIR_MASK) | (_U(two & _PAIR_MASK) << size)
-                words[to], word, used, full = _appended(word, used, bits, size + _U(two >> np.uint32(_PAIR_BITS)))
+                words[to], word, used, full = appended(word, used, bits, size + _U(two >> np.uint32(_PAIR_BITS)))
                 to += full
         following = k + 1
     whole = data.size // SEGMENT * SEGMENT
     word, to, used = _run(whole - SEGMENT * following, entries, words, word, to, used)
     for i in range(whole, data.size + 1):
         bits, size = _one(entries, np.int64(data[i]) if i < data.size else _END)
-        words[to], word, used, full = _appended(word, used, bits, size)
+        words[to], word, used, full = appended(word, used, bits, size)
         to += full
     words[to] = word
     return np.int64(to) * 64 + np.int64(used)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from roadscan.kernels.bit_words import appended
 from roadscan.kernels.options import inlined, kernel
 from roadscan.kernels.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
@@ -205,19 +206,6 @@ def _varint(number):
     return bits, size
 
 
-@inlined
-def _appended(word, used, bits, count):
-    """Put `count` bits behind the `used` ones of a word: (that word, the word to go on with, its bits, 1 if it is new).
-
-    A new word follows where the old one is full.
-    """
-    now = word | (bits << used)
-    total = used + count
-    full = total >> _U(6)
-    following = (bits >> _U(1)) >> (_U(63) - used)
-    return now, following if full else now, total & _U(63), full
-
-
 @kernel
 def _pack(above, widths, words, to, word, used):
     """Write the miniblocks of a block behind what words hold: (word to go on with, its index, its bits)."""
@@ -228,7 +216,7 @@ def _pack(above, widths, words, to, word, used):
             bits = _U(0)
             for i in range(at_once):
                 bits |= _U(above[own + _U(q + i)]) << (width * _U(i))
-            words[to], word, used, full = _appended(word, used, bits, width * _U(at_once))
+            words[to], word, used, full = appended(word, used, bits, width * _U(at_once))
             to += full
     return to, word, used
 
@@ -264,7 +252,7 @@ def encode(values, words):
     first = np.int64(values[0]) if count > 0 else np.int64(0)
     for number in (_U(BLOCK), _U(MINIBLOCKS), _U(count), _U(first << 1)):
         bits, size = _varint(number)
-        words[to], word, used, full = _appended(word, used, bits, size)
+        words[to], word, used, full = appended(word, used, bits, size)
         to += full
     above = np.zeros(BLOCK, np.int32)
     for start in range(1, count, BLOCK):
@@ -277,7 +265,7 @@ def encode(values, words):
             above[i] -= least
         widths = widths_of(above)
         for number, size in (_varint(_U(np.int64((least << 1) ^ (least >> 31)))), (widths, _U(8 * MINIBLOCKS))):
-            words[to], word, used, full = _appended(word, used, number, size)
+            words[to], word, used, full = appended(word, used, number, size)
             to += full
         to, word, used = _pack(above, widths, words, to, word, used)
     words[to] = word

@@ -13,7 +13,9 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from roadscan.kernels import vectors
 from roadscan.kernels.options import Kernel, bare
+from roadscan.kernels.vectors import I32, I64, everywhere, instruction
 
 LANES = 16
 LARGEST = np.int32(2**31 - 1)
@@ -23,8 +25,8 @@ OUTLIER_SIGMAS = 3.0
 REACH = OUTLIER_SIGMAS * MAD_TO_SIGMA
 """Heights count as far from the median as this many times the median distance (MAD)."""
 
-_I32, _I64, _F64 = ir.IntType(32), ir.IntType(64), ir.DoubleType()
-_ROW = ir.VectorType(_I32, LANES)
+_F64 = ir.DoubleType()
+_ROW = ir.VectorType(I32, LANES)
 
 
 def exchanges(n):
@@ -51,34 +53,26 @@ class Lanes:
     def __init__(self, context, builder, signature, arguments):
         self.b = builder
         self.data = [
-            context.make_array(t)(context, builder, a).data if isinstance(t, types.Array) else a
-            for t, a in zip(signature.args, arguments, strict=True)
+            vectors.start(context, builder, signature, arguments, k) if isinstance(kind, types.Array) else arguments[k]
+            for k, kind in enumerate(signature.args)
         ]
 
     def load(self, which, k=0):
         """Row k of an array of int32."""
-        value = self.b.load(self._place(which, k, _ROW))
-        value.align = 4
-        return value
+        return vectors.load(self.b, self._place(which, k, _ROW), _ROW)
 
     def store(self, which, value, k=0):
         """Store a vector; k counts vectors of its type."""
-        self.b.store(value, self._place(which, k, value.type)).align = 4
+        vectors.store(self.b, value, self._place(which, k, value.type))
 
     def _place(self, which, k, kind):
         start = self.b.bitcast(self.data[which], kind.as_pointer())
-        return self.b.gep(start, [ir.Constant(_I64, k)])
+        return self.b.gep(start, [I64(k)])
 
     def all(self, value, kind=_ROW):
         """The same number in every lane."""
         number = float(value) if isinstance(kind.element, ir.DoubleType) else int(value)
         return ir.Constant(kind, [number] * kind.count)
-
-    def spread(self, value, kind):
-        """A scalar in every lane."""
-        one = self.b.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_I32, 0))
-        zeros = ir.Constant(ir.VectorType(_I32, kind.count), [0] * kind.count)
-        return self.b.shuffle_vector(one, ir.Constant(kind, ir.Undefined), zeros)
 
     def least(self, a, b):
         """The smaller of two, lane by lane."""
@@ -106,13 +100,12 @@ class Lanes:
             found = self.b.select(self.b.icmp_signed("==", index, self.all(k)), row, found)
         return found
 
-    def halves(self, row, kind=_I64):
+    def halves(self, row, kind=I64):
         """Both halves of a row of int32 as wider numbers."""
         wide = ir.VectorType(kind, LANES // 2)
         parts = []
         for first in (0, LANES // 2):
-            which = ir.Constant(ir.VectorType(_I32, LANES // 2), list(range(first, first + LANES // 2)))
-            half = self.b.shuffle_vector(row, ir.Constant(_ROW, ir.Undefined), which)
+            half = vectors.picked(self.b, row, row, range(first, first + LANES // 2))
             parts.append(self.b.sitofp(half, wide) if kind is _F64 else self.b.sext(half, wide))
         return parts
 
@@ -160,18 +153,14 @@ def _statistics(n):
     def write(lanes):
         b = lanes.b
         raw, there, centre, away = lanes.medians(n, 0, 1)
-        double, wide = (ir.VectorType(kind, LANES // 2) for kind in (_F64, _I64))
-        floor, root = (
-            b.module.declare_intrinsic(f"llvm.{name}.v8f64", fnty=ir.FunctionType(double, [double]))
-            for name in ("floor", "sqrt")
-        )
-        least, quantum = (lanes.spread(lanes.data[k], double) for k in (4, 5))
+        double, wide = (ir.VectorType(kind, LANES // 2) for kind in (_F64, I64))
+        least, quantum = (everywhere(b, double, lanes.data[k]) for k in (4, 5))
         reach = []
         for half in lanes.halves(away, _F64):
             far = b.fmul(lanes.all(REACH, double), half)
-            far = b.call(floor, [b.select(b.fcmp_ordered(">", far, least), far, least)])
-            reach.append(b.fptosi(far, ir.VectorType(_I32, LANES // 2)))
-        farthest = b.shuffle_vector(reach[0], reach[1], ir.Constant(_ROW, list(range(LANES))))
+            far = instruction(b, "llvm.floor.v8f64", double, b.select(b.fcmp_ordered(">", far, least), far, least))
+            reach.append(b.fptosi(far, ir.VectorType(I32, LANES // 2)))
+        farthest = vectors.picked(b, *reach, range(LANES))
         total, squares, near = ([lanes.all(0, wide)] * 2 for _ in range(3))
         used, low, high = lanes.all(0), lanes.all(LARGEST), lanes.all(-int(LARGEST))
         for row, own in zip(raw, there, strict=True):
@@ -196,7 +185,7 @@ def _statistics(n):
             lanes.store(6, b.fmul(b.sitofp(b.add(medians[k], highs[k]), double), quantum), 6 + k)
             variance = b.fsub(b.fdiv(square, sizes[k]), b.fmul(average, average))
             variance = b.select(b.fcmp_ordered(">", variance, lanes.all(0, double)), variance, lanes.all(0, double))
-            lanes.store(6, b.fmul(b.call(root, [variance]), quantum), 8 + k)
+            lanes.store(6, b.fmul(instruction(b, "llvm.sqrt.v8f64", double, variance), quantum), 8 + k)
             lanes.store(6, b.fdiv(lights[k], sizes[k]), 10 + k)
 
     @intrinsic

@@ -54,6 +54,13 @@ def median_row(a, b, c, d, e, f, g, absent, median, count):
         count[j] = n
 
 
+@inlined
+def row_of_line(values, margin, line, k, i, n):
+    """The k-th cells of the lines through the n cells of row i."""
+    first = margin + line[k, 1]
+    return values[i + margin + line[k, 0], first : first + n]
+
+
 @kernel
 def line_medians(values, margin, line, absent, median, count):
     """Median of the seven cells of a line through each cell.
@@ -65,18 +72,15 @@ def line_medians(values, margin, line, absent, median, count):
     median, count : (rows, columns) float64, out; see :func:`median_row`.
     """
     rows, n = median.shape
-    k0, k1, k2, k3 = margin + line[0, 1], margin + line[1, 1], margin + line[2, 1], margin + line[3, 1]
-    k4, k5, k6 = margin + line[4, 1], margin + line[5, 1], margin + line[6, 1]
     for i in range(rows):
-        r = i + margin
         median_row(
-            values[r + line[0, 0], k0 : k0 + n],
-            values[r + line[1, 0], k1 : k1 + n],
-            values[r + line[2, 0], k2 : k2 + n],
-            values[r + line[3, 0], k3 : k3 + n],
-            values[r + line[4, 0], k4 : k4 + n],
-            values[r + line[5, 0], k5 : k5 + n],
-            values[r + line[6, 0], k6 : k6 + n],
+            row_of_line(values, margin, line, 0, i, n),
+            row_of_line(values, margin, line, 1, i, n),
+            row_of_line(values, margin, line, 2, i, n),
+            row_of_line(values, margin, line, 3, i, n),
+            row_of_line(values, margin, line, 4, i, n),
+            row_of_line(values, margin, line, 5, i, n),
+            row_of_line(values, margin, line, 6, i, n),
             absent,
             median[i],
             count[i],
@@ -104,18 +108,15 @@ def line_means(values, margin, line, absent, mean):
     well. What holds nothing has no mean.
     """
     rows, n = mean.shape
-    k0, k1, k2, k3 = margin + line[0, 1], margin + line[1, 1], margin + line[2, 1], margin + line[3, 1]
-    k4, k5, k6 = margin + line[4, 1], margin + line[5, 1], margin + line[6, 1]
     for i in range(rows):
-        r = i + margin
         mean_row(
-            values[r + line[0, 0], k0 : k0 + n],
-            values[r + line[1, 0], k1 : k1 + n],
-            values[r + line[2, 0], k2 : k2 + n],
-            values[r + line[3, 0], k3 : k3 + n],
-            values[r + line[4, 0], k4 : k4 + n],
-            values[r + line[5, 0], k5 : k5 + n],
-            values[r + line[6, 0], k6 : k6 + n],
+            row_of_line(values, margin, line, 0, i, n),
+            row_of_line(values, margin, line, 1, i, n),
+            row_of_line(values, margin, line, 2, i, n),
+            row_of_line(values, margin, line, 3, i, n),
+            row_of_line(values, margin, line, 4, i, n),
+            row_of_line(values, margin, line, 5, i, n),
+            row_of_line(values, margin, line, 6, i, n),
             absent,
             mean[i],
         )

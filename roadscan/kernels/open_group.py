@@ -14,28 +14,23 @@ from numba.extending import intrinsic
 from roadscan.kernels.accumulate import COUNTS, LANES, LIGHT_SHIFT, LIGHTS, LINE, MARK_SHIFT, SLOTS
 from roadscan.kernels.lanes import generator
 from roadscan.kernels.options import Kernel
+from roadscan.kernels.vectors import I32, I64, load, picked
+
+_LINE = ir.VectorType(I32, LANES)
 
 
 def _turned(b, rows):
     """Transpose 16 rows: to put every row between those of eight rows further on, four times."""
-    kind = ir.VectorType(ir.IntType(32), LANES)
-    halves = [
-        ir.Constant(kind, [n for k in range(8) for n in (first + k, LANES + first + k)]) for first in (0, LANES // 2)
-    ]
+    halves = [[n for k in range(8) for n in (first + k, LANES + first + k)] for first in (0, LANES // 2)]
     for _ in range(4):
-        rows = [b.shuffle_vector(rows[k], rows[k + 8], half) for k in range(8) for half in halves]
+        rows = [picked(b, rows[k], rows[k + 8], half) for k in range(8) for half in halves]
     return rows
 
 
 def _write(lanes):
     b = lanes.b
-    lines = b.bitcast(b.gep(lanes.data[0], [lanes.data[1]]), ir.VectorType(ir.IntType(32), LANES).as_pointer())
-    rows = []
-    for k in range(LANES):
-        row = b.load(b.gep(lines, [ir.Constant(ir.IntType(64), k)]))
-        row.align = 64
-        rows.append(row)
-    rows = _turned(b, rows)
+    first = b.bitcast(b.gep(lanes.data[0], [lanes.data[1]]), _LINE.as_pointer())
+    rows = _turned(b, [load(b, b.gep(first, [I64(k)]), _LINE) for k in range(LANES)])
     sixteen = lanes.all(16)
     for k in range(SLOTS // 2):
         lanes.store(2, b.ashr(b.shl(rows[k], sixteen), sixteen), 2 * k)
@@ -46,15 +41,12 @@ def _write(lanes):
     lanes.store(5, b.lshr(high, lanes.all(MARK_SHIFT - 32)))
 
 
-def _compiled() -> Kernel:
-    @intrinsic
-    def opened(typingctx, lines, first, heights, counts, light, marks):
-        return types.void(lines, first, heights, counts, light, marks), generator(_write)
-
-    return opened
+@intrinsic
+def _opened(typingctx, lines, first, heights, counts, light, marks):
+    return types.void(lines, first, heights, counts, light, marks), generator(_write)
 
 
-def _interpreted(lines, first, heights, counts, light, marks):
+def _opened_by_numpy(lines, first, heights, counts, light, marks):
     own = lines[int(first) : int(first) + LANES * LINE].reshape(LANES, LINE)
     heights[:SLOTS] = own[:, :SLOTS].T
     header = np.ascontiguousarray(own[:, SLOTS:]).view(np.uint64)[:, 0].astype(object)
@@ -63,7 +55,7 @@ def _interpreted(lines, first, heights, counts, light, marks):
     marks[:] = [h >> MARK_SHIFT for h in header]
 
 
-open_group: Kernel = _interpreted if numba.config.DISABLE_JIT else _compiled()
+open_group: Kernel = _opened_by_numpy if numba.config.DISABLE_JIT else _opened
 """open_group(lines, first, heights, counts, light, marks): the lines of a group, see ``kernels.accumulate``.
 
 lines : (m,) int16; first : uint64, where the group begins; heights : (≥ SLOTS, LANES) int32, out, relative to the

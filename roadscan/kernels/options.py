@@ -51,17 +51,6 @@ def bare_inlined(function: Kernel) -> Kernel:
     return _compiled(function, forceinline=True, counted=False)
 
 
-def compiles_for(*features: str) -> bool:
-    """True if kernels are compiled, and for a processor that has all these features (LLVM's names)."""
-    if numba.config.DISABLE_JIT:
-        return False
-    stated = os.environ.get("NUMBA_CPU_FEATURES")
-    if stated is None and "NUMBA_CPU_NAME" in os.environ:
-        return False
-    known = llvmlite.binding.get_host_cpu_features().flatten() if stated is None else stated
-    return {f"+{feature}" for feature in features} <= set(known.split(","))
-
-
 def _compiled(function: Kernel, *, forceinline: bool, counted: bool = True) -> Kernel:
     before = numba.config.CACHE_DIR
     folder = _cache_folder(function.__code__.co_filename)

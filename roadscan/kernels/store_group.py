@@ -8,66 +8,46 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from roadscan.kernels.lanes import LANES, Lanes
+from roadscan.kernels.lanes import LANES, generator
 from roadscan.kernels.options import Kernel
+from roadscan.kernels.vectors import I16, I32, I64, constant, everywhere, load, store
 
-_I16, _I32, _I64, _F32, _F64 = ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType(), ir.DoubleType()
+_SHORTS, _DOUBLES, _FLOATS = (ir.VectorType(kind, LANES) for kind in (I16, ir.DoubleType(), ir.FloatType()))
 _OUT, _COUNTS, _COLUMN, _ROW, _CELL, _WRITTEN, _PASS = range(7)
 
 
-def _write(lanes: Lanes) -> None:
+def _write(lanes):
     b = lanes.b
 
-    def put(which, value):
-        place = b.bitcast(b.gep(lanes.data[which], [lanes.data[_CELL]]), value.type.as_pointer())
-        b.store(value, place).align = 2
+    def put(which, at, value):
+        store(b, value, b.gep(lanes.data[which], [at]))
 
     def counting(kind, first):
         vector = ir.VectorType(kind, LANES)
-        return b.add(lanes.spread(lanes.data[first], vector), ir.Constant(vector, list(range(LANES))))
+        return b.add(everywhere(b, vector, lanes.data[first]), constant(vector, range(LANES)))
 
-    def statistic(k):
-        """Row k of the table of statistics."""
-        place = b.bitcast(lanes.data[_OUT], ir.VectorType(_F64, LANES).as_pointer())
-        value = b.load(b.gep(place, [_I64(k)]))
-        value.align = 8
-        return value
-
-    put(7, counting(_I16, _COLUMN))
-    put(8, lanes.spread(lanes.data[_ROW], ir.VectorType(_I16, LANES)))
-    put(9, lanes.load(_COUNTS))
-    for k in range(4):
-        put(10 + k, statistic(k))
-    for k in range(2):
-        put(14 + k, b.fptrunc(statistic(4 + k), ir.VectorType(_F32, LANES)))
-    put(16, counting(_I32, _WRITTEN))
-    ids = b.bitcast(
-        b.gep(lanes.data[17], [b.sext(lanes.data[_WRITTEN], _I64)]), ir.VectorType(_I16, LANES).as_pointer()
-    )
-    b.store(lanes.spread(lanes.data[_PASS], ir.VectorType(_I16, LANES)), ids).align = 2
+    table = b.bitcast(lanes.data[_OUT], _DOUBLES.as_pointer())
+    statistics = [load(b, b.gep(table, [I64(k)]), _DOUBLES) for k in range(6)]
+    statistics[4:] = [b.fptrunc(row, _FLOATS) for row in statistics[4:]]
+    columns = [counting(I16, _COLUMN), everywhere(b, _SHORTS, lanes.data[_ROW]), lanes.load(_COUNTS), *statistics]
+    for which, value in enumerate([*columns, counting(I32, _WRITTEN)], start=_PASS + 1):
+        put(which, lanes.data[_CELL], value)
+    put(17, b.sext(lanes.data[_WRITTEN], I64), everywhere(b, _SHORTS, lanes.data[_PASS]))
 
 
-def _compiled() -> Kernel:
-    @intrinsic
-    def stored(
-        typingctx, out, counts, first_column, row_number, cell, written, pass_id,
+@intrinsic
+def _stored(
+    typingctx, out, counts, first_column, row_number, cell, written, pass_id,
+    column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
+):  # fmt: skip
+    arguments = (
+        out, counts, first_column, row_number, cell, written, pass_id,
         column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
-    ):  # fmt: skip
-        arguments = (
-            out, counts, first_column, row_number, cell, written, pass_id,
-            column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
-        )  # fmt: skip
-
-        def generate(context, builder, signature, values):
-            _write(Lanes(context, builder, signature, values))
-            return context.get_dummy_value()
-
-        return types.void(*arguments), generate
-
-    return stored
+    )  # fmt: skip
+    return types.void(*arguments), generator(_write)
 
 
-def _interpreted(
+def _stored_by_numpy(
     out, counts, first_column, row_number, cell, written, pass_id,
     column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
 ):  # fmt: skip
@@ -79,7 +59,7 @@ def _interpreted(
     pass_ids[int(written) : int(written) + LANES] = pass_id
 
 
-store_group: Kernel = _interpreted if numba.config.DISABLE_JIT else _compiled()
+store_group: Kernel = _stored_by_numpy if numba.config.DISABLE_JIT else _stored
 """store_group(out, counts, first_column, row_number, cell, written, pass_id, column, …): see ``cells.finish_cells``.
 
 out : (6, 16) float64; counts : (16,) int32; first_column, row_number : uint16; cell : uint64, where the sixteen go in

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inlined, kernel
 
 FITTED, PLANE, LEVEL = 0, 1, 2
 """What a gradient was taken from: the polynomial asked for, a plane, or nothing."""
@@ -36,27 +36,29 @@ def grow(starts, neighbours, ring, first, count, seen, centre):
     return total
 
 
-@kernel
-def is_narrow(x, y, i, ring, count):
-    """Whether points lie so nearly on a line with a vertex that their scatter would pass for the slope across."""
+@inlined
+def offset_squares(x, y, i, ring, count):
+    """Sums of dx², dx · dy and dy² over the offsets from a vertex to a ring."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for k in range(count):
         dx, dy = x[ring[k]] - x[i], y[ring[k]] - y[i]
         xx += dx * dx
         xy += dx * dy
         yy += dy * dy
+    return xx, xy, yy
+
+
+@kernel
+def is_narrow(x, y, i, ring, count):
+    """Whether points lie so nearly on a line with a vertex that their scatter would pass for the slope across."""
+    xx, xy, yy = offset_squares(x, y, i, ring, count)
     return xx * yy - xy * xy < NARROWEST * (xx + yy) ** 2
 
 
 @kernel
 def whitening(x, y, i, ring, count, white):
     """Lower triangular 2 × 2 factor of the mean square of the offsets to a ring; False where they lie on a line."""
-    xx, xy, yy = 0.0, 0.0, 0.0
-    for k in range(count):
-        dx, dy = x[ring[k]] - x[i], y[ring[k]] - y[i]
-        xx += dx * dx
-        xy += dx * dy
-        yy += dy * dy
+    xx, xy, yy = offset_squares(x, y, i, ring, count)
     white[0] = math.sqrt(xx / count)
     if not white[0] > 0.0:
         return False

@@ -7,7 +7,6 @@ The patch is the paper's: 10 m × 3.6 m, 26,310 points, some 275,000 nodes. All 
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import Delaunay
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Figure, thread_seconds
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings, detailed_surface
 from roadscan.surfaces.normals import slopes_at
@@ -23,6 +22,7 @@ from roadscan.surfaces.sites import sites
 from roadscan.surfaces.triangulation import triangulate
 from roadscan.surfaces.window import GridWindow
 from roadscan.tiles.grid import Bounds
+from tests.surfaces.test_detailed import franke
 
 ORIGIN = np.array([431_000.0, 5_400_000.0, 0.0])
 POINTS = 26_310
@@ -50,25 +50,33 @@ def _patch() -> Iterator[Figure]:
     local = points[:, :2] - ORIGIN[:2]
     asked = np.stack([v.ravel() for v in np.meshgrid(*window.nodes_m())], axis=1) - ORIGIN[:2]
     scipy = CloughTocher2DInterpolator(Delaunay(local), points[:, 2])
-    qhull = _cpu_ms(lambda: Delaunay(local))
-    other = _cpu_ms(lambda: scipy(asked))
-    yield Figure("order, duplicates", _cpu_ms(lambda: sites(points)), "ms")
+    qhull = _ms(lambda: Delaunay(local))
+    other = _ms(lambda: scipy(asked))
+    yield Figure("order, duplicates", _ms(lambda: sites(points)), "ms")
     yield Figure(
-        f"triangulation, {POINTS:,} points", _cpu_ms(lambda: triangulate(places, 0.3)), "ms", qhull, "Qhull alone"
+        f"triangulation, {POINTS:,} points",
+        _ms(lambda: triangulate(places, 0.3)),
+        "ms",
+        qhull,
+        "Qhull alone",
     )
-    yield Figure("slopes, cubic", _cpu_ms(lambda: slopes_at(places, mesh, "cubic")), "ms")
-    yield Figure("slopes, quadratic", _cpu_ms(lambda: slopes_at(places, mesh, "quadratic")), "ms")
-    yield Figure("control points", _cpu_ms(lambda: cubic_surface(places, mesh, slopes)), "ms")
+    yield Figure("slopes, cubic", _ms(lambda: slopes_at(places, mesh, "cubic")), "ms")
+    yield Figure("slopes, quadratic", _ms(lambda: slopes_at(places, mesh, "quadratic")), "ms")
+    yield Figure("control points", _ms(lambda: cubic_surface(places, mesh, slopes)), "ms")
     nodes = f"{window.rows * window.columns:,} nodes (bar: a fifth)"
-    yield Figure(f"heights, {nodes}", _cpu_ms(lambda: surface.heights(window)), "ms", other, "SciPy, slopes given")
+    yield Figure(f"heights, {nodes}", _ms(lambda: surface.heights(window)), "ms", other, "SciPy, slopes given")
     yield Figure(
         "control points and heights",
-        _cpu_ms(lambda: cubic_surface(places, mesh, slopes).heights(window)),
+        _ms(lambda: cubic_surface(places, mesh, slopes).heights(window)),
         "ms",
         other,
         "SciPy, slopes given",
     )
-    yield Figure("whole detailed stage (bar: 500)", _cpu_ms(lambda: detailed_surface(points, window, settings)), "ms")
+    yield Figure(
+        "whole detailed stage (bar: 500)",
+        _ms(lambda: detailed_surface(points, window, settings)),
+        "ms",
+    )
 
 
 def _franke(count: int, seeds: int) -> Iterator[Figure]:
@@ -95,22 +103,5 @@ def _franke(count: int, seeds: int) -> Iterator[Figure]:
         )
 
 
-def franke(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Franke (1979)."""
-    return (
-        0.75 * np.exp(-((9 * x - 2) ** 2 + (9 * y - 2) ** 2) / 4)
-        + 0.75 * np.exp(-((9 * x + 1) ** 2) / 49 - (9 * y + 1) / 10)
-        + 0.5 * np.exp(-((9 * x - 7) ** 2 + (9 * y - 3) ** 2) / 4)
-        - 0.2 * np.exp(-((9 * x - 4) ** 2) - (9 * y - 7) ** 2)
-    )
-
-
-def _cpu_ms(function: Callable[[], object], runs: int = 5) -> float:
-    """Shortest CPU time of this thread."""
-    function()
-    times = []
-    for _ in range(runs):
-        started = time.thread_time()
-        function()
-        times.append(time.thread_time() - started)
-    return 1e3 * min(times)
+def _ms(function: Callable[[], object]) -> float:
+    return 1e3 * thread_seconds(function)

@@ -7,8 +7,7 @@ less. The road is 4 m wide, inclined, with noise, loose stones (10 % of the cell
 from __future__ import annotations
 
 import datetime as dt
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,7 @@ import numpy as np
 import rasterio
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Figure, thread_seconds
 from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, Tile, TileSummary
@@ -47,14 +46,14 @@ def _models(cells: TileCells, folder: Path) -> Iterator[Figure]:
     for product, spacing_mm, bar in ((ModelLas(), 100, 25), (ModelLasFine(), 20, 60)):
         options = product.options()
         side = round(spacing_mm / 5)
-        own = _best(lambda side=side: decimate(cells, side, CELL_M))
+        own = thread_seconds(lambda side=side: decimate(cells, side, CELL_M))
         yield Figure(
             f"model {spacing_mm} mm, heights alone", _per_cell(own, cells), "ns/cell",
-            _per_cell(_best(lambda side=side: _by_numpy(cells, side), 1), cells),
+            _per_cell(thread_seconds(lambda side=side: _by_numpy(cells, side), 1), cells),
             "NumPy: the same rule, all squares at once",
         )  # fmt: skip
         path = folder / "model.laz"
-        whole = _best(lambda p=product, o=options, f=path: p.write(tile, o, CONTEXT, f))
+        whole = thread_seconds(lambda p=product, o=options, f=path: p.write(tile, o, CONTEXT, f))
         yield Figure(f"model {spacing_mm} mm, written as LAZ (bar: {bar})", _per_cell(whole, cells), "ns/cell")
         yield Figure(f"model {spacing_mm} mm, file", path.stat().st_size / len(cells), "B/cell")
 
@@ -64,9 +63,9 @@ def _pictures(cells: TileCells, folder: Path) -> Iterator[Figure]:
     for product, make in ((PavementIntensity(), IntensityOptions), (PavementShaded(), ShadedOptions)):
         for kind in ("png", "bmp"):
             path, options = folder / f"picture.{kind}", make(format=kind)
-            spent = _best(lambda p=product, o=options, f=path: p.write(tile, o, CONTEXT, f))
+            spent = thread_seconds(lambda p=product, o=options, f=path: p.write(tile, o, CONTEXT, f))
             total += spent if kind == "png" else 0.0
-            hand = _best(lambda p=product, f=path: _picture_by_hand(cells, p.name, f), 1)
+            hand = thread_seconds(lambda p=product, f=path: _picture_by_hand(cells, p.name, f), 1)
             yield Figure(
                 f"{product.name}, {kind}", _per_cell(spent, cells), "ns/cell", _per_cell(hand, cells),
                 "NumPy and cv2.imwrite",
@@ -82,11 +81,11 @@ def _sheets(folder: Path) -> Iterator[Figure]:
     total = 0.0
     for output in outputs:
         path = folder / output.name
-        spent = _best(lambda o=output, p=path: product.write(o, road.summaries, road, options, CONTEXT, p), 2)
+        spent = thread_seconds(lambda o=output, p=path: product.write(o, road.summaries, road, options, CONTEXT, p), 2)
         total += spent
         hand, against = None, ""
         if output.name.startswith("height_40mm"):
-            hand = _best(lambda o=output: road.by_gdal(o.tiles, folder / "gdal.tif"), 1)
+            hand = thread_seconds(lambda o=output: road.by_gdal(o.tiles, folder / "gdal.tif"), 1)
             against = "GDAL: sparse GeoTIFF, its overviews, its COG driver"
         yield Figure(f"sheet {output.name.rsplit('_', 2)[0]}, 1.1 km of road", spent, "s", hand, against)
     yield Figure("all sheets of 1.1 km of road", total, "s")
@@ -187,14 +186,3 @@ def _picture_by_hand(cells: TileCells, name: str, path: Path) -> None:
 
 def _per_cell(seconds: float, cells: TileCells) -> float:
     return seconds * 1e9 / len(cells)
-
-
-def _best(function: Callable[[], object], runs: int = 5) -> float:
-    """Least processor time of the thread, after a call that is not counted."""
-    function()
-    times = []
-    for _ in range(runs):
-        started = time.thread_time()
-        function()
-        times.append(time.thread_time() - started)
-    return min(times)

@@ -7,7 +7,6 @@ that other work on the machine disturbs them less.
 from __future__ import annotations
 
 import datetime as dt
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import rasterio
 from rasterio.enums import Resampling
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Figure, thread_seconds
 from roadscan.jobs.cell_files import cells_table, overviews_table, write_cells, write_overviews
 from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
@@ -81,17 +80,6 @@ def figures(folder: Path) -> Iterator[Figure]:
         1e3 * thread_seconds(lambda: plain_geotiff(small, context, path, True), 20),
         "rasterio with overviews",
     )
-
-
-def thread_seconds(function: Callable[[], object], runs: int = 5) -> float:
-    """Shortest processor time of `runs` calls, after one that is not counted."""
-    function()
-    times = []
-    for _ in range(runs):
-        started = time.thread_time()
-        function()
-        times.append(time.thread_time() - started)
-    return min(times)
 
 
 def context_of(edge: int) -> ProductContext:

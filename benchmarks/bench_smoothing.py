@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.ndimage import median_filter
 from scipy.sparse.linalg import cg, spsolve
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Figure, thread_seconds
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.smoothing import Smoothing, smooth_surface, steps
 from tests.surfaces.patches import (
@@ -53,18 +53,18 @@ def speed() -> Iterator[Figure]:
     height[:, 400:404] -= 0.01
     height[rng.random(height.shape) < 0.05] = np.nan
     cells = height.size
-    whole = _core_seconds(lambda: smooth_surface(height, config))
-    median = _core_seconds(lambda: median_filter(height, 9), 1)
+    whole = thread_seconds(lambda: smooth_surface(height, config))
+    median = thread_seconds(lambda: median_filter(height, 9), 1)
     against = "scipy.ndimage.median_filter 9 × 9 alone, which knows no holes"
     yield Figure("smoothing, all of it", cells / whole / 1e6, "M cells/s of a core", cells / median / 1e6, against)
     height = height[:400, 200:600]
     cells = height.size
     of = Smoothing.of(height, config)
-    own = _core_seconds(of.minimum)
+    own = thread_seconds(of.minimum)
     started = time.thread_time()
     hessian, aim, start = system(of)
     built = time.thread_time() - started
-    solved = _core_seconds(lambda: cg(hessian, aim, x0=start, rtol=0.0, atol=_left(hessian, aim, start, config)), 1)
+    solved = thread_seconds(lambda: cg(hessian, aim, x0=start, rtol=0.0, atol=_left(hessian, aim, start, config)), 1)
     against = f"scipy.sparse.linalg.cg, matrix ready (it takes {built:.0f} s more)"
     yield Figure(f"minimisation, {steps(config)} steps", cells / own / 1e6, "M cells/s", cells / solved / 1e6, against)
     small = Smoothing.of(height[:100, 150:250], config)
@@ -72,20 +72,11 @@ def speed() -> Iterator[Figure]:
     started = time.thread_time()
     exact = spsolve(hessian.tocsc(), aim).reshape(100, 100)
     direct = time.thread_time() - started
-    own = _core_seconds(small.minimum)
+    own = thread_seconds(small.minimum)
     against = "scipy.sparse.linalg.spsolve, matrix ready"
     yield Figure("minimisation, 100 × 100", 1e4 / own / 1e6, "M cells/s", 1e4 / direct / 1e6, against)
     off = np.nanmax(np.abs(small.minimum() - 560.0 - exact))
     yield Figure("minimisation, greatest distance from the direct solver", float(off * 1e6), "µm")
-
-
-def _core_seconds(function: Callable[[], object], runs: int = 5) -> float:
-    times = []
-    for _ in range(runs + 1 if runs > 1 else 1):
-        started = time.thread_time()
-        function()
-        times.append(time.thread_time() - started)
-    return min(times)
 
 
 def _left(hessian: sparse.csr_array, aim: np.ndarray, start: np.ndarray, config: SurfaceSmoothing) -> float:

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from roadscan.products.base import Product, TileProduct, products
+from roadscan.products.base import Product, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
 from roadscan.tables.schema import TableSchema, schema_names, table_schema
 
@@ -285,7 +285,7 @@ def _made_words(product: Product) -> str:
 
 
 def _files_words(product: Product) -> str:
-    if isinstance(product, TileProduct):
+    if isinstance(product, TileFiles):
         return f"`tiles/{product.name}/COLUMN_ROW{product.suffix}`"
     return f"`products/{product.name}/…`"
 

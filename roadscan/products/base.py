@@ -1,8 +1,8 @@
 """The contract of a product, and the registry that finds products by themselves.
 
 A product is one file in this folder (or one entry point of the group ``roadscan.products``) with one
-subclass of :class:`TileProduct` or :class:`SurveyProduct`. It writes whole files to the path it is given;
-keys, temporary names, checks and the manifest are done for it.
+subclass of :class:`TileProduct`, :class:`SurfaceProduct` or :class:`SurveyProduct`. It writes whole files to the path
+it is given; keys, temporary names, checks and the manifest are done for it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
+from roadscan.surfaces.tile import SurfaceTile
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
@@ -114,8 +115,8 @@ class LoadCells(Protocol):
         """
 
 
-class TileProduct(ABC):
-    """A product of one file a tile, written while the tile's points are in memory."""
+class TileFiles(ABC):
+    """What the two kinds of product with one file a tile share."""
 
     name: ClassVar[str]
     """Name in survey files, and of its folder below ``tiles/``."""
@@ -131,8 +132,6 @@ class TileProduct(ABC):
     """Made where the survey file does not list products."""
     default_cells: ClassVar[Cells] = "any"
     """Made by default only with fine cells (below 2 cm) or only with coarse ones, if it is made by default."""
-    needs_points: ClassVar[bool] = False
-    """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
 
     def suffix_for(self, options: Strict) -> str:
         """File suffix under these settings."""
@@ -151,12 +150,31 @@ class TileProduct(ABC):
         return
 
     @abstractmethod
+    def check(self, path: Path) -> None:
+        """Raise :class:`roadscan.model.errors.StoreError` unless `path` is whole and readable."""
+
+
+class TileProduct(TileFiles):
+    """A product of one file a tile, written while the tile's points are in memory."""
+
+    needs_points: ClassVar[bool] = False
+    """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
+
+    @abstractmethod
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
         """Write the tile's file to `path` (a temporary name on a local disk)."""
 
+
+class SurfaceProduct(TileFiles):
+    """A product of one file a tile, written while the tile's reconstructed surface is in memory.
+
+    It is made in the stage `surfaces`, which the section `[surface]` of the survey file turns on; without that
+    section none is made by default.
+    """
+
     @abstractmethod
-    def check(self, path: Path) -> None:
-        """Raise :class:`roadscan.model.errors.StoreError` unless `path` is whole and readable."""
+    def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's file to `path` (a temporary name on a local disk); some cell of the tile has a height."""
 
 
 class SurveyProduct(ABC):
@@ -194,7 +212,7 @@ class SurveyProduct(ABC):
         """Raise :class:`roadscan.model.errors.StoreError` unless `path` is whole and readable."""
 
 
-Product: TypeAlias = TileProduct | SurveyProduct
+Product: TypeAlias = TileProduct | SurfaceProduct | SurveyProduct
 
 
 def is_default(product: Product, cell_m: float) -> bool:
@@ -211,18 +229,14 @@ def products() -> dict[str, Product]:
     for module_info in pkgutil.iter_modules(package.__path__):
         module = importlib.import_module(f"roadscan.products.{module_info.name}")
         for value in vars(module).values():
-            if (
-                isinstance(value, type)
-                and issubclass(value, TileProduct | SurveyProduct)
-                and value.__module__ == module.__name__
-            ):
+            if isinstance(value, type) and issubclass(value, Product) and value.__module__ == module.__name__:
                 _add(found, value)
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         _add(found, entry.load())
     return dict(sorted(found.items()))
 
 
-def _add(found: dict[str, Product], kind: type[TileProduct | SurveyProduct]) -> None:
+def _add(found: dict[str, Product], kind: type[Product]) -> None:
     if kind.__abstractmethods__:
         return
     if kind.name in found:

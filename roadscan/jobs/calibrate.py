@@ -186,7 +186,7 @@ def outdated_calibrations(plan: SurveyPlan) -> list[str]:
     if not plan.store.exists(MOUNTINGS):
         return []
     by_key: dict[str, dict[str, str]] = {}
-    for row in pq.read_table(pa.BufferReader(plan.store.read_bytes(MOUNTINGS))).to_pylist():
+    for row in plan.store.read_table(MOUNTINGS).to_pylist():
         if row["calibration"]:
             by_key.setdefault(row["calibration"], {})[row["sensor"]] = row["estimated_at"] or ""
     return [
@@ -222,7 +222,7 @@ def _keep(store: Store, rows: list[dict[str, Any]]) -> None:
     schema = table_schema("mountings")
     known: list[dict[str, Any]] = []
     if store.exists(MOUNTINGS):
-        known = pq.read_table(pa.BufferReader(store.read_bytes(MOUNTINGS))).to_pylist()
+        known = store.read_table(MOUNTINGS).to_pylist()
     places = {tuple(row[c] for c in schema.sort) for row in rows}
     kept = [row for row in known if tuple(row[c] for c in schema.sort) not in places]
     ordered = sorted([*kept, *rows], key=lambda row: tuple(row[c] for c in schema.sort))

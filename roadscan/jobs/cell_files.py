@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -97,7 +96,7 @@ def write_overviews(path: Path, levels: Sequence[Level]) -> None:
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
     """Cells of a finished tile; what a ``surface`` leaves out is NaN, and it names no passes."""
-    rows = pq.read_table(io.BytesIO(store.read_bytes(record.path)))
+    rows = store.read_table(record.path)
     n = rows.num_rows
     known: dict[str, Any] = {name: rows.column(name).to_numpy() for name in rows.column_names if name != "passes"}
     for column in table_schema("cells").columns:

@@ -96,7 +96,7 @@ def _residuals(rows: list[dict[str, Any]]) -> Residuals | None:
 
 
 def _read(store: Store, path: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = pq.read_table(pa.BufferReader(store.read_bytes(path))).to_pylist()
+    rows: list[dict[str, Any]] = store.read_table(path).to_pylist()
     return rows
 
 

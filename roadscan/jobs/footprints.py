@@ -6,7 +6,6 @@ Clouds, whose points are placed already, are read.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.compute import Compute
@@ -256,8 +254,9 @@ def load_ranges(
         record = manifest.get(PRODUCT, one.file)
         if record is None or (files is not None and one.file not in files) or _is_apart(record, window):
             continue
-        stream = io.BytesIO(plan.store.read_bytes(record.path))
-        table = pq.read_table(stream, columns=_LOADED, filters=wanted)
+        table = plan.store.read_table(record.path, _LOADED)
+        if wanted is not None:
+            table = table.filter(wanted)
         tables.append(table)
         numbers.append(np.full(table.num_rows, number, np.int32))
     rows = pa.concat_tables(tables)

@@ -267,7 +267,7 @@ def load_corrections(store: Store, run: str) -> Corrections | None:
     """Corrections of a run's trajectory, None where no adjustment wrote any."""
     if not store.exists(CORRECTIONS):
         return None
-    rows = _small_table(store, CORRECTIONS)
+    rows = store.read_table(CORRECTIONS)
     rows = rows.filter(pa.compute.equal(rows.column("run"), run))
     if rows.num_rows == 0:
         return None
@@ -283,16 +283,12 @@ def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounti
     if not store.exists(MOUNTINGS):
         return {}
     found: dict[tuple[str, str], list[tuple[int, Mounting]]] = {}
-    for row in _small_table(store, MOUNTINGS).sort_by("valid_from_gps_ns").to_pylist():
+    for row in store.read_table(MOUNTINGS).sort_by("valid_from_gps_ns").to_pylist():
         rotation = rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
         rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
         lever = (row["lever_forward_m"], row["lever_right_m"], row["lever_down_m"])
         found.setdefault((row["run"], row["sensor"]), []).append((row["valid_from_gps_ns"], Mounting(lever, rows)))
     return found
-
-
-def _small_table(store: Store, path: str) -> pa.Table:
-    return pq.read_table(pa.BufferReader(store.read_bytes(path)))
 
 
 def _charts(frame: MapFrame, trajectory: Trajectory) -> Charts:

@@ -182,7 +182,7 @@ def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | Non
         if record.product in products():
             products()[record.product].check(local)
         elif record.path.endswith(".parquet"):
-            pq.read_table(local, partitioning=None)
+            pq.ParquetFile(local).read(use_threads=False)
     except (RoadscanError, OSError, pa.ArrowInvalid) as error:
         return f"{record.path}: {error}"
     return None

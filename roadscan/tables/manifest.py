@@ -178,7 +178,7 @@ class Manifest:
             self._store.remove(part.path)
 
     def _read(self, path: str) -> pa.Table:
-        return pq.read_table(io.BytesIO(self._store.read_bytes(path)))
+        return self._store.read_table(path)
 
     def _write(self, table: pa.Table, number: int, keep: bool = False) -> None:
         path = f"{_FOLDER}/part-{number:08d}.parquet"

@@ -210,8 +210,10 @@ class TilePlan:
         edge = max(1, round(_SQUARE_M / self.plan.survey.config.tiles.size_m))
         numbers = np.sort(numbers)
         first = self.tiles.first_epoch_gps_ns[numbers]
-        east, north = (part[numbers].astype(np.int64) // edge for part in (self.tiles.column, self.tiles.row))
-        _, square = np.unique((north << 32) + east, return_inverse=True)
+        square = self._squares(numbers, edge)
+        while edge > 1 and int(square.max()) < 4 * workers:
+            edge //= 2
+            square = self._squares(numbers, edge)
         begun = np.full(int(square.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(begun, square, first)
         turn = np.empty(begun.size, np.int64)
@@ -220,6 +222,12 @@ class TilePlan:
         stretch = turn[square] // together
         order = np.lexsort((numbers, first, stretch))
         return np.split(numbers[order], np.flatnonzero(np.diff(stretch[order])) + 1)
+
+    def _squares(self, numbers: npt.NDArray[np.int64], edge: int) -> npt.NDArray[np.intp]:
+        """Number of the square of `edge` by `edge` tiles in which each tile lies."""
+        east, north = (part[numbers].astype(np.int64) // edge for part in (self.tiles.column, self.tiles.row))
+        square: npt.NDArray[np.intp] = np.unique((north << 32) + east, return_inverse=True)[1]
+        return square
 
     def task(self, block: Block) -> TileTask:
         """A task over a block."""

@@ -26,6 +26,7 @@ CASES = (
     ("encoder", "", 70.0, {}),
     ("encoder, poses with errors", "", 70.0, NOISE),
     ("encoder, poses with errors", "", 290.0, NOISE),
+    ("encoder, poses with errors", "", 600.0, NOISE),
 )
 
 

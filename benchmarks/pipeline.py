@@ -48,9 +48,10 @@ def main() -> None:
 
 
 def survey_with(file: Path, wanted: list[str]) -> Survey:
-    """The survey, making those of the wanted products that there are."""
+    """The survey, making those of the wanted products that there are; of a cell its surface is kept (`cell_table`)."""
     made = [name for name in wanted if name in products()]
     values = load_toml(file)
+    values["tiles"]["cell_table"] = "surface"
     return Survey.parse(values | {"products": {"make": made}}, folder=file.resolve().parent, file=file)
 
 

@@ -13,11 +13,11 @@ up is looked up once a run, and the heights of a run are stored as one vector.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
+from roadscan.kernels.georeference import KEPT
 from roadscan.kernels.line_access import VECTOR, fetch_line, store_heights
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.runs import find_runs, sum_up
@@ -254,85 +254,40 @@ def accumulate(
     return counted
 
 
-@bare_inlined
-def note(column, row, epochs, sigma, edge, tile_rows, spans, sigmas):
-    """Note epochs and σ of readings with the active tiles that they fall into."""
-    west, south, tile = np.int64(-(1 << 40)), np.int64(-(1 << 40)), np.int64(-1)
-    for j in range(column.size):
-        x, y = np.int64(column[j]), np.int64(row[j])
-        if not (west <= x < west + edge and south <= y < south + edge):
-            west, south, tile = tile_at(x, y, edge, tile_rows)
-            if tile >= 0:
-                sigmas[tile, 0] = max(sigmas[tile, 0], sigma[0])
-                sigmas[tile, 1] = max(sigmas[tile, 1], sigma[1])
-        if tile >= 0:
-            spans[tile, 0] = min(spans[tile, 0], epochs[j])
-            spans[tile, 1] = max(spans[tile, 1], epochs[j])
-
-
 @bare
-def accumulate_placed(
-    east, north, height, classes, passes, intensity, gain, epochs, intervals, corner, cell_quanta, edge,
-    tile_rows, groups, pool, work, spans, sigmas, interval_sigmas, first,
+def accumulate_cells(
+    column, row, heights, passes, intensity, edge, tile_rows, groups, pool, work, fates, first
 ):  # fmt: skip
-    """Count readings that have their places into the cells of active tiles.
+    """Count readings that know their cells, best in the order of cells.
 
     Parameters
     ----------
-    east, north, height : (n,) float64, whole quanta of the map.
-    classes : (n,) uint8, 0 for readings that are kept.
-    passes : (n,) int32, number of the reading's pass among the accumulator's, −1 where it is in none.
-    intensity : (n,) unsigned; gain : uint32, see :func:`accumulate`; epochs : (n,) int64, GPS ns.
-    intervals : (n,) int32, interval of the trajectory that placed each reading, a row of `interval_sigmas`.
-    corner : (2,) tuple of int64, south-west corner of tile_rows[0, 0] (quanta).
-    cell_quanta, edge, tile_rows, groups, pool : see :func:`accumulate`; work : as :func:`work_arrays` makes them.
-    spans : (a, 2) int64, in/out, first and last epoch of each active tile.
-    sigmas : (a, 2) float64, in/out, largest σ of the poses; interval_sigmas : (k, 2) float64.
+    column, row : (n,) int32; heights : (n + VECTOR,) int32, as in :func:`accumulate`; all in active tiles.
+    passes : (n,) int32, number of the reading's pass among the accumulator's; intensity : (n,) uint16.
+    edge, tile_rows, groups, pool : see :func:`accumulate`; work : as :func:`work_arrays` makes them.
+    fates : (6,) int64, in/out, readings that were kept.
     first : int, reading to begin with.
 
     Returns
     -------
-    done : int, the reading before which the pool ran short of free elements; n at the end.
-    counted : int, readings that fell into active tiles.
+    int, the reading before which the pool ran short of free elements; n at the end.
     """
     free, held = pool[4], pool[6]
-    column, row, heights, starts, sums, cells, touched = work
-    per_cell = 1.0 / cell_quanta
-    counted = 0
+    _, _, _, starts, sums, cells, touched = work
     start = first
-    while start < east.size:
+    while start < column.size:
         if free.size - held[0] < 2 * PIECE:
-            return start, counted
-        end = start
-        while (
-            end < min(start + PIECE, east.size)
-            and passes[end] == passes[start]
-            and (intervals[end] == intervals[start])
-        ):
+            return start
+        end, last = start, min(start + PIECE, column.size)
+        while end < last and passes[end] == passes[start]:
             end += 1
-        n = end - start
-        low, high = np.int64(2**31 - 1), np.int64(-(2**31))
-        for j in range(n):
-            i = start + j
-            wanted = (classes[i] == 0) & (passes[i] >= 0)
-            x = math.floor((east[i] - corner[0] + 0.5) * per_cell)
-            y = math.floor((north[i] - corner[1] + 0.5) * per_cell)
-            # What lies far outside must not come back into the box when it is cut to 32 bits.
-            wanted &= (x > NOWHERE) & (x < -NOWHERE) & (y > NOWHERE) & (y < -NOWHERE)
-            column[j] = np.int32(x) if wanted else np.int32(NOWHERE)
-            row[j] = np.int32(y) if wanted else np.int32(0)
-            heights[j] = np.int32(height[i]) if wanted else np.int32(0)
-            if wanted:
-                low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
-        if low <= high:
-            counted += accumulate(
-                column[:n], row[:n], heights, low, high, intensity[start:end], gain, passes[start], starts, sums,
-                cells, tile_rows, groups, edge, pool, touched,
-            )  # fmt: skip
-            sigma = interval_sigmas[intervals[start]]
-            note(column[:n], row[:n], epochs[start:end], sigma, edge, tile_rows, spans, sigmas)
+        low, high = reach_of(heights[start:end])
+        fates[KEPT] += accumulate(
+            column[start:end], row[start:end], heights[start : end + VECTOR], low, high, intensity[start:end],
+            np.uint32(1), passes[start], starts, sums, cells, tile_rows, groups, edge, pool, touched,
+        )  # fmt: skip
         start = end
-    return start, counted
+    return start
 
 
 @bare

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.kernels import cells as finishing
 from roadscan.kernels.accumulate import LANES, LINE, SLOTS, work_arrays
+from roadscan.kernels.by_cell import order_arrays
 from roadscan.kernels.cells import AHEAD, find_groups, finish_cells
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
@@ -49,6 +50,7 @@ class Pool:
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
         self._columns: list[npt.NDArray[Any]] = []
+        self._order: tuple[npt.NDArray[Any], ...] = order_arrays(0)
         self._make(_FIRST_ELEMENTS)
 
     @property
@@ -94,6 +96,12 @@ class Pool:
             if self._columns[k].size < size:
                 self._columns[k] = np.empty(size * 5 // 4, kind)
         return tuple(array[:size] for array, size in zip(self._columns, sizes, strict=True))
+
+    def order(self, readings: int) -> tuple[npt.NDArray[Any], ...]:
+        """Arrays for so many readings, as ``kernels.by_cell`` takes them; kept for the next ones."""
+        if self._order[0].size < readings:
+            self._order = order_arrays(readings)
+        return self._order
 
     def clear(self) -> None:
         """Take all elements back."""
@@ -147,8 +155,8 @@ class Accumulator:
         self._pool = Pool() if pool is None else pool
         self._unused: list[int] = []
         self._groups = np.empty((0, self._groups_per_tile), np.int32)
-        self._spans = np.empty((0, 2), np.int64)
-        self._sigmas = np.empty((0, 2), np.float64)
+        self.spans = np.empty((0, 2), np.int64)
+        self.sigmas = np.empty((0, 2), np.float64)
         self._work = work_arrays(0)
         self._found = np.empty(self._groups_per_tile + AHEAD, np.int32)
 
@@ -171,7 +179,11 @@ class Accumulator:
                 self._add_rows(max(4, len(self._groups)))
             row = self._unused.pop()
             self.tile_rows[tile.row - self._south, tile.column - self._west] = row
-            self._spans[row], self._sigmas[row] = _NEVER, -1.0
+            self.spans[row], self.sigmas[row] = _NEVER, -1.0
+
+    def order(self, readings: int) -> tuple[Any, ...]:
+        """Arrays in which so many readings are put into the order of their cells: the same ones every time."""
+        return self._pool.order(readings)
 
     def run(self, kernel: Callable[..., int], items: int, elements: int) -> None:
         """Call `kernel` with the pool and the item to begin with until it has done all items.
@@ -181,7 +193,7 @@ class Accumulator:
         done = 0
         while True:
             done = kernel(
-                self.tile_rows, self._groups, self._pool.arrays, self._work, self._spans, self._sigmas, done
+                self.tile_rows, self._groups, self._pool.arrays, self._work, self.spans, self.sigmas, done
             )  # fmt: skip
             if done >= items:
                 return
@@ -200,7 +212,7 @@ class Accumulator:
         if taken == 0:
             return None
         cells = self._cells(tile, self._groups[row], taken, most_lines * SLOTS)
-        (first, last), (horizontal, down) = self._spans[row].tolist(), self._sigmas[row].tolist()
+        (first, last), (horizontal, down) = self.spans[row].tolist(), self.sigmas[row].tolist()
         return cells, TileEvidence(first, last, horizontal, down)
 
     def drop(self) -> None:
@@ -216,8 +228,8 @@ class Accumulator:
     def _add_rows(self, more: int) -> None:
         before = len(self._groups)
         self._groups = np.concatenate([self._groups, np.full((more, self._groups_per_tile), -1, np.int32)])
-        self._spans = np.concatenate([self._spans, np.zeros((more, 2), np.int64)])
-        self._sigmas = np.concatenate([self._sigmas, np.zeros((more, 2))])
+        self.spans = np.concatenate([self.spans, np.zeros((more, 2), np.int64)])
+        self.sigmas = np.concatenate([self.sigmas, np.zeros((more, 2))])
         self._unused += range(before, before + more)
         self._work = work_arrays(before + more)
 

@@ -8,11 +8,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.accumulate import PIECE
+from roadscan.kernels.accumulate import PIECE, accumulate_cells
+from roadscan.kernels.by_cell import into_order
 from roadscan.kernels.flat_profiles import accumulate_profiles
 from roadscan.kernels.georeference import FATES
-from roadscan.kernels.placed_cells import accumulate_mirror, accumulate_returns
-from roadscan.kernels.placing import CHUNK
+from roadscan.kernels.placed_cells import find_mirror, find_returns
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.flat_profiles import FlatProfiles, flat_profiles
 from roadscan.points.place import EIGHT_TO_SIXTEEN_BITS, Placement
@@ -76,32 +76,26 @@ class Counting:
     ) -> None:
         """Count n returns; all arrays are (n,), `passes` as in :meth:`profiles`."""
         for rows, mounting in self.placement.mountings.pieces(pose_epochs_gps_ns):
-            x, y, z = (axis[rows] for axis in xyz_sensor_m)
-            arrays = (
-                epochs_gps_ns[rows],
-                pose_epochs_gps_ns[rows],
-                x,
-                y,
-                z,
-                intensity[rows],
-                _SIXTEEN_BITS,
-                passes[rows],
-            )
-            poses = self.placement.poses(mounting)
-
-            def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
-                done: int = accumulate_returns(
-                    *arrays, poses, self.placement.limits, float(QUANTA_PER_M), *self._cells, tile_rows, groups,  # noqa: B023
-                    pool, work, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
-                )  # fmt: skip
-                return done
-
-            self.accumulator.run(count, arrays[0].size, 2 * (CHUNK + PIECE))
+            poses, order = self.placement.poses(mounting), self.accumulator.order(rows.stop - rows.start)
+            found = find_returns(
+                epochs_gps_ns[rows], pose_epochs_gps_ns[rows], *(axis[rows] for axis in xyz_sensor_m), passes[rows],
+                poses, *self._place, *order[:4], self.fates,
+            )  # fmt: skip
+            self._count(found, order, passes[rows], intensity[rows], _SIXTEEN_BITS)
 
     @property
     def _cells(self) -> tuple[tuple[int, int], int, int]:
         grid = self.accumulator.grid
         return self.accumulator.corner_quanta, grid.cell_quanta, grid.cells_per_edge
+
+    @property
+    def _place(self) -> tuple[Any, ...]:
+        """Limits and cells, active tiles and what is noted of them."""
+        held = self.accumulator
+        return (
+            self.placement.limits, float(QUANTA_PER_M), *self._cells,
+            held.tile_rows, held.spans, held.sigmas, self.placement.interval_sigmas_m,
+        )  # fmt: skip
 
     def _flat(self, flat: FlatProfiles, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
         def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
@@ -118,14 +112,23 @@ class Counting:
         m = geometry.readings
         readings = np.arange(epochs.size * m)
         own_epochs = geometry.reading_epochs(epochs[readings // m], readings % m)
-        scale = (geometry.range_offset_m, geometry.range_step_m)
+        order = self.accumulator.order(own_epochs.size)
+        found = find_mirror(
+            epochs, own_epochs, raw, passes, *geometry.rays(), (geometry.range_offset_m, geometry.range_step_m),
+            geometry.reading_period_ns, poses, *self._place, *order[:4], self.fates,
+        )  # fmt: skip
+        self._count(found, order, passes, bright.reshape(-1), _EIGHT_BITS)
 
-        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
-            done: int = accumulate_mirror(
-                epochs, own_epochs, raw, bright.reshape(-1), _EIGHT_BITS, passes, *geometry.rays(), scale,
-                geometry.reading_period_ns, poses, self.placement.limits, float(QUANTA_PER_M), *self._cells,
-                tile_rows, groups, pool, work, spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
+    def _count(self, found: int, order: Any, passes: Int32, intensity: Any, gain: np.uint32) -> None:
+        """Count readings that were found, in the order of their cells."""
+        into_order(found, order, passes, intensity, gain)
+        column, row, heights, of_pass, bright = order[7:]
+
+        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
+            done: int = accumulate_cells(
+                column[:found], row[:found], heights, of_pass, bright,
+                self.accumulator.grid.cells_per_edge, tile_rows, groups, pool, work, self.fates, first,
             )  # fmt: skip
             return done
 
-        self.accumulator.run(count, epochs.size, 2 * (max(CHUNK, m) + PIECE))
+        self.accumulator.run(count, found, 2 * PIECE)

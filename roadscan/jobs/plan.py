@@ -21,6 +21,7 @@ from roadscan.jobs.readings import (
     TrajectorySource,
     load_mountings,
 )
+from roadscan.jobs.road import check_road, road_of
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import LanePass, RunId
@@ -144,9 +145,10 @@ def _sources(
             )
             source = ReadingSource(
                 record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
-                *limits, key, clock,
+                *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal),
             )  # fmt: skip
             found.append((source, files))
+    check_road(survey.config.segmentation, [source for source, _ in found])
     return found
 
 

@@ -17,6 +17,7 @@ from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting, Mountings
+from roadscan.model.segmentation import RoadSegmentation
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
@@ -31,6 +32,8 @@ from roadscan.points.place import (
     place_cloud,
 )
 from roadscan.points.readings import ScanGeometry
+from roadscan.points.road_profiles import RoadFinder
+from roadscan.points.turns import TICK_NS, WINDOW_NS
 from roadscan.tables.logs import DataFile
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -72,6 +75,9 @@ class ReadingSource:
     """Hash of all that places the readings: poses, corrections, mounting, clock, range limits, map, grid, code."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
+    road: RoadSegmentation | None = None
+    """How the road is told in profiles, so that nothing else counts; None where all readings do. Not in `key`: it
+    belongs to the keys of tiles."""
 
     def spans(self, ingested: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
         """First and last epochs (GPS ns) on time, of spans of ingested epochs."""
@@ -219,7 +225,10 @@ class Placer:
     def _placement(self, source: ReadingSource, spans: list[tuple[int, int]]) -> Placement:
         if source.trajectory is None:
             raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
-        trajectory = load_trajectory(self._store, source.trajectory, spans, self._ground.max_gap_s)
+        wide = WINDOW_NS + TICK_NS if source.road is not None and source.road.turns is not None else 0
+        around = [(first - wide, last + wide) for first, last in spans]
+        trajectory = load_trajectory(self._store, source.trajectory, around, self._ground.max_gap_s)
+        limits = source.range_min_m, source.range_max_m
         return Placement(
             trajectory=trajectory,
             charts=_charts(self._ground.map, trajectory),
@@ -228,6 +237,7 @@ class Placer:
             range_max_m=source.range_max_m,
             heights=self._ground.heights,
             tile_quanta=self._ground.grid.size_quanta,
+            road=None if source.road is None else RoadFinder(source.road, trajectory, source.mountings, *limits),
         )
 
 

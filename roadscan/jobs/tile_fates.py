@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.georeference import FATES, KEPT, OUTSIDE
+from roadscan.kernels.georeference import KEPT, OUTSIDE
 from roadscan.model.ids import TileId
-from roadscan.points.place import FATE_NAMES
+from roadscan.points.place import COUNTED_FATES, FATE_NAMES
 from roadscan.tables.manifest import OutputRecord
 
 
@@ -19,10 +19,10 @@ class Fates:
     """Readings by fate of the row groups of a task, by the tile that tells them."""
 
     def __init__(self) -> None:
-        self._counts: dict[TileId, npt.NDArray[np.int64]] = defaultdict(lambda: np.zeros(FATES, np.int64))
+        self._counts: dict[TileId, npt.NDArray[np.int64]] = defaultdict(lambda: np.zeros(COUNTED_FATES, np.int64))
 
     def add(self, tile: TileId, fates: npt.NDArray[np.int64]) -> None:
-        """Count (6,) readings by fate; those that were placed outside the task's tiles are kept ones, too."""
+        """Count (11,) readings by fate; those that were placed outside the task's tiles are kept ones, too."""
         self._counts[tile] += fates
 
     def of(self, tile: TileId) -> dict[str, int]:
@@ -32,7 +32,7 @@ class Fates:
         counts = self._counts[tile].copy()
         counts[KEPT] += counts[OUTSIDE]
         counts[OUTSIDE] = 0
-        return {name: int(n) for name, n in zip(FATE_NAMES[:FATES], counts, strict=True) if n}
+        return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
 
 
 def told(records: Iterable[OutputRecord]) -> dict[str, int]:

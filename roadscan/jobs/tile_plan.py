@@ -15,6 +15,7 @@ from roadscan.jobs.fingerprint import key_of, keys_of
 from roadscan.jobs.footprints import FootprintRanges
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, RawSlice
+from roadscan.jobs.road import road_key
 from roadscan.jobs.row_groups import GroupsByTile
 from roadscan.jobs.tile_files import WantedProduct
 from roadscan.model.ids import LanePass, TileId
@@ -146,7 +147,10 @@ def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
     starts = np.flatnonzero(is_first)
     ends = np.append(starts[1:], order.size)[: starts.size]
     digests = {one.path: one.digest for _, files in plan.sources for one in files}
-    names = np.array([key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run)) for s in f.slices], "S16")
+    names = np.array(
+        [key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run), *road_key(s.source)) for s in f.slices],
+        "S16",
+    )
     content = np.empty(order.size, dtype=[("name", "S16"), ("first", "<i4"), ("last", "<i4")])
     content["name"] = names[f.slice_index[order]]
     content["first"], content["last"] = f.first_group[order], f.last_group[order]

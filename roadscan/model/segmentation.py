@@ -1,4 +1,4 @@
-"""Settings of the profile segmentation (``roadscan.points.segmentation`` says what they do)."""
+"""Settings of what tells road readings from others (``roadscan.points.segmentation``, ``.range_filter``)."""
 
 from __future__ import annotations
 
@@ -36,3 +36,30 @@ class SegmentationConfig(Strict):
     """Fewest readings that it is fitted to."""
     bridge_m: float = Field(default=1.5, gt=0.0)
     """Widest gap that the road is taken to go on behind (m): behind poles, across potholes."""
+
+
+class RangeFilter(Strict):
+    """Settings of the range filter for turns."""
+
+    base_m: float = Field(default=1.0, gt=0.0)
+    """Path over which the turn is measured (m)."""
+    radius_max_m: float = Field(default=100.0, gt=0.0)
+    """A wider turn is none: no scanner reads the road that far (m)."""
+
+
+class RoadSegmentation(Strict):
+    """Profiles are segmented, and only readings that hit the road count in cells, rasters and figures.
+
+    Nothing is deleted: every other reading keeps its class, is counted by it (`roadscan status`) and listed by
+    `roadscan classes`; `filters.keep_marked` carries it into the LAS files. An empty table switches it on.
+    """
+
+    sensors: list[str] | None = Field(default=None, min_length=1)
+    """Sensors of the rig whose profiles are segmented; left out, all those of scans whose profiles lie across the road
+    and look down: less than 60° between the profile's normal and the driving direction, and between the sensor's z and
+    straight down."""
+    profiles: SegmentationConfig = SegmentationConfig()
+    """How profiles are segmented."""
+    turns: RangeFilter | None = None
+    """Switches the range filter for turns on, an empty table with its defaults: on the inner side, readings beyond the
+    crossing of successive profiles are `overlapping`. Left out, all of them count."""

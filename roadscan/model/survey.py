@@ -15,6 +15,7 @@ from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Rig, Sensor
+from roadscan.model.segmentation import RoadSegmentation
 from roadscan.model.smoothing import SmootherConfig, SplineConfig
 from roadscan.model.strict import Strict, load_toml
 
@@ -238,7 +239,8 @@ class FilterConfig(Strict):
     Census Bureau aims at 7.6 m in 95 % of cases for TIGER/Line)."""
     keep_marked: bool = False
     """Keep the points that a filter leaves out in the point files (LAS without `spacing_m`), withheld and marked by
-    class: 7 too low, 18 too high, 64 nearer and 65 farther than the sensor's range limits, 66 off the centre lines.
+    class: 7 too low, 18 too high, 64 nearer and 65 farther than the sensor's range limits, 66 off the centre lines;
+    of `[segmentation]` 67 above the surface, 68 scattered, 69 grazing, 70 off the carriageway, 71 overlapping.
     Cells, rasters and figures never use them; a tile that holds no other point gets no files."""
     centre_line_options: dict[str, Any] = {}
     """Settings of the layer (`roadscan formats road_lines`): its name, attributes, units, widths by class."""
@@ -313,6 +315,8 @@ class SurveyConfig(Strict):
     """Poses."""
     filters: FilterConfig = FilterConfig()
     """Filters of points."""
+    segmentation: RoadSegmentation | None = None
+    """Left out, all readings of profiles count; with it, even as an empty table, only those that hit the road."""
     tiles: TileConfig = TileConfig()
     """Tiles and cells."""
     products: ProductConfig = ProductConfig()
@@ -358,6 +362,14 @@ class Survey:
                         expected="a sensor of the rig: " + (", ".join(rig.sensors) or "it has none"),
                         file=file,
                     )
+        chosen = (config.segmentation.sensors or []) if config.segmentation is not None else []
+        for name in chosen:
+            if name not in rig.sensors:
+                raise ConfigError(
+                    f"segmentation.sensors names the unknown sensor '{name}'{nearest(name, rig.sensors)}",
+                    expected="a sensor of the rig: " + (", ".join(rig.sensors) or "it has none"),
+                    file=file,
+                )
         return cls(config, rig, folder)
 
     @property

@@ -29,6 +29,8 @@ OUTSIDE_PASS: Final = 7
 OFF_CENTRE_LINE: Final = 8
 OVERLAPPING: Final = 13
 """Beyond the crossing of successive profiles in a turn."""
+NOT_ROAD: Final = (CLASS_ABOVE, CLASS_SCATTERED, CLASS_GRAZING, CLASS_OFF_ROAD, OVERLAPPING)
+"""Classes of the profile segmentation and of the range filter for turns."""
 
 READING_CLASSES: Final[dict[int, str]] = {
     CLASS_KEPT: "kept",
@@ -47,8 +49,8 @@ READING_CLASSES: Final[dict[int, str]] = {
     OVERLAPPING: "overlapping",
 }
 """Name of each class of readings; the last five are those of the profile segmentation and of the range filter for
-turns. Where a reading fails several tests, the first of this order counts, but that
-range comes before pose."""
+turns. Where a reading fails several tests, the first of this order counts, but that range comes before pose, and
+segmentation and turns before heights."""
 
 LAS_CLASSES: Final = np.zeros(256, dtype=np.uint8)
 """Class in LAS (ASPRS LAS 1.4 R15, table 17) of points that are kept marked, by class of the reading: 7 low noise and

@@ -18,8 +18,6 @@ s²/2R = 5 µm (R the Earth's radius), and a 32-bit float resolves 0.6 µm."""
 EVERY_RAW_RANGE: Final = (np.uint16(1), np.uint16(65_535))
 """All raw ranges that are returns."""
 
-_RAWS: Final = np.arange(1 << 16)
-
 
 @dataclass(frozen=True)
 class FlatProfiles:
@@ -40,11 +38,10 @@ def flat_profiles(geometry: ScanGeometry, range_min_m: float, range_max_m: float
     """Flat profiles of a geometry between range limits; None where they have to be placed reading by reading."""
     if geometry.reading_period_ns > 0.0:
         return None
-    every = geometry.range_offset_m + geometry.range_step_m * _RAWS
-    kept = np.flatnonzero((every >= range_min_m) & (every <= range_max_m) & (_RAWS > 0))
-    low, high = (int(kept[0]), int(kept[-1])) if kept.size else (1, 0)
+    low, high = geometry.raw_limits(range_min_m, range_max_m)
     origins, directions = geometry.rays()
-    ends = np.concatenate([(origins + every[raw] * directions)[:, 1:] for raw in (low, high)])
+    reach_m = [geometry.range_offset_m + geometry.range_step_m * raw for raw in (low, high)]
+    ends = np.concatenate([(origins + far_m * directions)[:, 1:] for far_m in reach_m])
     middle = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     if np.hypot(*(ends - middle).T).max() > REACH_M:
         return None

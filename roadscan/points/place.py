@@ -20,10 +20,11 @@ from roadscan.model.ids import LanePass
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
-from roadscan.points.classes import KEPT, TOO_HIGH, TOO_LOW
+from roadscan.points.classes import KEPT, NOT_ROAD, READING_CLASSES, TOO_HIGH, TOO_LOW
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.flat_profiles import EVERY_RAW_RANGE, flat_profiles
 from roadscan.points.readings import ScanGeometry
+from roadscan.points.road_profiles import RoadFinder, RoadProfiles
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -41,8 +42,13 @@ EXTRA_COLUMNS: Final = (
     "red", "green", "blue",
 )  # fmt: skip
 
-FATE_NAMES: Final = ("kept", "no_pose", "range", "height", "outside", "no_return", "outside_pass", "centre_line")
-"""What can become of a reading; the first six in the kernels' order."""
+FATE_NAMES: Final = (
+    "kept", "no_pose", "range", "height", "outside", "no_return", *(READING_CLASSES[k] for k in NOT_ROAD),
+    "outside_pass", "centre_line",
+)  # fmt: skip
+"""What can become of a reading; the first six in the kernels' order, then what segmentation says it is."""
+COUNTED_FATES: Final = FATES + len(NOT_ROAD)
+"""So many of them are counted, beginning with the first."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,7 @@ class Placed:
     intensity: npt.NDArray[np.uint16]
     classification: npt.NDArray[np.uint8]
     fates: Int64
-    """(6,) counts of readings by fate."""
+    """(11,) counts of readings by fate (``FATE_NAMES``); of clouds the first six."""
     classes: UInt8 | None = None
     """(n,) class of each point's reading, where readings that a filter leaves out were asked for too."""
     extra: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
@@ -109,6 +115,8 @@ class Placement:
     range_max_m: float
     heights: HeightLimits
     tile_quanta: int
+    road: RoadFinder | None = None
+    """Readings of profiles that did not hit the road are left out; None where all count."""
 
     def poses(self, mounting: Mounting) -> tuple[Any, ...]:
         """What the kernels need to place readings of a mounting: it, the trajectory, the charts of the map."""
@@ -169,9 +177,9 @@ class Placement:
     ) -> tuple[Int32, Int64]:
         """Tiles (n, 2) of all points of a batch, and the fates of its readings; `geometry` for scans.
 
-        `marked`: tiles of those too that a filter leaves out.
+        `marked`: tiles of those too that a filter leaves out. The road is not told from what is beside it.
         """
-        work = self._work(batch, geometry, EVERYWHERE, marked)
+        work = replace(self, road=None)._work(batch, geometry, EVERYWHERE, marked)
         return work.tiles, work.fates
 
     def classes(self, batch: pa.RecordBatch, geometry: ScanGeometry | None) -> UInt8:
@@ -183,16 +191,29 @@ class Placement:
         lines are not looked at.
         """
         classes = np.zeros(_readings(batch, geometry), np.uint8)
-        self._place(batch, geometry, EVERYWHERE, self.limits, classes)
+        self._filtered(batch, geometry, EVERYWHERE, classes)
         return classes
 
     def _work(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, marked: bool) -> _Work:
         if not marked:
-            return self._place(batch, geometry, window, self.limits)
+            return self._filtered(batch, geometry, window)
         classes = np.zeros(_readings(batch, geometry), np.uint8)
-        limited = self._place(batch, geometry, window, self.limits, classes)
+        limited = self._filtered(batch, geometry, window, classes)
         every = self._place(batch, geometry, window, _NO_LIMITS)
         return replace(every, fates=limited.fates, classes=classes)
+
+    def _filtered(
+        self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, classes: UInt8 | None = None
+    ) -> _Work:
+        """Place the readings that no filter leaves out, and write the classes of all where they are asked for."""
+        if self.road is None or geometry is None:
+            return self._place(batch, geometry, window, self.limits, classes)
+        road = self.road.profiles(_numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), geometry)
+        work = self._place(batch, geometry, window, self.limits, classes, road)
+        road.tell(work.fates)
+        if classes is not None:
+            road.mark(classes)
+        return work
 
     def _place(
         self,
@@ -201,6 +222,7 @@ class Placement:
         window: Window,
         limits: tuple[float, ...],
         classes: UInt8 | None = None,
+        road: RoadProfiles | None = None,
     ) -> _Work:
         work = _Work.of(_readings(batch, geometry))
         epochs = _numpy(batch, "pose_epoch_gps_ns" if geometry is None else "epoch_gps_ns")
@@ -218,7 +240,7 @@ class Placement:
                 )  # fmt: skip
             else:
                 readings = slice(rows.start * geometry.readings, rows.stop * geometry.readings)
-                ranges = _lists(piece, "range", geometry.readings)
+                ranges = _lists(piece, "range", geometry.readings) if road is None else road.ranges[rows]
                 out = (
                     own.rows, own.readings, own.tiles, own.quanta, work.fates,
                     _NO_MARKS if classes is None else classes[readings],
@@ -256,7 +278,7 @@ class _Work:
     def of(cls, n: int) -> _Work:
         return cls(
             np.empty(n, np.int32), np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 3), np.int32),
-            np.zeros(FATES, np.int64),
+            np.zeros(COUNTED_FATES, np.int64),
         )  # fmt: skip
 
     def after(self, n: int) -> _Work:

@@ -25,21 +25,11 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
-from roadscan.model.strict import Strict
+from roadscan.model.segmentation import RangeFilter
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
-
-
-class RangeFilter(Strict):
-    """Settings of the range filter for turns."""
-
-    base_m: float = Field(default=1.0, gt=0.0)
-    """Path over which the turn is measured (m)."""
-    radius_max_m: float = Field(default=100.0, gt=0.0)
-    """A wider turn is none: no scanner reads the road that far (m)."""
 
 
 def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter) -> Float64:
@@ -50,14 +40,18 @@ def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter
     path_m : (n,) position of each profile along the sensor's own path (m), not decreasing.
     heading_rad : (n,) heading of each profile, clockwise positive; whole turns do not matter.
     """
-    limits = np.full((path_m.size, 2), np.inf)
-    arc, turn = _arc_and_turn(path_m, heading_rad, settings.base_m)
-    turning = (np.abs(turn) > 1e-9) & (arc > 0.0)
-    with np.errstate(divide="ignore"):
-        critical = np.where(turning, arc / np.sin(np.clip(np.abs(turn), 1e-12, math.pi / 2)), np.inf)
-    critical[critical > settings.radius_max_m] = np.inf
-    limits[turn < 0.0, 0] = critical[turn < 0.0]
-    limits[turn > 0.0, 1] = critical[turn > 0.0]
+    return limits_of_turns(*_arc_and_turn(path_m, heading_rad, settings.base_m), settings)
+
+
+def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) -> Float64:
+    """Limits (n, 2) to the left and right (m), from arcs (n,), negative backwards, and changes of heading (n,)."""
+    limits = np.full((arc_m.size, 2), np.inf)
+    turning = (np.abs(turn_rad) > 1e-9) & (arc_m != 0.0)
+    critical = np.abs(arc_m) / np.sin(np.clip(np.abs(turn_rad), 1e-9, math.pi / 2))
+    critical[~turning | (critical > settings.radius_max_m)] = np.inf
+    left = arc_m * turn_rad < 0.0
+    limits[left, 0] = critical[left]
+    limits[~left, 1] = critical[~left]
     return limits
 
 

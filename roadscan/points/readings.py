@@ -52,6 +52,12 @@ class ScanGeometry(Strict):
             return np.stack([zero, where, zero], axis=-1), np.stack([zero, zero, one], axis=-1)
         return np.zeros((self.readings, 3)), np.stack([zero, np.sin(where), np.cos(where)], axis=-1)
 
+    def raw_limits(self, range_min_m: float, range_max_m: float) -> tuple[int, int]:
+        """Lowest and highest raw value whose range lies within the limits (m); (1, 0) where none does."""
+        every = self.range_offset_m + self.range_step_m * np.arange(1 << 16)
+        kept = 1 + np.flatnonzero((every[1:] >= range_min_m) & (every[1:] <= range_max_m))
+        return (int(kept[0]), int(kept[-1])) if kept.size else (1, 0)
+
     def reading_epochs(self, epochs_gps_ns: Int64, reading: npt.NDArray[np.integer[Any]]) -> Int64:
         """Epochs (n,) of readings by their numbers in the profile (n,), from the epochs of their profiles (n,)."""
         if not self.reading_period_ns:

@@ -84,7 +84,7 @@ def segmented(
     classes = np.empty(ranges.shape, np.uint8)
     segment_profiles(
         np.ascontiguousarray(ranges), origins_y, origins_z, directions_y, directions_z,
-        (geometry.range_offset_m, geometry.range_step_m), _raw_limits(geometry, range_min_m, range_max_m),
+        (geometry.range_offset_m, geometry.range_step_m), geometry.raw_limits(range_min_m, range_max_m),
         _numbers(settings), classes,
     )  # fmt: skip
     return classes
@@ -101,10 +101,3 @@ def _numbers(s: SegmentationConfig) -> tuple[float, ...]:
         s.bin_m, s.share, s.gate_m, s.scatter_factor, float(s.scatter_readings), math.radians(s.grazing_deg),
         s.chord_m, s.step_m, s.noise_factor, s.slope, s.window_m, float(s.window_readings), s.bridge_m,
     )  # fmt: skip
-
-
-def _raw_limits(geometry: ScanGeometry, range_min_m: float, range_max_m: float) -> tuple[int, int]:
-    """Lowest and highest raw value within the limits."""
-    low = math.ceil((range_min_m - geometry.range_offset_m) / geometry.range_step_m - 1e-9)
-    high = (range_max_m - geometry.range_offset_m) / geometry.range_step_m + 1e-9
-    return max(low, 1), int(min(high, 65_535.0))

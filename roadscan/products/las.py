@@ -72,8 +72,8 @@ class Las(TileProduct):
     A point that is kept when the others are thinned out is a recorded one, with its own position, time and
     pass; of several at the median height it is the first one recorded.
 
-    With `filters.keep_marked` the points that filters leave out follow the others, withheld, in the classes 7, 18, 64,
-    65 and 66 (see there); thinned-out files do not hold them.
+    With `filters.keep_marked` the points that filters leave out follow the others, withheld, in the classes 7, 18 and
+    64 to 71 (see there); thinned-out files do not hold them.
     """
 
     name: ClassVar[str] = "las"

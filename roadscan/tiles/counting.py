@@ -11,11 +11,10 @@ import numpy.typing as npt
 from roadscan.kernels.accumulate import PIECE, accumulate_cells
 from roadscan.kernels.by_cell import into_order
 from roadscan.kernels.flat_profiles import accumulate_profiles
-from roadscan.kernels.georeference import FATES
 from roadscan.kernels.placed_cells import find_mirror, find_returns
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.flat_profiles import FlatProfiles, flat_profiles
-from roadscan.points.place import EIGHT_TO_SIXTEEN_BITS, Placement
+from roadscan.points.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement
 from roadscan.points.readings import ScanGeometry
 from roadscan.tiles.accumulator import Accumulator
 
@@ -34,7 +33,7 @@ class Counting:
     accumulator: Accumulator
     geometry: ScanGeometry | None
     """None for returns."""
-    fates: Int64 = field(default_factory=lambda: np.zeros(FATES, np.int64))
+    fates: Int64 = field(default_factory=lambda: np.zeros(COUNTED_FATES, np.int64))
     """Readings by fate (``FATE_NAMES``); those of tiles that are not active count as outside."""
 
     def profiles(
@@ -57,6 +56,10 @@ class Counting:
             raise ValueError("profiles need a scan geometry")
         bright = np.zeros(ranges.shape, np.uint8) if intensity is None else intensity
         flat = flat_profiles(geometry, self.placement.range_min_m, self.placement.range_max_m)
+        if self.placement.road is not None:
+            road = self.placement.road.profiles(epochs_gps_ns, ranges, geometry)
+            road.tell(self.fates)
+            ranges = road.ranges
         for rows, mounting in self.placement.mountings.pieces(epochs_gps_ns):
             poses = self.placement.poses(mounting)
             epochs, raw, shine = epochs_gps_ns[rows], ranges[rows], bright[rows]

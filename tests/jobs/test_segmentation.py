@@ -1,0 +1,179 @@
+"""A run with [segmentation]: classes against the simulator's truth, the same cells by either way and in any blocks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from roadscan.jobs.classes import write_classes
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.status import survey_status
+from roadscan.model.errors import ConfigError
+from roadscan.model.survey import Survey
+from roadscan.points.classes import LAS_CLASSES, NOT_ROAD, READING_CLASSES
+from roadscan.simulate import Scene, simulate, truth
+
+from .conftest import Simulated, changed, outputs
+
+CELLS = {"products__make": ["geotiff", "tile_table"]}
+ON: dict[str, Any] = {"segmentation": {"turns": {}}}
+SENSORS = ("profiler_left", "profiler_right", "sick")
+NAMES = [READING_CLASSES[kind] for kind in NOT_ROAD]
+
+SCENE: dict[str, Any] = {
+    "id": "street",
+    "seed": 77,
+    "length_m": 14.0,
+    "passes": [{"lane": 2}],
+    "road": {
+        "alignment": [{"kind": "arc", "length_m": 14.0, "radius_m": 60.0}],
+        "lanes": 2,
+        "lane_width_m": 2.75,
+        "verge_width_m": 6.0,
+        "verge_slope": -0.02,
+        "texture": {"mpd_mm": 0.8},
+        "kerbs": [{"side": "left", "height_m": 0.10}, {"side": "right", "height_m": 0.14}],
+        "potholes": [{"station_m": 11.0, "offset_m": 1.4, "radius_m": 0.3, "depth_m": 0.05}],
+        "cracks": [{"width_m": 0.02, "depth_m": 0.02, "points_m": [[1.0, 0.8], [13.0, 1.3]]}],
+    },
+    "roadside": {
+        "parked_cars": [{"station_m": 5.0, "offset_m": 3.6}, {"station_m": 9.0, "offset_m": -3.2}],
+        "trees": [{"station_m": 3.0, "offset_m": 5.0, "every_m": 4.0, "count": 3, "height_m": 7.0}],
+        "poles": [{"station_m": 1.0, "offset_m": 3.05, "every_m": 2.0, "count": 6, "height_m": 0.9}],
+    },
+    "vehicle": {"speed_m_per_s": 7.0},
+    "lidar": {"on": False},
+    "sick": {"on": True, "divergence_deg": 0.4},
+    "profilers": {"spacing_m": 0.1, "readings": 1000},
+    "noise": {"profiler_range_m": 0.0003, "sick_range_m": 0.006, "dropout": 0.002, "impulse": 0.0005},
+}
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    """A narrow street with kerbs, cars, trees and poles; run with segmentation, without points."""
+    folder = tmp_path_factory.mktemp("street") / "survey"
+    survey = Simulated(simulate(Scene.parse(SCENE), folder, write_hits=True).survey_file)
+    survey.run("cells", **ON, **CELLS)
+    return survey
+
+
+def classes_of(street: Simulated, sensor: str, **settings: Any) -> np.ndarray:
+    """Class of every reading (profiles, readings), with only these settings changed."""
+    survey, out = changed(Survey.load(street.survey_file), settings), street.survey_file.parent / "classes.parquet"
+    write_classes(survey, street.store("cells"), "run-1", sensor, out)
+    table = pq.read_table(out)
+    return table.column("class").to_numpy().reshape(-1, int(table.column("reading")[-1].as_py()) + 1)
+
+
+def hits_of(street: Simulated, sensor: str) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each beam hit the carriageway, and whether it hit anything else; what half met an edge is neither."""
+    known = truth.load(street.survey_file.parent)
+    table = pq.read_table(known.hits_file("run-1", sensor))
+
+    def of(name: str) -> np.ndarray:
+        flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        return flat.reshape(table.num_rows, -1)
+
+    easting, northing = of("easting_m"), of("northing_m")
+    met = np.isfinite(easting)
+    if "is_mixed" in table.column_names:
+        met &= ~of("is_mixed")
+    ground = met & (of("object_id") == 0)
+    offset = np.full(met.shape, np.inf)
+    offset[ground] = known.station_offset_m(easting[ground], northing[ground])[1]
+    road = ground & (np.abs(offset) <= known.scene.road.paved_m)
+    return road, met & ~road
+
+
+def test_road_is_kept_and_others_are_rejected(street: Simulated) -> None:
+    others_of_all = 0
+    for sensor in SENSORS:
+        classes, (road, others) = classes_of(street, sensor, **ON), hits_of(street, sensor)
+        kept = classes == 0
+        measured = ~np.isin(classes, [1, 3, 4])
+        assert kept[road & measured].mean() >= 0.99, sensor
+        others &= measured
+        others_of_all += others.sum()
+        assert others.sum() == 0 or (~kept)[others].mean() >= 0.97, sensor
+        assert set(np.unique(classes[others & ~kept])) <= set(NOT_ROAD)
+    assert others_of_all > 10_000
+
+
+def test_every_reading_is_told_by_its_fate(street: Simulated) -> None:
+    status = survey_status(changed(Survey.load(street.survey_file), ON | CELLS), street.store("cells"))
+    counts: dict[str, int] = dict.fromkeys(NAMES, 0)
+    readings = 0
+    for sensor in SENSORS:
+        classes = classes_of(street, sensor, **ON)
+        readings += classes.size
+        for kind in NOT_ROAD:
+            counts[READING_CLASSES[kind]] += int((classes == kind).sum())
+    assert sum(status.readings.values()) == readings
+    assert {name: status.readings.get(name, 0) for name in NAMES} == counts
+    assert sum(counts.values()) > 10_000
+    assert status.is_complete
+
+
+def test_neither_points_nor_blocks_change_a_byte(street: Simulated) -> None:
+    cells = outputs(street.store("cells"))
+    assert cells
+    street.run("cells-1", **ON, **CELLS, tiles__block_tiles=1)
+    assert outputs(street.store("cells-1")) == cells
+    street.run("points", **ON, products__make=["geotiff", "tile_table", "las"], tiles__block_tiles=2)
+    assert {p: b for p, b in outputs(street.store("points")).items() if not p.startswith("tiles/las/")} == cells
+
+
+def test_marked_points_are_those_beside_the_road(street: Simulated) -> None:
+    street.run("marked", **ON, filters__keep_marked=True, products__make=["geotiff", "tile_table", "las"])
+    marked, plain = street.store("marked"), street.store("cells")
+    las = {p: laspy.read(marked.path(p)) for p in marked.files("tiles/las")}
+    found = {int(LAS_CLASSES[kind]): 0 for kind in NOT_ROAD}
+    for own in las.values():
+        withheld = np.asarray(own.withheld) == 1
+        for kind, count in zip(*np.unique(np.asarray(own.classification)[withheld], return_counts=True), strict=True):
+            found[int(kind)] += int(count)
+    everything = [classes_of(street, sensor, **ON) for sensor in SENSORS]
+    expected = {int(LAS_CLASSES[k]): sum(int((c == k).sum()) for c in everything) for k in NOT_ROAD}
+    assert sum(found.values()) > 10_000
+    assert all(found[kind] <= expected[kind] for kind in found)  # a tile with no road has no files
+    assert sum(found.values()) >= 0.5 * sum(expected.values())
+    kept = sum(int((np.asarray(own.withheld) == 0).sum()) for own in las.values())
+    assert kept == sum(int((c == 0).sum()) for c in everything)
+    ours, theirs = outputs(marked), outputs(plain)
+    assert {p: b for p, b in ours.items() if not p.startswith("tiles/las/")} == theirs
+
+
+def test_only_settings_of_the_segmentation_make_tiles_stale(street: Simulated) -> None:
+    def keys(**settings: Any) -> tuple[int, int]:
+        survey = changed(Survey.load(street.survey_file), CELLS | settings)
+        status = survey_status(survey, street.store("cells"))
+        return status.tiles_stale, status.tiles_current
+
+    assert keys(**ON)[0] == 0
+    assert keys(**ON, tiles__block_tiles=3)[0] == 0
+    assert keys(segmentation={"turns": {}, "sensors": list(SENSORS)})[0] == 0
+    for other in (None, {}, {"turns": {"base_m": 2.0}}, {"turns": {}, "profiles": {"step_m": 0.02}}):
+        assert keys(segmentation=other)[1] == 0
+    touched_by_both = keys(segmentation={"turns": {}, "sensors": ["profiler_left", "sick"]})
+    assert 0 < touched_by_both[0] < keys(segmentation=None)[0]
+    plans = [
+        plan_survey(changed(Survey.load(street.survey_file), settings), street.store("cells")) for settings in (ON, {})
+    ]
+    keys_of_readings = [[source.key for source, _ in plan.sources] for plan in plans]
+    assert keys_of_readings[0] == keys_of_readings[1]  # so footprints stay current
+
+
+def test_what_cannot_be_segmented_is_refused(street: Simulated) -> None:
+    survey = Survey.load(street.survey_file)
+    with pytest.raises(ConfigError, match=r"unknown sensor 'sik'.*did you mean 'sick'"):
+        changed(survey, {"segmentation": {"sensors": ["sik"]}})
+    with pytest.raises(ConfigError, match=r"unknown key 'segmentation\.profile'.*did you mean 'profiles'"):
+        changed(survey, {"segmentation": {"profile": {}}})
+    sideways = {n: s | {"axes": "rfu"} for n, s in survey.rig.model_dump()["sensors"].items()}
+    with pytest.raises(ConfigError, match="no sensor whose profiles lie across the road"):
+        plan_survey(changed(survey, ON | {"rig": {"sensors": sideways}}), street.store("cells"))

@@ -169,10 +169,10 @@ def test_every_reading_has_one_fate() -> None:
     xyz = np.array([[0.5, 0, 0], [5, 0, 0], [200, 0, 0], [5, 0, 0], [5, 0, 40.0]])
     p = placement(path, frame, range_min_m=1.0, range_max_m=100.0, above_body_max_m=20.0)
     placed = p.returns(returns(times, xyz), EVERYWHERE)
-    assert placed.fates.tolist() == [1, 1, 2, 1, 0, 0]
+    assert placed.fates.tolist() == [1, 1, 2, 1, 0, *[0] * 6]
     column, row = placed.tiles[0]
     window = Window(int(column) + 1, int(row), int(column) + 2, int(row) + 1)
-    assert p.returns(returns(times, xyz), window).fates.tolist() == [0, 1, 2, 1, 1, 0]
+    assert p.returns(returns(times, xyz), window).fates.tolist() == [0, 1, 2, 1, 1, *[0] * 6]
 
 
 def test_intensity_of_eight_bits_fills_sixteen() -> None:

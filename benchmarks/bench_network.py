@@ -27,7 +27,7 @@ from roadscan.jobs.compute import OnDask, rare_collections
 from roadscan.jobs.footprints import PRODUCT, FootprintTask, index_footprints
 from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
-from roadscan.jobs.tiles import TaskResult, run_tasks
+from roadscan.jobs.tiles import TaskResult, compute_tiles, run_tasks
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store
 
@@ -120,7 +120,7 @@ def _network(region: Region, client: Any, seen: _Seen) -> Manifest:
         tiles = plan_tiles(region.footprints, plan)
         planned = TilePlan(plan, region.footprints, tiles, wanted, context)
         tasks = planned.tasks(stale_tiles(tiles, wanted, manifest), compute.workers)
-        _check(run_tasks(tasks, planned.singly, manifest, compute))
+        _check(run_tasks(compute_tiles, tasks, planned.singly, manifest, compute))
         seen.tiles_touched += len(tiles)
     return manifest
 

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from roadscan.products.base import Product, TileFiles, products
+from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
 from roadscan.tables.schema import TableSchema, schema_names, table_schema
 
@@ -281,6 +281,8 @@ def product_list(_: str) -> str:
 def _made_words(product: Product) -> str:
     if not product.default:
         return "on request"
+    if isinstance(product, SurfaceProduct):
+        return "with `[surface]`"
     return {"any": "always", "fine": "cells below 2 cm", "coarse": "cells of 2 cm or more"}[product.default_cells]
 
 

@@ -43,7 +43,7 @@ def run(
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
 ) -> None:
-    """Run a survey: ingest, navigate, footprints, tiles, products. Does only what is missing or stale."""
+    """Run a survey: ingest, navigate, footprints, tiles, surfaces, products. Does only what is missing or stale."""
     if dry_run:
         _print_status(_status(survey_file), survey_file)
         return
@@ -165,6 +165,12 @@ def tile(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler 
     _run(survey_file, _stages("tiles"), workers, scheduler)
 
 
+@app.command()
+def surfaces(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
+    """Cells or points of tiles into the reconstructed surface and its files ([surface] of the survey file)."""
+    _run(survey_file, _stages("surfaces"), workers, scheduler)
+
+
 @app.command("products")
 def make_products(
     survey_file: Annotated[
@@ -177,13 +183,14 @@ def make_products(
     if survey_file is not None:
         _run(survey_file, _stages("products"), workers, scheduler)
         return
-    from roadscan.products.base import TileProduct, products
+    from roadscan.products.base import SurfaceProduct, TileProduct, products
 
+    of = {TileProduct: "tile", SurfaceProduct: "surface"}
     made = {"any": "yes", "fine": "of cells below 2 cm", "coarse": "of cells of 2 cm or more"}
     rows = [
         (
             name,
-            "tile" if isinstance(p, TileProduct) else "survey",
+            next((word for kind, word in of.items() if isinstance(p, kind)), "survey"),
             made[p.default_cells] if p.default else "on request",
             p.title,
         )

@@ -20,6 +20,9 @@ _SHAPING = ("model", "kernels", "navigation", "points", "tiles", "jobs")
 _SOLVING = ("model", "kernels", "navigation")
 """Layers whose code computes trajectories, clocks and mountings."""
 
+_RECONSTRUCTING = ("model", "kernels", "points", "tiles", "surfaces", "jobs")
+"""Layers whose code makes the surface of cells or points."""
+
 
 def key_of(*parts: Any) -> str:
     """Sixteen hexadecimal digits over JSON-like values (order matters, dictionaries are sorted)."""
@@ -60,6 +63,12 @@ def code_version() -> str:
 def solver_version() -> str:
     """Version of the code that computes trajectories, clocks and mountings."""
     return _version(_SOLVING)
+
+
+@functools.cache
+def surface_version() -> str:
+    """Version of the code that makes the surface of cells or points."""
+    return _version(_RECONSTRUCTING)
 
 
 def _version(layers: tuple[str, ...]) -> str:

@@ -11,9 +11,10 @@ from roadscan.jobs.cell_files import read_cells, read_overview
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.tile_files import WantedProduct
+from roadscan.jobs.tile_files import WantedProduct, WantedSurface
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE
 from roadscan.jobs.tiles import summary_of
+from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.model.survey import Survey
@@ -21,6 +22,7 @@ from roadscan.products.base import (
     Output,
     Product,
     ProductContext,
+    SurfaceProduct,
     SurveyProduct,
     TileProduct,
     TileSummary,
@@ -65,10 +67,23 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
     """Products that the survey file asks for, with their checked settings."""
     config = survey.config.products
     cell_m = survey.config.tiles.cell_m
-    names = config.make if config.make is not None else [n for n, p in products().items() if is_default(p, cell_m)]
+    with_surface = survey.config.surface is not None
+    names = config.make if config.make is not None else _default_names(cell_m, with_surface)
     for name in config.options:
         product_named(name)
-    return [(p, p.options.parse(config.options.get(p.name, {}))) for p in (product_named(n) for n in names)]
+    wanted = [product_named(n) for n in names]
+    for product in wanted:
+        if isinstance(product, SurfaceProduct) and not with_surface:
+            raise ConfigError(
+                f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
+                change="add the section [surface] to the survey file, or leave the product out",
+            )
+    return [(p, p.options.parse(config.options.get(p.name, {}))) for p in wanted]
+
+
+def _default_names(cell_m: float, with_surface: bool) -> list[str]:
+    made = [(n, p) for n, p in products().items() if is_default(p, cell_m)]
+    return [n for n, p in made if with_surface or not isinstance(p, SurfaceProduct)]
 
 
 def product_context(plan: SurveyPlan) -> ProductContext:
@@ -84,6 +99,16 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
         if isinstance(product, TileProduct):
             product.check_options(options, context)
             wanted.append(WantedProduct(product, options, _product_key(product, options, context)))
+    return wanted
+
+
+def wanted_surface_products(survey: Survey, context: ProductContext) -> list[WantedSurface]:
+    """The same, of products of the reconstructed surface."""
+    wanted: list[WantedSurface] = []
+    for product, options in wanted_products(survey):
+        if isinstance(product, SurfaceProduct):
+            product.check_options(options, context)
+            wanted.append(WantedSurface(product, options, _product_key(product, options, context)))
     return wanted
 
 

@@ -15,9 +15,11 @@ from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
+from roadscan.jobs.surface_plan import SURFACE, files_without_surface, plan_surface_work
+from roadscan.jobs.surfaces import compute_surfaces
 from roadscan.jobs.tile_files import tile_file_names
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, plan_tiles, stale_tiles
-from roadscan.jobs.tiles import run_tasks
+from roadscan.jobs.tiles import compute_tiles, run_tasks
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -86,11 +88,28 @@ def run_tiles(run: Run) -> None:
     manifest.remove(work.gone)
     tasks = work.planned.tasks(work.chosen, run.compute.workers)
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
-    failures = run_tasks(tasks, work.planned.singly, manifest, run.compute, _bar(run, "tiles"))
+    failures = run_tasks(compute_tiles, tasks, work.planned.singly, manifest, run.compute, _bar(run, "tiles"))
     manifest.forget(TILE, [unit for unit, _ in failures])
     empty = {unit for unit, r in manifest.of(TILE).items() if not r.path}
     manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in {OVERVIEWS, *tile_file_names()}])
     run.failed("tiles", failures)
+
+
+def run_surfaces(run: Run) -> None:
+    """Cells or points → the reconstructed surface and its products."""
+    manifest = Manifest(run.store)
+    work = plan_surface_work(run.survey, run.store, run.selection, manifest)
+    manifest.remove(work.gone)
+    if work.note:
+        run.reporter.line(f"note: {work.note}")
+    if work.planned is None or not work.chosen:
+        return
+    tasks = work.planned.tasks(work.chosen, run.compute.workers)
+    report = _bar(run, "surfaces")
+    failures = run_tasks(compute_surfaces, tasks, work.planned.singly, manifest, run.compute, report)
+    manifest.forget(SURFACE, [unit for unit, _ in failures])
+    manifest.remove(files_without_surface(manifest))
+    run.failed("surfaces", failures)
 
 
 def run_products(run: Run) -> None:
@@ -115,6 +134,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("navigate", "trajectories from GNSS, IMU and odometer, clocks from shared motion", run_navigate),
     Stage("footprints", "which raw block touches which tile", run_footprints),
     Stage("tiles", "readings into points, cells and tile files", run_tiles),
+    Stage("surfaces", "cells or points into the reconstructed surface and its files", run_surfaces),
     Stage("products", "mosaics, pictures and tables over all tiles", run_products),
 )
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from roadscan.model.ids import TileId
 from roadscan.products.base import Tile, TileSummary
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tiles.accumulator import TileEvidence
+from roadscan.tiles.blocks import Block
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.statistics import cells_of
 
@@ -55,14 +56,26 @@ class ComputedTile:
     failure: str = ""
 
 
+class OfTiles(Protocol):
+    """A task over some tiles."""
+
+    @property
+    def block(self) -> Block:
+        """The tiles."""
+
+
+T = TypeVar("T", bound=OfTiles)
+
+
 def run_tasks(
-    tasks: Sequence[TileTask],
-    singly: Callable[[Sequence[TileId]], list[TileTask]],
+    function: Callable[[T], TaskResult],
+    tasks: Sequence[T],
+    singly: Callable[[Sequence[TileId]], list[T]],
     manifest: Manifest,
     compute: Compute,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
-    """Compute tasks; returns the failures.
+    """Compute tasks by `function`; returns the failures.
 
     A task that fails as a whole (a worker out of memory, a damaged raw block where points are made) is tried again
     tile by tile, with the tasks that `singly` makes of its tiles, so that only the tiles at fault are lost.
@@ -73,13 +86,13 @@ def run_tasks(
     again: list[TileId] = []
     report(0, total)
 
-    def rounds() -> Iterator[Sequence[TileTask]]:
+    def rounds() -> Iterator[Sequence[T]]:
         yield tasks
         if again:
             yield singly(again)
 
     for round_tasks in rounds():
-        for done in compute.map(compute_tiles, round_tasks):
+        for done in compute.map(function, round_tasks):
             tiles = done.task.block.tiles
             if done.result is not None:
                 manifest.add(done.result.records)

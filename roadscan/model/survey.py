@@ -18,6 +18,7 @@ from roadscan.model.rig import Rig, Sensor
 from roadscan.model.segmentation import RoadSegmentation
 from roadscan.model.smoothing import SmootherConfig, SplineConfig
 from roadscan.model.strict import Strict, load_toml
+from roadscan.model.surface import SurfaceConfig
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 
@@ -319,6 +320,8 @@ class SurveyConfig(Strict):
     """Left out, all readings of profiles count; with it, even as an empty table, only those that hit the road."""
     tiles: TileConfig = TileConfig()
     """Tiles and cells."""
+    surface: SurfaceConfig | None = None
+    """Reconstruction of the road's surface; left out, there is none."""
     products: ProductConfig = ProductConfig()
     """Products."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Final, cast
@@ -19,12 +19,13 @@ from rasterio.transform import Affine
 
 from roadscan.kernels.raster_blocks import cut_lines, encode_block, round_values
 from roadscan.model.crs import MapFrame
+from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.products import raster
 from roadscan.products.base import ProductContext, Tile, TileProduct
 from roadscan.products.packer import Packer
 from roadscan.products.quantities import Quantity, band_of
-from roadscan.products.raster import CellBox
+from roadscan.products.raster import Band, CellBox
 from roadscan.products.tiff import Page, Tag, check_tiff, digest_item, tiff_parts
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level, pyramid_of
@@ -74,7 +75,9 @@ class GeoTiff(TileProduct):
         images = [_image(tile.cells, bands, context), *_overviews(tile, bands, context)]
         packer = Packer()
         pages = [_page(image, bands, number > 0, packer) for number, image in enumerate(images)]
-        first = dataclasses.replace(pages[0], tags=(*pages[0].tags, *_description(tile.cells, bands, context)))
+        place = CellBox.around([tile.cells.tile], context.grid).transform(context)
+        about = description(tile.cells.tile, place, [band_of(b, context) for b in bands], context)
+        first = dataclasses.replace(pages[0], tags=(*pages[0].tags, *about))
         with path.open("wb") as stream:
             stream.writelines(tiff_parts([first, *pages[1:]]))
 
@@ -151,15 +154,16 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Pac
                     continue
                 encode_block(image.column, image.row, rounded, first, last, block * edge, out, line, differences)
                 blocks.append(packer.pack(out))
-    return Page(_layout(image.edge, edge, len(bands), reduced), blocks)
+    return Page(layout(image.edge, image.edge, edge, len(bands), reduced), blocks)
 
 
 @functools.lru_cache(maxsize=64)
-def _layout(edge: int, block: int, bands: int, reduced: bool) -> tuple[Tag, ...]:
+def layout(width: int, height: int, block: int, bands: int, reduced: bool) -> tuple[Tag, ...]:
+    """Tags of an image of float32 bands, each in square blocks of its own (`block` pixels), NaN where nothing lies."""
     return (
         Tag(254, "I", [1 if reduced else 0]),
-        Tag(256, "I", [edge]),
-        Tag(257, "I", [edge]),
+        Tag(256, "I", [width]),
+        Tag(257, "I", [height]),
         Tag(258, "H", [32] * bands),
         Tag(259, "H", [8]),
         Tag(262, "H", [1]),
@@ -174,18 +178,17 @@ def _layout(edge: int, block: int, bands: int, reduced: bool) -> tuple[Tag, ...]
     )
 
 
-def _description(cells: TileCells, bands: tuple[Quantity, ...], context: ProductContext) -> list[Tag]:
+def description(tile: TileId, place: Affine, bands: Sequence[Band], context: ProductContext) -> list[Tag]:
     """Place on the map, names, units and the rest of the metadata."""
-    place = CellBox.around([cells.tile], context.grid).transform(context)
     items = [
         f'<Item name="{name}">{escape(value)}</Item>'
         for name, value in (
             ("ROADSCAN_SURVEY", context.survey_id),
             ("ROADSCAN_HEIGHT", "local" if context.map.is_local else context.map.height),
-            ("ROADSCAN_TILE", str(cells.tile)),
+            ("ROADSCAN_TILE", str(tile)),
         )
     ]
-    text = "\n  ".join(["<GDALMetadata>", digest_item(), *items, *_band_items(bands, context)])
+    text = "\n  ".join(["<GDALMetadata>", digest_item(), *items, *_band_items(bands)])
     return [
         Tag(305, "s", [raster.SOFTWARE.encode()]),
         Tag(306, "s", [f"{context.date:%Y:%m:%d} 00:00:00".encode()]),
@@ -196,9 +199,9 @@ def _description(cells: TileCells, bands: tuple[Quantity, ...], context: Product
     ]
 
 
-def _band_items(bands: tuple[Quantity, ...], context: ProductContext) -> list[str]:
+def _band_items(bands: Sequence[Band]) -> list[str]:
     items: list[str] = []
-    for number, band in enumerate(band_of(b, context) for b in bands):
+    for number, band in enumerate(bands):
         for name, value in (("DESCRIPTION", band.description), ("UNITTYPE", band.unit)):
             items.append(f'<Item name="{name}" sample="{number}" role="{name.lower()}">{escape(value)}</Item>')
     return items

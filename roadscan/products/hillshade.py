@@ -158,7 +158,7 @@ class Light(Protocol):
         """Exaggeration of the heights."""
 
 
-def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
+def horn_slopes(heights_m: Float64, cell_m: float, cell_north_m: float | None = None) -> tuple[Float64, Float64]:
     """Slopes towards east and north of the inner cells of a north-up raster.
 
     The weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), eq. for
@@ -168,7 +168,7 @@ def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
     Parameters
     ----------
     heights_m : (rows + 2, columns + 2), NaN where unknown.
-    cell_m : edge of a cell (m).
+    cell_m : edge of a cell (m); that towards east, where that towards north is stated.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def horn_slopes(heights_m: Float64, cell_m: float) -> tuple[Float64, Float64]:
     to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
     unknown = np.isnan(heights_m[1:-1, 1:-1])
     to_east[unknown] = to_north[unknown] = np.nan  # eight neighbours would give the empty cell between them a slope
-    return to_east / (8 * cell_m), to_north / (8 * cell_m)
+    return to_east / (8 * cell_m), to_north / (8 * (cell_north_m or cell_m))
 
 
 def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
@@ -196,12 +196,15 @@ def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
     return np.where(missing, continued, near)
 
 
-def shade(heights_m: Float64, cell_m: float, options: Light) -> npt.NDArray[np.uint8]:
+def shade(
+    heights_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
+) -> npt.NDArray[np.uint8]:
     """Shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where the height is unknown.
 
-    The brightness of a matt surface: the cosine between its normal and the direction of the light.
+    The brightness of a matt surface: the cosine between its normal and the direction of the light. Cells whose edges
+    differ have that towards north stated, too.
     """
-    east, north = horn_slopes(heights_m, cell_m)
+    east, north = horn_slopes(heights_m, cell_m, cell_north_m)
     east *= options.z_factor
     north *= options.z_factor
     azimuth, altitude = math.radians(options.azimuth_deg), math.radians(options.altitude_deg)

@@ -14,8 +14,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.model.strict import Strict
+from roadscan.model.surface import SlopeKind
 from roadscan.surfaces.clough_tocher import CubicSurface, cubic_surface
-from roadscan.surfaces.normals import RINGS, SlopeKind, slopes_at
+from roadscan.surfaces.normals import RINGS, slopes_at
 from roadscan.surfaces.sites import sites
 from roadscan.surfaces.triangulation import triangulate
 from roadscan.surfaces.window import GridWindow

@@ -27,16 +27,15 @@ none) the slope is zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.vertex_gradients import CUBIC_TERMS, MOST_RINGS, QUADRATIC_TERMS, vertex_gradients
+from roadscan.model.surface import SlopeKind
 from roadscan.surfaces.sites import Sites
 from roadscan.surfaces.triangulation import Triangulation
-
-SlopeKind = Literal["quadratic", "cubic"]
 
 RINGS: Final = MOST_RINGS
 """Farthest neighbours that a slope depends on, in edges."""

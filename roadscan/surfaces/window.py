@@ -47,6 +47,21 @@ class GridWindow:
         (column, end_column), (row, end_row) = ((_first(low, edge), _first(high, edge)) for low, high, edge in spans)
         return cls(column, row, end_column - column, end_row - row, cell_east_m, cell_north_m)
 
+    def grown(self, cells: int) -> GridWindow:
+        """The window with `cells` more on each of the four sides."""
+        return GridWindow(
+            self.first_column - cells, self.first_row - cells, self.columns + 2 * cells, self.rows + 2 * cells,
+            self.cell_east_m, self.cell_north_m,
+        )  # fmt: skip
+
+    def bounds(self) -> Bounds:
+        """Box on the map (m) of the cells."""
+        east, north = self.cell_east_m, self.cell_north_m
+        return Bounds(
+            self.first_column * east, self.first_row * north,
+            (self.first_column + self.columns) * east, (self.first_row + self.rows) * north,
+        )  # fmt: skip
+
     def nodes_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """(columns,) eastings and (rows,) northings of the nodes (m)."""
         return (

@@ -1,0 +1,200 @@
+"""What the stage `surfaces` has to do: keys of surfaces, which are stale, and tasks of neighbouring tiles."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from roadscan.jobs.fingerprint import key_of, surface_version
+from roadscan.jobs.footprints import load_ranges
+from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.products import product_context, wanted_surface_products
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.surface_regions import Regions, stated_regions
+from roadscan.jobs.tile_files import WantedSurface, surface_file_names
+from roadscan.jobs.tile_plan import TILE, TilePlan, TileTask, plan_tiles
+from roadscan.model.gpstime import utc_from_gps_ns
+from roadscan.model.ids import TileId
+from roadscan.model.surface import SurfaceConfig
+from roadscan.model.survey import Survey
+from roadscan.products.base import ProductContext
+from roadscan.surfaces.reconstruction import SurfaceGrid
+from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.store import Store
+from roadscan.tiles.blocks import Block, cut_blocks
+
+SURFACE = "surfaces"
+"""Manifest name of a tile's surface as a whole; it has no file of its own."""
+
+_BLOCK_TILES = 4
+"""Edge of the largest block of tiles whose surface is made from cells: each tile's cells are read once or twice."""
+
+
+@dataclass(frozen=True)
+class SurfaceTask:
+    """Everything a worker needs to make the surface of some tiles; it holds no data."""
+
+    store: Store
+    grid: SurfaceGrid
+    block: Block
+    keys: tuple[str, ...]
+    """Key of each tile's surface."""
+    cells: tuple[OutputRecord, ...]
+    """Records of the cells in reach, where the surface is made of cells."""
+    readings: TileTask | None
+    """What places the points in reach, where it is made of points."""
+    regions: Regions | None
+    """Polygons in reach; None where the surface is made everywhere."""
+    dates: tuple[dt.date, ...]
+    """UTC date of each tile's first reading."""
+    products: tuple[WantedSurface, ...]
+    context: ProductContext
+
+
+@dataclass(frozen=True)
+class SurfacePlan:
+    """Tiles whose surface is due, and what it is made of."""
+
+    tiles: TilePlan
+    grid: SurfaceGrid
+    cells: Mapping[TileId, OutputRecord]
+    """Records of the tiles that hold cells."""
+    regions: Regions | None
+    products: tuple[WantedSurface, ...]
+    keys: Mapping[TileId, str]
+    """Key of each tile's surface that is due."""
+
+    def stale(self, manifest: Manifest) -> list[TileId]:
+        """Tiles whose surface is missing or out of date, or lacks a product."""
+        return [tile for tile, key in self.keys.items() if not self._is_current(tile, key, manifest)]
+
+    def near(self, chosen: Iterable[TileId]) -> set[TileId]:
+        """Tiles whose surface depends on one of the chosen."""
+        seen = {t for tile in chosen for t in self._in_reach(tile)}
+        return seen & set(self.keys)
+
+    def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> list[SurfaceTask]:
+        """Tasks over the chosen tiles, in blocks of neighbours."""
+        config = self.tiles.plan.survey.config.tiles
+        if self.grid.config.method == "points":
+            numbers = self.tiles.tiles.number
+            readings = {t: int(self.tiles.tiles.readings[numbers[t]]) for t in chosen}
+            blocks = cut_blocks(readings, config.block_tiles, config.max_block_readings)
+        else:
+            edge = _BLOCK_TILES if len(chosen) >= 4 * _BLOCK_TILES * workers else 2
+            blocks = cut_blocks(dict.fromkeys(chosen, 1), edge, edge * edge)
+        return [self.task(b.tiles) for b in blocks]
+
+    def singly(self, chosen: Sequence[TileId]) -> list[SurfaceTask]:
+        """A task for each tile."""
+        return [self.task((tile,)) for tile in chosen]
+
+    def task(self, tiles: tuple[TileId, ...]) -> SurfaceTask:
+        """A task over some tiles."""
+        block = Block(tiles, self.grid.rings())
+        reach = sorted({t for tile in tiles for t in self._in_reach(tile)})
+        of_points = self.grid.config.method == "points"
+        boxes = [self.grid.reach(tile) for tile in tiles]
+        return SurfaceTask(
+            store=self.tiles.plan.store,
+            grid=self.grid,
+            block=block,
+            keys=tuple(self.keys[t] for t in tiles),
+            cells=() if of_points else tuple(self.cells[t] for t in reach if t in self.cells),
+            readings=self.tiles.task(block) if of_points else None,
+            regions=None if self.regions is None else self.regions.near(*boxes),
+            dates=tuple(_date(self.cells[t]) for t in tiles),
+            products=self.products,
+            context=self.tiles.context,
+        )
+
+    def _in_reach(self, tile: TileId) -> list[TileId]:
+        return self.grid.tiles.tiles_in(self.grid.reach(tile))
+
+    def _is_current(self, tile: TileId, key: str, manifest: Manifest) -> bool:
+        unit = str(tile)
+        record = manifest.get(SURFACE, unit)
+        if record is None or record.key != key:
+            return False
+        return not record.figures()["cells"] or all(
+            manifest.is_current(name, unit, key_of(key, wanted.key))
+            for wanted in self.products
+            for name in wanted.files
+        )
+
+
+@dataclass(frozen=True)
+class SurfaceWork:
+    """What the stage `surfaces` has to do."""
+
+    planned: SurfacePlan | None
+    """None where no surface is asked for."""
+    chosen: Sequence[TileId]
+    """Tiles whose surface is made now."""
+    gone: Sequence[OutputRecord]
+    """Files of surfaces that are no longer due, and of products no longer wanted."""
+    note: str = ""
+
+
+def plan_surface_work(survey: Survey, store: Store, selection: Selection | None, manifest: Manifest) -> SurfaceWork:
+    """Compare the surfaces there are with those there should be, once the tiles are done.
+
+    With a selection of tiles, these, and of those that depend on them the stale ones.
+    """
+    names = {SURFACE, *surface_file_names()}
+    if survey.config.surface is None:
+        return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()])
+    plan = plan_survey(survey, store)
+    footprints, context = load_ranges(plan, manifest), product_context(plan)
+    wanted = tuple(wanted_surface_products(survey, context))
+    if not wanted:
+        note = "the survey file has a section [surface], and no product of the surface is asked for"
+        return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
+    tiles = TilePlan(plan, footprints, plan_tiles(footprints, plan), (), context)
+    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest)
+    units = {str(tile) for tile in planned.keys}
+    names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
+    gone = [r for name in names for u, r in manifest.of(name).items() if u not in units or name not in names_wanted]
+    stale = planned.stale(manifest)
+    if selection is None:
+        return SurfaceWork(planned, stale, gone)
+    own = set(selection.tiles(tiles.tiles, footprints, plan.ground.grid))
+    due = own | (planned.near(own) & set(stale))
+    return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone)
+
+
+def plan_surfaces(
+    tiles: TilePlan, config: SurfaceConfig, products: tuple[WantedSurface, ...], manifest: Manifest
+) -> SurfacePlan:
+    """Surfaces that are due: of all tiles that hold cells, or of those that a polygon touches."""
+    grid = SurfaceGrid(tiles.plan.ground.grid, config)
+    regions = stated_regions(tiles.plan.survey)
+    cells = {TileId.parse(unit): r for unit, r in manifest.of(TILE).items() if r.path}
+    of_points = config.method == "points"
+    inputs = (
+        dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
+        if of_points
+        else {tile: r.digest for tile, r in cells.items()}
+    )
+    common = key_of(surface_version(), config.model_dump(mode="json", exclude={"polygons"}), grid.tiles)
+    keys: dict[TileId, str] = {}
+    for tile in sorted(cells, key=lambda t: (t.row, t.column)):
+        box = grid.reach(tile)
+        near = None if regions is None else regions.near(box)
+        if near is not None and not near.near(grid.tiles.bounds(tile)).shapes.size:
+            continue
+        around = [(str(t), inputs[t]) for t in grid.tiles.tiles_in(box) if t in inputs]
+        keys[tile] = key_of(common, str(_date(cells[tile])), around, None if near is None else near.key())
+    return SurfacePlan(tiles, grid, cells, regions, products, keys)
+
+
+def files_without_surface(manifest: Manifest) -> list[OutputRecord]:
+    """Files of tiles that turned out to have no surface."""
+    empty = {unit for unit, r in manifest.of(SURFACE).items() if not r.figures()["cells"]}
+    return [r for name in surface_file_names() for unit, r in manifest.of(name).items() if unit in empty]
+
+
+def _date(cells: OutputRecord) -> dt.date:
+    """UTC date of a tile's first reading."""
+    return utc_from_gps_ns(cells.figures()["first_epoch_gps_ns"]).date()

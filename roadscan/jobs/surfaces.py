@@ -1,0 +1,106 @@
+"""Surfaces: cells or points of a tile and its surroundings → its surface → files. One task a block of tiles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import OrderedDict
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from roadscan.jobs.cell_files import read_cells
+from roadscan.jobs.compute import reason_of
+from roadscan.jobs.surface_plan import SURFACE, SurfaceTask
+from roadscan.jobs.tile_files import publish_product
+from roadscan.jobs.tile_points import load_points
+from roadscan.jobs.tiles import TaskResult
+from roadscan.model.ids import TileId
+from roadscan.points.cloud import TilePoints
+from roadscan.products.base import ProductContext
+from roadscan.surfaces.reconstruction import Patch, patch_of_cells, patch_of_points, surface_of
+from roadscan.surfaces.tile import INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.tables.manifest import OutputRecord
+from roadscan.tiles.cells import TileCells
+
+_CELLS_KEPT = 24_000_000
+"""Cells that stay in memory for the tiles that follow: six tiles full of 5 mm, 700 MB."""
+
+
+def compute_surfaces(task: SurfaceTask) -> TaskResult:
+    """Make the surfaces of a task's tiles and write their files (runs on a worker)."""
+    source = _Cells(task) if task.readings is None else _Points(task)
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    for tile, key, date in zip(task.block.tiles, task.keys, task.dates, strict=True):
+        context = dataclasses.replace(task.context, date=date)
+        try:
+            wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
+            records += _write(task, key, surface_of(tile, source.patch(tile), task.grid, wanted), context)
+        except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
+            failures.append((str(tile), reason_of(error)))
+    return TaskResult(tuple(records), tuple(failures))
+
+
+class _Cells:
+    """Cells of finished tiles, read once and kept while there is room."""
+
+    def __init__(self, task: SurfaceTask) -> None:
+        self._task = task
+        self._records = {TileId.parse(r.unit): r for r in task.cells}
+        self._kept: OrderedDict[TileId, TileCells] = OrderedDict()
+
+    def patch(self, tile: TileId) -> Patch:
+        """What the cells say of a tile and its surroundings."""
+        grid = self._task.grid
+        near = [t for t in grid.tiles.tiles_in(grid.reach(tile)) if t in self._records]
+        return patch_of_cells(grid.window(tile), map(self._read, near))
+
+    def _read(self, tile: TileId) -> TileCells:
+        cells = self._kept.pop(tile, None)
+        if cells is None:
+            cells = read_cells(self._task.store, self._records[tile], self._task.grid.tiles.cells_per_edge)
+        self._kept[tile] = cells
+        while len(self._kept) > 1 and sum(map(len, self._kept.values())) > _CELLS_KEPT:
+            self._kept.popitem(last=False)
+        return cells
+
+
+class _Points:
+    """Points of a block and its surroundings, placed at once."""
+
+    def __init__(self, task: SurfaceTask) -> None:
+        if task.readings is None:
+            raise TypeError("a task without readings")
+        self._grid = task.grid
+        self._points: dict[TileId, TilePoints] = dict(load_points(task.readings))
+
+    def patch(self, tile: TileId) -> Patch:
+        """The detailed model of a tile and its surroundings."""
+        near = self._grid.tiles.tiles_in(self._grid.reach(tile))
+        own = [self._points[t] for t in near if t in self._points]
+        return patch_of_points(self._grid.window(tile), own, self._grid)
+
+
+def _write(task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext) -> list[OutputRecord]:
+    """Files of a surface; its own record comes last, so that a tile is current only with all its files."""
+    unit, figures = str(surface.tile), _figures(surface)
+    records: list[OutputRecord] = []
+    with task.store.scratch() as folder:
+        for wanted in task.products if figures["cells"] else ():
+            write = partial(wanted.product.write, surface, wanted.options, context)
+            records += publish_product(wanted, unit, write, key, task.store, folder)
+    return [*records, OutputRecord(SURFACE, unit, key, "", 0, "", json.dumps(figures))]
+
+
+def _figures(surface: SurfaceTile) -> dict[str, Any]:
+    origin = surface.origin[surface.inner]
+    change = (surface.height_m - surface.raw_m)[surface.inner]
+    known = change[~np.isnan(change)]
+    return {
+        "cells": int(np.count_nonzero(origin)),
+        "measured": int(np.count_nonzero(origin == MEASURED)),
+        "interpolated": int(np.count_nonzero(origin == INTERPOLATED)),
+        "change_rms_m": float(np.sqrt(np.mean(known * known))) if known.size else None,
+    }

@@ -1,0 +1,197 @@
+"""The surface of a tile, from the tiles' cells or from points: what is needed around it, raw heights, smoothing.
+
+A tile is computed on a window that reaches beyond it: by the cells that products see of the neighbours
+(:data:`SHOWN_M`), by those that smoothing depends on, and, for points, by those that triangles depend on. The outer
+ones are cut off again, so all that is left has the same bits in every tile that sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.ids import TileId
+from roadscan.model.surface import SurfaceConfig
+from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.points.cloud import QUANTUM_M, TilePoints
+from roadscan.surfaces.clough_tocher import cubic_surface
+from roadscan.surfaces.detailed import DetailedSettings
+from roadscan.surfaces.normals import slopes_at
+from roadscan.surfaces.sites import sites
+from roadscan.surfaces.smoothing import halo_cells, smooth_surface
+from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surfaces.triangulation import triangulate
+from roadscan.surfaces.window import GridWindow
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import Bounds, TileGrid
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+
+SHOWN_M: Final = 1.0
+"""What products see of the neighbouring tiles, at least (m)."""
+
+_BRIGHTEST: Final = 65_535.0
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """The cells of a survey's surface, and how far a tile has to look around itself."""
+
+    tiles: TileGrid
+    config: SurfaceConfig
+
+    @property
+    def cell_m(self) -> tuple[float, float]:
+        """Edges of a cell (m): east, north."""
+        return self.config.cell_m or (self.tiles.cell_m, self.tiles.cell_m)
+
+    @property
+    def shown(self) -> int:
+        """Cells of the neighbours that products see, on each side."""
+        return math.ceil(SHOWN_M / min(self.cell_m) - 1e-9)
+
+    @property
+    def smoothed(self) -> int:
+        """Cells beyond those that smoothing depends on."""
+        settings = self.config.smoothing_settings()
+        return 0 if settings is None else halo_cells(settings)
+
+    def window(self, tile: TileId) -> GridWindow:
+        """Cells that are computed for a tile."""
+        return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(self.shown + self.smoothed)
+
+    def reach(self, tile: TileId) -> Bounds:
+        """Box (m) of all cells or points that a tile's surface depends on."""
+        box, margin = self.window(tile).bounds(), 0.0
+        if self.config.method == "points":
+            margin = self.detailed.halo_m + max(self.cell_m)
+        return Bounds(
+            box.easting_min_m - margin,
+            box.northing_min_m - margin,
+            box.easting_max_m + margin,
+            box.northing_max_m + margin,
+        )
+
+    def rings(self) -> int:
+        """Rings of tiles around a tile that :meth:`reach` touches."""
+        tile = TileId(0, 0)
+        own, box = self.tiles.bounds(tile), self.reach(tile)
+        beyond = max(box.easting_max_m - own.easting_max_m, box.northing_max_m - own.northing_max_m)
+        return math.ceil((beyond + max(self.cell_m)) / self.tiles.size_m)
+
+    @property
+    def detailed(self) -> DetailedSettings:
+        """Settings of the detailed model."""
+        return DetailedSettings(max_gap_m=self.config.max_gap_m, slopes=self.config.slopes)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Raw arrays (rows, columns) of a window, row 0 the southernmost."""
+
+    raw_m: Float64
+    origin: npt.NDArray[np.uint8]
+    intensity: Float32
+
+
+def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
+    """What tiles' cells say of a window: robust heights and mean intensities.
+
+    Parameters
+    ----------
+    window : in the tiles' own cells.
+    tiles : those that share cells with it, in any order.
+    """
+    shape = window.rows, window.columns
+    raw, intensity = np.full(shape, np.nan), np.full(shape, np.nan, np.float32)
+    for cells in tiles:
+        row = cells.row.astype(np.int64) + (cells.tile.row * cells.cells_per_edge - window.first_row)
+        column = cells.column.astype(np.int64) + (cells.tile.column * cells.cells_per_edge - window.first_column)
+        own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
+        raw[row[own], column[own]] = cells.height_robust_m[own]
+        intensity[row[own], column[own]] = cells.intensity_mean[own]
+    return Patch(raw, np.where(np.isnan(raw), EMPTY, MEASURED).astype(np.uint8), intensity)
+
+
+def patch_of_points(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid) -> Patch:
+    """The detailed model through points, at the nodes of a window.
+
+    A cell with a point in it is measured, the others that hold a height are interpolated. Intensities are a smooth
+    surface over the same triangles.
+
+    Parameters
+    ----------
+    tiles : those that :meth:`SurfaceGrid.reach` touches, in any order.
+    """
+    box, margin = window.bounds(), grid.detailed.halo_m + max(grid.cell_m)
+    parts = [_near(one, grid.tiles, box, margin) for one in tiles]
+    places = np.concatenate([p for p, _ in parts]) if parts else np.empty((0, 3))
+    light = np.concatenate([i for _, i in parts]) if parts else np.empty(0)
+    ground = sites(places)
+    brightness = sites(np.column_stack([places[:, :2], light]))
+    mesh = triangulate(ground, grid.detailed.max_gap_m)
+    raw = cubic_surface(ground, mesh, slopes_at(ground, mesh, grid.detailed.slopes).slopes).heights(window)
+    grey = cubic_surface(brightness, mesh, slopes_at(brightness, mesh, "quadratic").slopes).heights(window)
+    origin = np.where(np.isnan(raw), EMPTY, np.where(_held(window, places), MEASURED, INTERPOLATED))
+    return Patch(raw, origin.astype(np.uint8), np.clip(grey, 0.0, _BRIGHTEST).astype(np.float32))
+
+
+def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | None = None) -> SurfaceTile:
+    """Smooth a window's heights, and cut off what was needed for that alone.
+
+    Parameters
+    ----------
+    patch : of :meth:`SurfaceGrid.window`.
+    wanted : (rows, columns) of the window, cells outside which there shall be no surface; None for all.
+    """
+    settings = grid.config.smoothing_settings()
+    height = patch.raw_m if settings is None else smoothed_where_known(patch.raw_m, settings)
+    rim, window = grid.smoothed, grid.window(tile)
+    inner = (slice(rim, window.rows - rim), slice(rim, window.columns - rim))
+    raw, height = patch.raw_m[inner].copy(), height[inner].copy()
+    origin, intensity = patch.origin[inner].copy(), patch.intensity[inner].copy()
+    if wanted is not None:
+        left_out = ~wanted[inner]
+        raw[left_out] = height[left_out] = np.nan
+        intensity[left_out], origin[left_out] = np.nan, EMPTY
+    return SurfaceTile(tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, grid.config.sigma_m)
+
+
+def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:
+    """Smoothed heights (rows, columns), computed on the smallest box of known cells: a grid ends like a hole."""
+    known = ~np.isnan(raw_m)
+    if not known.any():
+        return raw_m
+    spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    rows, columns = (slice(int(s[0]), int(s[-1]) + 1) for s in spans)
+    height = np.full(raw_m.shape, np.nan)
+    height[rows, columns] = smooth_surface(raw_m[rows, columns], settings)
+    return height
+
+
+def _near(points: TilePoints, tiles: TileGrid, box: Bounds, margin_m: float) -> tuple[Float64, Float64]:
+    """Places (n, 3) and intensities (n,) of a tile's points within `margin_m` of a box."""
+    corner = tiles.bounds(points.tile)
+    easting = corner.easting_min_m + points.x_quanta * QUANTUM_M
+    northing = corner.northing_min_m + points.y_quanta * QUANTUM_M
+    near = (easting >= box.easting_min_m - margin_m) & (easting <= box.easting_max_m + margin_m)
+    near &= (northing >= box.northing_min_m - margin_m) & (northing <= box.northing_max_m + margin_m)
+    places = np.column_stack([easting[near], northing[near], points.height_quanta[near] * QUANTUM_M])
+    return places, points.intensity[near].astype(np.float64)
+
+
+def _held(window: GridWindow, places_m: Float64) -> Bool:
+    """(rows, columns) cells with a place in them."""
+    column = np.floor(places_m[:, 0] / window.cell_east_m).astype(np.int64) - window.first_column
+    row = np.floor(places_m[:, 1] / window.cell_north_m).astype(np.int64) - window.first_row
+    own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
+    held = np.zeros((window.rows, window.columns), bool)
+    held[row[own], column[own]] = True
+    return held

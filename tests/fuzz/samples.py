@@ -32,6 +32,7 @@ from roadscan.sensors.nmea_writer import Fix, sentences
 from roadscan.sensors.sick_telegrams import encode_scans, encode_telegram, write_telegrams
 from roadscan.sensors.text_table import LINE_BYTES_MAX
 from tests.fuzz.mutations import Change, Inside
+from tests.fuzz.pose_samples import control_csv, pose_feather, pose_parquet
 from tests.sensors import (
     test_argoverse,
     test_carmen,
@@ -53,7 +54,6 @@ from tests.sensors import (
     test_velodyne_pcap,
 )
 from tests.sensors.e57_files import PAGE, PAYLOAD, small_e57
-from tests.sensors.test_pose_and_control_fuzz import control_csv, pose_feather, pose_parquet
 
 GPS = Clock(TimeSystem.GPS)
 WEEK = Clock(TimeSystem.GPS_WEEK, week=2405)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import random
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,11 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
+from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import LogSource, Reject, Rows, format_named, format_of
 from roadscan.tables.schema import table_schema
-from tests.sensors.test_pose_and_control_fuzz import mutated
 
 GPS = Clock(TimeSystem.GPS)
 FIRST_S = 1_400_000_000
@@ -326,24 +324,6 @@ def test_lines_that_returns_alone_end_do_not_vanish(tmp_path: Path, above: str) 
 def sample(path: Path) -> Path:
     """A small sound log."""
     return write(path, *[plain(k) for k in range(6)])
-
-
-def test_mutants(tmp_path: Path) -> None:
-    path = sample(tmp_path / "a.clf")
-    data = path.read_bytes()
-    draw = random.Random("carmen")
-    outcomes = []
-    for _ in range(200):
-        path.write_bytes(mutated(data, draw))
-        format_named("carmen").sniff(path)
-        try:
-            log = read_carmen(path)
-            outcomes.append(len(log.ranges) + sum(r.records for r in log.rejects))
-        except RoadscanError as error:
-            assert str(error)
-    assert len(outcomes) > 150
-    # Of the six lines some are cut off or joined; otherwise each is there, or its reject.
-    assert sum(n >= 5 for n in outcomes) > 0.8 * len(outcomes)
 
 
 # --- the recording ----------------------------------------------------------------------------------

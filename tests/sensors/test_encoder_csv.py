@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.rig import Rig, Sensor
 from roadscan.sensors.base import format_of
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
-from tests.sensors.test_pose_and_control_fuzz import mutated
 
 ENCODER = Sensor(kind="encoder")
 STATED: dict[str, Any] = {"clock": GPS_SECONDS, "sensor": ENCODER}
@@ -222,30 +220,6 @@ def test_the_worth_of_a_tick_stands_in_the_rig_file() -> None:
     assert rig.sensors["wheel"].metres_per_tick == 0.0021
     with pytest.raises(ConfigError, match="metres_per_tick"):
         Rig.parse({"sensors": {"wheel": {"kind": "encoder", "metres_per_tick": 0}}})
-
-
-@pytest.mark.parametrize("options", [TOTAL | {"counter_bits": 16}, {"record": "increment"}])
-def test_mutants(tmp_path: Path, options: dict[str, Any]) -> None:
-    path = tmp_path / "a.csv"
-    rng = random.Random("encoder")
-    outcomes = []
-    for _ in range(200):
-        path.write_bytes(mutated(sample(), rng))
-        format_named_sniffs(path)
-        try:
-            log = read_log("encoder_csv", path, options, **STATED)
-            outcomes.append(log.table.num_rows + sum(r.records for r in log.rejects))
-        except RoadscanError as error:
-            assert str(error)
-    assert len(outcomes) > 50
-    assert max(outcomes) >= 6
-
-
-def format_named_sniffs(path: Path) -> None:
-    try:
-        format_of(path)
-    except FormatError as error:
-        assert "fits" not in error.arrived
 
 
 def test_the_recorded_drive(recordings: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import math
-import random
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.rig import Sensor
 from roadscan.sensors.base import format_of
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
-from tests.sensors.test_pose_and_control_fuzz import mutated
 
 NAMES = "time_s,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s,acc_x_g,acc_y_g,acc_z_g,temperature_deg_c"
 IMU = Sensor(kind="imu")
@@ -163,21 +161,6 @@ def test_a_table_of_poses_is_none_of_an_imu(tmp_path: Path) -> None:
     names = NAMES + ",latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"
     path = write(tmp_path / "a.csv", names, "1400000000,0,0,0,0,0,1,20,50,10,100,0,0,0")
     assert format_of(path).name == "trajectory_csv"
-
-
-def test_mutants(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    rng = random.Random("imu")
-    outcomes = []
-    for _ in range(200):
-        path.write_bytes(mutated(sample(), rng))
-        try:
-            log = read_log("imu_csv", path, **STATED)
-            outcomes.append(log.table.num_rows + sum(r.records for r in log.rejects))
-        except RoadscanError as error:
-            assert str(error)
-    assert len(outcomes) > 50
-    assert max(outcomes) >= 6
 
 
 def test_the_recorded_drive(recordings: Path) -> None:

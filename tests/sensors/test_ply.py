@@ -14,7 +14,7 @@ import pytest
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_of
-from tests.sensors.readings import read, survive
+from tests.sensors.readings import read
 
 plyfile = pytest.importorskip("plyfile")
 
@@ -266,16 +266,6 @@ def test_lists_of_changing_length_take_linear_time(tmp_path: Path) -> None:
     log = read("ply", path, NOON, crs="local")
     assert time.monotonic() - started < 15.0
     assert np.array_equal(log["x_m"], np.arange(count))
-
-
-@pytest.mark.parametrize("lists", [False, True])
-@pytest.mark.parametrize("coding", CODINGS)
-def test_mutants(tmp_path: Path, coding: str, lists: bool) -> None:
-    path = written(tmp_path, small_ply(coding, lists))
-    made = {"crs": "local", "clock": ADJUSTED}
-    done, refused = survive("ply", path, path, count=100, options={"unit": "metre"}, make=lambda: made)
-    assert done > 20
-    assert refused > 5
 
 
 @pytest.mark.parametrize("coding", CODINGS)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-import shutil
 import warnings
 import zipfile
 from pathlib import Path
@@ -20,7 +18,6 @@ from roadscan.model.errors import ConfigError, CrsError, FormatError
 from roadscan.sensors.base import format_named, format_of
 from roadscan.sensors.road_lines import TIGER_ROADS
 from tests.sensors.log_reading import Log, read_log
-from tests.sensors.test_pose_and_control_fuzz import mutated, survives
 
 UTM17 = MapFrame(crs="EPSG:26917")
 MIAMI = np.array([[-80.19, 25.77], [-80.189, 25.77], [-80.189, 25.772]])
@@ -237,27 +234,6 @@ def test_cut_off(tmp_path: Path) -> None:
         read_log("road_lines", path, map=UTM17)
     with pytest.raises(FormatError, match="does not exist"):
         read_log("road_lines", tmp_path / "none.shp", map=UTM17)
-
-
-@pytest.mark.parametrize("suffix", [".shp", ".dbf", ".prj", ".zip", ".geojson", ".gpkg"])
-def test_mutated_layers(tmp_path: Path, suffix: str) -> None:
-    frame = tiger().to_crs("EPSG:4326") if suffix == ".geojson" else tiger()
-    shape = suffix in {".shp", ".dbf", ".prj"}
-    seed = zipped(tmp_path) if suffix == ".zip" else write(tmp_path / f"seed{'.shp' if shape else suffix}", frame)
-    data = seed.with_suffix(suffix).read_bytes()
-    rng = random.Random(f"roadscan lines {suffix}")
-    outcomes = []
-    for i in range(60):
-        damaged = tmp_path / f"{i}{suffix}"  # GDAL remembers files by name
-        if shape:
-            for other in (".shp", ".shx", ".dbf", ".prj"):
-                shutil.copy(seed.with_suffix(other), damaged.with_suffix(other))
-        damaged.write_bytes(mutated(data, rng))
-        path = damaged.with_suffix(".shp") if shape else damaged
-        assert format_named("road_lines").sniff(path) in {True, False}
-        assert format_named("control_vector").sniff(path) in {True, False}
-        outcomes.append(survives("road_lines", path, {}, {"map": UTM17}))
-    assert any(o is not None for o in outcomes)
 
 
 def test_vertices_that_are_no_numbers_and_doubled_attributes(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
-import random
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import Geoid
-from roadscan.model.errors import ConfigError, CrsError, FormatError, RoadscanError, TimeSystemError
+from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.sensors.base import format_named, format_of
 from tests.sensors.log_reading import Log, read_log, source_of
-from tests.sensors.test_pose_and_control_fuzz import MUTANTS, mutated
 
 ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 STATED: dict[str, Any] = {"crs": "EPSG:4979"}
@@ -357,21 +355,3 @@ def test_lines_that_end_in_returns_alone_do_not_vanish(tmp_path: Path) -> None:
     log = read_log("rtklib_pos", path, **STATED)
     assert log.table.num_rows == 0
     assert len(log.rejects) == 1
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_mutants(tmp_path: Path, packed: bool) -> None:
-    rng = random.Random("roadscan pos")
-    path = tmp_path / ("a.pos.gz" if packed else "a.pos")
-    data = gzip.compress(sample()) if packed else sample()
-    path.write_bytes(data)
-    assert read_log("rtklib_pos", path, **STATED).table.num_rows == 6
-    outcomes = []
-    for _ in range(MUTANTS // 2 if packed else MUTANTS):
-        path.write_bytes(mutated(data, rng))
-        format_named("rtklib_pos").sniff(path)
-        try:
-            outcomes.append(read_log("rtklib_pos", path, **STATED).table.num_rows)
-        except RoadscanError as error:
-            assert str(error)
-    assert outcomes, "every mutant was refused as a whole"

@@ -15,7 +15,7 @@ import pytest
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import LogSource, NoOptions, Rows, format_named, format_of
-from tests.sensors.readings import read, survive
+from tests.sensors.readings import read
 
 READINGS = 12
 PROFILES = 200
@@ -307,12 +307,3 @@ def test_other_tables_are_not_taken_for_scans(tmp_path: Path) -> None:
     assert not format_named("scans").sniff(tmp_path / "missing.parquet")
     (tmp_path / "empty").mkdir()
     assert not format_named("scans").sniff(tmp_path / "empty")
-
-
-@pytest.mark.parametrize("write", [write_parquet, write_arrow, write_compressed])
-def test_damaged_bytes_never_crash(tmp_path: Path, write: Writer) -> None:
-    path = tmp_path / "a.table"
-    write(profiles(), path)
-    done, refused = survive("scans", path, path)
-    assert done > 20
-    assert refused > 20

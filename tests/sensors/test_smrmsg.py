@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import gzip
 import math
-import random
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from roadscan.model.errors import FormatError, RoadscanError, TimeSystemError
+from roadscan.model.errors import FormatError, TimeSystemError
 from roadscan.model.gpstime import WEEK_S, Clock, TimeSystem
 from roadscan.sensors import text_table
 from roadscan.sensors.base import format_named, format_of
 from tests.sensors.log_reading import Log, read_log, source_of
-from tests.sensors.test_pose_and_control_fuzz import MUTANTS, mutated
 
 WEEK = 2405
 CLOCK = Clock(TimeSystem.GPS_WEEK, week=WEEK)
@@ -258,23 +255,6 @@ def test_wrong_accuracy_files(tmp_path: Path) -> None:
     write(tmp_path / "empty.out", [])
     with pytest.raises(FormatError, match=r"empty\.out: the file has 0 bytes"):
         sbet_with(poses, "empty.out")
-
-
-@pytest.mark.parametrize("carried", [False, True])
-def test_mutants(tmp_path: Path, carried: bool) -> None:
-    rng = random.Random("roadscan smrmsg")
-    path = tmp_path / "acc.out"
-    poses = sbet(tmp_path / "a.sbet", [1000.0 + 0.5 * i for i in range(20)])
-    outcomes: list[Any] = []
-    for _ in range(MUTANTS // 2):
-        path.write_bytes(mutated(sample(), rng))
-        format_named("smrmsg").sniff(path)
-        try:
-            log = sbet_with(poses, "acc.out") if carried else read_log("smrmsg", path, clock=CLOCK)
-            outcomes.append(log.table.num_rows)
-        except RoadscanError as error:
-            assert str(error)
-    assert outcomes, "every mutant was refused as a whole"
 
 
 @pytest.mark.parametrize("time", [math.inf, -math.inf, math.nan, 1e308])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.cell_runs import run_end
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import bare, kernel
 
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
 """Added and taken away again, it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""
@@ -14,7 +14,7 @@ TO_WHOLE = 1.5 * 2.0**52
 """Added and taken away again, it rounds a number below 2⁵¹ to a whole one (intensities)."""
 
 
-@kernel
+@bare
 def _add_pairs(count, height, intensity, base, cells, points, above, light):
     """Add two cells side by side to each pixel."""
     for p in range(cells.size):
@@ -30,7 +30,7 @@ def _add_pairs(count, height, intensity, base, cells, points, above, light):
         light[p] += ((west + TO_WHOLE) - TO_WHOLE) + ((east + TO_WHOLE) - TO_WHOLE)
 
 
-@kernel
+@bare
 def _add_run(first, factor, count, height, intensity, base, sums):
     """Add cells side by side, from column `first` on, to the sums (4, …) of their pixels."""
     end, pairs = count.size, 0
@@ -61,7 +61,7 @@ def _add_run(first, factor, count, height, intensity, base, sums):
         i += 1
 
 
-@kernel
+@bare
 def _fold(line, factor, pixels):
     """Add `factor` pixels to each of the next level, and leave zeros. The usual four are spelled out."""
     if factor == 4:
@@ -74,7 +74,7 @@ def _fold(line, factor, pixels):
     line[:] = 0.0
 
 
-@kernel
+@bare
 def _means(cells, points, above, light, base, out_count, out_cells, out_height, out_intensity):
     """Write pixels side by side that all hold a cell."""
     for p in range(cells.size):
@@ -87,30 +87,15 @@ def _means(cells, points, above, light, base, out_count, out_cells, out_height, 
         out_intensity[p] = light[p] / points[p]
 
 
-@kernel
-def reduce_cells(
+@bare
+def _reduce(
     column, row, count, height, intensity, base, factors, edges, starts, sums,
-    out_column, out_row, out_count, out_cells, out_height, out_intensity, written,
+    out_column, out_row, out_count, out_cells, out_height, out_intensity, written, west, east,
 ):  # fmt: skip
-    """Pixels of all levels in one pass over the cells, strip by strip; the sums of a strip feed the next level.
-
-    Parameters
-    ----------
-    column, row : (n,) uint16, sorted by row, column; count : (n,) uint32.
-    height : (n,) float64, m; intensity : (n,) float32, mean of the cell's points.
-    base : float64, whole metres near the heights: sums are of heights above it.
-    factors : (levels,) int64, ascending, each a multiple of the one before.
-    edges, starts : (levels,) int64, pixels along an edge; first place of each level in the outputs.
-    sums : (levels, 4, pixels along an edge of the first) float64, zeros; zeros again at the end. Cells, points, height
-        above `base`, intensity of a strip's pixels.
-    out_column, out_row : (…,) uint16, out; out_count, out_cells : uint32; out_height : float64, m;
-        out_intensity : float32.
-    written : (levels,) int64, out: pixels of each level.
-    """
+    """:func:`reduce_cells`; west, east : (levels,) int64, edges[0] and 0, pixels of a strip that have sums."""
     n = row.size
     levels = factors.size
     written[:] = 0
-    west, east = np.full(levels, edges[0]), np.zeros(levels, np.int64)
     i = 0
     while i < n:
         strip = row[i] // factors[0]
@@ -154,3 +139,31 @@ def reduce_cells(
             following //= ratio
             if following == line:
                 break  # more of this line of pixels is to come
+
+
+@kernel
+def reduce_cells(
+    column, row, count, height, intensity, base, factors, edges, starts, sums,
+    out_column, out_row, out_count, out_cells, out_height, out_intensity, written,
+):  # fmt: skip
+    """Pixels of all levels in one pass over the cells, strip by strip; the sums of a strip feed the next level.
+
+    Parameters
+    ----------
+    column, row : (n,) uint16, sorted by row, column; count : (n,) uint32.
+    height : (n,) float64, m; intensity : (n,) float32, mean of the cell's points.
+    base : float64, whole metres near the heights: sums are of heights above it.
+    factors : (levels,) int64, ascending, each a multiple of the one before.
+    edges, starts : (levels,) int64, pixels along an edge; first place of each level in the outputs.
+    sums : (levels, 4, pixels along an edge of the first) float64, zeros; zeros again at the end. Cells, points, height
+        above `base`, intensity of a strip's pixels.
+    out_column, out_row : (…,) uint16, out; out_count, out_cells : uint32; out_height : float64, m;
+        out_intensity : float32.
+    written : (levels,) int64, out: pixels of each level.
+    """
+    levels = factors.size
+    _reduce(
+        column, row, count, height, intensity, base, factors, edges, starts, sums,
+        out_column, out_row, out_count, out_cells, out_height, out_intensity, written,
+        np.full(levels, edges[0]), np.zeros(levels, np.int64),
+    )  # fmt: skip

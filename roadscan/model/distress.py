@@ -1,0 +1,64 @@
+"""Settings of the detection of cracks and potholes on a gridded surface."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from roadscan.model.strict import Strict
+
+
+class CrackDetection(Strict):
+    """What is a crack (``surfaces/valleys.py``), and what its figures are (``surfaces/cracks.py``)."""
+
+    max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
+    """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""
+    strong_sigmas: float = Field(default=6.0, gt=0.0)
+    """A crack begins where a line of cells lies deeper than its flanks by this many σ of such lines nearby …"""
+    weak_sigmas: float = Field(default=3.0, gt=0.0)
+    """… and goes on as long as it lies deeper by this many …"""
+    min_valley_m: float = Field(default=0.0004, ge=0.0)
+    """… and by this much (m), as the mean over the cells of the line: a crack narrower than a cell looks shallow."""
+    nearby_share: float = Field(default=0.4, ge=0.0, lt=1.0)
+    """A cell is no crack if its line is less than this share as deep as the deepest within the length of a line."""
+    spur_m: float = Field(default=0.04, ge=0.0, le=0.5)
+    """Side branches shorter than this (m) are frays of a crack's wall, and left out."""
+    min_length_m: float = Field(default=0.15, ge=0.0)
+    """Least length of a crack with all its branches, over all tiles (m)."""
+    min_depth_m: float = Field(default=0.001, ge=0.0)
+    """Least mean depth of a crack (m)."""
+    lane_angle_deg: float = Field(default=30.0, gt=0.0, le=45.0)
+    """A crack within this angle of the lane's direction is longitudinal, within this of its normal transverse, else
+    diagonal (degrees)."""
+    alligator_polygons: int = Field(default=3, ge=1)
+    """A net of cracks that closes at least this many polygons …"""
+    alligator_nodes_per_m2: float = Field(default=4.0, gt=0.0)
+    """… and has this many junctions per square metre of the ground that it covers is an alligator crack."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> CrackDetection:
+        if self.weak_sigmas > self.strong_sigmas:
+            raise ValueError(f"weak_sigmas {self.weak_sigmas:g} is above strong_sigmas {self.strong_sigmas:g}")
+        return self
+
+
+class PotholeDetection(Strict):
+    """What is a pothole (``surfaces/potholes.py``)."""
+
+    block_m: float = Field(default=0.05, gt=0.0, le=0.5)
+    """Edge of the blocks whose mean heights show the ground around (m)."""
+    window_m: float = Field(default=0.55, gt=0.0, le=5.0)
+    """Half the edge of the square in which the ground is looked for (m); holes up to 1.4 times as wide are found."""
+    edge_depth_m: float = Field(default=0.008, gt=0.0)
+    """Depth below the ground at which a pothole's outline runs (m)."""
+    min_depth_m: float = Field(default=0.02, gt=0.0)
+    """Least depth of its deepest block (m): settled patches and sunk manholes are mostly less."""
+    min_area_m2: float = Field(default=0.005, gt=0.0)
+    """Least area (m²)."""
+    max_elongation: float = Field(default=4.0, ge=1.0)
+    """Longer than this many times its breadth it is a rut or a trench."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> PotholeDetection:
+        if self.edge_depth_m > self.min_depth_m:
+            raise ValueError(f"edge_depth_m {self.edge_depth_m:g} is above min_depth_m {self.min_depth_m:g}")
+        return self

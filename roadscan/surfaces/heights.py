@@ -1,0 +1,69 @@
+"""A window of a gridded surface, as the detection of cracks and potholes takes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.errors import RoadscanError
+
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+HEIGHT_STEP_M = 1e-5
+"""Heights are whole multiples of this, so that sums do not depend on their order."""
+_OUTLIER_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class HeightWindow:
+    """Heights of a rectangle of square cells, its northernmost row last.
+
+    Cells are counted from the map's origin: cell (row, column) covers northing [row, row + 1) · `cell_m`.
+    """
+
+    raw_m: Float64
+    """(rows, columns) heights before smoothing (m), NaN where there is none."""
+    height_m: Float64
+    """The same after smoothing."""
+    cell_m: float
+    sigma_m: float
+    """1 σ of the noise of one cell's raw height (m)."""
+    first_row: int = 0
+    """Row on the map of the window's first row."""
+    first_column: int = 0
+    halo: int = 0
+    """Cells along each border that belong to the neighbours: they are looked at, and nothing is reported of them."""
+
+    def __post_init__(self) -> None:
+        if self.raw_m.ndim != 2 or self.raw_m.shape != self.height_m.shape:
+            raise RoadscanError(
+                f"heights of shapes {self.raw_m.shape} and {self.height_m.shape}",
+                expected="two grids of the same rows and columns",
+            )
+        if 2 * self.halo >= min(self.raw_m.shape, default=0):
+            raise RoadscanError(
+                f"a window of {self.raw_m.shape[0]} × {self.raw_m.shape[1]} cells with a halo of {self.halo}",
+                expected="cells that are not halo",
+            )
+
+    def is_inner(self, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Bool:
+        """Which cells (n,), counted within the window, are not halo."""
+        rows, columns = self.raw_m.shape
+        return np.asarray(
+            (row >= self.halo) & (row < rows - self.halo) & (column >= self.halo) & (column < columns - self.halo)
+        )
+
+    def cleaned_m(self) -> Float64:
+        """Raw heights without those that the smoothing left out as impulses."""
+        off = np.abs(self.raw_m - self.height_m)
+        with np.errstate(invalid="ignore"):
+            return np.where(off <= _OUTLIER_SIGMAS * self.sigma_m, self.raw_m, np.nan)
+
+    def map_m(self, row: npt.ArrayLike, column: npt.ArrayLike) -> Float64:
+        """Easting and northing (n, 2) of places in cells within the window; .5 is a cell's middle."""
+        east = (np.asarray(column, np.float64) + self.first_column) * self.cell_m
+        north = (np.asarray(row, np.float64) + self.first_row) * self.cell_m
+        return np.stack([east, north], axis=-1)

@@ -1,0 +1,118 @@
+"""The cells of a skeleton as a graph: who is whose neighbour, short side branches, paths from node to node."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+PRUNINGS = 2
+
+
+@dataclass(frozen=True)
+class SkeletonGraph:
+    """Cells (n,) in order of row and column, and edges (m, 2) between neighbours, the first cell before the second.
+
+    Cells that share a side are neighbours; those that share a corner are, unless another cell joins them by sides. So
+    three cells in a corner are no loop.
+    """
+
+    row: Int64
+    column: Int64
+    edges: Int64
+
+    @classmethod
+    def of(cls, skeleton: Bool) -> SkeletonGraph:
+        """Graph of a grid of cells (rows, columns)."""
+        row, column = np.nonzero(skeleton)
+        number = np.full((skeleton.shape[0] + 1, skeleton.shape[1] + 2), -1)
+        number[row, column + 1] = np.arange(row.size)
+        east, north = number[row, column + 2], number[row + 1, column + 1]
+        west = number[row, column]
+        own = np.arange(row.size)
+        pairs = [np.stack([own, other], axis=-1)[other >= 0] for other in (east, north)]
+        for side, other in ((east, number[row + 1, column + 2]), (west, number[row + 1, column])):
+            joined = (other >= 0) & (side < 0) & (north < 0)
+            pairs.append(np.stack([own, other], axis=-1)[joined])
+        return cls(row, column, np.concatenate(pairs))
+
+    @property
+    def degree(self) -> Int64:
+        """Neighbours of each cell (n,)."""
+        return np.bincount(self.edges.ravel(), minlength=self.row.size)
+
+    def neighbours(self) -> list[list[int]]:
+        """Of each cell its neighbours, ascending."""
+        both = np.concatenate([self.edges, self.edges[:, ::-1]])
+        both = both[np.lexsort((both[:, 1], both[:, 0]))]
+        cuts = np.searchsorted(both[:, 0], np.arange(self.row.size + 1)).tolist()
+        beside = both[:, 1].tolist()
+        return [beside[a:b] for a, b in itertools.pairwise(cuts)]
+
+    def spurs(self, cells: int) -> list[int]:
+        """Cells of branches that end within `cells` of a junction."""
+        beside = self.neighbours()
+        found: list[int] = []
+        for end in np.flatnonzero(self.degree == 1).tolist():
+            path, before, here = [end], -1, end
+            while len(path) <= cells and len(beside[here]) <= 2:
+                onward = [k for k in beside[here] if k != before]
+                if not onward:
+                    break
+                before, here = here, onward[0]
+                path.append(here)
+            if len(beside[here]) > 2:
+                found += path[:-1]
+        return found
+
+    def smoothed(self, place: Float64) -> Float64:
+        """Places (n, 2) moved halfway to the middle of both neighbours, where a cell has two."""
+        total = np.zeros_like(place)
+        np.add.at(total, self.edges[:, 0], place[self.edges[:, 1]])
+        np.add.at(total, self.edges[:, 1], place[self.edges[:, 0]])
+        return np.where((self.degree == 2)[:, None], 0.5 * place + 0.25 * total, place)
+
+    def paths(self, own: Bool) -> Iterator[list[int]]:
+        """Paths (cells) over those edges (m,) that are `own`, from node to node.
+
+        A node is a cell with other than two neighbours, or one where the own edges end.
+        """
+        mine = SkeletonGraph(self.row, self.column, self.edges[own])
+        beside = mine.neighbours()
+        is_node = (self.degree != 2) | (mine.degree != 2)
+        walked: set[tuple[int, int]] = set()
+        rings = np.flatnonzero(~is_node).tolist()
+        for start in [*np.flatnonzero(is_node & (mine.degree > 0)).tolist(), *rings]:
+            for second in beside[start]:
+                if (start, second) in walked:
+                    continue
+                path = _walk(start, second, beside, is_node)
+                walked.update(itertools.pairwise(path))
+                walked.update(itertools.pairwise(path[::-1]))
+                yield path
+
+
+def pruned(skeleton: Bool, spur_cells: int) -> SkeletonGraph:
+    """Graph of a skeleton without its spurs."""
+    cells = skeleton.copy()
+    graph = SkeletonGraph.of(cells)
+    for _ in range(PRUNINGS):
+        spurs = graph.spurs(spur_cells)
+        cells[graph.row[spurs], graph.column[spurs]] = False
+        graph = SkeletonGraph.of(cells)
+    return graph
+
+
+def _walk(start: int, second: int, beside: list[list[int]], is_node: Bool) -> list[int]:
+    path = [start, second]
+    while not is_node[path[-1]] and path[-1] != start:
+        onward = [k for k in beside[path[-1]] if k != path[-2]]
+        path.append(onward[0])
+    return path

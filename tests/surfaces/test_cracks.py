@@ -1,0 +1,267 @@
+"""Cracks: the simulator's road with known cracks, drawn forms that are none, and shapely and SciPy as judges."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import shapely
+from scipy.ndimage import distance_transform_edt, label
+
+from roadscan.kernels.cross_sections import cross_sections
+from roadscan.model.distress import CrackDetection
+from roadscan.model.errors import ConfigError, RoadscanError
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+from roadscan.surfaces.crack_network import join_cracks
+from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells, sharpened
+from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.skeleton_graph import SkeletonGraph, pruned
+from roadscan.surfaces.valleys import _thinned
+
+CONFIG = CrackDetection()
+CELL_M = 0.0025
+NOISE_M = 0.0003
+SEEN_FROM = 58
+"""Cells along the border of a window in which nothing is found."""
+ROAD = {"roughness": {"iso_class": "C"}, "texture": {"mpd_mm": 0.8}, "cross_slope": 0.03, "ruts": [{"offset_m": 0.9}]}
+BRANCHED = [[(10.1, 0.65), (10.4, 0.9), (10.85, 1.05)], [(10.4, 0.9), (10.3, 1.25)]]
+
+
+def road(lines=(), width_m=0.005, depth_m=0.003, cells=(340, 340), fine=2, seed=1, **more):
+    """Heights of a patch from station 10 and offset 0.55 on, each the mean of four readings; its truth as lines."""
+    cracks = [{"points_m": line, "width_m": width_m, "depth_m": depth_m} for line in lines]
+    scene = Scene(seed=7).changed(map={"azimuth_deg": 0.0}, road={**ROAD, "cracks": cracks, **more})
+    north = round((scene.map.northing_m + 10.0) / CELL_M)
+    east = round((scene.map.easting_m + 0.55) / CELL_M)
+    y, x = ((k + (np.arange(n * fine) + 0.5) / fine) * CELL_M for k, n in zip((north, east), cells, strict=True))
+    height = Surface(scene).height_m(*np.broadcast_arrays(x[None], y[:, None]))
+    rng = np.random.default_rng(seed)
+    height += rng.normal(0.0, NOISE_M, height.shape)
+    height = height.reshape(cells[0], fine, cells[1], fine).mean(axis=(1, 3))
+    height[rng.random(cells) < 0.03] = np.nan
+    corner = scene.map.easting_m, scene.map.northing_m
+    truth = shapely.MultiLineString([[(corner[0] + o, corner[1] + s) for s, o in one] for one in lines])
+    edge = SEEN_FROM * CELL_M
+    truth = truth & shapely.box(
+        east * CELL_M + edge,
+        north * CELL_M + edge,
+        (east + cells[1]) * CELL_M - edge,
+        (north + cells[0]) * CELL_M - edge,
+    )
+    return HeightWindow(height, height, CELL_M, NOISE_M, north, east), truth
+
+
+def drawn(height_m, cell_m=0.005, seed=2, halo=0, first=(0, 0)):
+    noise = np.random.default_rng(seed).normal(0.0, 0.0002, height_m.shape)
+    return HeightWindow(height_m + noise, height_m + noise, cell_m, 0.0002, *first, halo)
+
+
+def joined(window, config=CONFIG, lane=0.0):
+    return join_cracks(crack_pieces(window, config), lane, window.cell_m, config)
+
+
+def scores(found, truth, tolerance_m):
+    """Share of what was found that is true, and of what is true that was found."""
+    places = shapely.points(np.concatenate([shapely.get_coordinates(c.line) for c in found]))
+    true = [line.interpolate(s) for line in truth.geoms for s in np.arange(0.0, line.length, CELL_M)]
+    return tuple(
+        float((shapely.distance(a, b) <= tolerance_m).mean())
+        for a, b in ((places, truth), (true, shapely.union_all([c.line for c in found])))
+    )
+
+
+@pytest.fixture(scope="module")
+def branched():
+    window, truth = road(BRANCHED)
+    return window, truth, joined(window)
+
+
+def test_a_crack_of_5_mm_by_3_mm_is_found_where_it_is(branched):
+    _, truth, found = branched
+    assert min(scores(found, truth, 2 * CELL_M)) > 0.95
+    assert sum(c.length_m for c in found) == pytest.approx(truth.length, rel=0.03)
+
+
+def test_its_figures_are_those_of_the_simulator(branched):
+    (one,) = branched[2]
+    assert one.depth_mean_m == pytest.approx(0.003, rel=0.1)
+    assert one.width_mean_m == pytest.approx(0.541 * 0.005, abs=2 * CELL_M)  # (1 - u²)² = 1/2
+    assert (one.junctions, one.ends, one.polygons) == (1, 3, 0)
+    assert one.depth_max_m >= one.depth_mean_m and one.width_max_m >= one.width_mean_m
+    assert one.area_m2 == pytest.approx(one.length_m * one.width_mean_m)
+
+
+def test_a_clean_road_with_stains_has_none():
+    window, _ = road(
+        stains=[{"station_m": 10.4, "offset_m": 1.0}], tyre_marks=[{"points_m": [(10.0, 0.9), (11.0, 0.9)]}]
+    )
+    assert crack_pieces(window, CONFIG) == []
+
+
+def test_deep_and_wide_cracks_keep_their_depth_and_width():
+    window, truth = road(BRANCHED[:1], 0.02, 0.015)
+    (one,) = joined(window)
+    assert one.depth_mean_m == pytest.approx(0.015, rel=0.05)
+    assert one.width_mean_m == pytest.approx(0.541 * 0.02, abs=CELL_M / 2)
+    assert one.length_m == pytest.approx(truth.length, rel=0.04)
+
+
+def step(x):
+    return 0.12 * np.clip(x - 150, 0, 2) / 2
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda x, y: step(x) + 0.0002 * np.abs(x - 150),
+        lambda x, y: 0.010 * np.clip((x - 150) / 6, 0, 1),
+        lambda x, y: 0.0004 * np.abs(x - 150),
+        lambda x, y: -0.05 * np.clip(1 - ((x - 150) ** 2 + (y - 150) ** 2) / 40**2, 0, 1),
+        lambda x, y: -0.008 * ((x % 60 - 30) ** 2 + (y % 60 - 30) ** 2 < 16),
+        lambda x, y: 0.004 * (np.abs(x - 150) < 3),
+    ],
+    ids=["kerb", "edge of a patch", "rut", "pothole", "lost stones", "ridge"],
+)
+def test_what_is_no_crack(form):
+    y, x = np.indices((300, 300))
+    assert joined(drawn(560 + 0.0001 * x + form(x, y))) == []
+
+
+def test_types_follow_the_lane():
+    y, _ = np.indices((240, 240))
+    window = drawn(-0.006 * (np.abs(y - 120) < 1.5))
+    ((along,), (across,), (aslant,)) = (joined(window, lane=np.radians(lane)) for lane in (90.0, 0.0, -45.0))
+    assert (along.kind, across.kind, aslant.kind) == ("longitudinal", "transverse", "diagonal")
+    assert along.azimuth_deg == pytest.approx(90.0, abs=1.0)
+    assert (along.lane_angle_deg, across.lane_angle_deg) == pytest.approx((0.0, 90.0), abs=1.0)
+    assert across.transverse_m == pytest.approx(across.length_m) and across.longitudinal_m == 0.0
+
+
+def net(halo=0, first=(7_000, 9_000)):
+    """A net of cracks, 0.25 m apart, aslant, with holes in the data."""
+    y, x = np.indices((500, 520))
+    distance = np.minimum(np.abs((0.96 * x + 0.28 * y) % 50 - 25), np.abs((0.96 * y - 0.28 * x) % 50 - 25))
+    height = 560 - 0.008 * np.clip(1 - (distance / 1.8) ** 2, 0, 1)
+    height[np.hypot(x - 260, y - 250) > 170] = 560.0
+    height[200:205, 300:330] = np.nan
+    return drawn(height, halo=halo, first=first)
+
+
+def test_a_net_is_an_alligator_and_closes_the_polygons_that_shapely_closes():
+    window = net()
+    pieces = crack_pieces(window, CONFIG)
+    (one,) = join_cracks(pieces, 0.0, 0.005, CONFIG)
+    assert one.kind == "alligator"
+    closed = shapely.polygonize([shapely.LineString(p.line_m) for p in pieces])
+    assert one.polygons == len(closed.geoms) > 20
+    assert one.length_m == pytest.approx(sum(p.length_m for p in pieces))
+    assert one.depth_mean_m == pytest.approx(0.008, rel=0.1)
+
+
+def edges_of(pieces):
+    return {frozenset(e) for p in pieces for e in itertools.pairwise(map(tuple, p.line_m.tolist()))}
+
+
+def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
+    config = CrackDetection(max_width_m=0.02)
+    halo = halo_cells(config, 0.005)
+    whole = net(halo)
+    expected = crack_pieces(whole, config)
+    found = []
+    for rows in (slice(0, 2 * halo + 61), slice(61, None)):
+        for columns in (slice(0, 2 * halo + 50), slice(50, None)):
+            cut = whole.raw_m[rows, columns]
+            first = whole.first_row + (rows.start or 0), whole.first_column + (columns.start or 0)
+            found += crack_pieces(HeightWindow(cut, cut, 0.005, 0.0002, *first, halo), config)
+    assert len(found) > len(expected) > 10
+    assert sum(len(p.line_m) - 1 for p in found) == len(edges_of(found))  # none twice
+    assert edges_of(found) == edges_of(expected)
+    figures = [
+        (c.kind, c.junctions, c.ends, c.polygons, c.depth_max_m, c.width_max_m, pytest.approx(c.length_m))
+        for c in join_cracks(expected, 0.0, 0.005, config)
+    ]
+    again = join_cracks(found, 0.0, 0.005, config)
+    assert [
+        (c.kind, c.junctions, c.ends, c.polygons, c.depth_max_m, c.width_max_m, c.length_m) for c in again
+    ] == figures
+
+
+def test_short_pieces_count_when_they_join():
+    def piece(a, b):
+        line = np.array([[0.01 * a, 5.0], [0.01 * b, 5.0]])
+        return CrackPiece(
+            line, (500, a), (500, b), *[float(v) for v in (0.01 * (b - a), 0.01 * (b - a))], 1e-5, 0.004, 1e-4, 0.01
+        )
+
+    assert join_cracks([piece(0, 8)], 0.0, 0.01, CONFIG) == []
+    (one,) = join_cracks([piece(8, 16), piece(0, 8)], 0.0, 0.01, CONFIG)
+    assert one.length_m == pytest.approx(0.16) and one.line.length == pytest.approx(0.16)
+    assert sorted(one.pieces.tolist()) == [0, 1]
+
+
+def test_thinning_keeps_the_topology_that_scipy_counts():
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        blobs = np.zeros((90, 90), np.uint8)
+        for _ in range(12):
+            (a, b), (c, d) = rng.integers(10, 80, (2, 2))
+            t = np.linspace(0, 1, 200)
+            i, j = np.rint(a + t * (c - a)).astype(int), np.rint(b + t * (d - b)).astype(int)
+            blobs[i, j] = blobs[i + 1, j] = blobs[i, j + 1] = 1
+        thin = _thinned(blobs, 12)
+        eight = np.ones((3, 3))
+        assert label(thin, eight)[1] == label(blobs, eight)[1]
+        assert label(~thin)[1] == label(blobs == 0)[1]
+        assert distance_transform_edt(thin).max() < 2.0
+        assert not (thin & (blobs == 0)).any()
+
+
+def test_spurs_go_and_branches_stay():
+    cells = np.zeros((40, 40), bool)
+    cells[20, 3:37] = True
+    cells[21:24, 10] = True
+    cells[21:35, 25] = True
+    graph = pruned(cells, 5)
+    assert graph.row.size == cells.sum() - 3
+    assert (graph.degree == 1).sum() == 3
+    paths = list(graph.paths(np.ones(len(graph.edges), bool)))
+    assert sum(map(len, paths)) - len(paths) == len(graph.edges)
+    ring = np.zeros((9, 9), bool)
+    ring[2, 3:6] = ring[6, 3:6] = ring[3:6, 2] = ring[3:6, 6] = True
+    (path,) = SkeletonGraph.of(ring).paths(np.ones(12, bool))
+    assert path[0] == path[-1] and len(path) == 13
+
+
+@pytest.mark.parametrize("width_cells", [1.3, 2.0, 5.0])
+def test_widths_and_depths_seen_through_cells_are_sharpened(width_cells):
+    north, east, fine = np.sin(0.35), np.cos(0.35), 8
+    y, x = (np.indices((40 * fine, 60 * fine)) + 0.5) / fine
+    right = (x - 30.2) * north - (y - 20.3) * east
+    form = 560.0 + 0.01 * right - 0.01 * np.exp(-4 * np.log(2) * (right / width_cells) ** 2)
+    cells = form.reshape(40, fine, 60, fine).mean(axis=(1, 3))
+    row, column, flank = np.array([20, 21]), np.array([30, 33]), np.full(2, 8)
+    out = np.empty((2, 4))
+    cross_sections(cells, row, column, np.full(2, north), np.full(2, east), flank, 13, out)
+    width, depth = sharpened(out[:, 1], out[:, 0])
+    np.testing.assert_allclose(width, width_cells, rtol=0.12)
+    np.testing.assert_allclose(depth, 0.01, rtol=0.08)
+    np.testing.assert_allclose(out[:, 3], out[:, 0] - 0.01 * 10, atol=0.03)
+    truth = (30.2 - column - 0.5) * north - (20.3 - row - 0.5) * east
+    np.testing.assert_allclose(out[:, 2], truth, atol=0.15)
+
+
+def test_nothing_where_nothing_was_measured():
+    assert crack_pieces(drawn(np.full((60, 60), np.nan)), CONFIG) == []
+    assert crack_pieces(drawn(np.full((400, 400), np.nan)), CONFIG) == []
+    assert join_cracks([], 0.0, 0.005, CONFIG) == []
+
+
+def test_says_what_does_not_fit():
+    with pytest.raises(RoadscanError, match="halo of 5; expected cells that are not halo"):
+        HeightWindow(np.zeros((10, 20)), np.zeros((10, 20)), 0.005, 0.0005, 0, 0, 5)
+    with pytest.raises(RoadscanError, match="expected two grids"):
+        HeightWindow(np.zeros((10, 20)), np.zeros((10, 21)), 0.005, 0.0005)
+    with pytest.raises(ConfigError, match="weak_sigmas 9 is above"):
+        CrackDetection.parse({"weak_sigmas": 9.0})

@@ -1,0 +1,280 @@
+"""The stage `surfaces`: the same surface in every tile that sees it, made once, and nearer to the truth than cells."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from itertools import combinations
+from pathlib import Path
+
+import geopandas
+import numpy as np
+import pytest
+import rasterio
+import shapely
+
+from roadscan.jobs import surfaces
+from roadscan.jobs.compute import Compute, Inline, compute_on
+from roadscan.jobs.selection import Selection
+from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.status import verify_store
+from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, plan_surface_work
+from roadscan.model.errors import ConfigError
+from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.simulate import simulate
+from roadscan.simulate.truth import load
+from roadscan.surfaces.reconstruction import surface_of
+from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.store import Store
+
+from .conftest import Lines, Simulated, changed, outputs, small_scene
+
+SURFACES = tuple(s for s in STAGES if s.name == "surfaces")
+CELLS = {"method": "cells", "sigma_m": 0.004}
+POINTS = {"method": "points", "sigma_m": 0.006, "cell_m": [0.1, 0.15], "max_gap_m": 0.5}
+MADE = {"make": ["surface", "surface_mesh", "surface_pictures"], "options": {}}
+
+
+class Reconstructed:
+    """A finished survey whose stage `surfaces` can be run again and again."""
+
+    def __init__(self, simulated: Simulated, store: Store) -> None:
+        self.simulated, self.store = simulated, store
+
+    def survey(self, surface: dict[str, object] | None, products: dict[str, object] = MADE) -> Survey:
+        return changed(Survey.load(self.simulated.survey_file), {"surface": surface, "products": products})
+
+    def run(
+        self, survey: Survey, compute: Compute | None = None, selection: Selection | None = None
+    ) -> tuple[list[str], dict[str, bytes]]:
+        """Tiles whose surface was made, and all files of surfaces."""
+        before = Manifest(self.store).of(SURFACE)
+        run = Run(survey, self.store, compute or Inline(), selection, Lines())
+        run_stages(run, SURFACES)
+        after = Manifest(self.store).of(SURFACE)
+        files = {p: data for p, data in outputs(self.store).items() if p.startswith("tiles/surface")}
+        return sorted(u for u in after if after[u] != before.get(u)), files
+
+    def forget(self) -> None:
+        manifest = Manifest(self.store)
+        manifest.forget(SURFACE, list(manifest.of(SURFACE)))
+
+    def plan(self, survey: Survey) -> SurfacePlan:
+        planned = plan_surface_work(survey, self.store, None, Manifest(self.store)).planned
+        assert planned is not None
+        return planned
+
+    def surfaces(self, survey: Survey) -> dict[TileId, SurfaceTile]:
+        """Each tile's surface, made by a task of its own."""
+        planned = self.plan(survey)
+        return {t: s for task in planned.singly(list(planned.keys)) for t, s in _surfaces(task)}
+
+
+def _surfaces(task: SurfaceTask) -> Iterator[tuple[TileId, SurfaceTile]]:
+    source = surfaces._Cells(task) if task.readings is None else surfaces._Points(task)
+    for tile in task.block.tiles:
+        wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
+        yield tile, surface_of(tile, source.patch(tile), task.grid, wanted)
+
+
+def assert_seamless(found: dict[TileId, SurfaceTile]) -> None:
+    """Where two tiles see the same cell, both hold the same bits of it."""
+    shared = 0
+    for a, b in combinations(found.values(), 2):
+        cuts = [_cut(a, b), _cut(b, a)]
+        if cuts[0] is None or cuts[1] is None:
+            continue
+        for name in ("raw_m", "height_m", "origin", "intensity"):
+            one, other = getattr(a, name)[cuts[0]], getattr(b, name)[cuts[1]]
+            assert one.tobytes() == other.tobytes(), (a.tile, b.tile, name)
+        shared += int(np.count_nonzero(a.origin[cuts[0]]))
+    assert shared > 1000
+
+
+def _cut(a: SurfaceTile, b: SurfaceTile) -> tuple[slice, slice] | None:
+    """Rows and columns of `a` that `b` holds as well."""
+    spans = []
+    for first, own, other, size in (
+        (a.window.first_row, a.window.rows, b.window.first_row, b.window.rows),
+        (a.window.first_column, a.window.columns, b.window.first_column, b.window.columns),
+    ):
+        low, high = max(first, other), min(first + own, other + size)
+        if low >= high:
+            return None
+        spans.append(slice(low - first, high - first))
+    return spans[0], spans[1]
+
+
+@pytest.fixture(scope="module")
+def cells(finished: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Reconstructed:
+    """The small survey of profilers and lidar, its tiles made; of its own, because the stage writes into it."""
+    root = tmp_path_factory.mktemp("cells")
+    source = finished.store()
+    shutil.copytree(source.url, root / "store")
+    return Reconstructed(finished, Store(str(root / "store"), source.survey_id))
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory: pytest.TempPathFactory) -> Reconstructed:
+    """A SICK's profiles over 14 m of road, its tiles made."""
+    folder = tmp_path_factory.mktemp("points") / "survey"
+    scene = small_scene(
+        length_m=14.0, passes=[{"lane": 2}], sick={"on": True}, profilers={"on": False}, lidar={"on": False}
+    )
+    simulated = Simulated(simulate(scene, folder).survey_file)
+    simulated.run(segmentation={}, products={"make": [], "options": {}})
+    return Reconstructed(simulated, simulated.store())
+
+
+def test_cells_are_seamless_and_keep_to_their_tile(cells: Reconstructed) -> None:
+    found = cells.surfaces(cells.survey(CELLS))
+    assert_seamless(found)
+    one = found[max(found, key=lambda t: np.count_nonzero(found[t].origin[found[t].inner]))]
+    assert one.height_m[one.inner].shape == (200, 200)
+    assert one.halo * one.cell_m[0] >= 1.0
+    assert (np.isnan(one.height_m) == (one.origin == EMPTY)).all()
+    assert set(np.unique(one.origin)) == {EMPTY, MEASURED}
+
+
+def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = cells.survey(CELLS)
+    made, files = cells.run(survey)
+    assert len(made) > 10 and len(files) == 3 * len(made)
+    assert cells.run(survey) == ([], files)  # nothing is done twice
+    cells.forget()
+    monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
+    monkeypatch.setattr("roadscan.jobs.surfaces._CELLS_KEPT", 0)
+    with compute_on(2) as two:
+        assert cells.run(survey, two)[1] == files
+    assert verify_store(cells.store) == []
+
+
+def test_what_is_stale_is_made_again(cells: Reconstructed) -> None:
+    survey = cells.survey(CELLS)
+    _, files = cells.run(survey)
+    manifest = Manifest(cells.store)
+    changed_tile = next(iter(manifest.of(SURFACE)))
+    tile = manifest.get("tile", changed_tile)
+    assert tile is not None
+    manifest.add([tile._replace(digest="another")])
+    column, row = map(int, changed_tile.split("_"))
+    around = {f"{column + c}_{row + r}" for c in (-1, 0, 1) for r in (-1, 0, 1)} & set(manifest.of(SURFACE))
+    assert set(map(str, cells.plan(survey).stale(Manifest(cells.store)))) == around
+    manifest.add([tile])
+    one = TileId.parse(changed_tile)
+    assert cells.run(survey, selection=Selection(named=(one,)))[1] == files
+    cells.store.remove(f"tiles/surface/{changed_tile}.tif")
+    assert [str(t) for t in cells.plan(survey).stale(Manifest(cells.store))] == [changed_tile]
+    assert cells.run(survey)[1] == files
+    fewer = cells.run(cells.survey(CELLS, {"make": ["surface"], "options": {}}))[1]
+    assert sorted(fewer) == sorted(p for p in files if p.startswith("tiles/surface/"))
+    assert cells.run(cells.survey(None, {"make": [], "options": {}})) == ([], {})
+
+
+def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructed) -> None:
+    cells.forget()
+    survey = cells.survey(CELLS, {"make": ["surface"], "options": {}})
+    tile = str(next(iter(cells.plan(survey).keys)))
+    path = Path(cells.store.path(f"tiles/cells/{tile}.parquet"))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(Exception, match="surfaces"):
+        cells.run(survey)
+    column, row = map(int, tile.split("_"))
+    lost = set(map(str, cells.plan(survey).keys)) - set(Manifest(cells.store).of(SURFACE))
+    assert tile in lost and all(
+        abs(int(u.split("_")[0]) - column) < 2 and abs(int(u.split("_")[1]) - row) < 2 for u in lost
+    )
+    path.write_bytes(content)
+    assert set(cells.run(survey)[0]) == lost
+
+
+def test_smoothed_cells_are_nearer_to_the_truth(cells: Reconstructed) -> None:
+    truth = load(cells.simulated.survey_file.parent)
+    raw, smooth = _errors(cells.surfaces(cells.survey(CELLS)), truth)
+    assert np.sqrt(np.mean(smooth**2)) < 0.75 * np.sqrt(np.mean(raw**2))
+
+
+def test_points_are_seamless_and_nearer_to_the_truth(points: Reconstructed) -> None:
+    found = points.surfaces(points.survey(POINTS))
+    assert_seamless(found)
+    assert {EMPTY, MEASURED, INTERPOLATED} == set(np.unique(np.concatenate([s.origin.ravel() for s in found.values()])))
+    raw, smooth = _errors(found, load(points.simulated.survey_file.parent))
+    assert np.sqrt(np.mean(smooth**2)) < 0.7 * np.sqrt(np.mean(raw**2))
+
+
+def _errors(found: dict[TileId, SurfaceTile], truth: object) -> tuple[np.ndarray, np.ndarray]:
+    """Raw and smoothed heights less the truth (m), on the carriageway, of all tiles' own cells."""
+    parts = []
+    for one in found.values():
+        easting, northing = np.meshgrid(*one.window.nodes_m())
+        station, offset = truth.station_offset_m(easting, northing)
+        own = np.zeros(one.origin.shape, bool)
+        own[one.inner] = True
+        own &= (one.origin != EMPTY) & (np.abs(offset) < 3.2) & (station > 1.0) & (station < truth.scene.length_m - 1.0)
+        true_m = truth.height_m(easting[own], northing[own])
+        parts.append(np.stack([one.raw_m[own] - true_m, one.height_m[own] - true_m]))
+    raw, smooth = np.concatenate(parts, axis=1)
+    usual = np.abs(raw) < 0.05  # cells of things that stand on the road are no error of its surface
+    assert usual.sum() > 1000
+    return raw[usual], smooth[usual]
+
+
+def test_blocks_of_points_change_no_byte(points: Reconstructed) -> None:
+    survey = points.survey(POINTS)
+    _, files = points.run(survey)
+    points.forget()
+    assert points.run(changed(survey, {"tiles__block_tiles": 1}))[1] == files
+
+
+def test_polygons_bound_the_surface(points: Reconstructed, tmp_path: Path) -> None:
+    whole = points.surfaces(points.survey(POINTS))
+    tile, seen = max(whole.items(), key=lambda one: np.count_nonzero(one[1].origin[one[1].inner]))
+    box = points.plan(points.survey(POINTS)).grid.tiles.bounds(tile)
+    ring = shapely.Point(box.easting_min_m + 5.0, box.northing_min_m + 5.0).buffer(2.5)
+    layer = tmp_path / "regions.gpkg"
+    geopandas.GeoDataFrame(geometry=[ring], crs=Survey.load(points.simulated.survey_file).config.map.crs).to_file(layer)
+    survey = points.survey({**POINTS, "regions": "polygons", "polygons": str(layer)})
+    found = points.surfaces(survey)
+    assert list(found) == [tile]
+    east, north = np.meshgrid(*seen.window.nodes_m())
+    inside = shapely.contains_xy(ring, east, north)
+    assert np.array_equal(found[tile].height_m, np.where(inside, seen.height_m, np.nan), equal_nan=True)
+    assert inside.sum() > 100 and (found[tile].origin[~inside] == EMPTY).all()
+    made, files = points.run(survey)
+    assert made == [str(tile)] and {Path(p).stem for p in files} == {str(tile)}
+    with rasterio.open(points.store.path(f"tiles/surface/{tile}.tif")) as raster:
+        assert np.isfinite(raster.read(1)).sum() == np.count_nonzero(found[tile].origin[found[tile].inner])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"method": "cells", "sigma_m": 0.001, "cell_m": [0.01, 0.03]}, "cell_m is a setting of method"),
+        ({"method": "cells", "sigma_m": 0.001, "smoothing": {"sigma_m": 0.002}}, "state the noise once"),
+        ({"method": "points", "sigma_m": 0.001, "smooth": False, "smoothing": {"detail_sigmas": 5}}, "smooth = false"),
+        ({"method": "points", "sigma_m": 0.001, "regions": "polygons"}, "belong together"),
+        ({"method": "points", "sigma_m": 0.001, "cell_m": [0.01, 3.0]}, "edges from"),
+        ({"method": "cells"}, "sigma_m"),
+        ({"method": "cell", "sigma_m": 0.001}, "method"),
+    ],
+)
+def test_settings_that_do_not_fit(cells: Reconstructed, settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        cells.survey(settings)
+
+
+def test_a_product_of_the_surface_needs_one(cells: Reconstructed) -> None:
+    run = Run(cells.survey(None, {"make": ["surface_mesh"], "options": {}}), cells.store, Inline(), None, Lines())
+    with pytest.raises(ConfigError, match=r"add the section \[surface\]"):
+        run_stages(run, [s for s in STAGES if s.name == "tiles"])
+
+
+def test_figures_of_a_surface(cells: Reconstructed) -> None:
+    cells.run(cells.survey(CELLS))
+    record = next(iter(Manifest(cells.store).of(SURFACE).values()))
+    figures = json.loads(record.detail)
+    assert record.path == "" and figures["cells"] == figures["measured"] + figures["interpolated"] > 0

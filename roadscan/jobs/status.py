@@ -19,6 +19,7 @@ from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.products import plan_outputs
 from roadscan.jobs.stages import Run, plan_tile_work
+from roadscan.jobs.surface_plan import plan_surface_work
 from roadscan.jobs.tile_fates import told
 from roadscan.jobs.tile_plan import TILE
 from roadscan.model.errors import RoadscanError
@@ -42,6 +43,8 @@ class Status:
     """Readings by fate."""
     tiles_current: int = 0
     tiles_stale: int = 0
+    surfaces_stale: int = 0
+    """Tiles whose reconstructed surface is missing or stale, of those that hold cells by now."""
     products_stale: int = 0
     """Files of survey products that are missing or stale."""
     outputs: dict[str, int] = field(default_factory=dict)
@@ -59,7 +62,7 @@ class Status:
     def is_complete(self) -> bool:
         """True if nothing is missing, stale or failed."""
         ingested = all(log["state"] == "ingested" for log in self.logs)
-        done = not self.tiles_stale and not self.products_stale
+        done = not (self.tiles_stale or self.surfaces_stale or self.products_stale)
         return ingested and done and not self.failures and not self.note
 
 
@@ -121,11 +124,13 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)
+    status.surfaces_stale = len(plan_surface_work(survey, store, None, manifest).chosen)
     status.products_stale = len(plan_outputs(work.planned.plan, manifest)[0])
     largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
     status.next_run = {
         "tasks": len(tasks),
         "tiles": len(stale),
+        "surfaces": status.surfaces_stale,
         "products": status.products_stale,
         "raw_bytes": sum(t.raw_bytes for t in tasks),
         "worker_memory_bytes": WORKER_BASE_BYTES + largest if tasks else 0,

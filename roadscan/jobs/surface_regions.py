@@ -69,7 +69,8 @@ def stated_regions(survey: Survey) -> Regions | None:
 def _shapes(path: Path) -> npt.NDArray[Any]:
     with gdal_faults(path, _EXPECTED):
         layer = chosen_layer(layer_names(path), None, path)
-    parts = [shapes_of(batch, "") for batch in feature_batches(path, layer, _EXPECTED)]
+        geometry = pyogrio.read_info(gdal_name(path), layer=layer).get("geometry_name") or ""
+    parts = [shapes_of(batch, geometry) for batch in feature_batches(path, layer, _EXPECTED)]
     shapes = np.concatenate(parts) if parts else np.empty(0, object)
     sound = np.isin(shapely.get_type_id(shapes), _POLYGONS) & shapely.is_valid(shapes) & ~shapely.is_empty(shapes)
     if not sound.all():

@@ -38,6 +38,8 @@ SHOWN_M: Final = 1.0
 """What products see of the neighbouring tiles, at least (m)."""
 
 _BRIGHTEST: Final = 65_535.0
+_CELLS_SMOOTHED: Final = 2_000_000
+"""Cells that are smoothed at once, about: smoothing needs 100 bytes of memory a cell."""
 
 
 @dataclass(frozen=True)
@@ -165,14 +167,22 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
 
 
 def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:
-    """Smoothed heights (rows, columns), computed on the smallest box of known cells: a grid ends like a hole."""
+    """Smoothed heights (rows, columns), computed on the smallest box of known cells: a grid ends like a hole.
+
+    Strip by strip, to save memory: a strip reaches beyond its own rows by the halo of the smoothing.
+    """
     known = ~np.isnan(raw_m)
     if not known.any():
         return raw_m
     spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
     rows, columns = (slice(int(s[0]), int(s[-1]) + 1) for s in spans)
     height = np.full(raw_m.shape, np.nan)
-    height[rows, columns] = smooth_surface(raw_m[rows, columns], settings)
+    halo = halo_cells(settings)
+    strip = max(_CELLS_SMOOTHED // (columns.stop - columns.start), 2 * halo)
+    for first in range(rows.start, rows.stop, strip):
+        last = min(first + strip, rows.stop)
+        low, high = max(first - halo, rows.start), min(last + halo, rows.stop)
+        height[first:last, columns] = smooth_surface(raw_m[low:high, columns], settings)[first - low : last - low]
     return height
 
 

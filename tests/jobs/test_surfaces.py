@@ -247,7 +247,7 @@ def _errors(found: dict[TileId, SurfaceTile], truth: object) -> tuple[np.ndarray
 
 def test_blocks_of_points_change_no_bit(points: Reconstructed) -> None:
     singly = points.surfaces(**POINTS)
-    pair = sorted(singly, key=lambda t: -np.count_nonzero(singly[t].raw_m))[:2]
+    pair = sorted(singly, key=lambda t: -np.count_nonzero(singly[t].origin))[:2]
     together = dict(_surfaces(points.plan(points.survey(POINTS)).task(tuple(pair))))
     for tile in pair:
         for name in ("raw_m", "height_m", "origin", "intensity"):

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from roadscan.jobs.classes import write_classes
+from roadscan.jobs.compute import Inline
 from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.jobs.status import survey_status
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
-from roadscan.points.classes import LAS_CLASSES, NOT_ROAD, READING_CLASSES
+from roadscan.points.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
 from roadscan.simulate import Scene, simulate, truth
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.store import Store
 
 from .conftest import Simulated, changed, outputs
 
 CELLS = {"products__make": ["geotiff", "tile_table"]}
 ON: dict[str, Any] = {"segmentation": {"turns": {}}}
 SENSORS = ("profiler_left", "profiler_right", "sick")
+PROFILES = 250
 NAMES = [READING_CLASSES[kind] for kind in NOT_ROAD]
 
 SCENE: dict[str, Any] = {
@@ -177,3 +184,61 @@ def test_what_cannot_be_segmented_is_refused(street: Simulated) -> None:
     sideways = {n: s | {"axes": "rfu"} for n, s in survey.rig.model_dump()["sensors"].items()}
     with pytest.raises(ConfigError, match="no sensor whose profiles lie across the road"):
         plan_survey(changed(survey, ON | {"rig": {"sensors": sideways}}), street.store("cells"))
+
+
+def write_turn(folder: Path) -> Survey:
+    """Three quarters of a circle of 5 m radius on level ground, 2 m/s; a mirror scanner 2 m above it, 25 Hz."""
+    seconds = np.arange(0.0, 12.0, 0.02)
+    heading = 2.0 * seconds / 5.0
+    places = [5.0 - 5.0 * np.cos(heading), 5.0 * np.sin(heading)]
+    rows = zip(1.4e9 + seconds, *places, np.degrees(heading), strict=True)
+    lines = [f"{t:.2f},{e:.6f},{n:.6f},102.0,0,0,{h:.6f}" for t, e, n, h in rows]
+    head = "time_s,easting_m,northing_m,height_m,roll_deg,pitch_deg,heading_deg"
+    (folder / "path.csv").write_text("\n".join([head, *lines, ""]))
+    angle = np.radians(75.0 - 1.5 * np.arange(101))
+    ranges = np.tile(np.round(2000.0 / np.cos(angle)).astype(np.uint16), (PROFILES, 1))
+    geometry = {"kind": "polar", "readings": 101, "first": angle[0], "step": -np.radians(1.5), "range_step_m": 0.001}
+    geometry |= {"reading_period_ns": 5e4}
+    epochs = 1_400_000_000 * 10**9 + 10**9 + np.arange(PROFILES) * 40_000_000
+    lists = [
+        pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 101) for values in (ranges, ranges.astype(np.uint8))
+    ]
+    pq.write_table(
+        pa.table({"epoch_gps_ns": epochs, "range": lists[0], "intensity": lists[1]}), folder / "scans.parquet"
+    )
+    path = {"path": "path.csv", "format": "trajectory_csv", "crs": "local", "clock": {"system": "gps"}}
+    scans = {"path": "scans.parquet", "format": "scans", "sensor": "s", "options": {"scan_geometry": geometry}}
+    values = {
+        "id": "turn",
+        "map": {"local": {"name": "yard"}},
+        "tiles": {"cell_m": 0.5, "size_m": 2.0},
+        "rig": {"sensors": {"s": {"kind": "lidar", "lever_arm_body_m": [0.5, 0.0, 0.0]}}},
+        "runs": [{"id": "r", "logs": [path, scans]}],
+        "segmentation": {"turns": {}},
+        "products": {"make": ["geotiff"]},
+    }
+    return Survey.parse(values, folder=folder)
+
+
+def test_what_overlaps_in_a_turn_is_left_out_in_any_blocks(tmp_path: Path) -> None:
+    survey = write_turn(tmp_path)
+
+    def run(name: str, **settings: Any) -> Store:
+        store = Store(str(tmp_path / name), "turn")
+        run_stages(Run(changed(survey, settings), store, Inline()), STAGES)
+        return store
+
+    store = run("a")
+    out = tmp_path / "classes.parquet"
+    counts = write_classes(survey, store, "r", "s", out)
+    classes = pq.read_table(out).column("class").to_numpy().reshape(PROFILES, -1)
+    across = 2.0 * np.tan(np.radians(75.0 - 1.5 * np.arange(101)))
+    assert set(counts) == {"kept", "overlapping"}
+    assert np.array_equal(classes == OVERLAPPING, np.tile(across > 5.0, (PROFILES, 1)))
+    cells = outputs(store)
+    points = run("b", tiles__block_tiles=1, products__make=["geotiff", "las"])
+    assert {path: content for path, content in outputs(points).items() if not path.startswith("tiles/las/")} == cells
+    manifest = Manifest(store)
+    manifest.forget("tile", list(manifest.of("tile"))[::3])
+    run("a")  # other tasks, with fewer poses at hand
+    assert outputs(store) == cells

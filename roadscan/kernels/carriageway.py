@@ -27,45 +27,45 @@ PENDING_ABOVE, PENDING_BELOW = np.uint8(254), np.uint8(255)
 REJOIN = 3
 """So many readings on the line, one after another, say that the road goes on behind an object or a hole."""
 
-
-NUMBER = 5
-"""After the five sums of a line: how many readings `trail` holds."""
-
-
-@inlined
-def line_at(sums, y):
-    """Value at y of the least-squares line of `sums`: count, Σy, Σup, Σy², Σy up."""
-    count = sums[0]
-    mean_y, mean_up = sums[1] / count, sums[2] / count
-    spread = sums[3] / count - mean_y * mean_y
-    slope = (sums[4] / count - mean_y * mean_up) / spread if spread > 1e-6 else 0.0
-    return mean_up + slope * (y - mean_y)
+NO_LINE = (0.0,) * 5
+"""Sums of a line through no reading."""
 
 
 @inlined
-def count_in(sums, y, up, sign):
-    """Add a reading to the sums of a line, or take it out with sign −1."""
-    sums[0] += sign
-    sums[1] += sign * y
-    sums[2] += sign * up
-    sums[3] += sign * y * y
-    sums[4] += sign * y * up
+def line_at(line, y):
+    """Value at y of the least-squares line of the sums `line`: count, Σy, Σup, Σy², Σy up."""
+    count, sum_y, sum_up, sum_yy, sum_y_up = line
+    spread = count * sum_yy - sum_y * sum_y
+    slope = (count * sum_y_up - sum_y * sum_up) / spread if spread > 1e-6 * count * count else 0.0
+    return (sum_up + slope * (count * y - sum_y)) / count
+
+
+@inlined
+def counted_in(line, y, up, sign):
+    """The sums of a line with one more reading, or with one less for sign −1."""
+    return (
+        line[0] + sign,
+        line[1] + sign * y,
+        line[2] + sign * up,
+        line[3] + sign * y * y,
+        line[4] + sign * y * up,
+    )
 
 
 @kernel
-def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds):
+def follow_road(y, up, height, spread, start, way, settings, trail, head, line, kinds):
     """Step 4: go outwards from reading `start` as long as the readings carry on the road's line.
 
     Parameters
     ----------
     spread : (n,) float64, what the noise adds to the tolerance (m); way : +1 or −1.
-    trail : (n,) int32, in/out: readings of the line so far; sums : (6,) float64, in/out: theirs, see NUMBER.
+    trail : (n,) int32, in/out: readings of the line so far; head : int64, how many; line : (5,) tuple, their sums.
     kinds : (n,) uint8, in/out.
     """
     n = y.size
     step, slope, bridge = settings[STEP], settings[SLOPE], settings[BRIDGE]
     window, window_readings = settings[WINDOW], np.int64(settings[WINDOW_READINGS])
-    head, tail = np.int64(sums[NUMBER]), np.int64(0)
+    tail = np.int64(0)
     origin_y, origin_up = y[start], up[start]
     last, since, good = start, np.int64(-1), 0
     end = n if way > 0 else -1
@@ -75,7 +75,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
             gap = abs(y[j] - y[last])
             if gap > bridge:
                 break
-            over = up[j] - origin_up - line_at(sums, y[j] - origin_y)
+            over = up[j] - origin_up - line_at(line, y[j] - origin_y)
             most = step + spread[j] + slope * gap
             fits = abs(over) <= most
             if since >= 0 and not fits:
@@ -89,7 +89,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
             if fits and since < 0:
                 trail[head] = j
                 head += 1
-                count_in(sums, y[j] - origin_y, up[j] - origin_up, 1.0)
+                line = counted_in(line, y[j] - origin_y, up[j] - origin_up, 1.0)
                 last = j
             elif fits:
                 good += 1
@@ -98,7 +98,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
                         if kinds[i] == CLASS_KEPT:
                             trail[head] = i
                             head += 1
-                            count_in(sums, y[i] - origin_y, up[i] - origin_up, 1.0)
+                            line = counted_in(line, y[i] - origin_y, up[i] - origin_up, 1.0)
                         elif kinds[i] == PENDING_ABOVE:
                             kinds[i] = CLASS_SCATTERED
                         elif kinds[i] == PENDING_BELOW:
@@ -109,7 +109,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
                 good = 0
                 kinds[j] = PENDING_ABOVE if over > 0.0 else PENDING_BELOW
             while head - tail > window_readings and abs(y[last] - y[trail[tail]]) > window:
-                count_in(sums, y[trail[tail]] - origin_y, up[trail[tail]] - origin_up, -1.0)
+                line = counted_in(line, y[trail[tail]] - origin_y, up[trail[tail]] - origin_up, -1.0)
                 tail += 1
         j += way
     first = j if since < 0 else since
@@ -121,7 +121,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
 
 
 @kernel
-def road_from(start, y, up, height, spread, settings, trail, sums, kinds):
+def road_from(start, y, up, height, spread, settings, trail, kinds):
     """Step 4 from one reading on: both ways, beginning with the line through the readings around it.
 
     Readings that begin the line differ from the start by no more than the gate in `height`.
@@ -133,8 +133,7 @@ def road_from(start, y, up, height, spread, settings, trail, sums, kinds):
     n = y.size
     window, window_readings = settings[WINDOW], np.int64(settings[WINDOW_READINGS])
     for way in (-1, 1):
-        for i in range(sums.size):
-            sums[i] = 0.0
+        line, head = NO_LINE, np.int64(0)
         # The line begins behind the start, so that both ways begin with the same readings.
         first = start
         while (
@@ -146,11 +145,11 @@ def road_from(start, y, up, height, spread, settings, trail, sums, kinds):
         i = first
         while i != start + way:
             if kinds[i] == CLASS_KEPT and abs(height[i] - height[start]) <= settings[GATE]:
-                trail[np.int64(sums[NUMBER])] = i
-                sums[NUMBER] += 1.0
-                count_in(sums, y[i] - y[start], up[i] - up[start], 1.0)
+                trail[head] = i
+                head += 1
+                line = counted_in(line, y[i] - y[start], up[i] - up[start], 1.0)
             i += way
-        follow_road(y, up, height, spread, start, way, settings, trail, sums, kinds)
+        follow_road(y, up, height, spread, start, way, settings, trail, head, line, kinds)
     return count_kept(kinds)
 
 
@@ -171,7 +170,7 @@ def copy_kinds(source, target):
 
 
 @kernel
-def mark_off_road(y, up, height, spread, settings, trail, sums, trial, best, kinds):
+def mark_off_road(y, up, height, spread, settings, trail, trial, best, kinds):
     """Step 4: readings that are not connected with the carriageway: the connected surface with most readings.
 
     The middle reading is tried first; others only where it reaches less than half of all.
@@ -192,7 +191,7 @@ def mark_off_road(y, up, height, spread, settings, trail, sums, trial, best, kin
         if start < 0 or (most > 0 and best[start] == CLASS_KEPT):
             continue
         copy_kinds(kinds, trial)
-        found = road_from(start, y, up, height, spread, settings, trail, sums, trial)
+        found = road_from(start, y, up, height, spread, settings, trail, trial)
         if found > most:
             most = found
             copy_kinds(trial, best)

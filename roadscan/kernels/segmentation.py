@@ -57,23 +57,27 @@ def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index
     -------
     int, how many returns there are.
     """
+    place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up)
     n = 0
     for j in range(raw.size):
-        value = np.int64(raw[j])
-        if value == 0:
-            classes[j] = CLASS_NO_RETURN
-        elif value < raw_limits[0]:
-            classes[j] = CLASS_TOO_NEAR
-        elif value > raw_limits[1]:
-            classes[j] = CLASS_TOO_FAR
-        else:
-            distance = scale[0] + scale[1] * value
-            classes[j] = CLASS_KEPT
-            y[n] = y0[j] + distance * dy[j]
-            up[n] = -(z0[j] + distance * dz[j])
-            index[n] = j
-            n += 1
+        y[n] = y[j]
+        up[n] = up[j]
+        index[n] = j
+        n += classes[j] == CLASS_KEPT
     return n
+
+
+@kernel
+def place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up):
+    """Class and place (m,) of every reading; arguments of :func:`profile_points`. Alone, the loop vectorises."""
+    low, high = np.uint16(raw_limits[0]), np.uint16(raw_limits[1])
+    for j in range(raw.size):
+        distance = scale[0] + scale[1] * raw[j]
+        y[j] = y0[j] + distance * dy[j]
+        up[j] = -(z0[j] + distance * dz[j])
+        beyond = np.uint8(CLASS_TOO_NEAR) if raw[j] < low else np.uint8(CLASS_TOO_FAR)
+        kind = np.uint8(CLASS_KEPT) if (raw[j] >= low) & (raw[j] <= high) else beyond
+        classes[j] = kind if raw[j] else np.uint8(CLASS_NO_RETURN)
 
 
 @inlined
@@ -269,6 +273,13 @@ def is_grazing(y, up, j, k, beam_y, beam_up, sine):
     return cross * cross < sine * sine * (a * a + b * b)
 
 
+@inlined
+def is_near(y, up, j, k, least):
+    """True where the readings j and k are less than √least (m) apart."""
+    a, b = y[k] - y[j], up[k] - up[j]
+    return a * a + b * b < least
+
+
 @kernel
 def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
     """Step 3 (ii): readings where beam and surface meet at less than the limit, seen from both sides.
@@ -277,19 +288,21 @@ def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
     """
     n = y.size
     least = chord * chord
-    before, after = 0, 0
+    after = 0
     for j in range(n):
-        while before + 1 < j and (y[before + 1] - y[j]) ** 2 + (up[before + 1] - up[j]) ** 2 >= least:
-            before += 1
         after = max(after, min(j + 1, n - 1))
-        while after + 1 < n and (y[after] - y[j]) ** 2 + (up[after] - up[j]) ** 2 < least:
+        while after + 1 < n and is_near(y, up, j, after, least):
             after += 1
-        if kinds[j] == CLASS_KEPT:
-            beam_y, beam_up = dy[index[j]], -dz[index[j]]
-            if (j == 0 or is_grazing(y, up, j, before, beam_y, beam_up, sine)) and (
-                j == n - 1 or is_grazing(y, up, j, after, beam_y, beam_up, sine)
-            ):
-                kinds[j] = CLASS_GRAZING
+        if kinds[j] != CLASS_KEPT:
+            continue
+        beam_y, beam_up = dy[index[j]], -dz[index[j]]
+        if j < n - 1 and not is_grazing(y, up, j, after, beam_y, beam_up, sine):
+            continue
+        before = max(j - 1, 0)
+        while before > 0 and is_near(y, up, j, before, least):
+            before -= 1
+        if j == 0 or is_grazing(y, up, j, before, beam_y, beam_up, sine):
+            kinds[j] = CLASS_GRAZING
 
 
 @kernel
@@ -309,7 +322,7 @@ def segment_profiles(ranges, y0, z0, dy, dz, scale, raw_limits, settings, classe
     index, trail = np.empty(m, np.int32), np.empty(m, np.int32)
     kinds, trial, best = np.empty(m, np.uint8), np.empty(m, np.uint8), np.empty(m, np.uint8)
     counts = np.empty(np.int64(2.0 * HISTOGRAM_REACH_M / settings[BIN]) | 1, np.int32)
-    line, sample = np.zeros(6), np.empty(NOISE_SAMPLES)
+    sample = np.empty(NOISE_SAMPLES)
     sine = np.sin(settings[GRAZING])
     for p in range(ranges.shape[0]):
         n = profile_points(ranges[p], y0, z0, dy, dz, scale, raw_limits, classes[p], y, up, index)
@@ -331,6 +344,6 @@ def segment_profiles(ranges, y0, z0, dy, dz, scale, raw_limits, settings, classe
         mark_grazing(y[:n], up[:n], index[:n], dy, dz, sine, settings[CHORD], kinds[:n])
         for i in range(n):
             bend[i] = settings[NOISE_FACTOR] * noise * max(abs(dz[index[i]]), LEAST_DZ)
-        mark_off_road(y[:n], up[:n], height[:n], bend[:n], settings, trail[:n], line, trial[:n], best[:n], kinds[:n])
+        mark_off_road(y[:n], up[:n], height[:n], bend[:n], settings, trail[:n], trial[:n], best[:n], kinds[:n])
         for i in range(n):
             classes[p, index[i]] = kinds[i]

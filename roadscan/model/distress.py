@@ -8,7 +8,7 @@ from roadscan.model.strict import Strict
 
 
 class CrackDetection(Strict):
-    """What is a crack (``surfaces/valleys.py``), and what its figures are (``surfaces/cracks.py``)."""
+    """Where a surface has cracks (``surfaces/valleys.py``, ``surfaces/cracks.py``)."""
 
     max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
     """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""
@@ -22,6 +22,17 @@ class CrackDetection(Strict):
     """A cell is no crack if its line is less than this share as deep as the deepest within the length of a line."""
     spur_m: float = Field(default=0.04, ge=0.0, le=0.5)
     """Side branches shorter than this (m) are frays of a crack's wall, and left out."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> CrackDetection:
+        if self.weak_sigmas > self.strong_sigmas:
+            raise ValueError(f"weak_sigmas {self.weak_sigmas:g} is above strong_sigmas {self.strong_sigmas:g}")
+        return self
+
+
+class CrackJoining(Strict):
+    """What is a crack once its pieces are joined over all tiles, and of which type (``surfaces/crack_network.py``)."""
+
     min_length_m: float = Field(default=0.15, ge=0.0)
     """Least length of a crack with all its branches, over all tiles (m)."""
     min_depth_m: float = Field(default=0.001, ge=0.0)
@@ -34,15 +45,9 @@ class CrackDetection(Strict):
     alligator_nodes_per_m2: float = Field(default=4.0, gt=0.0)
     """… and has this many junctions per square metre of the ground that it covers is an alligator crack."""
 
-    @model_validator(mode="after")
-    def _in_order(self) -> CrackDetection:
-        if self.weak_sigmas > self.strong_sigmas:
-            raise ValueError(f"weak_sigmas {self.weak_sigmas:g} is above strong_sigmas {self.strong_sigmas:g}")
-        return self
-
 
 class PotholeDetection(Strict):
-    """What is a pothole (``surfaces/potholes.py``)."""
+    """Where a surface may have potholes (``surfaces/potholes.py``)."""
 
     block_m: float = Field(default=0.05, gt=0.0, le=0.5)
     """Edge of the blocks whose mean heights show the ground around (m)."""
@@ -51,14 +56,21 @@ class PotholeDetection(Strict):
     edge_depth_m: float = Field(default=0.008, gt=0.0)
     """Depth below the ground at which a pothole's outline runs (m)."""
     min_depth_m: float = Field(default=0.02, gt=0.0)
-    """Least depth of its deepest block (m): settled patches and sunk manholes are mostly less."""
-    min_area_m2: float = Field(default=0.005, gt=0.0)
-    """Least area (m²)."""
-    max_elongation: float = Field(default=4.0, ge=1.0)
-    """Longer than this many times its breadth it is a rut or a trench."""
+    """Least depth of the deepest block (m): settled patches and sunk manholes are mostly less."""
 
     @model_validator(mode="after")
     def _in_order(self) -> PotholeDetection:
         if self.edge_depth_m > self.min_depth_m:
             raise ValueError(f"edge_depth_m {self.edge_depth_m:g} is above min_depth_m {self.min_depth_m:g}")
         return self
+
+
+class PotholeJoining(Strict):
+    """What is a pothole once its pieces are joined over all tiles."""
+
+    min_depth_m: float = Field(default=0.02, gt=0.0)
+    """Least depth of its deepest block (m); below that of the detection it changes nothing."""
+    min_area_m2: float = Field(default=0.005, gt=0.0)
+    """Least area (m²)."""
+    max_elongation: float = Field(default=4.0, ge=1.0)
+    """Longer than this many times its breadth it is a rut or a trench."""

@@ -14,7 +14,7 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from roadscan.model.distress import CrackDetection
+from roadscan.model.distress import CrackJoining
 from roadscan.surfaces.cracks import CrackPiece
 
 Float64 = npt.NDArray[np.float64]
@@ -66,7 +66,7 @@ class Crack:
 
 
 def join_cracks(
-    pieces: Sequence[CrackPiece], lane_azimuth_rad: npt.ArrayLike, cell_m: float, config: CrackDetection
+    pieces: Sequence[CrackPiece], lane_azimuth_rad: npt.ArrayLike, cell_m: float, config: CrackJoining
 ) -> list[Crack]:
     """Cracks of all pieces that are long and deep enough, from south to north.
 
@@ -88,7 +88,7 @@ def join_cracks(
     return sorted((c for c in found if _is_crack(c, config)), key=lambda c: c.line.bounds[1::-1])
 
 
-def _is_crack(one: Crack, config: CrackDetection) -> bool:
+def _is_crack(one: Crack, config: CrackJoining) -> bool:
     long, deep = one.length_m >= config.min_length_m, one.depth_mean_m >= config.min_depth_m
     return long and deep and one.measured_share >= _LEAST_SHARE
 
@@ -106,7 +106,7 @@ def _crack(
     ends: Int64,
     azimuth: Float64,
     cell_m: float,
-    config: CrackDetection,
+    config: CrackJoining,
 ) -> Crack:
     mine = [pieces[k] for k in own.tolist()]
     length, measured = sum(p.length_m for p in mine), sum(p.measured_m for p in mine)
@@ -138,7 +138,7 @@ def _crack(
 
 
 def _kind(
-    junctions: int, polygons: int, covered_m2: float, parts: tuple[float, float, float], config: CrackDetection
+    junctions: int, polygons: int, covered_m2: float, parts: tuple[float, float, float], config: CrackJoining
 ) -> CrackType:
     if polygons >= config.alligator_polygons and junctions >= config.alligator_nodes_per_m2 * covered_m2:
         return "alligator"
@@ -160,7 +160,7 @@ def _shape(ends: Int64, length_m: Float64, cell_m: float) -> tuple[int, int, int
 
 
 def _directions(
-    pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackDetection
+    pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackJoining
 ) -> tuple[float, float, tuple[float, float, float]]:
     """Azimuth and angle to the lane (degrees) of the whole, and lengths along, across and aslant (m)."""
     turning, to_lane, parts = 0j, 0j, np.zeros(3)

@@ -28,7 +28,7 @@ from rasterio.features import shapes
 from scipy.ndimage import label
 
 from roadscan.kernels.ground import ground
-from roadscan.model.distress import PotholeDetection
+from roadscan.model.distress import PotholeDetection, PotholeJoining
 from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
 
 Float64 = npt.NDArray[np.float64]
@@ -105,7 +105,7 @@ def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[Potho
     return _pieces(window, low & inner, cells, blocks.of_cells(depth, window, absent=np.nan))
 
 
-def join_potholes(pieces: Sequence[PotholePiece], config: PotholeDetection) -> list[Pothole]:
+def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> list[Pothole]:
     """Potholes of the pieces of all tiles, from south to north."""
     if not pieces:
         return []

@@ -10,7 +10,7 @@ import shapely
 from scipy.ndimage import distance_transform_edt, label
 
 from roadscan.kernels.cross_sections import cross_sections
-from roadscan.model.distress import CrackDetection
+from roadscan.model.distress import CrackDetection, CrackJoining
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
@@ -20,7 +20,7 @@ from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.skeleton_graph import SkeletonGraph, pruned
 from roadscan.surfaces.valleys import _thinned
 
-CONFIG = CrackDetection()
+CONFIG, JOINING = CrackDetection(), CrackJoining()
 CELL_M = 0.0025
 NOISE_M = 0.0003
 SEEN_FROM = 58
@@ -58,8 +58,8 @@ def drawn(height_m, cell_m=0.005, seed=2, halo=0, first=(0, 0)):
     return HeightWindow(height_m + noise, height_m + noise, cell_m, 0.0002, *first, halo)
 
 
-def joined(window, config=CONFIG, lane=0.0):
-    return join_cracks(crack_pieces(window, config), lane, window.cell_m, config)
+def joined(window, lane=0.0):
+    return join_cracks(crack_pieces(window, CONFIG), lane, window.cell_m, JOINING)
 
 
 def scores(found, truth, tolerance_m):
@@ -152,7 +152,7 @@ def net(halo=0, first=(7_000, 9_000)):
 def test_a_net_is_an_alligator_and_closes_the_polygons_that_shapely_closes():
     window = net()
     pieces = crack_pieces(window, CONFIG)
-    (one,) = join_cracks(pieces, 0.0, 0.005, CONFIG)
+    (one,) = join_cracks(pieces, 0.0, 0.005, JOINING)
     assert one.kind == "alligator"
     closed = shapely.polygonize([shapely.LineString(p.line_m) for p in pieces])
     assert one.polygons == len(closed.geoms) > 20
@@ -180,9 +180,9 @@ def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
     assert edges_of(found) == edges_of(expected)
     figures = [
         (c.kind, c.junctions, c.ends, c.polygons, c.depth_max_m, c.width_max_m, pytest.approx(c.length_m))
-        for c in join_cracks(expected, 0.0, 0.005, config)
+        for c in join_cracks(expected, 0.0, 0.005, JOINING)
     ]
-    again = join_cracks(found, 0.0, 0.005, config)
+    again = join_cracks(found, 0.0, 0.005, JOINING)
     assert [
         (c.kind, c.junctions, c.ends, c.polygons, c.depth_max_m, c.width_max_m, c.length_m) for c in again
     ] == figures
@@ -195,8 +195,8 @@ def test_short_pieces_count_when_they_join():
             line, (500, a), (500, b), *[float(v) for v in (0.01 * (b - a), 0.01 * (b - a))], 1e-5, 0.004, 1e-4, 0.01
         )
 
-    assert join_cracks([piece(0, 8)], 0.0, 0.01, CONFIG) == []
-    (one,) = join_cracks([piece(8, 16), piece(0, 8)], 0.0, 0.01, CONFIG)
+    assert join_cracks([piece(0, 8)], 0.0, 0.01, JOINING) == []
+    (one,) = join_cracks([piece(8, 16), piece(0, 8)], 0.0, 0.01, JOINING)
     assert one.length_m == pytest.approx(0.16) and one.line.length == pytest.approx(0.16)
     assert sorted(one.pieces.tolist()) == [0, 1]
 
@@ -255,7 +255,7 @@ def test_widths_and_depths_seen_through_cells_are_sharpened(width_cells):
 def test_nothing_where_nothing_was_measured():
     assert crack_pieces(drawn(np.full((60, 60), np.nan)), CONFIG) == []
     assert crack_pieces(drawn(np.full((400, 400), np.nan)), CONFIG) == []
-    assert join_cracks([], 0.0, 0.005, CONFIG) == []
+    assert join_cracks([], 0.0, 0.005, JOINING) == []
 
 
 def test_says_what_does_not_fit():

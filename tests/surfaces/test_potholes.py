@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.model.distress import PotholeDetection
+from roadscan.model.distress import PotholeDetection, PotholeJoining
 from roadscan.model.errors import ConfigError
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.potholes import halo_cells, join_potholes, pothole_pieces
 
-CONFIG = PotholeDetection()
+CONFIG, JOINING = PotholeDetection(), PotholeJoining()
 CELL_M = 0.01
 NORTH, EAST = 71_000, 33_007
 
@@ -23,8 +23,8 @@ def road(depth_m=0.05, radius_m=0.2, halo=0, shape=(320, 330), extra=lambda x, y
     return HeightWindow(height, height, CELL_M, 0.0005, NORTH, EAST, halo)
 
 
-def found(window, config=CONFIG):
-    return join_potholes(pothole_pieces(window, config), config)
+def found(window):
+    return join_potholes(pothole_pieces(window, CONFIG), JOINING)
 
 
 def test_a_paraboloid_has_its_area_depth_and_volume():
@@ -79,7 +79,7 @@ def test_tiles_give_the_potholes_of_the_whole():
             HeightWindow(part, part, CELL_M, 0.0005, NORTH + rows.start, EAST + columns.start, halo), CONFIG
         )
     assert len(pieces) == 4
-    (one,) = join_potholes(pieces, CONFIG)
+    (one,) = join_potholes(pieces, JOINING)
     assert one.outline.equals(expected.outline)
     assert (one.area_m2, one.volume_m3) == pytest.approx((expected.area_m2, expected.volume_m3))
     assert one.depth_max_m == expected.depth_max_m

@@ -56,6 +56,8 @@ class OutputTask:
     """Records of the cells that the output may read."""
     overviews: tuple[OutputRecord, ...] = ()
     """Records of the overviews of the same tiles, where there are any."""
+    files: tuple[OutputRecord, ...] = ()
+    """Records of the files of surface products that the output is made from."""
 
     @property
     def target(self) -> str:
@@ -72,6 +74,8 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
     for name in config.options:
         product_named(name)
     wanted = [product_named(n) for n in names]
+    read = (n for p in wanted if isinstance(p, SurveyProduct) for n in p.reads if n not in names)
+    wanted += [product_named(n) for n in dict.fromkeys(read)]
     for product in wanted:
         if isinstance(product, SurfaceProduct) and not with_surface:
             raise ConfigError(
@@ -124,7 +128,16 @@ def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask]
         task
         for product, options in wanted_products(plan.survey)
         if isinstance(product, SurveyProduct)
-        for task in _tasks(product, options, plan, context, by_tile, overviews, summaries)
+        for task in _tasks(
+            product,
+            options,
+            plan,
+            context,
+            by_tile,
+            overviews,
+            summaries,
+            [r for name in product.reads for r in manifest.of(name).values()],
+        )
     ]
     due = {(t.product.name, t.output.name) for t in tasks}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
@@ -151,7 +164,7 @@ def write_output(task: OutputTask) -> OutputRecord:
     with task.store.scratch() as folder:
         path = folder / Path(task.output.name).name
         task.product.write(
-            task.output, task.summaries, StoredTiles(task.store, task.cells, task.overviews, task.context),
+            task.output, task.summaries, StoredTiles(task.store, task.cells, task.overviews, task.context, task.files),
             task.options, task.context, path,
         )  # fmt: skip
         size, digest = path.stat().st_size, file_digest(path)
@@ -168,8 +181,10 @@ class StoredTiles:
         cells: Sequence[OutputRecord],
         overviews: Sequence[OutputRecord],
         context: ProductContext,
+        files: Sequence[OutputRecord] = (),
     ) -> None:
         self._store = store
+        self._files = {(r.product, r.unit): r for r in files}
         self._cells = {r.unit: r for r in cells}
         self._overviews = {r.unit: r for r in overviews}
         self._edge = context.grid.cells_per_edge
@@ -178,6 +193,11 @@ class StoredTiles:
         """Cells of a tile; None where the survey has no such tile."""
         record = self._cells.get(str(tile))
         return None if record is None else read_cells(self._store, record, self._edge)
+
+    def file(self, product: str, tile: TileId) -> bytes | None:
+        """Content of a tile's file of a surface product; None where there is none."""
+        record = self._files.get((product, str(tile)))
+        return None if record is None else self._store.read_bytes(record.path)
 
     def overview(self, tile: TileId, factor: int) -> Level | None:
         """Overview of a tile; made from its cells where none was stored with them."""
@@ -196,11 +216,14 @@ def _tasks(
     by_tile: Mapping[TileId, OutputRecord],
     overviews: Mapping[str, OutputRecord],
     summaries: Mapping[TileId, TileSummary],
+    files: Sequence[OutputRecord],
 ) -> list[OutputTask]:
     tasks: list[OutputTask] = []
     for output in product.outputs(list(summaries.values()), options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
-        key = key_of(_product_key(product, options, context), output.name, [(r.unit, r.digest, r.detail) for r in own])
+        read = _read(product, files, output)
+        parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
+        key = key_of(_product_key(product, options, context), output.name, parts)
         tasks.append(
             OutputTask(
                 plan.store,
@@ -212,9 +235,16 @@ def _tasks(
                 tuple(summaries[t] for t in sorted(output.tiles) if t in summaries),
                 own,
                 tuple(overviews[r.unit] for r in own if r.unit in overviews),
+                read,
             )
         )
     return tasks
+
+
+def _read(product: SurveyProduct, files: Sequence[OutputRecord], output: Output) -> tuple[OutputRecord, ...]:
+    """Files of surface products that an output is made from, in the order of tiles."""
+    units = {str(t) for t in output.tiles} if product.reads else set()
+    return tuple(sorted((r for r in files if r.unit in units), key=lambda r: (r.product, TileId.parse(r.unit))))
 
 
 def _product_key(product: Product, options: Strict, context: ProductContext) -> str:

@@ -114,6 +114,9 @@ class LoadCells(Protocol):
         `factor` is one of :func:`roadscan.tiles.pyramid.overview_factors`.
         """
 
+    def file(self, product: str, tile: TileId) -> bytes | None:
+        """Content of a tile's file of a surface product that this product `reads`, or None where there is none."""
+
 
 class TileFiles(ABC):
     """What the two kinds of product with one file a tile share."""
@@ -186,6 +189,8 @@ class SurveyProduct(ABC):
     options: ClassVar[type[Strict]] = NoOptions
     default: ClassVar[bool] = True
     default_cells: ClassVar[Cells] = "any"
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Surface products whose files of the tiles it is made from; they are made wherever this product is."""
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:

@@ -19,7 +19,7 @@ from roadscan.surfaces.cracks import CrackPiece
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator"]
+CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unknown"]
 
 _CHORD_M = 0.1
 """Directions are those of chords about this long."""
@@ -73,7 +73,8 @@ def join_cracks(
     Parameters
     ----------
     pieces : of all tiles; their order does not matter but for the last bit of sums.
-    lane_azimuth_rad : direction of the lane, clockwise from map north: one for all pieces or one for each (n,).
+    lane_azimuth_rad : direction of the lane, clockwise from map north: one for all pieces or one for each (n,); NaN
+        where it is not known.
     """
     if not pieces:
         return []
@@ -143,7 +144,7 @@ def _kind(
     if polygons >= config.alligator_polygons and junctions >= config.alligator_nodes_per_m2 * covered_m2:
         return "alligator"
     kinds: tuple[CrackType, ...] = ("longitudinal", "transverse", "diagonal")
-    return kinds[int(np.argmax(parts))]
+    return kinds[int(np.argmax(parts))] if sum(parts) > 0.0 else "unknown"
 
 
 def _shape(ends: Int64, length_m: Float64, cell_m: float) -> tuple[int, int, int]:
@@ -176,6 +177,7 @@ def _directions(
         off = np.abs((angle - lane + np.pi / 2) % np.pi - np.pi / 2)
         along, across = off <= limit, off >= np.pi / 2 - limit
         share = size * (one.length_m / max(size.sum(), 1e-12))
-        parts += [share[along].sum(), share[across].sum(), share[~along & ~across].sum()]
+        if not math.isnan(lane):
+            parts += [share[along].sum(), share[across].sum(), share[~along & ~across].sum()]
     azimuth_deg = math.degrees(np.angle(turning) / 2) % 180.0
     return azimuth_deg, abs(math.degrees(np.angle(to_lane) / 2)), (float(parts[0]), float(parts[1]), float(parts[2]))

@@ -14,6 +14,8 @@ from roadscan.tables.store import Store
 
 _SMALL = ("clocks", "clock_residuals", "corrections", "mountings")
 """Tables of results, held in one file each."""
+_DISTRESS = ("cracks", "potholes")
+_PER_TILE = ("cells", "overviews")
 _ALWAYS = ("rejects",)
 """Tables that answer even before they have a row: no rejects is news too."""
 
@@ -23,7 +25,8 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
-    ``tiles``, ``cells``, ``overviews``, ``footprints`` and ``outputs`` are there once a run has made them,
+    ``tiles``, ``cells``, ``overviews``, ``cracks``, ``potholes``, ``footprints``, ``outputs`` are there once a run has
+    made them,
     ``clocks``, ``mountings`` and ``corrections`` once they were estimated. `logs` are the keys of the logs to
     show, all in the store where left out.
     """
@@ -56,10 +59,11 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
         if found:
             _view(connection, name, [_url(store, f) for f in found], hive=False)
     places = {"cells": "tiles/cells", "overviews": "tiles/overviews", "tiles": "products/tile_table"}
+    places |= {name: f"products/{name}" for name in _DISTRESS}
     for name, folder in places.items():
         found = store.files(folder, ".parquet")
         if found:
-            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=name != "tiles")
+            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=name in _PER_TILE)
     return connection
 
 

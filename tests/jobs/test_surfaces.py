@@ -38,7 +38,7 @@ from .conftest import Lines, Simulated, changed, outputs, small_scene
 
 SURFACES = tuple(s for s in STAGES if s.name == "surfaces")
 CELLS: dict[str, object] = {"method": "cells", "sigma_m": 0.004}
-POINTS: dict[str, object] = {"method": "points", "sigma_m": 0.006, "cell_m": (0.04, 0.06)}
+POINTS: dict[str, object] = {"method": "points", "sigma_m": 0.006, "cell_m": (0.03, 0.04)}
 MADE = {"make": ["surface", "surface_pictures"], "options": {}}
 
 
@@ -87,9 +87,10 @@ class Reconstructed:
 
     @cache  # noqa: B019  as long as the module's tests
     def surfaces(self, **settings: object) -> dict[TileId, SurfaceTile]:
-        """Each tile's surface, made by a task of its own."""
+        """Surfaces of the six tiles with most cells, each made by a task of its own."""
         planned = self.plan(self.survey({k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}))
-        return {t: s for task in planned.singly(list(planned.keys)) for t, s in _surfaces(task)}
+        fullest = sorted(planned.keys, key=lambda t: -planned.cells[t].figures()["cells"])[:6]
+        return {t: s for task in planned.singly(fullest) for t, s in _surfaces(task)}
 
 
 def _surfaces(task: SurfaceTask) -> Iterator[tuple[TileId, SurfaceTile]]:

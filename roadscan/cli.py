@@ -167,7 +167,7 @@ def tile(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler 
 
 @app.command()
 def surfaces(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
-    """Cells or points of tiles into the reconstructed surface and its files ([surface] of the survey file)."""
+    """Cells or points of tiles into the reconstructed surface and its files (section `surface` of the survey file)."""
     _run(survey_file, _stages("surfaces"), workers, scheduler)
 
 
@@ -613,5 +613,10 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
 
 
 def _cell(value: Any) -> str:
-    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = _number(value) if isinstance(value, float) else str(value)
     return text if len(text) <= 60 else text[:59] + "…"
+
+
+def _number(value: float) -> str:
+    """Six digits, and millimetres of what is as large as a coordinate."""
+    return f"{value:.3f}" if 1e5 <= abs(value) < 1e9 else f"{value:.6g}"

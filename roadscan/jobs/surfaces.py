@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections import OrderedDict
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,12 +14,13 @@ from roadscan.jobs.cell_files import read_cells
 from roadscan.jobs.compute import reason_of
 from roadscan.jobs.surface_plan import SURFACE, SurfaceTask
 from roadscan.jobs.tile_files import publish_product
+from roadscan.jobs.tile_plan import TileTask
 from roadscan.jobs.tile_points import load_points
 from roadscan.jobs.tiles import TaskResult
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import TilePoints
 from roadscan.products.base import ProductContext
-from roadscan.surfaces.reconstruction import Patch, patch_of_cells, patch_of_points, surface_of
+from roadscan.surfaces.reconstruction import Patch, SurfaceGrid, patch_of_cells, patch_of_points, surface_of
 from roadscan.surfaces.tile import INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tiles.cells import TileCells
@@ -30,7 +31,7 @@ _CELLS_KEPT = 24_000_000
 
 def compute_surfaces(task: SurfaceTask) -> TaskResult:
     """Make the surfaces of a task's tiles and write their files (runs on a worker)."""
-    source = _Cells(task) if task.readings is None else _Points(task)
+    source = source_of(task)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     for tile, key, date in zip(task.block.tiles, task.keys, task.dates, strict=True):
@@ -41,6 +42,18 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), reason_of(error)))
     return TaskResult(tuple(records), tuple(failures))
+
+
+class Source(Protocol):
+    """What the surface is made of."""
+
+    def patch(self, tile: TileId) -> Patch:
+        """Heights of a tile and its surroundings before smoothing."""
+
+
+def source_of(task: SurfaceTask) -> Source:
+    """Cells or points of a task, as it says."""
+    return _Cells(task) if task.readings is None else _Points(task.grid, task.readings)
 
 
 class _Cells:
@@ -70,11 +83,9 @@ class _Cells:
 class _Points:
     """Points of a block and its surroundings, placed at once."""
 
-    def __init__(self, task: SurfaceTask) -> None:
-        if task.readings is None:
-            raise TypeError("a task without readings")
-        self._grid = task.grid
-        self._points: dict[TileId, TilePoints] = dict(load_points(task.readings))
+    def __init__(self, grid: SurfaceGrid, readings: TileTask) -> None:
+        self._grid = grid
+        self._points: dict[TileId, TilePoints] = dict(load_points(readings))
 
     def patch(self, tile: TileId) -> Patch:
         """The detailed model of a tile and its surroundings."""

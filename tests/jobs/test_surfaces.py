@@ -18,12 +18,12 @@ import pytest
 import rasterio
 import shapely
 
-from roadscan.jobs import surfaces
 from roadscan.jobs.compute import Compute, Done, Inline
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.jobs.status import verify_store
 from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, plan_surface_work
+from roadscan.jobs.surfaces import source_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -94,7 +94,7 @@ class Reconstructed:
 
 
 def _surfaces(task: SurfaceTask) -> Iterator[tuple[TileId, SurfaceTile]]:
-    source = surfaces._Cells(task) if task.readings is None else surfaces._Points(task)
+    source = source_of(task)
     for tile in task.block.tiles:
         wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
         yield tile, surface_of(tile, source.patch(tile), task.grid, wanted)

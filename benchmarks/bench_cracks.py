@@ -1,0 +1,172 @@
+"""Cracks and potholes: what is found of cracks of known width and depth by size of the cells, and how fast.
+
+Cells are the medians of a profiler's readings, 1 mm apart both ways (noise σ 0.3 mm, 0.05 % impulses, 2 % dropouts),
+of the simulator's road with texture (mean profile depth 0.8 mm), unevenness of class C, ruts and cross slope.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from benchmarks.timing import Figure, thread_seconds
+from roadscan.model.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
+from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+from roadscan.surfaces.crack_network import Crack, join_cracks
+from roadscan.surfaces.cracks import crack_pieces
+from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.potholes import join_potholes, pothole_pieces
+from roadscan.surfaces.smoothing import smooth_surface
+from roadscan.surfaces.valleys import LINE_HALF, flank_cells
+
+SEEDS = (1, 2, 3)
+READING_M, SIGMA_M, IMPULSES, DROPOUTS = 0.001, 0.0003, 0.0005, 0.02
+CLASSES_M = ((0.005, 0.003), (0.005, 0.008), (0.010, 0.010), (0.020, 0.020))
+CELLS_M = (0.005, 0.0025, 0.002)
+BENT = [[(10.05, 0.62), (10.4, 0.95), (10.7, 1.0), (11.2, 1.3)], [(10.5, 0.97), (10.45, 1.6)]]
+ROAD: dict[str, Any] = {
+    "roughness": {"iso_class": "C"},
+    "texture": {"mpd_mm": 0.8},
+    "cross_slope": 0.03,
+    "ruts": [{"offset_m": 0.9}],
+}
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A patch as a profiler sees it, and its scene."""
+
+    window: HeightWindow
+    scene: Scene
+
+    def on_map(self, lines: Sequence[Sequence[tuple[float, float]]]) -> Any:
+        """Lines of stations and offsets on the map, as far as a window shows them."""
+        east, north = self.scene.map.easting_m, self.scene.map.northing_m
+        w = self.window
+        edge = 1 + LINE_HALF + 3 * flank_cells(CrackDetection(), w.cell_m)[-1]
+        low = w.map_m(edge, edge)
+        high = w.map_m(*(n - edge for n in w.raw_m.shape))
+        whole = shapely.MultiLineString([[(east + o, north + s) for s, o in one] for one in lines])
+        return shapely.intersection(whole, shapely.box(*low, *high))
+
+
+def figures(_: Path) -> Iterator[Figure]:
+    """Cracks by class and cell, a net, clean roads, potholes, speed."""
+    for cell_m in CELLS_M:
+        for width_m, depth_m in CLASSES_M:
+            yield from quality(cell_m, width_m, depth_m)
+    yield from net()
+    yield from clean()
+    yield from potholes()
+    yield from speed()
+
+
+def seen(
+    road: dict[str, Any], cell_m: float, size_m: tuple[float, float], seed: int, reading_m: float = READING_M
+) -> Seen:
+    """A patch from station 10 and offset 0.5 on: medians of readings, then smoothed."""
+    scene = Scene(seed=seed).changed(map={"azimuth_deg": 0.0}, road={**ROAD, **road})
+    surface = Surface(scene)
+    per = round(cell_m / reading_m)
+    rows, columns = (round(s / cell_m) for s in size_m)
+    first_row, first_column = (round(v / cell_m) for v in (scene.map.northing_m + 10.0, scene.map.easting_m + 0.5))
+    east = (first_column + (np.arange(columns * per) + 0.5) / per) * cell_m
+    rng = np.random.default_rng(seed)
+    raw = np.empty((rows, columns))
+    for a in range(0, rows, 100):
+        b = min(a + 100, rows)
+        north = (first_row + a + (np.arange((b - a) * per) + 0.5) / per) * cell_m
+        height = surface.height_m(*np.broadcast_arrays(east[None], north[:, None]))
+        height += rng.normal(0.0, SIGMA_M, height.shape)
+        height += np.where(rng.random(height.shape) < IMPULSES, rng.uniform(-0.03, 0.03, height.shape), 0.0)
+        height[rng.random(height.shape) < DROPOUTS] = np.nan
+        cells = height.reshape(b - a, per, columns, per).swapaxes(1, 2).reshape(b - a, columns, -1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            raw[a:b] = np.nanmedian(cells, axis=2)
+    smooth = smooth_surface(raw, SurfaceSmoothing(sigma_m=SIGMA_M))
+    return Seen(HeightWindow(raw, smooth, cell_m, SIGMA_M, first_row, first_column), scene)
+
+
+def cracks_of(one: Seen) -> list[Crack]:
+    return join_cracks(crack_pieces(one.window, CrackDetection()), 0.0, one.window.cell_m, CrackJoining())
+
+
+def scores(found: Sequence[Crack], truth: Any, cell_m: float) -> tuple[float, float]:
+    """Precision and recall of places along the lines, a cell apart, 2 cells of tolerance."""
+    if not found:
+        return 1.0, 0.0
+    lines = shapely.union_all([c.line for c in found])
+    every = lambda of: [one.interpolate(s) for one in shapely.get_parts(of) for s in np.arange(0, one.length, cell_m)]  # noqa: E731
+    near = [shapely.distance(every(a), b) <= 2 * cell_m for a, b in ((lines, truth), (truth, lines))]
+    return float(near[0].mean()), float(near[1].mean())
+
+
+def quality(cell_m: float, width_m: float, depth_m: float) -> Iterator[Figure]:
+    cracks = [{"points_m": line, "width_m": width_m, "depth_m": depth_m} for line in BENT]
+    rows = []
+    for seed in SEEDS:
+        one = seen({"cracks": cracks}, cell_m, (1.0, 1.0), seed)
+        found, truth = cracks_of(one), one.on_map(BENT)
+        length = sum(c.length_m for c in found)
+        mean = [sum(getattr(c, n) * c.length_m for c in found) / length for n in ("depth_mean_m", "width_mean_m")]
+        rows.append((*scores(found, truth, cell_m), *mean, length / truth.length))
+    precision, recall, depth, width, length = np.mean(rows, axis=0)
+    what = f"{cell_m * 1e3:g} mm cells, crack {width_m * 1e3:g} × {depth_m * 1e3:g} mm"
+    yield Figure(f"{what}: precision", precision, "", None, "bar: 0.95")
+    yield Figure(f"{what}: recall", recall, "", None, f"bar: 0.95; least of 3 seeds {min(r[1] for r in rows):.3f}")
+    yield Figure(f"{what}: mean depth", depth * 1e3, "mm", depth_m * 1e3, "truth (bar: 10 %)")
+    yield Figure(f"{what}: width at half depth", width * 1e3, "mm", 541.2 * width_m, "truth (bar: 2 cells)")
+    yield Figure(f"{what}: length over true length", length, "")
+
+
+def net() -> Iterator[Figure]:
+    field = {"station_m": 11.0, "offset_m": 1.3, "length_m": 1.2, "width_m": 0.8}
+    for cell_m in (0.005, 0.0025):
+        found = cracks_of(seen({"alligators": [field]}, cell_m, (2.0, 1.6), 1))
+        largest = max(found, key=lambda c: c.length_m)
+        what = f"net of 5 × 8 mm cracks, {cell_m * 1e3:g} mm cells: pieces of {largest.kind}"
+        yield Figure(what, len(found), "", 1, f"one net; {largest.polygons} polygons in the largest")
+
+
+def clean() -> Iterator[Figure]:
+    stains = {
+        "stains": [{"station_m": 12.0 + 9 * k, "offset_m": 1.2} for k in range(10)],
+        "tyre_marks": [{"points_m": [(20.0, 0.9), (60.0, 1.0), (100.0, 0.95)]}],
+    }
+    for mpd_mm in (0.8, 1.5):
+        road = {**stains, "texture": {"mpd_mm": mpd_mm}}
+        found = cracks_of(seen(road, 0.005, (100.0, 1.5), 4, 0.0025))
+        yield Figure(f"100 m without a crack, texture {mpd_mm} mm, stains", len(found), "cracks", None, "bar: 0")
+
+
+def potholes() -> Iterator[Figure]:
+    for radius_m, depth_m in ((0.08, 0.03), (0.2, 0.05), (0.3, 0.04)):
+        hole = {"station_m": 11.2, "offset_m": 1.7, "radius_m": radius_m, "depth_m": depth_m}
+        one = seen({"potholes": [hole]}, 0.005, (2.4, 2.4), 1, 0.0025)
+        found = join_potholes(pothole_pieces(one.window, PotholeDetection()), PotholeJoining())
+        volume = sum(p.volume_m3 for p in found)
+        what = f"pothole of {radius_m * 2e3:g} × {depth_m * 1e3:g} mm: volume ({len(found)} found)"
+        yield Figure(what, volume * 1e3, "l", np.pi * radius_m**2 * depth_m * 8 / 15 * 1e3, "truth, to its rim")
+
+
+def speed() -> Iterator[Figure]:
+    rng = np.random.default_rng(1)
+    raw = 500.0 + rng.normal(0.0, SIGMA_M, (1600, 1600))
+    raw[:, 400::400] -= 0.006
+    window = HeightWindow(raw, raw, 0.005, SIGMA_M, 0, 0, 200)
+    for what, work in (
+        ("pieces of cracks", lambda: crack_pieces(window, CrackDetection())),
+        ("pieces of potholes", lambda: pothole_pieces(window, PotholeDetection())),
+    ):
+        yield Figure(f"{what}, halo counted", raw.size / thread_seconds(work, 2) / 1e6, "M cells/s of a core")

@@ -25,6 +25,18 @@ def pair_means(heights, i, j, away, pair):
 
 
 @kernel
+def put_in_order(values, n):
+    """Sort the first n of values (m,) float64, some dozens, in place."""
+    for k in range(1, n):
+        value = values[k]
+        i = k
+        while i > 0 and values[i - 1] > value:
+            values[i] = values[i - 1]
+            i -= 1
+        values[i] = value
+
+
+@kernel
 def ground_of(heights, i, j, away, least, slack, pair, level, spread):
     """Ground at block (i, j), and the lowest of all sectors; NaN where no sector, or not each, has `least` pairs.
 
@@ -35,9 +47,9 @@ def ground_of(heights, i, j, away, least, slack, pair, level, spread):
         level[sector], spread[sector] = np.inf, np.inf
         n = pair_means(heights, i, j, away[sector], pair)
         if n >= least:
-            means = np.sort(pair[:n])
-            level[sector] = means[(6 * (n - 1)) // 10]
-            spread[sector] = means[(8 * (n - 1)) // 10] - means[(3 * (n - 1)) // 10]
+            put_in_order(pair, n)
+            level[sector] = pair[(6 * (n - 1)) // 10]
+            spread[sector] = pair[(8 * (n - 1)) // 10] - pair[(3 * (n - 1)) // 10]
             closest = min(closest, spread[sector])
             known += 1
     lowest, agreed = np.inf, np.inf

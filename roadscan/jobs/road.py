@@ -45,7 +45,8 @@ def looks_across(mounting: Mounting) -> bool:
 
 def check_road(settings: RoadSegmentation | None, sources: Sequence[ReadingSource]) -> None:
     """Raise ConfigError where the survey file asks for segmentation and there is nothing to segment."""
-    if settings is None or not sources or any(source.road is not None for source in sources):
+    scans = any(source.table == "scans" for source in sources)  # none where the log of the only profiler is damaged
+    if settings is None or not scans or any(source.road is not None for source in sources):
         return
     known = sorted({f"{source.sensor} ({source.table})" for source in sources})
     raise ConfigError(

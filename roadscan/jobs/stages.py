@@ -15,7 +15,7 @@ from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.surface_plan import SURFACE, files_without_surface, plan_surface_work
+from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
 from roadscan.jobs.surfaces import compute_surfaces
 from roadscan.jobs.tile_files import tile_file_names
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, plan_tiles, stale_tiles
@@ -192,6 +192,8 @@ class TileWork:
 def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     """Compare what there is with what there should be."""
     plan = plan_survey(run.survey, run.store)
+    if run.survey.config.surface is not None:
+        checked_surface(run.survey, run.survey.config.surface)  # before the tiles are computed for it
     footprints = load_ranges(plan, manifest)
     context = product_context(plan)
     wanted = tuple(wanted_tile_products(run.survey, context))

@@ -124,7 +124,9 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)
-    status.surfaces_stale = len(plan_surface_work(survey, store, None, manifest).chosen)
+    surfaces = plan_surface_work(survey, store, None, manifest)
+    waiting = set() if surfaces.planned is None else surfaces.planned.waiting & surfaces.planned.cells.keys()
+    status.surfaces_stale = len(surfaces.chosen) + len(waiting)
     status.products_stale = len(plan_outputs(work.planned.plan, manifest)[0])
     largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
     status.next_run = {

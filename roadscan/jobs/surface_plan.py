@@ -6,6 +6,8 @@ import datetime as dt
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import shapely
+
 from roadscan.jobs.fingerprint import key_of, surface_version
 from roadscan.jobs.footprints import load_ranges
 from roadscan.jobs.plan import plan_survey
@@ -14,6 +16,7 @@ from roadscan.jobs.selection import Selection
 from roadscan.jobs.surface_regions import Regions, stated_regions
 from roadscan.jobs.tile_files import WantedSurface, surface_file_names
 from roadscan.jobs.tile_plan import TILE, TilePlan, TileTask, plan_tiles
+from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.model.surface import SurfaceConfig
@@ -23,9 +26,13 @@ from roadscan.surfaces.reconstruction import SurfaceGrid
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store
 from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.grid import TileGrid
 
 SURFACE = "surfaces"
 """Manifest name of a tile's surface as a whole; it has no file of its own."""
+
+_MOST_SMOOTHED = 500
+"""Cells on each side that smoothing may depend on: the window of a tile of 2,000 cells is twice its size."""
 
 _BLOCK_TILES = 4
 """Edge of the largest block of tiles whose surface is made from cells: each tile's cells are read once or twice."""
@@ -64,6 +71,8 @@ class SurfacePlan:
     products: tuple[WantedSurface, ...]
     keys: Mapping[TileId, str]
     """Key of each tile's surface that is due."""
+    waiting: frozenset[TileId] = frozenset()
+    """Tiles whose surface depends on cells that are missing or out of date: what there is of it stays."""
 
     def stale(self, manifest: Manifest) -> list[TileId]:
         """Tiles whose surface is missing or out of date, or lacks a product."""
@@ -153,40 +162,77 @@ def plan_surface_work(survey: Survey, store: Store, selection: Selection | None,
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
     tiles = TilePlan(plan, footprints, plan_tiles(footprints, plan), (), context)
     planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest)
-    units = {str(tile) for tile in planned.keys}
+    units = {str(tile) for tile in (*planned.keys, *planned.waiting)}
     names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
     gone = [r for name in names for u, r in manifest.of(name).items() if u not in units or name not in names_wanted]
     stale = planned.stale(manifest)
+    waiting = len(planned.waiting)
+    note = f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"
+    note = note if waiting else ""
     if selection is None:
-        return SurfaceWork(planned, stale, gone)
+        return SurfaceWork(planned, stale, gone, note)
     own = set(selection.tiles(tiles.tiles, footprints, plan.ground.grid))
     due = own | (planned.near(own) & set(stale))
-    return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone)
+    return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone, note)
 
 
 def plan_surfaces(
     tiles: TilePlan, config: SurfaceConfig, products: tuple[WantedSurface, ...], manifest: Manifest
 ) -> SurfacePlan:
     """Surfaces that are due: of all tiles that hold cells, or of those that a polygon touches."""
-    grid = SurfaceGrid(tiles.plan.ground.grid, config)
-    regions = stated_regions(tiles.plan.survey)
-    cells = {TileId.parse(unit): r for unit, r in manifest.of(TILE).items() if r.path}
+    grid, regions = checked_surface(tiles.plan.survey, config)
+    expected = dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
+    records = {TileId.parse(unit): r for unit, r in manifest.of(TILE).items()}
+    cells = {tile: r for tile, r in records.items() if r.path}
     of_points = config.method == "points"
-    inputs = (
-        dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
-        if of_points
-        else {tile: r.digest for tile, r in cells.items()}
-    )
+    inputs = expected if of_points else {tile: r.digest for tile, r in cells.items()}
+    behind = set() if of_points else {t for t, key in expected.items() if t not in records or records[t].key != key}
+    waiting = {t for t in expected if behind.intersection(grid.tiles.tiles_in(grid.reach(t)))} if behind else set()
     common = key_of(surface_version(), config.model_dump(mode="json", exclude={"polygons"}), grid.tiles)
     keys: dict[TileId, str] = {}
-    for tile in sorted(cells, key=lambda t: (t.row, t.column)):
+    for tile in sorted(cells.keys() - waiting, key=lambda t: (t.row, t.column)):
         box = grid.reach(tile)
         near = None if regions is None else regions.near(box)
         if near is not None and not near.near(grid.tiles.bounds(tile)).shapes.size:
             continue
         around = [(str(t), inputs[t]) for t in grid.tiles.tiles_in(box) if t in inputs]
         keys[tile] = key_of(common, str(_date(cells[tile])), around, None if near is None else near.key())
-    return SurfacePlan(tiles, grid, cells, regions, products, keys)
+    if regions is not None and cells and not keys:
+        raise _beside(regions, config, list(cells), grid)
+    return SurfacePlan(tiles, grid, cells, regions, products, keys, frozenset(waiting))
+
+
+def checked_surface(survey: Survey, config: SurfaceConfig) -> tuple[SurfaceGrid, Regions | None]:
+    """Grid and polygons of a survey's surface; ConfigError where its settings do not fit the tiles."""
+    tiles = TileGrid(survey.config.tiles.size_m, survey.config.tiles.cell_m)
+    grid = SurfaceGrid(tiles, config)
+    if grid.smoothed > _MOST_SMOOTHED:
+        raise ConfigError(
+            f"with these weights smoothing depends on {grid.smoothed:,} cells on each side",
+            expected=f"at most {_MOST_SMOOTHED}",
+            change="lower surface.smoothing.curvature_weight or median_weight",
+        )
+    if config.method == "points" and config.max_gap_m > tiles.size_m / 2:
+        raise ConfigError(
+            f"surface.max_gap_m {config.max_gap_m:g} bridges more than half a tile of {tiles.size_m:g} m",
+            change="make it smaller, or tiles.size_m larger",
+        )
+    return grid, stated_regions(survey)
+
+
+def _beside(regions: Regions, config: SurfaceConfig, tiles: Sequence[TileId], grid: SurfaceGrid) -> ConfigError:
+    """The error for polygons that touch no tile."""
+    boxes = [grid.tiles.bounds(tile) for tile in tiles]
+    survey = (
+        min(b.easting_min_m for b in boxes), min(b.northing_min_m for b in boxes),
+        max(b.easting_max_m for b in boxes), max(b.northing_max_m for b in boxes),
+    )  # fmt: skip
+    layer, there = (", ".join(f"{v:.1f}" for v in box) for box in (shapely.total_bounds(regions.shapes), survey))
+    return ConfigError(
+        f"the polygons of {config.polygons} touch no tile: on the map they span {layer} (west, south, east, north)",
+        expected=f"polygons within {there}",
+        change="check surface.polygons_crs and the order of the layer's axes",
+    )
 
 
 def files_without_surface(manifest: Manifest) -> list[OutputRecord]:

@@ -72,7 +72,8 @@ def _shapes(path: Path) -> npt.NDArray[Any]:
         geometry = pyogrio.read_info(gdal_name(path), layer=layer).get("geometry_name") or ""
     parts = [shapes_of(batch, geometry) for batch in feature_batches(path, layer, _EXPECTED)]
     shapes = np.concatenate(parts) if parts else np.empty(0, object)
-    sound = np.isin(shapely.get_type_id(shapes), _POLYGONS) & shapely.is_valid(shapes) & ~shapely.is_empty(shapes)
+    holds_ground = ~(shapely.is_missing(shapes) | shapely.is_empty(shapes))
+    sound = np.isin(shapely.get_type_id(shapes), _POLYGONS) & shapely.is_valid(shapes) | ~holds_ground
     if not sound.all():
         raise ConfigError(
             f"feature {int(np.flatnonzero(~sound)[0])} of the layer (counted from 0) is no sound polygon",
@@ -80,9 +81,10 @@ def _shapes(path: Path) -> npt.NDArray[Any]:
             change="mend the feature, or take it out of the layer",
             file=path,
         )
+    shapes = shapes[holds_ground]  # a feature without ground costs itself
     if not shapes.size:
         raise ConfigError("the layer has no polygon", expected="at least one", file=path)
-    return shapes
+    return np.asarray(shapes)
 
 
 def _crs(path: Path, stated: str | None) -> str:

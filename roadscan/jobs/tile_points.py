@@ -64,8 +64,9 @@ def load_tiles(task: TileTask, fates: Fates) -> Iterator[LoadedTile]:
     joined = parts.join()
     width = box[2] - box[0]
     local = (joined.tiles[:, 1] - box[1]) * width + (joined.tiles[:, 0] - box[0])
-    order = np.argsort(local.astype(np.uint16), kind="stable").astype(np.int32)  # 16 bits: a radix sort
     ends = np.cumsum(np.bincount(local, minlength=width * (box[3] - box[1])))
+    kind = np.uint16 if ends.size <= 1 << 16 else np.uint32  # 16 bits: a radix sort
+    order = np.argsort(local.astype(kind), kind="stable").astype(np.int32)
     del local
     for tile in sorted(task.block.with_halo(), key=lambda t: (t.row, t.column)):
         index = (tile.row - box[1]) * width + (tile.column - box[0])

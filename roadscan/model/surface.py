@@ -31,7 +31,8 @@ class SurfaceConfig(Strict):
     """`points`: edges of the grid's cells (m), east and north, such as [0.01, 0.03]; left out, `tiles.cell_m` both
     ways. The tiles' own cells are the grid of `cells`."""
     max_gap_m: float = Field(default=0.3, gt=0.0, le=10.0)
-    """`points`: widest hole that is bridged (m): no surface is made where a disc of this diameter holds no reading."""
+    """`points`: widest hole that is bridged (m), at most half a tile's edge: no surface is made where a disc of this
+    diameter holds no reading, nor in a tile without any."""
     slopes: SlopeKind = "quadratic"
     """`points`: how the slope at a reading is found: `quadratic` is calm where heights are noisy, `cubic` follows exact
     heights most closely."""

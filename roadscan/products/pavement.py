@@ -34,8 +34,8 @@ class IntensityOptions(PictureOptions):
 
     black: float = Field(default=0.0)
     """Intensity (digital number) that is drawn black. The same for all tiles, so that their pictures match."""
-    white: float = Field(default=255.0)
-    """Intensity (digital number) that is drawn white; 255 suits sensors of 8 bits."""
+    white: float = Field(default=65_535.0)
+    """Intensity (digital number) that is drawn white; 65,535 is the brightest that a sensor says, of 8 bits or 16."""
 
     @model_validator(mode="after")
     def _in_order(self) -> IntensityOptions:

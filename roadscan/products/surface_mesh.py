@@ -29,8 +29,8 @@ class SurfaceMeshOptions(Strict):
     a tile."""
     black: float = 0.0
     """Intensity (digital number) that is drawn black. The same for all tiles, so that their meshes match."""
-    white: float = 255.0
-    """Intensity (digital number) that is drawn white; 255 suits sensors of 8 bits."""
+    white: float = 65_535.0
+    """Intensity (digital number) that is drawn white; 65,535 is the brightest that a sensor says, of 8 bits or 16."""
 
     @model_validator(mode="after")
     def _in_order(self) -> SurfaceMeshOptions:

@@ -215,6 +215,29 @@ def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructe
     assert set(cells.run(survey)[0]) == lost
 
 
+def test_surfaces_wait_for_cells_of_the_survey_as_it_is(cells: Reconstructed) -> None:
+    survey = cells.survey(CELLS)
+    _, files = cells.run(survey)
+    coarser = changed(survey, {"tiles__cell_m": 2 * survey.config.tiles.cell_m})
+    work = plan_surface_work(coarser, cells.store, None, Manifest(cells.store))
+    assert "run `roadscan tiles`" in work.note and work.planned is not None
+    assert set(map(str, work.planned.waiting)) >= set(Manifest(cells.store).of(SURFACE))
+    assert cells.run(coarser) == ([], files)  # cells of the other grid are not taken for those of this one
+
+
+def test_a_tile_that_failed_keeps_its_surface(cells: Reconstructed) -> None:
+    survey = cells.survey(CELLS)
+    _, files = cells.run(survey)
+    manifest = Manifest(cells.store)
+    unit = next(iter(manifest.of(SURFACE)))
+    record = manifest.get("tile", unit)
+    assert record is not None
+    manifest.forget("tile", [unit])
+    assert cells.run(survey) == ([], files)
+    manifest.add([record])
+    assert cells.run(survey) == ([], files)
+
+
 def test_smoothed_cells_are_nearer_to_the_truth(cells: Reconstructed) -> None:
     truth = load(cells.simulated.survey_file.parent)
     raw, smooth = _errors(cells.surfaces(**CELLS), truth)
@@ -273,6 +296,35 @@ def test_polygons_bound_the_surface(points: Reconstructed, tmp_path: Path) -> No
     assert made == [str(tile)] and {Path(p).stem for p in files} == {str(tile)}
     with rasterio.open(points.store.path(f"tiles/surface/{tile}.tif")) as raster:
         assert np.isfinite(raster.read(1)).sum() == np.count_nonzero(found[tile].origin[found[tile].inner])
+
+
+def test_polygons_beside_the_survey_are_an_error(points: Reconstructed, tmp_path: Path) -> None:
+    box = points.plan(points.survey(POINTS)).grid.tiles.bounds(next(iter(points.plan(points.survey(POINTS)).keys)))
+    swapped = shapely.Point(box.northing_min_m, box.easting_min_m).buffer(2.5)
+    crs = Survey.load(points.simulated.survey_file).config.map.crs
+    layer = tmp_path / "swapped.gpkg"
+    geopandas.GeoDataFrame(geometry=[swapped, None], crs=crs).to_file(layer)
+    survey = points.survey({**POINTS, "regions": "polygons", "polygons": str(layer)})
+    with pytest.raises(ConfigError, match="touch no tile"):
+        points.run(survey)
+    geopandas.GeoDataFrame(geometry=[None], crs=crs).to_file(tmp_path / "nothing.gpkg")
+    with pytest.raises(ConfigError, match="no polygon"):
+        points.run(points.survey({**POINTS, "regions": "polygons", "polygons": str(tmp_path / "nothing.gpkg")}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"method": "points", "sigma_m": 0.001, "max_gap_m": 9.0}, "bridges more than half a tile"),
+        ({"method": "cells", "sigma_m": 0.001, "smoothing": {"curvature_weight": 10_000}}, "smoothing depends on"),
+    ],
+)
+def test_settings_that_do_not_fit_the_tiles_stop_a_run_before_them(
+    cells: Reconstructed, settings: dict[str, object], message: str
+) -> None:
+    run = Run(cells.survey(settings), cells.store, Inline(), None, Lines())
+    with pytest.raises(ConfigError, match=message):
+        run_stages(run, [s for s in STAGES if s.name == "tiles"])
 
 
 @pytest.mark.parametrize(

@@ -106,5 +106,5 @@ def test_a_bad_world_file_is_found(tmp_path):
 
 
 def test_black_lies_below_white():
-    with pytest.raises(ValidationError, match="black 255 is not below white 255"):
-        IntensityOptions(black=255.0)
+    with pytest.raises(ValidationError, match="black 65535 is not below white 65535"):
+        IntensityOptions(black=65_535.0)

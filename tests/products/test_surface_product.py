@@ -46,7 +46,7 @@ def surface(tile: TileId, cell_m: tuple[float, float] = (0.05, 0.05), seed: int 
         np.hypot(easting - box.easting_min_m - 6.0, northing % 10.0 - 5.0) < 0.4
     )
     origin = np.where(nothing, EMPTY, np.where((northing / cell_m[1]).astype(int) % 2, MEASURED, INTERPOLATED))
-    light = np.where(nothing, np.nan, 100.0 + 50.0 * np.sin(northing))
+    light = np.where(nothing, np.nan, 257.0 * (100.0 + 50.0 * np.sin(northing)))  # as of a sensor of 8 bits
     raw[nothing] = true[nothing] = np.nan
     return SurfaceTile(tile, window, halo, raw, true, origin.astype(np.uint8), light.astype(np.float32), 0.003)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 START_TIMEOUT_S = 120.0
-STOP_TIMEOUT_S = 20.0
+STOP_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,14 @@ _ROW_GROUP_ROWS: Final = 65_536
 
 
 def write_geo_table(
-    path: Path, columns: pa.Table, geometry: str, shapes_m: npt.NDArray[Any], kinds: list[str], context: ProductContext
+    path: Path,
+    columns: pa.Table,
+    geometry: str,
+    shapes_m: npt.NDArray[Any],
+    kinds: list[str],
+    context: ProductContext,
+    *,
+    counterclockwise: bool = False,
 ) -> None:
     """Write rows with their geometry, in the CRS's own unit.
 
@@ -29,18 +35,18 @@ def write_geo_table(
     ----------
     columns : the plain columns; geometry : name of the geometry's column.
     shapes_m : (n,) shapely geometries on the map (m); kinds : their types, such as ``["Polygon"]``.
+    counterclockwise : whether the outer rings of all polygons run that way, which the file then states.
     """
     unit_m = context.map.horizontal_unit_m
     shapes = shapes_m if unit_m == 1.0 else shapely.transform(shapes_m, lambda xy: xy / unit_m)
     field = pa.field(geometry, pa.binary(), nullable=False)
     table = columns.append_column(field, pa.array(shapely.to_wkb(shapes), pa.binary()))
-    about = {
-        "version": "1.1.0",
-        "primary_column": geometry,
-        "columns": {geometry: {"encoding": "WKB", "geometry_types": kinds, "crs": _crs(context), "edges": "planar"}},
-    }
+    column = {"encoding": "WKB", "geometry_types": kinds, "crs": _crs(context), "edges": "planar"}
+    if counterclockwise:
+        column["orientation"] = "counterclockwise"
     if len(shapes):
-        about["columns"][geometry]["bbox"] = [float(v) for v in shapely.total_bounds(shapes)]  # type: ignore[index]
+        column["bbox"] = [float(v) for v in shapely.total_bounds(shapes)]
+    about = {"version": "1.1.0", "primary_column": geometry, "columns": {geometry: column}}
     table = table.replace_schema_metadata({"geo": json.dumps(about, sort_keys=True)})
     pq.write_table(
         table, path, compression="zstd", row_group_size=_ROW_GROUP_ROWS, write_page_checksum=True, version="2.6"
@@ -49,7 +55,7 @@ def write_geo_table(
 
 def read_geo_table(content: bytes, context: ProductContext) -> tuple[pa.Table, npt.NDArray[Any]]:
     """Plain columns, and geometries on the map (m)."""
-    table = pq.read_table(io.BytesIO(content))
+    table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # by this thread: see Store.read_table
     name = json.loads(table.schema.metadata[b"geo"])["primary_column"]
     shapes = shapely.from_wkb(table[name].to_numpy())
     unit_m = context.map.horizontal_unit_m

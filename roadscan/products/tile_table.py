@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import shapely
 
-from roadscan.model.crs import crs_from_text
-from roadscan.model.errors import StoreError
 from roadscan.model.strict import Strict
 from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+from roadscan.products.geo_table import check_geo_table, write_geo_table
 
 _FILE: Final = "tiles.parquet"
-_OUTLINE: Final = "outline"
-_ROW_GROUP_ROWS: Final = 65_536
 
 _COLUMNS: Final = pa.schema(
     [
@@ -71,30 +66,12 @@ class TileTable(SurveyProduct):
     ) -> None:
         """Write the table, sorted by column and row of the tile."""
         rows = sorted(tiles, key=lambda t: t.tile)
-        outlines = _outlines(rows, context)
         table = pa.Table.from_pylist([_row(one, context) for one in rows], schema=_COLUMNS)
-        table = table.append_column(
-            pa.field(_OUTLINE, pa.binary(), nullable=False), pa.array(shapely.to_wkb(outlines), pa.binary())
-        )
-        table = table.replace_schema_metadata({"geo": json.dumps(_geo_metadata(outlines, context), sort_keys=True)})
-        pq.write_table(
-            table, path, compression="zstd", row_group_size=_ROW_GROUP_ROWS, write_page_checksum=True, version="2.6"
-        )
+        write_geo_table(path, table, "outline", _outlines_m(rows, context), ["Polygon"], context, counterclockwise=True)
 
     def check(self, path: Path) -> None:
         """Decode every column, page checksums included, and every outline."""
-        try:
-            with pq.ParquetFile(path, page_checksum_verification=True) as file:
-                table = file.read()
-            metadata = json.loads((table.schema.metadata or {})[b"geo"])
-            outlines = shapely.from_wkb(table[metadata["primary_column"]].to_numpy())
-        except (OSError, pa.ArrowException, KeyError, ValueError, shapely.errors.ShapelyError) as error:
-            raise StoreError(f"the tile table cannot be read: {error}", change="make it again", file=path) from error
-        missing = [name for name in _COLUMNS.names if name not in table.column_names]
-        if missing:
-            raise StoreError(f"the tile table lacks '{missing[0]}'", change="make it again", file=path)
-        if not bool(np.all(shapely.is_valid(outlines))):
-            raise StoreError("an outline of the tile table is not valid", change="make it again", file=path)
+        check_geo_table(path, _COLUMNS)
 
 
 def _row(one: TileSummary, context: ProductContext) -> dict[str, Any]:
@@ -121,23 +98,8 @@ def _row(one: TileSummary, context: ProductContext) -> dict[str, Any]:
     }
 
 
-def _outlines(rows: Sequence[TileSummary], context: ProductContext) -> Any:
-    """(n,) polygons in the CRS's own unit, counter-clockwise."""
+def _outlines_m(rows: Sequence[TileSummary], context: ProductContext) -> Any:
+    """(n,) polygons on the map (m), counter-clockwise."""
     boxes = [context.grid.bounds(one.tile) for one in rows]
     edges = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
-    return shapely.box(*(edges.reshape(-1, 4) / context.map.horizontal_unit_m).T, ccw=True)
-
-
-def _geo_metadata(outlines: Any, context: ProductContext) -> dict[str, Any]:
-    """Metadata of GeoParquet 1.1 (OGC)."""
-    crs = None if context.map.crs is None else crs_from_text(context.map.crs).to_json_dict()
-    column: dict[str, Any] = {
-        "encoding": "WKB",
-        "geometry_types": ["Polygon"],
-        "crs": crs,
-        "orientation": "counterclockwise",
-        "edges": "planar",
-    }
-    if outlines.size:
-        column["bbox"] = [float(v) for v in shapely.total_bounds(outlines)]
-    return {"version": "1.1.0", "primary_column": _OUTLINE, "columns": {_OUTLINE: column}}
+    return shapely.box(*edges.reshape(-1, 4).T, ccw=True)

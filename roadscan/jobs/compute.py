@@ -201,7 +201,7 @@ def _embedded(stack: contextlib.ExitStack, workers: int | None) -> Any:
     from distributed import Client, LocalCluster
 
     # A worker's memory is bounded by the size of its blocks, so Dask's spilling and pausing stay out of the way, and
-    # nobody looks at its figures, of which it takes hundreds a second: a tenth of the processors' time.
+    # nobody looks at its figures, of which it would take hundreds a second.
     stack.enter_context(
         dask.config.set(
             {
@@ -212,8 +212,6 @@ def _embedded(stack: contextlib.ExitStack, workers: int | None) -> Any:
                 "distributed.worker.profile.enabled": False,
                 "distributed.admin.tick.interval": "1s",
                 "distributed.admin.system-monitor.interval": "5s",
-                "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 64 << 20,
-                "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 32 << 20,
                 "distributed.comm.timeouts.connect": "60s",
             }
         )

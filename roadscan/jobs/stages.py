@@ -10,6 +10,7 @@ from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
+from roadscan.jobs.found_regions import find_due_regions, region_pieces
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
@@ -98,6 +99,10 @@ def run_tiles(run: Run) -> None:
 def run_surfaces(run: Run) -> None:
     """Cells or points → the reconstructed surface and its products."""
     manifest = Manifest(run.store)
+    surface = run.survey.config.surface
+    if surface is not None and surface.regions == "found":
+        plan = plan_survey(run.survey, run.store)
+        run.failed("surfaces", find_due_regions(plan, manifest, run.compute, _bar(run, "regions of interest")))
     work = plan_surface_work(run.survey, run.store, run.selection, manifest)
     manifest.remove(work.gone)
     if work.note:
@@ -194,6 +199,7 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     plan = plan_survey(run.survey, run.store)
     if run.survey.config.surface is not None:
         checked_surface(run.survey, run.survey.config.surface)  # before the tiles are computed for it
+        region_pieces(plan)
     footprints = load_ranges(plan, manifest)
     context = product_context(plan)
     wanted = tuple(wanted_tile_products(run.survey, context))

@@ -10,6 +10,7 @@ import shapely
 
 from roadscan.jobs.fingerprint import key_of, surface_version
 from roadscan.jobs.footprints import load_ranges
+from roadscan.jobs.found_regions import REGIONS, FoundRegions, load_found_regions
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import product_context, wanted_surface_products
 from roadscan.jobs.selection import Selection
@@ -52,7 +53,7 @@ class SurfaceTask:
     readings: TileTask | None
     """What places the points in reach, where it is made of points."""
     regions: Regions | None
-    """Polygons in reach; None where the surface is made everywhere."""
+    """Polygons or found regions in reach; None where the surface is made everywhere."""
     dates: tuple[dt.date, ...]
     """UTC date of each tile's first reading."""
     products: tuple[WantedSurface, ...]
@@ -151,7 +152,7 @@ def plan_surface_work(survey: Survey, store: Store, selection: Selection | None,
 
     With a selection of tiles, these, and of those that depend on them the stale ones.
     """
-    names = {SURFACE, *surface_file_names()}
+    names = {SURFACE, REGIONS, *surface_file_names()}
     if survey.config.surface is None:
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()])
     plan = plan_survey(survey, store)
@@ -161,14 +162,19 @@ def plan_surface_work(survey: Survey, store: Store, selection: Selection | None,
         note = "the survey file has a section [surface], and no product of the surface is asked for"
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
     tiles = TilePlan(plan, footprints, plan_tiles(footprints, plan), (), context)
-    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest)
+    found = load_found_regions(plan, manifest)
+    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found)
     units = {str(tile) for tile in (*planned.keys, *planned.waiting)}
     names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
-    gone = [r for name in names for u, r in manifest.of(name).items() if u not in units or name not in names_wanted]
+    gone = [
+        r
+        for name in names - {REGIONS}
+        for u, r in manifest.of(name).items()
+        if u not in units or name not in names_wanted
+    ]
+    gone += found.gone
     stale = planned.stale(manifest)
-    waiting = len(planned.waiting)
-    note = f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"
-    note = note if waiting else ""
+    note = _waiting_note(len(planned.waiting), found)
     if selection is None:
         return SurfaceWork(planned, stale, gone, note)
     own = set(selection.tiles(tiles.tiles, footprints, plan.ground.grid))
@@ -176,19 +182,34 @@ def plan_surface_work(survey: Survey, store: Store, selection: Selection | None,
     return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone, note)
 
 
+def _waiting_note(waiting: int, found: FoundRegions) -> str:
+    if not waiting:
+        return ""
+    if found.due:
+        return f"surfaces of {waiting:,} tiles wait for regions of interest: run `roadscan surfaces`"
+    return f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"
+
+
 def plan_surfaces(
-    tiles: TilePlan, config: SurfaceConfig, products: tuple[WantedSurface, ...], manifest: Manifest
+    tiles: TilePlan,
+    config: SurfaceConfig,
+    products: tuple[WantedSurface, ...],
+    manifest: Manifest,
+    found: FoundRegions,
 ) -> SurfacePlan:
-    """Surfaces that are due: of all tiles that hold cells, or of those that a polygon touches."""
+    """Surfaces that are due: of all tiles that hold cells, or of those that a polygon or a found region touches."""
     grid, regions = checked_surface(tiles.plan.survey, config)
+    regions = found.regions if config.regions == "found" else regions
     expected = dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
     records = {TileId.parse(unit): r for unit, r in manifest.of(TILE).items()}
     cells = {tile: r for tile, r in records.items() if r.path}
     of_points = config.method == "points"
     inputs = expected if of_points else {tile: r.digest for tile, r in cells.items()}
-    behind = set() if of_points else {t for t, key in expected.items() if t not in records or records[t].key != key}
+    behind = found.waiting(tiles.footprints)
+    if not of_points:
+        behind |= {t for t, key in expected.items() if t not in records or records[t].key != key}
     waiting = {t for t in expected if behind.intersection(grid.tiles.tiles_in(grid.reach(t)))} if behind else set()
-    common = key_of(surface_version(), config.model_dump(mode="json", exclude={"polygons"}), grid.tiles)
+    common = key_of(surface_version(), config.model_dump(mode="json", exclude={"polygons", "search"}), grid.tiles)
     keys: dict[TileId, str] = {}
     for tile in sorted(cells.keys() - waiting, key=lambda t: (t.row, t.column)):
         box = grid.reach(tile)
@@ -197,7 +218,7 @@ def plan_surfaces(
             continue
         around = [(str(t), inputs[t]) for t in grid.tiles.tiles_in(box) if t in inputs]
         keys[tile] = key_of(common, str(_date(cells[tile])), around, None if near is None else near.key())
-    if regions is not None and cells and not keys:
+    if config.regions == "polygons" and regions is not None and cells and not keys:
         raise _beside(regions, config, list(cells), grid)
     return SurfacePlan(tiles, grid, cells, regions, products, keys, frozenset(waiting))
 

@@ -1,4 +1,4 @@
-"""Polygons inside which the surface of points is made: read once a run."""
+"""Polygons inside which the surface of points is made, those of the survey file: read once a run."""
 
 from __future__ import annotations
 

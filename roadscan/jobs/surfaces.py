@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.jobs.cell_files import read_cells
 from roadscan.jobs.compute import reason_of
@@ -38,7 +39,7 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
         context = dataclasses.replace(task.context, date=date)
         try:
             wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
-            records += _write(task, key, surface_of(tile, source.patch(tile), task.grid, wanted), context)
+            records += _write(task, key, surface_of(tile, source.patch(tile, wanted), task.grid, wanted), context)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), reason_of(error)))
     return TaskResult(tuple(records), tuple(failures))
@@ -47,8 +48,8 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
 class Source(Protocol):
     """What the surface is made of."""
 
-    def patch(self, tile: TileId) -> Patch:
-        """Heights of a tile and its surroundings before smoothing."""
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
+        """Heights of a tile and its surroundings before smoothing; `wanted` are the cells that will be kept."""
 
 
 def source_of(task: SurfaceTask) -> Source:
@@ -64,7 +65,7 @@ class _Cells:
         self._records = {TileId.parse(r.unit): r for r in task.cells}
         self._kept: OrderedDict[TileId, TileCells] = OrderedDict()
 
-    def patch(self, tile: TileId) -> Patch:
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
         """What the cells say of a tile and its surroundings."""
         grid = self._task.grid
         near = [t for t in grid.tiles.tiles_in(grid.reach(tile)) if t in self._records]
@@ -87,11 +88,11 @@ class _Points:
         self._grid = grid
         self._points: dict[TileId, TilePoints] = dict(load_points(readings))
 
-    def patch(self, tile: TileId) -> Patch:
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
         """The detailed model of a tile and its surroundings."""
         near = self._grid.tiles.tiles_in(self._grid.reach(tile))
         own = [self._points[t] for t in near if t in self._points]
-        return patch_of_points(self._grid.window(tile), own, self._grid)
+        return patch_of_points(self._grid.window(tile), own, self._grid, wanted)
 
 
 def _write(task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext) -> list[OutputRecord]:

@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.strict import Strict
+from roadscan.model.surface_regions import RegionSettings
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 
 SlopeKind = Literal["quadratic", "cubic"]
@@ -36,8 +37,11 @@ class SurfaceConfig(Strict):
     slopes: SlopeKind = "quadratic"
     """`points`: how the slope at a reading is found: `quadratic` is calm where heights are noisy, `cubic` follows exact
     heights most closely."""
-    regions: Literal["everywhere", "polygons"] = "everywhere"
-    """`points`: where the surface is made: wherever there are readings, or inside the polygons of a layer."""
+    regions: Literal["everywhere", "polygons", "found"] = "everywhere"
+    """`points`: where the surface is made: wherever there are readings; inside the polygons of a layer; or where the
+    coarse model of the profiles varies in depth more than its street does."""
+    search: RegionSettings = RegionSettings()
+    """How such regions are found; of `regions = "found"`."""
     polygons: Path | None = None
     """Layer of polygons (GeoPackage, GeoJSON, shapefile), relative to the survey file."""
     polygons_crs: str | None = None
@@ -50,7 +54,7 @@ class SurfaceConfig(Strict):
         if not self.smooth and self.smoothing != SurfaceSmoothing():
             raise ValueError("smooth = false, and yet settings of the smoothing: leave one of them out")
         if self.method == "cells":
-            for name in ("cell_m", "max_gap_m", "slopes", "regions", "polygons", "polygons_crs"):
+            for name in ("cell_m", "max_gap_m", "slopes", "regions", "search", "polygons", "polygons_crs"):
                 if getattr(self, name) != type(self).model_fields[name].default:
                     raise ValueError(f'{name} is a setting of method = "points"')
         if self.cell_m is not None and not all(0.0005 <= edge <= 1.0 for edge in self.cell_m):
@@ -59,6 +63,8 @@ class SurfaceConfig(Strict):
             )
         if (self.regions == "polygons") != (self.polygons is not None):
             raise ValueError('regions = "polygons" and the layer `polygons` belong together')
+        if self.regions != "found" and self.search != RegionSettings():
+            raise ValueError('settings of the search, and yet regions = "found" is not asked for')
         return self
 
     def smoothing_settings(self) -> SurfaceSmoothing | None:

@@ -105,6 +105,19 @@ class Placed:
 
 
 @dataclass(frozen=True)
+class ProfilePoints:
+    """Readings of n profiles on the map; arrays (n, m)."""
+
+    epoch_gps_ns: Int64
+    """(n,) of the profiles."""
+    easting_m: Float64
+    northing_m: Float64
+    height_m: Float64
+    kept: npt.NDArray[np.bool_]
+    """False for readings that a filter leaves out; their places are 0."""
+
+
+@dataclass(frozen=True)
 class Placement:
     """How the readings of one sensor in one run become points."""
 
@@ -171,6 +184,20 @@ class Placement:
         return Placed(
             work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
         )
+
+    def by_profile(self, batch: pa.RecordBatch, geometry: ScanGeometry) -> ProfilePoints:
+        """Where the readings of rows of the table ``scans`` lie, profile by profile."""
+        work = self._work(batch, geometry, EVERYWHERE, marked=False)
+        shape = batch.num_rows, geometry.readings
+        east, north, height = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        kept = np.zeros(shape, bool)
+        at = work.rows, work.readings
+        corner = work.tiles.astype(np.int64) * self.tile_quanta
+        east[at] = (corner[:, 0] + work.quanta[:, 0]) / QUANTA_PER_M
+        north[at] = (corner[:, 1] + work.quanta[:, 1]) / QUANTA_PER_M
+        height[at] = work.quanta[:, 2] / QUANTA_PER_M
+        kept[at] = True
+        return ProfilePoints(_numpy(batch, "epoch_gps_ns"), east, north, height, kept)
 
     def touched(
         self, batch: pa.RecordBatch, geometry: ScanGeometry | None, *, marked: bool = False

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -122,7 +122,9 @@ def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
     return Patch(raw, np.where(np.isnan(raw), EMPTY, MEASURED).astype(np.uint8), intensity)
 
 
-def patch_of_points(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid) -> Patch:
+def patch_of_points(
+    window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid, wanted: Bool | None = None
+) -> Patch:
     """The detailed model through points, at the nodes of a window.
 
     A cell with a point in it is measured, the others that hold a height are interpolated. Intensities are a smooth
@@ -131,7 +133,35 @@ def patch_of_points(window: GridWindow, tiles: Iterable[TilePoints], grid: Surfa
     Parameters
     ----------
     tiles : those that :meth:`SurfaceGrid.reach` touches, in any order.
+    wanted : (rows, columns) cells whose surface is wanted; None for all. What these do not depend on may be left out.
     """
+    if wanted is None:
+        return _detailed(window, tiles, grid)
+    shape = window.rows, window.columns
+    empty = Patch(np.full(shape, np.nan), np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32))
+    if not wanted.any():
+        return empty
+    rows, columns = (_needed(np.asarray(wanted.any(axis=axis)), grid.smoothed) for axis in (1, 0))
+    part = replace(
+        window,
+        first_row=window.first_row + rows.start,
+        first_column=window.first_column + columns.start,
+        rows=rows.stop - rows.start,
+        columns=columns.stop - columns.start,
+    )
+    made = _detailed(part, tiles, grid)
+    for name in ("raw_m", "origin", "intensity"):
+        getattr(empty, name)[rows, columns] = getattr(made, name)
+    return empty
+
+
+def _needed(wanted: Bool, beyond: int) -> slice:
+    """From the first to the last that is wanted, and so many more on both sides."""
+    at = np.flatnonzero(wanted)
+    return slice(max(int(at[0]) - beyond, 0), min(int(at[-1]) + 1 + beyond, wanted.size))
+
+
+def _detailed(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid) -> Patch:
     box, margin = window.bounds(), grid.detailed.halo_m + max(grid.cell_m)
     parts = [_near(one, grid.tiles, box, margin) for one in tiles]
     places = np.concatenate([p for p, _ in parts]) if parts else np.empty((0, 3))

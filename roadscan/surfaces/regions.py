@@ -20,11 +20,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from pydantic import Field
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 
 from roadscan.kernels.coarse import PATCH_SUMS, sum_patches
-from roadscan.model.strict import Strict
+from roadscan.model.surface_regions import RegionSettings
 from roadscan.surfaces.coarse import CoarseModel
 
 Float64 = npt.NDArray[np.float64]
@@ -35,27 +34,6 @@ STATED: Final = "stated"
 
 _FEWEST: Final = 12
 """Nodes that a patch needs."""
-
-
-class RegionSettings(Strict):
-    """Settings of the search for regions of interest."""
-
-    patch_m: float = Field(default=0.25, gt=0.0)
-    """Edge of a patch, about (m): a whole number of steps of the coarse model."""
-    level_patches: int = Field(default=5, ge=3)
-    """Patches along the road whose plane is the street's level at the middle one; odd."""
-    section_m: float = Field(default=50.0, gt=0.0)
-    """Length of road whose median roughness is the street's own (m)."""
-    factor: float = Field(default=2.5, gt=1.0)
-    """How many times rougher than the street a patch of interest is."""
-    least_m: float = Field(default=0.0015, ge=0.0)
-    """Least roughness of a patch of interest (m, root mean square)."""
-    join_m: float = Field(default=0.5, ge=0.0)
-    """Patches this near to one another belong together (m)."""
-    patches_min: int = Field(default=2, ge=1)
-    """Fewest patches of a region."""
-    pad_m: float = Field(default=0.25, ge=0.0)
-    """What a region's box extends beyond its patches (m)."""
 
 
 @dataclass(frozen=True)

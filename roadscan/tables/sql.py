@@ -25,8 +25,8 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
-    ``tiles``, ``cells``, ``overviews``, ``cracks``, ``potholes``, ``footprints``, ``outputs`` are there once a run has
-    made them,
+    ``tiles``, ``cells``, ``overviews``, ``cracks``, ``potholes``, ``regions``, ``footprints``, ``outputs`` are there
+    once a run has made them,
     ``clocks``, ``mountings`` and ``corrections`` once they were estimated. `logs` are the keys of the logs to
     show, all in the store where left out.
     """
@@ -53,7 +53,7 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
     for table in _ALWAYS:
         if table not in files:
             connection.register(table, table_schema(table).arrow().empty_table())
-    held_whole = [("footprints", "tables/footprints"), ("outputs", "manifest/outputs")]
+    held_whole = [(name, f"tables/{name}") for name in ("footprints", "regions")] + [("outputs", "manifest/outputs")]
     for name, folder in held_whole + [(name, f"tables/{name}") for name in _SMALL]:
         found = store.files(folder, ".parquet")
         if found:

@@ -32,6 +32,7 @@ from roadscan.simulate.truth import load
 from roadscan.surfaces.reconstruction import surface_of
 from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tables.manifest import Manifest
+from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 
 from .conftest import Lines, Simulated, changed, outputs, small_scene
@@ -39,6 +40,7 @@ from .conftest import Lines, Simulated, changed, outputs, small_scene
 SURFACES = tuple(s for s in STAGES if s.name == "surfaces")
 CELLS: dict[str, object] = {"method": "cells", "sigma_m": 0.004}
 POINTS: dict[str, object] = {"method": "points", "sigma_m": 0.006, "cell_m": (0.03, 0.04)}
+POTHOLE = {"station_m": 6.0, "offset_m": 1.4, "radius_m": 0.3, "depth_m": 0.05}
 MADE = {"make": ["surface", "surface_pictures"], "options": {}}
 
 
@@ -97,10 +99,10 @@ def _surfaces(task: SurfaceTask) -> Iterator[tuple[TileId, SurfaceTile]]:
     source = source_of(task)
     for tile in task.block.tiles:
         wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
-        yield tile, surface_of(tile, source.patch(tile), task.grid, wanted)
+        yield tile, surface_of(tile, source.patch(tile, wanted), task.grid, wanted)
 
 
-def assert_seamless(found: dict[TileId, SurfaceTile]) -> None:
+def assert_seamless(found: dict[TileId, SurfaceTile], least: int = 1000) -> None:
     """Where two tiles see the same cell, both hold the same bits of it."""
     shared = 0
     for a, b in combinations(found.values(), 2):
@@ -111,7 +113,7 @@ def assert_seamless(found: dict[TileId, SurfaceTile]) -> None:
             one, other = getattr(a, name)[cuts[0]], getattr(b, name)[cuts[1]]
             assert one.tobytes() == other.tobytes(), (a.tile, b.tile, name)
         shared += int(np.count_nonzero(a.origin[cuts[0]]))
-    assert shared > 1000
+    assert shared > least
 
 
 def _cut(a: SurfaceTile, b: SurfaceTile) -> tuple[slice, slice] | None:
@@ -144,6 +146,7 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> Reconstructed:
     scene = small_scene(
         length_m=10.0, passes=[{"lane": 2, "speed_m_per_s": 4.0}], noise={"sick_range_m": 0.006},
         sick={"on": True}, profilers={"on": False}, lidar={"on": False},
+        road={"potholes": [POTHOLE]},
     )  # fmt: skip
     simulated = Simulated(simulate(scene, folder).survey_file)
     simulated.run(segmentation={}, products={"make": [], "options": {}})
@@ -298,6 +301,46 @@ def test_polygons_bound_the_surface(points: Reconstructed, tmp_path: Path) -> No
         assert np.isfinite(raster.read(1)).sum() == np.count_nonzero(found[tile].origin[found[tile].inner])
 
 
+UNSMOOTHED: dict[str, object] = {**POINTS, "smooth": False, "max_gap_m": 0.15}
+FOUND: dict[str, object] = {**UNSMOOTHED, "regions": "found"}
+
+
+def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadscan.jobs.found_regions._LONGEST_S", 1)  # several pieces of the drive
+    survey = points.survey(FOUND, {"make": ["surface"], "options": {}})
+    before = points.plan(survey)
+    assert before.waiting and not before.keys  # nobody looked for regions yet
+    _, files = points.run(survey)
+    rows = query(points.store, "SELECT * FROM regions").to_pylist()
+    truth = load(points.simulated.survey_file.parent)
+    shapes = shapely.from_wkb([row["outline"] for row in rows])
+    on_road = shapely.transform(shapes, lambda xy: np.stack(truth.station_offset_m(*xy.T), axis=-1))
+    assert shapely.contains_xy(shapely.union_all(on_road), POTHOLE["station_m"], POTHOLE["offset_m"])
+    assert all(row["roughness_m"] > 0.0015 and row["area_m2"] > 0.3 for row in rows)
+    planned = points.plan(survey)
+    found = dict(_surfaces(planned.task(tuple(planned.keys))))
+    assert_seamless(found, 100)
+    tile = max(found, key=lambda t: np.count_nonzero(found[t].origin))
+    everywhere = points.plan(points.survey(UNSMOOTHED)).task((tile,))
+    ((_, whole),) = _surfaces(everywhere)
+    inside = shapely.contains_xy(shapely.union_all(shapes), *np.meshgrid(*whole.window.nodes_m()))
+    assert np.array_equal(found[tile].height_m, np.where(inside, whole.height_m, np.nan), equal_nan=True)
+
+    tables = {p: points.store.read_bytes(p) for p in points.store.files("tables/regions")}
+    manifest = Manifest(points.store)
+    pieces = list(manifest.of("regions"))
+    assert len(pieces) > 3
+    manifest.forget("regions", pieces)
+    points.forget()
+    monkeypatch.setattr("roadscan.jobs.found_regions._CHUNK_ROWS", 7)
+    assert points.run(survey, TwoThreads())[1] == files  # neither workers nor chunks matter
+    assert {p: points.store.read_bytes(p) for p in points.store.files("tables/regions")} == tables
+    assert points.run(survey) == ([], files)
+    assert verify_store(points.store) == []
+    assert points.run(points.survey(None, {"make": [], "options": {}})) == ([], {})
+    assert not points.store.files("tables/regions")
+
+
 def test_polygons_beside_the_survey_are_an_error(points: Reconstructed, tmp_path: Path) -> None:
     box = points.plan(points.survey(POINTS)).grid.tiles.bounds(next(iter(points.plan(points.survey(POINTS)).keys)))
     swapped = shapely.Point(box.northing_min_m, box.easting_min_m).buffer(2.5)
@@ -334,6 +377,7 @@ def test_settings_that_do_not_fit_the_tiles_stop_a_run_before_them(
         ({"method": "cells", "sigma_m": 0.001, "smoothing": {"sigma_m": 0.002}}, "state the noise once"),
         ({"method": "points", "sigma_m": 0.001, "smooth": False, "smoothing": {"detail_sigmas": 5}}, "smooth = false"),
         ({"method": "points", "sigma_m": 0.001, "regions": "polygons"}, "belong together"),
+        ({"method": "points", "sigma_m": 0.001, "search": {"factor": 3.0}}, "is not asked for"),
         ({"method": "points", "sigma_m": 0.001, "cell_m": [0.01, 3.0]}, "edges from"),
         ({"method": "cells"}, "sigma_m"),
         ({"method": "cell", "sigma_m": 0.001}, "method"),

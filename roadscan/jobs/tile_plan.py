@@ -17,6 +17,7 @@ from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, RawSlice
 from roadscan.jobs.road import road_key
 from roadscan.jobs.row_groups import GroupsByTile
+from roadscan.jobs.stretches import DrivenTiles, cut_stretches
 from roadscan.jobs.tile_files import WantedProduct
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.survey import CellColumns
@@ -31,25 +32,12 @@ TILE = "tile"
 OVERVIEWS = "overviews"
 """Manifest name of a tile's overviews; their record has the key of the tile's own."""
 
-_SQUARE_M = 100.0
-"""Edge of the squares whose tiles stay together, where no product needs points."""
-
-_SQUARES = 15
-"""Squares that one task computes at most: a kilometre of road oblique to the grid, one and a half along it."""
-
 
 @dataclass(frozen=True)
-class PlannedTiles:
-    """Every tile that readings may touch, by row and column; arrays are (n,)."""
+class PlannedTiles(DrivenTiles):
+    """Every tile that readings may touch, by row and column, with its key."""
 
-    column: npt.NDArray[np.int32]
-    row: npt.NDArray[np.int32]
     keys: tuple[str, ...]
-    readings: npt.NDArray[np.int64]
-    """About how many."""
-    first_epoch_gps_ns: npt.NDArray[np.int64]
-    groups: GroupsByTile
-    """Row groups that may touch them."""
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -199,7 +187,7 @@ class TilePlan:
         ids = self.tiles.ids
         return [
             self._task(Block(tuple(ids[n] for n in own.tolist())), own, own)
-            for own in self._stretches(numbers, workers)
+            for own in cut_stretches(self.tiles, numbers, config.size_m, workers)
         ]
 
     def singly(self, chosen: Sequence[TileId]) -> list[TileTask]:
@@ -208,30 +196,6 @@ class TilePlan:
 
     def _points_of(self, task: TileTask) -> bool:
         return task.needs_points or any(s.source.table == "cloud" for s in self.footprints.slices)
-
-    def _stretches(self, numbers: npt.NDArray[np.int64], workers: int) -> list[npt.NDArray[np.int64]]:
-        """Tiles in the order in which they were driven over, cut into stretches of some squares each."""
-        edge = max(1, round(_SQUARE_M / self.plan.survey.config.tiles.size_m))
-        numbers = np.sort(numbers)
-        first = self.tiles.first_epoch_gps_ns[numbers]
-        square = self._squares(numbers, edge)
-        while edge > 1 and int(square.max()) < 4 * workers:
-            edge //= 2
-            square = self._squares(numbers, edge)
-        begun = np.full(int(square.max()) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(begun, square, first)
-        turn = np.empty(begun.size, np.int64)
-        turn[np.argsort(begun, kind="stable")] = np.arange(begun.size)
-        together = max(1, min(_SQUARES, begun.size // (4 * workers)))
-        stretch = turn[square] // together
-        order = np.lexsort((numbers, first, stretch))
-        return np.split(numbers[order], np.flatnonzero(np.diff(stretch[order])) + 1)
-
-    def _squares(self, numbers: npt.NDArray[np.int64], edge: int) -> npt.NDArray[np.intp]:
-        """Number of the square of `edge` by `edge` tiles in which each tile lies."""
-        east, north = (part[numbers].astype(np.int64) // edge for part in (self.tiles.column, self.tiles.row))
-        square: npt.NDArray[np.intp] = np.unique((north << 32) + east, return_inverse=True)[1]
-        return square
 
     def task(self, block: Block) -> TileTask:
         """A task over a block."""

@@ -15,19 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.readings import Placer, RawSlice, geometry_of, read_rows
+from roadscan.jobs.readings import Placer, RawSlice, geometry_of
 from roadscan.jobs.tile_fates import Fates
 from roadscan.jobs.tile_plan import TileTask
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import LanePass, TileId
 from roadscan.points.place import passes_of
 from roadscan.tables.profiles import ProfileReader
+from roadscan.tables.returns import ReturnsReader
 from roadscan.tables.schema import table_schema
 from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError, TileEvidence
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.counting import Counting
 
-_RETURN_COLUMNS = ["epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity"]
 _RETURNS_AT_ONCE = 1 << 18
 _READINGS_AT_ONCE = 1 << 20
 _PIECES_AHEAD = 4
@@ -173,8 +173,7 @@ class _Source:
     slice: RawSlice
     passes: tuple[LanePass, ...]
     """Those of its run."""
-    reader: ProfileReader | None
-    """For scans."""
+    reader: ProfileReader | ReturnsReader
     at_once: int
     """Row groups that are read together."""
 
@@ -184,7 +183,7 @@ class _Source:
         geometry = geometry_of(one.source)
         rows = table_schema(one.source.table).row_group_rows
         most = _RETURNS_AT_ONCE // rows if geometry is None else _READINGS_AT_ONCE // (rows * geometry.readings)
-        reader = None if geometry is None else ProfileReader(task.store, one.file)
+        reader = (ReturnsReader if geometry is None else ProfileReader)(task.store, one.file)
         return cls(task, one, tuple(p for p in task.passes if p.run == one.source.run), reader, max(1, most))
 
     def pieces(self, first: int, end: int) -> Iterator[tuple[int, int]]:
@@ -194,13 +193,12 @@ class _Source:
 
     def expect(self, groups: Sequence[int]) -> None:
         """Let row groups be on their way that will be counted soon."""
-        if self.reader is not None:
-            self.reader.expect(groups)
+        self.reader.expect(groups)
 
     def count(self, counting: Counting, accumulator: Accumulator, groups: Sequence[int]) -> None:
         """Read row groups and count their readings."""
-        if self.reader is None:
-            self._count_returns(counting, accumulator, groups)
+        if isinstance(self.reader, ReturnsReader):
+            self._count_returns(self.reader, counting, accumulator, groups)
         else:
             self._count_profiles(self.reader, counting, accumulator, groups)
 
@@ -215,11 +213,15 @@ class _Source:
             own = geometry.reading_epochs(epochs[readings // geometry.readings], readings % geometry.readings)
         counting.profiles(epochs, rows.range, rows.intensity, self._passes(own, accumulator))
 
-    def _count_returns(self, counting: Counting, accumulator: Accumulator, groups: Sequence[int]) -> None:
-        rows = read_rows(self.task.store, self.slice.source, self.slice.file, groups, _RETURN_COLUMNS)
-        column = {name: rows.column(name).to_numpy() for name in _RETURN_COLUMNS}
-        epochs, pose_epochs, x, y, z, intensity = (column[name] for name in _RETURN_COLUMNS)
-        counting.returns(epochs, pose_epochs, (x, y, z), intensity, self._passes(epochs, accumulator))
+    def _count_returns(
+        self, reader: ReturnsReader, counting: Counting, accumulator: Accumulator, groups: Sequence[int]
+    ) -> None:
+        rows, clock = reader.read(groups), self.slice.source.clock
+        epochs, pose_epochs = rows.epoch_gps_ns, rows.pose_epoch_gps_ns
+        if clock is not None:
+            epochs, pose_epochs = clock.applied(epochs), clock.applied(pose_epochs)
+        xyz = rows.x_sensor_m, rows.y_sensor_m, rows.z_sensor_m
+        counting.returns(epochs, pose_epochs, xyz, rows.intensity, self._passes(epochs, accumulator))
 
     def _passes(self, epochs: npt.NDArray[np.int64], accumulator: Accumulator) -> npt.NDArray[np.int32]:
         """Index of each epoch's pass among the accumulator's, −1 for none."""

@@ -50,3 +50,18 @@ def split_rounded(values, per_step, step, line, bits, planes):
         _round(values[start:end], per_step, step, line[: end - start])
         for p in range(values.itemsize):
             _pick(bits[: end - start], bits.dtype.type(8 * p), planes[p * n + start : p * n + end])
+
+
+@kernel
+def join(first, second, third, fourth, values):
+    """Write (n,) values of 32 bits, unsigned, of their planes (n,) each, the lowest bytes first."""
+    for i in range(values.size):
+        low = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(8))
+        values[i] = low | (np.uint32(third[i]) << np.uint32(16)) | (np.uint32(fourth[i]) << np.uint32(24))
+
+
+@kernel
+def join_low(first, second, values):
+    """Write (n,) values of 16 bits, unsigned, of their planes (n,), whatever those above may hold."""
+    for i in range(values.size):
+        values[i] = np.uint16(first[i]) | (np.uint16(second[i]) << np.uint16(8))

@@ -160,7 +160,7 @@ def decode(data: Any, words: Any, start: int, end: int, values: Any) -> int:
     data, words
         the buffer as uint8 and, the same memory, as uint64; SLACK_BYTES follow the page.
     values
-        (n,) uint16 or uint8, contiguous; of a page with a fault they may be anything.
+        (n,) uint16, uint8 or int64, contiguous; of a page with a fault they may be anything.
     """
     if not (0 <= start <= end <= data.size - SLACK_BYTES and data.size <= 8 * words.size):
         return NO_BUFFER
@@ -173,7 +173,7 @@ def decode(data: Any, words: Any, start: int, end: int, values: Any) -> int:
         return BAD_HEADER
     if count != values.size:
         return OTHER_COUNT
-    common = count > 0 and (block, miniblocks) == (BLOCK, MINIBLOCKS)
+    common = count > 0 and (block, miniblocks) == (BLOCK, MINIBLOCKS) and values.itemsize <= 2
     last = unpack_blocks(data, at, end, header[3], values) if common else NOT_KNOWN
     if last != NOT_KNOWN:
         return WHOLE if last == end else LEFT_OVER
@@ -195,7 +195,7 @@ def room_words(count: int) -> int:
 
 
 @inlined
-def _varint(number):
+def varint_bits(number):
     """A number below 2⁴⁹ as the bytes of a varint, the first one lowest, and their bits."""
     bits, size = number & _BYTE, _U(8)
     rest = number >> _U(7)
@@ -207,7 +207,7 @@ def _varint(number):
 
 
 @kernel
-def _pack(above, widths, words, to, word, used):
+def pack_block(above, widths, words, to, word, used):
     """Write the miniblocks of a block behind what words hold: (word to go on with, its index, its bits)."""
     for k in range(MINIBLOCKS):
         width, own = (widths >> _U(8 * k)) & _U(255), _U(MINIBLOCK * k)
@@ -251,7 +251,7 @@ def encode(values, words):
     word, used, to = _U(0), _U(0), _U(0)
     first = np.int64(values[0]) if count > 0 else np.int64(0)
     for number in (_U(BLOCK), _U(MINIBLOCKS), _U(count), _U(first << 1)):
-        bits, size = _varint(number)
+        bits, size = varint_bits(number)
         words[to], word, used, full = appended(word, used, bits, size)
         to += full
     above = np.zeros(BLOCK, np.int32)
@@ -264,9 +264,9 @@ def encode(values, words):
         for i in range(BLOCK):
             above[i] -= least
         widths = widths_of(above)
-        for number, size in (_varint(_U(np.int64((least << 1) ^ (least >> 31)))), (widths, _U(8 * MINIBLOCKS))):
+        for number, size in (varint_bits(_U(np.int64((least << 1) ^ (least >> 31)))), (widths, _U(8 * MINIBLOCKS))):
             words[to], word, used, full = appended(word, used, number, size)
             to += full
-        to, word, used = _pack(above, widths, words, to, word, used)
+        to, word, used = pack_block(above, widths, words, to, word, used)
     words[to] = word
     return np.int64(to) * 8 + np.int64(used) // 8

@@ -60,7 +60,7 @@ def _differences(typingctx, values, at, above):
 
 
 @intrinsic
-def _pack(typingctx, above, first, width, data, to):
+def pack_block(typingctx, above, first, width, data, to):
     """Write 32 numbers of up to 16 bits from byte `to` on; some bytes behind them are set to 0."""
 
     def write(context, builder, signature, arguments):
@@ -152,6 +152,6 @@ def encode(values, words):
             if width > _U(_WIDEST):
                 _pack_wide(above, _U(k * MINIBLOCK), width, data, to)
             else:
-                _pack(above, _U(k * MINIBLOCK), width, data, to)
+                pack_block(above, _U(k * MINIBLOCK), width, data, to)
             to += _U(MINIBLOCK // 8) * width
     return np.int64(to)

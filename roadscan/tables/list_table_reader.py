@@ -2,101 +2,24 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from itertools import groupby
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from roadscan.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
+from roadscan.kernels.delta_packing import FAULTS, WHOLE, decode
 from roadscan.tables import pages
-from roadscan.tables.byte_source import LocalBytes, RemoteBytes
-from roadscan.tables.checksum import checksum
-from roadscan.tables.list_table import MAGIC, sealed
-
-TAIL_BYTES: Final = 8
-"""Length of the footer, and the mark that ends a Parquet file."""
-_WORD: Final = 8
-_LISTED: Final = ".list.element"
+from roadscan.tables.page_file import DamageError, PageFile
 
 Array = npt.NDArray[Any]
 
 
-class DamageError(Exception):
-    """What is wrong with a file."""
-
-
-@dataclass(frozen=True)
-class _Chunk:
-    """A column of a row group."""
-
-    start: int
-    """Byte of the file."""
-    size: int
-    values: int
-    nullable: bool
-
-
-def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
-    """The footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
-    size = stream.seek(0, os.SEEK_END)
-    tail = _read(stream, max(size - TAIL_BYTES, 0), size)
-    length = int.from_bytes(tail[:4], "little")
-    if tail[4:] != MAGIC or length > size - TAIL_BYTES:
-        raise DamageError("it does not end as a Parquet file")
-    tail = _read(stream, size - TAIL_BYTES - length, size)
-    ours = sealed(tail[:-TAIL_BYTES])
-    if ours is False:
-        raise DamageError("its footer does not have its checksum")
-    return pq.read_metadata(pa.BufferReader(tail)), ours is True
-
-
-def _read(stream: Any, start: int, end: int) -> bytes:
-    stream.seek(start)
-    return bytes(stream.read(end - start))
-
-
-class ListTableFile:
-    """Columns of row groups, one row group at a time; holds its buffer, so one a thread.
-
-    Bytes are read at once for all columns wanted; each page is held against its CRC-32 before it is looked at.
-    """
-
-    def __init__(self, source: LocalBytes | RemoteBytes, metadata: pq.FileMetaData) -> None:
-        self._source = source
-        self._size = source.stream.seek(0, os.SEEK_END)
-        self._metadata = metadata
-        self._checksum = checksum()
-        self._words = np.empty(0, np.uint64)
-        self._columns = _columns(metadata)
-        self._known: dict[tuple[int, str], _Chunk] = {}
-        self._chunks: dict[str, _Chunk] = {}
-        self._origin = 0
-
-    def load(self, group: int, names: Sequence[str]) -> None:
-        """Bring columns of a row group into the buffer."""
-        self._chunks = {name: self._located(group, name) for name in names}
-        self._origin, end = _span(self._chunks.values())
-        words = -(-(end - self._origin + SLACK_BYTES) // _WORD)
-        if self._words.size < words:
-            self._words = np.empty(words, np.uint64)
-        room = self._words.view(np.uint8).data[: end - self._origin]
-        if not self._source.read_into(self._origin, room):
-            raise DamageError("it is cut short")
-
-    def expect(self, groups: Sequence[int], names: Sequence[str]) -> None:
-        """Let the bytes of row groups be on their way that will be loaded soon; groups in a row in one piece."""
-        for _, run in groupby(enumerate(groups), lambda pair: pair[1] - pair[0]):
-            self._source.expect(*_span([self._located(group, name) for _, group in run for name in names]))
+class ListTableFile(PageFile):
+    """Columns of row groups."""
 
     def flat(self, name: str, values: Array) -> None:
         """Write a loaded column of int64 that is never null to (n,) `values`."""
-        data, at, end = self._page(name, pages.PLAIN)
+        data, at, end, _ = self.page(name, pages.PLAIN)
         if self._chunks[name].nullable or end - at != values.nbytes:
             raise DamageError(f"column '{name}' does not hold {values.size} values")
         values[:] = data[at:end].view("<i8")
@@ -104,7 +27,7 @@ class ListTableFile:
     def lists(self, name: str, values: Array) -> bool:
         """Write a loaded column of lists to (n, m) `values`; False, and nothing written, where a list is null."""
         chunk = self._chunks[name]
-        data, at, end = self._page(name, pages.DELTA_BINARY_PACKED)
+        data, at, end, _ = self.page(name, pages.DELTA_BINARY_PACKED)
         rows, size = values.shape
         levels = pages.list_levels(rows, size, np.ones(rows, np.bool_) if chunk.nullable else None)
         begin = at + len(levels)
@@ -112,48 +35,7 @@ class ListTableFile:
             if chunk.nullable:
                 return False
             raise DamageError(f"column '{name}' does not hold {rows} lists of {size} values")
-        fault = decode(data, self._words, begin, end, values.reshape(-1))
+        fault = decode(data, self.words, begin, end, values.reshape(-1))
         if fault != WHOLE:
             raise DamageError(f"column '{name}': {FAULTS[fault]}")
         return True
-
-    def _page(self, name: str, encoding: int) -> tuple[npt.NDArray[np.uint8], int, int]:
-        """The buffer, and where in it a column's levels and values begin and end, once they have their checksum."""
-        chunk, data = self._chunks[name], self._words.view(np.uint8)
-        start = chunk.start - self._origin
-        end = start + chunk.size
-        header = pages.read_page_header(data[start:end], chunk.values, encoding)
-        if header is None:
-            raise DamageError(f"column '{name}': a page's header is damaged")
-        start += header[0]
-        if self._checksum.of(data[start:end]) != header[1]:
-            raise DamageError(f"column '{name}': a page does not have its checksum")
-        return data, start, end
-
-    def _located(self, group: int, name: str) -> _Chunk:
-        known = self._known.get((group, name))
-        if known is not None:
-            return known
-        number, nullable = self._columns[name]
-        column = self._metadata.row_group(group).column(number)
-        chunk = _Chunk(column.data_page_offset, column.total_compressed_size, column.num_values, nullable)
-        if not 0 <= chunk.start <= chunk.start + chunk.size <= self._size:
-            raise DamageError("its footer speaks of pages outside of it")
-        self._known[group, name] = chunk
-        return chunk
-
-
-def _span(chunks: Iterable[_Chunk]) -> tuple[int, int]:
-    """First byte of some chunks, and the one behind the last."""
-    ends = [(c.start, c.start + c.size) for c in chunks]
-    return min(start for start, _ in ends), max(end for _, end in ends)
-
-
-def _columns(metadata: pq.FileMetaData) -> dict[str, tuple[int, bool]]:
-    """Number of each column by its name, and whether it may hold nulls."""
-    found = {}
-    for k in range(metadata.num_columns):
-        column = metadata.schema.column(k)
-        listed = column.path.endswith(_LISTED)
-        found[column.path.removesuffix(_LISTED)] = k, column.max_definition_level > listed
-    return found

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import re
 from itertools import groupby
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,8 +23,8 @@ PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
 _TYPE: Final = thrift.i32(0)
 """Of a data page."""
 _LENGTH_BYTES: Final = 4
-_SIZE_AND_CRC: Final = re.compile(rb".{3}([\x80-\xFF]{0,4}.).(?:[\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.)", re.DOTALL)
-"""A page's type, its bytes twice and its CRC, each behind the byte that names the field."""
+_SIZES_AND_CRC: Final = re.compile(rb".{3}([\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.)", re.DOTALL)
+"""A page's type, its bytes before and after it was compressed, its CRC, each behind the byte that names the field."""
 _LONGEST_HEADER: Final = 64
 
 Bools = np.ndarray[Any, np.dtype[np.bool_]]
@@ -71,17 +71,28 @@ def _about(values: int, encoding: int) -> thrift.Value:
     return thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
 
 
-def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> tuple[int, int] | None:
-    """Bytes of the header, and CRC, of the one page of a column chunk; None if it is not as `page_header` writes it."""
+class PageHeader(NamedTuple):
+    """What the header of a column chunk's one page says."""
+
+    length: int
+    """Bytes of the header itself."""
+    crc: int
+    raw: int
+    """Bytes of the page before it was compressed."""
+
+
+def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> PageHeader | None:
+    """Header of the one page of a column chunk; None if it is not as `page_header` writes it."""
     head = chunk[:_LONGEST_HEADER].tobytes()
-    found = _SIZE_AND_CRC.match(head)
+    found = _SIZES_AND_CRC.match(head)
     if found is None:
         return None
-    size, crc = _number(found[1]), _number(found[2]) % (1 << 32)
+    raw, size, crc = _number(found[1]), _number(found[2]), _number(found[3]) % (1 << 32)
     length = chunk.size - size
-    if size < 0 or not 0 < length <= len(head) or head[:length] != page_header(size, crc, values, encoding):
+    known = raw >= 0 and size >= 0 and 0 < length <= len(head)
+    if not known or head[:length] != page_header(size, crc, values, encoding, raw):
         return None
-    return length, crc
+    return PageHeader(length, crc, raw)
 
 
 def _number(varint: bytes) -> int:

@@ -17,7 +17,8 @@ import pyarrow.parquet as pq
 
 from roadscan.model.errors import StoreError
 from roadscan.tables.byte_source import opened
-from roadscan.tables.list_table_reader import DamageError, ListTableFile, read_footer
+from roadscan.tables.list_table_reader import ListTableFile
+from roadscan.tables.page_file import DamageError, read_footer
 from roadscan.tables.store import Store
 
 _COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]

@@ -19,6 +19,7 @@ from roadscan.tables.derived import with_derived
 from roadscan.tables.list_table import is_list_table, write_list_table
 from roadscan.tables.logs import DataFile, log_folder
 from roadscan.tables.merge import merged
+from roadscan.tables.number_table import is_number_table, write_number_table
 from roadscan.tables.schema import TableSchema, table_schema
 from roadscan.tables.store import Store, file_digest
 
@@ -138,6 +139,9 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     """Write rows in the encodings that measured best for their kind; same rows, same bytes."""
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)
+        return
+    if schema.compression == "lz4" and is_number_table(rows.schema):
+        write_number_table(path, rows, schema.row_group_rows)
         return
     encodings: dict[str, str] = {}
     strings: list[str] = []

@@ -24,7 +24,7 @@ from roadscan.tables.page_file import DamageError, PageFile, read_footer
 from roadscan.tables.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
-_KINDS: Final = {
+_KINDS: Final[dict[str, np.dtype[Any]]] = {
     _EPOCH: np.dtype(np.int64), _POSE_EPOCH: np.dtype(np.int64),
     "x_sensor_m": np.dtype(np.float32), "y_sensor_m": np.dtype(np.float32), "z_sensor_m": np.dtype(np.float32),
     "intensity": np.dtype(np.uint16),

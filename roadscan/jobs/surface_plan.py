@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import shapely
@@ -89,7 +89,7 @@ class SurfacePlan:
         config = self.tiles.plan.survey.config.tiles
         if self.grid.config.method == "points":
             numbers = self.tiles.tiles.number
-            readings = {t: int(self.tiles.tiles.readings[numbers[t]]) for t in chosen}
+            readings = {t: int(self.tiles.tiles.readings[numbers[t]]) if t in numbers else 0 for t in chosen}
             blocks = cut_blocks(readings, config.block_tiles, config.max_block_readings)
         else:
             edge = _BLOCK_TILES if len(chosen) >= 4 * _BLOCK_TILES * workers else 2
@@ -112,9 +112,9 @@ class SurfacePlan:
             block=block,
             keys=tuple(self.keys[t] for t in tiles),
             cells=() if of_points else tuple(self.cells[t] for t in reach if t in self.cells),
-            readings=self.tiles.task(block) if of_points else None,
+            readings=self.tiles.task(Block(tuple(t for t in reach if t in self.tiles.tiles))) if of_points else None,
             regions=None if self.regions is None else self.regions.near(*boxes),
-            dates=tuple(_date(self.cells[t]) for t in tiles),
+            dates=tuple(_date(t, self.cells) for t in tiles),
             products=self.products,
             context=self.tiles.context,
         )
@@ -197,7 +197,9 @@ def plan_surfaces(
     manifest: Manifest,
     found: FoundRegions,
 ) -> SurfacePlan:
-    """Surfaces that are due: of all tiles that hold cells, or of those that a polygon or a found region touches."""
+    """Surfaces that are due: of all tiles that hold cells, of points those between them too, or of those of them that a
+    polygon or a found region touches.
+    """
     grid, regions = checked_surface(tiles.plan.survey, config)
     regions = found.regions if config.regions == "found" else regions
     expected = dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
@@ -208,16 +210,18 @@ def plan_surfaces(
     behind = found.waiting(tiles.footprints)
     if not of_points:
         behind |= {t for t, key in expected.items() if t not in records or records[t].key != key}
-    waiting = {t for t in expected if behind.intersection(grid.tiles.tiles_in(grid.reach(t)))} if behind else set()
+    due = cells.keys() | (bridged_tiles(cells) if of_points else set())
+    near = ((t, grid.tiles.tiles_in(grid.reach(t))) for t in due | expected.keys()) if behind else ()
+    waiting = {t for t, around in near if behind.intersection(around)}
     common = key_of(surface_version(), config.model_dump(mode="json", exclude={"polygons", "search"}), grid.tiles)
     keys: dict[TileId, str] = {}
-    for tile in sorted(cells.keys() - waiting, key=lambda t: (t.row, t.column)):
+    for tile in sorted(due - waiting, key=lambda t: (t.row, t.column)):
         box = grid.reach(tile)
-        near = None if regions is None else regions.near(box)
-        if near is not None and not near.near(grid.tiles.bounds(tile)).shapes.size:
+        within = None if regions is None else regions.near(box)
+        if within is not None and not within.near(grid.tiles.bounds(tile)).shapes.size:
             continue
         around = [(str(t), inputs[t]) for t in grid.tiles.tiles_in(box) if t in inputs]
-        keys[tile] = key_of(common, str(_date(cells[tile])), around, None if near is None else near.key())
+        keys[tile] = key_of(common, str(_date(tile, cells)), around, None if within is None else within.key())
     if config.regions == "polygons" and regions is not None and cells and not keys:
         raise _beside(regions, config, list(cells), grid)
     return SurfacePlan(tiles, grid, cells, regions, products, keys, frozenset(waiting))
@@ -262,6 +266,23 @@ def files_without_surface(manifest: Manifest) -> list[OutputRecord]:
     return [r for name in surface_file_names() for unit, r in manifest.of(name).items() if unit in empty]
 
 
-def _date(cells: OutputRecord) -> dt.date:
-    """UTC date of a tile's first reading."""
-    return utc_from_gps_ns(cells.figures()["first_epoch_gps_ns"]).date()
+def bridged_tiles(cells: Collection[TileId]) -> set[TileId]:
+    """Tiles without cells across whose corner a triangle may reach.
+
+    Its corners lie in tiles on two adjoining sides: were they in one, or in one and the tile at its corner, a straight
+    line would part the triangle from this tile.
+    """
+    beside = {TileId(t.column + c, t.row + r) for t in cells for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))}
+    return {
+        t
+        for t in beside - set(cells)
+        if any(TileId(t.column + c, t.row) in cells for c in (-1, 1))
+        and any(TileId(t.column, t.row + r) in cells for r in (-1, 1))
+    }
+
+
+def _date(tile: TileId, cells: Mapping[TileId, OutputRecord]) -> dt.date:
+    """UTC date of a tile's first reading; of one that holds none, of the first in the tiles on its sides."""
+    sides = [TileId(tile.column + c, tile.row + r) for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    own = [tile] if tile in cells else [t for t in sides if t in cells]
+    return utc_from_gps_ns(min(cells[t].figures()["first_epoch_gps_ns"] for t in own)).date()

@@ -22,7 +22,7 @@ from roadscan.model.ids import TileId
 from roadscan.points.cloud import TilePoints
 from roadscan.products.base import ProductContext
 from roadscan.surfaces.reconstruction import Patch, SurfaceGrid, patch_of_cells, patch_of_points, surface_of
-from roadscan.surfaces.tile import INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surfaces.tile import FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tiles.cells import TileCells
 
@@ -114,5 +114,6 @@ def _figures(surface: SurfaceTile) -> dict[str, Any]:
         "cells": int(np.count_nonzero(origin)),
         "measured": int(np.count_nonzero(origin == MEASURED)),
         "interpolated": int(np.count_nonzero(origin == INTERPOLATED)),
+        "filled": int(np.count_nonzero(origin == FILLED)),
         "change_rms_m": float(np.sqrt(np.mean(known * known))) if known.size else None,
     }

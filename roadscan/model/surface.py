@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from roadscan.model.strict import Strict
 from roadscan.model.surface_regions import RegionSettings
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.surface_smoothing import SmoothingWeights, SurfaceSmoothing
 
 SlopeKind = Literal["quadratic", "cubic"]
 """How the slopes of the detailed model are found."""
@@ -26,14 +26,17 @@ class SurfaceConfig(Strict):
     triangulation profiler, 0.006 for a SICK LMS; more where cells are finer than the readings are apart."""
     smooth: bool = True
     """Adaptive regularised smoothing; without it the surface is what was measured."""
-    smoothing: SurfaceSmoothing = SurfaceSmoothing()
+    smoothing: SmoothingWeights = SmoothingWeights()
     """Its weights and thresholds; `sigma_m` is stated above."""
     cell_m: tuple[float, float] | None = None
     """`points`: edges of the grid's cells (m), east and north, such as [0.01, 0.03]; left out, `tiles.cell_m` both
     ways. The tiles' own cells are the grid of `cells`."""
     max_gap_m: float = Field(default=0.3, gt=0.0, le=10.0)
     """`points`: widest hole that is bridged (m), at most half a tile's edge: no surface is made where a disc of this
-    diameter holds no reading, nor in a tile without any."""
+    diameter holds no reading."""
+    fill_m: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Widest hole that is filled (m), along the grid's rows or columns, by a straight line between its rims; such cells
+    are marked as filled (origin 3). Water and glass give no reading. 0: holes stay open."""
     slopes: SlopeKind = "quadratic"
     """`points`: how the slope at a reading is found: `quadratic` is calm where heights are noisy, `cubic` follows exact
     heights most closely."""
@@ -49,9 +52,7 @@ class SurfaceConfig(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.smoothing.sigma_m != SurfaceSmoothing().sigma_m:
-            raise ValueError("state the noise once, as sigma_m of [surface], not of its smoothing")
-        if not self.smooth and self.smoothing != SurfaceSmoothing():
+        if not self.smooth and self.smoothing != SmoothingWeights():
             raise ValueError("smooth = false, and yet settings of the smoothing: leave one of them out")
         if self.method == "cells":
             for name in ("cell_m", "max_gap_m", "slopes", "regions", "search", "polygons", "polygons_crs"):
@@ -69,4 +70,4 @@ class SurfaceConfig(Strict):
 
     def smoothing_settings(self) -> SurfaceSmoothing | None:
         """The smoothing with its noise; None where it is off."""
-        return self.smoothing.model_copy(update={"sigma_m": self.sigma_m}) if self.smooth else None
+        return SurfaceSmoothing(sigma_m=self.sigma_m, **self.smoothing.model_dump()) if self.smooth else None

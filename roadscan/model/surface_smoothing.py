@@ -7,11 +7,9 @@ from pydantic import Field
 from roadscan.model.strict import Strict
 
 
-class SurfaceSmoothing(Strict):
+class SmoothingWeights(Strict):
     """Weights and thresholds of ``surfaces/smoothing.py``; the weights are those of Yu et al. (2007), section 4."""
 
-    sigma_m: float = Field(default=0.0005, gt=0.0, le=1.0)
-    """1 σ of the noise of one cell's height (m): 0.0005 for a triangulation profiler, 0.006 for a SICK LMS."""
     curvature_weight: float = Field(default=50.0, ge=0.0, le=10_000.0)
     """λ_C, weight of the directional high-pass filters against the weight 1 of the measured heights."""
     median_weight: float = Field(default=30.0, gt=0.0, le=10_000.0)
@@ -26,3 +24,10 @@ class SurfaceSmoothing(Strict):
     """A height farther than this many σ from the median has no weight of its own; "inf": all have (the paper)."""
     filter_sigmas: float = Field(default=0.5, gt=0.0)
     """A filter is off at a cell where it finds more than this many σ in the median: it would flatten a form."""
+
+
+class SurfaceSmoothing(SmoothingWeights):
+    """Weights and thresholds, and the noise that they are measured by."""
+
+    sigma_m: float = Field(default=0.0005, gt=0.0, le=1.0)
+    """1 σ of the noise of one cell's height (m): 0.0005 for a triangulation profiler, 0.006 for a SICK LMS."""

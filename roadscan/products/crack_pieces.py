@@ -16,7 +16,7 @@ from roadscan.products.base import ProductContext, SurfaceProduct
 from roadscan.products.geo_table import check_geo_table, read_geo_table, write_geo_table
 from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells
 from roadscan.surfaces.heights import HeightWindow
-from roadscan.surfaces.tile import SurfaceTile
+from roadscan.surfaces.tile import FILLED, SurfaceTile
 
 _SIMPLER_CELLS: Final = 0.25
 """Vertices that lie this near to a straight line are left out."""
@@ -42,9 +42,10 @@ def height_window(surface: SurfaceTile, needed: int, product: str) -> HeightWind
             change="give tiles.cell_m or surface.cell_m 5 mm or less, or look for narrower defects",
         )
     window = surface.window
+    seen = np.where(surface.origin == FILLED, np.nan, surface.height_m)  # a straight line is no evidence
     return HeightWindow(
         surface.raw_m,
-        surface.height_m,
+        seen,
         east,
         surface.sigma_m,
         window.first_row,

@@ -21,10 +21,11 @@ from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.points.cloud import QUANTUM_M, TilePoints
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings
+from roadscan.surfaces.holes import RIM, cells_across, fill_holes
 from roadscan.surfaces.normals import slopes_at
 from roadscan.surfaces.sites import sites
 from roadscan.surfaces.smoothing import halo_cells, smooth_surface
-from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surfaces.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surfaces.triangulation import triangulate
 from roadscan.surfaces.window import GridWindow
 from roadscan.tiles.cells import TileCells
@@ -65,9 +66,21 @@ class SurfaceGrid:
         settings = self.config.smoothing_settings()
         return 0 if settings is None else halo_cells(settings)
 
+    @property
+    def holes(self) -> tuple[int, int]:
+        """Empty cells in the widest hole that is filled: northwards, eastwards."""
+        east, north = self.cell_m
+        return cells_across(self.config.fill_m, north), cells_across(self.config.fill_m, east)
+
+    @property
+    def filled(self) -> int:
+        """Cells beyond those that are shown, that filling depends on."""
+        return max(self.holes) + RIM if max(self.holes) else 0
+
     def window(self, tile: TileId) -> GridWindow:
         """Cells that are computed for a tile."""
-        return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(self.shown + self.smoothed)
+        beyond = self.shown + self.filled + self.smoothed
+        return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(beyond)
 
     def reach(self, tile: TileId) -> Bounds:
         """Box (m) of all cells or points that a tile's surface depends on."""
@@ -141,7 +154,7 @@ def patch_of_points(
     empty = Patch(np.full(shape, np.nan), np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32))
     if not wanted.any():
         return empty
-    rows, columns = (_needed(np.asarray(wanted.any(axis=axis)), grid.smoothed) for axis in (1, 0))
+    rows, columns = (_needed(np.asarray(wanted.any(axis=axis)), grid.filled + grid.smoothed) for axis in (1, 0))
     part = replace(
         window,
         first_row=window.first_row + rows.start,
@@ -176,7 +189,7 @@ def _detailed(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid
 
 
 def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | None = None) -> SurfaceTile:
-    """Smooth a window's heights, and cut off what was needed for that alone.
+    """Smooth a window's heights, fill its holes, and cut off what was needed for that alone.
 
     Parameters
     ----------
@@ -185,15 +198,29 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
     """
     settings = grid.config.smoothing_settings()
     height = patch.raw_m if settings is None else smoothed_where_known(patch.raw_m, settings)
-    rim, window = grid.smoothed, grid.window(tile)
+    rim, window = grid.filled + grid.smoothed, grid.window(tile)
     inner = (slice(rim, window.rows - rim), slice(rim, window.columns - rim))
-    raw, height = patch.raw_m[inner].copy(), height[inner].copy()
-    origin, intensity = patch.origin[inner].copy(), patch.intensity[inner].copy()
+    raw, origin = patch.raw_m[inner].copy(), patch.origin[inner].copy()
+    if grid.filled:
+        seen = (slice(grid.smoothed, window.rows - grid.smoothed), slice(grid.smoothed, window.columns - grid.smoothed))
+        cut = (slice(grid.filled, -grid.filled),) * 2
+        height, intensity, filled = _filled(height[seen], patch.intensity[seen], grid)
+        height, intensity = height[cut], intensity[cut]
+        origin[filled[cut]] = FILLED
+    else:
+        height, intensity = height[inner].copy(), patch.intensity[inner].copy()
     if wanted is not None:
         left_out = ~wanted[inner]
         raw[left_out] = height[left_out] = np.nan
         intensity[left_out], origin[left_out] = np.nan, EMPTY
     return SurfaceTile(tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, grid.config.sigma_m)
+
+
+def _filled(height_m: Float64, intensity: Float32, grid: SurfaceGrid) -> tuple[Float64, Float32, Bool]:
+    """Heights and intensities of a window with holes filled, and which cells were."""
+    height, filled = fill_holes(height_m, ~np.isnan(height_m), grid.holes)
+    light, dark = fill_holes(intensity.astype(np.float64), ~np.isnan(intensity), grid.holes)
+    return height, np.where(filled & dark, light, intensity).astype(np.float32), filled
 
 
 def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:

@@ -34,13 +34,13 @@ class SurfaceTile:
     halo: int
     """Cells of neighbours on each of the four sides; they reach 1 m or farther."""
     raw_m: npt.NDArray[np.float64]
-    """Heights before smoothing (m, map frame), NaN where there is none."""
+    """Heights before smoothing (m, map frame), NaN where there is none: in filled cells as well."""
     height_m: npt.NDArray[np.float64]
     """Heights after smoothing (m, map frame), NaN where there is none; `raw_m` where smoothing is off."""
     origin: npt.NDArray[np.uint8]
     """0 empty, 1 measured, 2 interpolated, 3 filled; not empty where `height_m` is a number."""
     intensity: npt.NDArray[np.float32]
-    """Mean intensity of the readings of a cell, NaN where there is none."""
+    """Mean intensity of the readings of a cell, of filled cells that of their rims; NaN where there is none."""
     sigma_m: float
     """1 σ of the noise of one cell's height before smoothing (m)."""
 

@@ -22,7 +22,7 @@ from roadscan.jobs.compute import Compute, Done, Inline
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.jobs.status import verify_store
-from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, plan_surface_work
+from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles, plan_surface_work
 from roadscan.jobs.surfaces import source_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
@@ -30,7 +30,7 @@ from roadscan.model.survey import Survey
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load
 from roadscan.surfaces.reconstruction import surface_of
-from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surfaces.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
@@ -91,7 +91,8 @@ class Reconstructed:
     def surfaces(self, **settings: object) -> dict[TileId, SurfaceTile]:
         """Surfaces of the six tiles with most cells, each made by a task of its own."""
         planned = self.plan(self.survey({k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}))
-        fullest = sorted(planned.keys, key=lambda t: -planned.cells[t].figures()["cells"])[:6]
+        held = {t: r.figures()["cells"] for t, r in planned.cells.items()}
+        fullest = sorted(planned.keys, key=lambda t: -held.get(t, 0))[:6]
         return {t: s for task in planned.singly(fullest) for t, s in _surfaces(task)}
 
 
@@ -160,7 +161,9 @@ def test_cells_are_seamless_and_keep_to_their_tile(cells: Reconstructed) -> None
     assert one.height_m[one.inner].shape == (200, 200)
     assert one.halo * one.cell_m[0] >= 1.0
     assert (np.isnan(one.height_m) == (one.origin == EMPTY)).all()
-    assert set(np.unique(one.origin)) == {EMPTY, MEASURED}
+    assert set(np.unique(one.origin)) == {EMPTY, MEASURED, FILLED}
+    assert np.array_equal(np.isnan(one.raw_m), (one.origin == EMPTY) | (one.origin == FILLED))
+    assert not np.isnan(one.intensity[one.origin == FILLED]).any()
 
 
 def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +173,7 @@ def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: py
     assert cells.run(survey) == ([], files)  # nothing is done twice
     record = next(iter(Manifest(cells.store).of(SURFACE).values()))
     figures = json.loads(record.detail)
-    assert record.path == "" and figures["cells"] == figures["measured"] + figures["interpolated"] > 0
+    assert record.path == "" and figures["cells"] == sum(figures[k] for k in ("measured", "interpolated", "filled")) > 0
     cells.forget()
     monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
     monkeypatch.setattr("roadscan.jobs.surfaces._CELLS_KEPT", 0)
@@ -250,7 +253,7 @@ def test_smoothed_cells_are_nearer_to_the_truth(cells: Reconstructed) -> None:
 def test_points_are_seamless_and_nearer_to_the_truth(points: Reconstructed) -> None:
     found = points.surfaces(**POINTS)
     assert_seamless(found)
-    assert {EMPTY, MEASURED, INTERPOLATED} == set(np.unique(np.concatenate([s.origin.ravel() for s in found.values()])))
+    assert {EMPTY, MEASURED, INTERPOLATED} <= set(np.unique(np.concatenate([s.origin.ravel() for s in found.values()])))
     raw, smooth = _errors(found, load(points.simulated.survey_file.parent))
     assert np.sqrt(np.mean(smooth**2)) < 0.8 * np.sqrt(np.mean(raw**2))
 
@@ -355,6 +358,27 @@ def test_polygons_beside_the_survey_are_an_error(points: Reconstructed, tmp_path
         points.run(points.survey({**POINTS, "regions": "polygons", "polygons": str(tmp_path / "nothing.gpkg")}))
 
 
+def test_a_tile_without_a_reading_has_the_surface_that_reaches_into_it(points: Reconstructed) -> None:
+    survey = points.survey(POINTS)
+    planned = points.plan(survey)
+    tile = next(t for t in planned.keys if t in bridged_tiles(set(planned.cells) - {t}))
+    expected = dict(_surfaces(planned.task((tile,))))[tile]
+    manifest = Manifest(points.store)
+    record = manifest.get("tile", str(tile))
+    assert record is not None
+    manifest.add([record._replace(path="", bytes=0)])  # as if all its readings had been left out
+    without = points.plan(survey)
+    found = dict(_surfaces(without.task((tile,))))[tile]
+    assert tile not in without.cells and found.height_m.tobytes() == expected.height_m.tobytes()
+    manifest.add([record])
+
+
+def test_bridged_tiles_lie_between_two_sides() -> None:
+    stairs = {TileId(0, 0), TileId(1, 0), TileId(1, 1), TileId(2, 1)}
+    assert bridged_tiles(stairs) == {TileId(0, 1), TileId(2, 0)}
+    assert bridged_tiles({TileId(c, 5) for c in range(4)}) == set()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -374,7 +398,7 @@ def test_settings_that_do_not_fit_the_tiles_stop_a_run_before_them(
     ("settings", "message"),
     [
         ({"method": "cells", "sigma_m": 0.001, "cell_m": [0.01, 0.03]}, "cell_m is a setting of method"),
-        ({"method": "cells", "sigma_m": 0.001, "smoothing": {"sigma_m": 0.002}}, "state the noise once"),
+        ({"method": "cells", "sigma_m": 0.001, "smoothing": {"sigma_m": 0.0005}}, "smoothing.sigma_m"),
         ({"method": "points", "sigma_m": 0.001, "smooth": False, "smoothing": {"detail_sigmas": 5}}, "smooth = false"),
         ({"method": "points", "sigma_m": 0.001, "regions": "polygons"}, "belong together"),
         ({"method": "points", "sigma_m": 0.001, "search": {"factor": 3.0}}, "is not asked for"),

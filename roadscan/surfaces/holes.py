@@ -9,12 +9,14 @@ length the mean. Heights that were there stay as they are, and nothing goes beyo
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 RIM: Final = 3
@@ -26,60 +28,113 @@ def cells_across(fill_m: float, cell_m: float) -> int:
     return math.floor(fill_m / cell_m + 1e-9)
 
 
-def fill_holes(values: Float64, known: Bool, most: tuple[int, int]) -> tuple[Float64, Bool]:
-    """Fill the holes of a grid.
+@dataclass(frozen=True)
+class Holes:
+    """The cells that are filled: (n,) places in the flat grid, by the runs they lie in."""
 
-    Parameters
-    ----------
-    values : (rows, columns), of what is known.
-    known : (rows, columns), where it is.
-    most : cells in the widest hole along a column (northwards), and along a row (eastwards).
+    shape: tuple[int, int]
+    rows: _Runs
+    columns: _Runs
 
-    Returns
-    -------
-    The values with holes filled, and which cells were. A cell farther than the widest hole and its rim from the
-    window's border has the same bits in every window.
-    """
-    along, steps = _lines(values, known, most[1])
-    down, rises = (part.T for part in _lines(values.T, known.T, most[0]))
-    filled = (steps > 0) | (rises > 0)
-    one_way = np.where((rises == 0) | ((steps > 0) & (steps < rises)), along, down)
-    both = np.where((steps > 0) & (steps == rises), 0.5 * (along + down), one_way)
-    return np.where(filled, both, values), filled
+    @classmethod
+    def of(cls, known: Bool, most: tuple[int, int]) -> Holes:
+        """Holes of a grid.
 
+        Parameters
+        ----------
+        known : (rows, columns), where it holds a height.
+        most : cells in the widest hole along a column (northwards), and along a row (eastwards).
+        """
+        rows, columns = known.shape
+        return cls((rows, columns), _Runs.of(known, most[1], columns, 1), _Runs.of(known.T, most[0], 1, columns))
 
-def _lines(values: Float64, known: Bool, most: int) -> tuple[Float64, npt.NDArray[np.int32]]:
-    """Values along the rows of holes, and the cells in the hole that a cell lies in; 0 in none."""
-    line, width = np.zeros(values.shape), np.zeros(values.shape, np.int32)
-    rows, columns = values.shape
-    if most < 1 or columns < 3:
-        return line, width
-    inside = np.zeros((rows, columns + 2), np.int8)  # known beyond both ends, so that every run has two
-    inside[:, 1:-1] = ~known
-    row, edge = np.nonzero(np.diff(inside, axis=1))
-    row, first, end = row[::2], edge[::2], edge[1::2]
-    own = (first > 0) & (end < columns) & (end - first <= most)
-    row, first, end = row[own], first[own], end[own]
-    before, after = _rim(values, known, row, first - 1, -1), _rim(values, known, row, end, 1)
-    count = end - first
-    hole = np.repeat(np.arange(count.size), count)
-    place = np.arange(hole.size) - np.repeat(np.cumsum(count) - count, count)
-    share = (place + 1) / (count + 1)[hole]
-    at = row[hole], first[hole] + place
-    line[at] = before[hole] + share * (after - before)[hole]
-    width[at] = count[hole]
-    return line, width
+    def filled(self) -> Bool:
+        """(rows, columns) cells that lie in a hole."""
+        found = np.zeros(self.shape, bool)
+        for runs in (self.rows, self.columns):
+            found.flat[runs.cell] = True
+        return found
+
+    def fill(self, values: Float64) -> Float64:
+        """Values (rows, columns) with the holes filled.
+
+        A cell farther than the widest hole and its rim from the window's border has the same bits in every window.
+        """
+        found = values.copy()
+        flat, width = found.reshape(-1), np.zeros(values.size, np.int32)
+        across, down = self.rows.line(values.reshape(-1)), self.columns.line(values.reshape(-1))
+        flat[self.rows.cell], width[self.rows.cell] = across, self.rows.width
+        before = width[self.columns.cell]
+        with_row = flat[self.columns.cell]
+        mean = np.where(before == self.columns.width, 0.5 * (with_row + down), down)
+        wider = (before > 0) & (before < self.columns.width)
+        flat[self.columns.cell] = np.where(wider, with_row, mean)
+        return found
 
 
-def _rim(values: Float64, known: Bool, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64], step: int) -> Float64:
-    """Mean of the known cells from a column on, at most :data:`RIM` without a gap."""
-    total, count = values[row, column], np.ones(row.size)
-    goes_on = np.ones(row.size, bool)
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of empty cells along lines of the grid; places are those in the flat grid."""
+
+    first: Int64
+    """(k,) place of the known cell before each run; `last` the one after it."""
+    last: Int64
+    beside: Int64
+    """(k,) known cells before the run without a gap, that its rim takes; `beyond` those after it."""
+    beyond: Int64
+    step: int
+    """From cell to cell of a line."""
+    cell: Int64
+    """(n,) cells of all runs, and the run of each."""
+    run: Int64
+    share: Float64
+    """(n,) how far each cell is from the one rim to the other."""
+
+    @property
+    def width(self) -> Int64:
+        """(n,) cells in the run of each cell."""
+        width: Int64 = ((self.last - self.first) // self.step - 1)[self.run]
+        return width
+
+    @classmethod
+    def of(cls, known: Bool, most: int, line_step: int, step: int) -> _Runs:
+        """Runs along the rows of `known`, whose cells lie `line_step` and `step` apart in the flat grid."""
+        lines, cells = known.shape
+        flat = np.zeros((lines, cells + 1), bool)  # a gap after each line
+        flat[:, :-1] = known
+        flat = flat.reshape(-1)
+        edge = np.flatnonzero(flat[1:] != flat[:-1])
+        edge = edge[int(flat.size > 0 and not flat[0]) :]  # from the end of a known run on
+        end, begin = edge[0:-1:2], edge[1::2] + 1
+        own = (begin - end - 1 <= most) & (end // (cells + 1) == begin // (cells + 1))
+        beside, beyond = (_known_from(flat, at, away) for at, away in ((end[own], -1), (begin[own], 1)))
+        first, last = (at // (cells + 1) * line_step + at % (cells + 1) * step for at in (end[own], begin[own]))
+        size = begin[own] - end[own] - 1
+        run = np.repeat(np.arange(size.size), size)
+        place = np.arange(run.size) - np.repeat(np.cumsum(size) - size, size) + 1
+        return cls(first, last, beside, beyond, step, first[run] + place * step, run, place / (size + 1)[run])
+
+    def line(self, values: Float64) -> Float64:
+        """(n,) the straight line between the means of both rims, of a flat grid of values."""
+        before = _rim(values, self.first, self.beside, -self.step)
+        after = _rim(values, self.last, self.beyond, self.step)
+        found: Float64 = before[self.run] + self.share * (after - before)[self.run]
+        return found
+
+
+def _known_from(flat: Bool, at: Int64, away: int) -> Int64:
+    """(k,) known cells from a place on without a gap, at most :data:`RIM`."""
+    count, goes_on = np.ones(at.size, np.int64), np.ones(at.size, bool)
     for k in range(1, RIM):
-        there = column + k * step
-        goes_on &= (there >= 0) & (there < values.shape[1])
-        there = np.clip(there, 0, values.shape[1] - 1)
-        goes_on &= known[row, there]
-        total = total + np.where(goes_on, values[row, there], 0.0)
+        there = at + away * k
+        goes_on &= flat[np.clip(there, 0, flat.size - 1)] & (there >= 0)
         count += goes_on
+    return count
+
+
+def _rim(values: Float64, at: Int64, count: Int64, step: int) -> Float64:
+    total = values[at]
+    for k in range(1, RIM):
+        inside = count > k
+        total = total + np.where(inside, values[np.where(inside, at + k * step, at)], 0.0)
     return np.asarray(total / count)

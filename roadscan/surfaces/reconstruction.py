@@ -21,7 +21,7 @@ from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.points.cloud import QUANTUM_M, TilePoints
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings
-from roadscan.surfaces.holes import RIM, cells_across, fill_holes
+from roadscan.surfaces.holes import RIM, Holes, cells_across
 from roadscan.surfaces.normals import slopes_at
 from roadscan.surfaces.sites import sites
 from roadscan.surfaces.smoothing import halo_cells, smooth_surface
@@ -218,9 +218,8 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
 
 def _filled(height_m: Float64, intensity: Float32, grid: SurfaceGrid) -> tuple[Float64, Float32, Bool]:
     """Heights and intensities of a window with holes filled, and which cells were."""
-    height, filled = fill_holes(height_m, ~np.isnan(height_m), grid.holes)
-    light, dark = fill_holes(intensity.astype(np.float64), ~np.isnan(intensity), grid.holes)
-    return height, np.where(filled & dark, light, intensity).astype(np.float32), filled
+    found = Holes.of(~np.isnan(height_m), grid.holes)
+    return found.fill(height_m), found.fill(intensity.astype(np.float64)).astype(np.float32), found.filled()
 
 
 def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:

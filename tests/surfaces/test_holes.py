@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.surfaces.holes import RIM, cells_across, fill_holes
+from roadscan.surfaces.holes import RIM, Holes, cells_across
+
+
+def fill_holes(values: np.ndarray, known: np.ndarray, most: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Values with holes filled, and which cells were."""
+    holes = Holes.of(known, most)
+    return holes.fill(values), holes.filled()
 
 
 def test_a_hole_in_a_row_is_filled_as_numpy_interpolates() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.cell_files import read_cells, read_overview
 from roadscan.jobs.compute import Compute
+from roadscan.jobs.drives import Drives
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.tile_files import WantedProduct, WantedSurface
@@ -31,6 +32,7 @@ from roadscan.products.base import (
     products,
     source_digest,
 )
+from roadscan.products.lane_direction import LaneDirections
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store, file_digest
 from roadscan.tiles.cells import TileCells
@@ -58,6 +60,8 @@ class OutputTask:
     """Records of the overviews of the same tiles, where there are any."""
     files: tuple[OutputRecord, ...] = ()
     """Records of the files of surface products that the output is made from."""
+    drives: Drives | None = None
+    """Where the vehicles drove, for a product that asks."""
 
     @property
     def target(self) -> str:
@@ -164,7 +168,8 @@ def write_output(task: OutputTask) -> OutputRecord:
     with task.store.scratch() as folder:
         path = folder / Path(task.output.name).name
         task.product.write(
-            task.output, task.summaries, StoredTiles(task.store, task.cells, task.overviews, task.context, task.files),
+            task.output, task.summaries,
+            StoredTiles(task.store, task.cells, task.overviews, task.context, task.files, task.drives),
             task.options, task.context, path,
         )  # fmt: skip
         size, digest = path.stat().st_size, file_digest(path)
@@ -182,8 +187,10 @@ class StoredTiles:
         overviews: Sequence[OutputRecord],
         context: ProductContext,
         files: Sequence[OutputRecord] = (),
+        drives: Drives | None = None,
     ) -> None:
         self._store = store
+        self._drives = drives
         self._files = {(r.product, r.unit): r for r in files}
         self._cells = {r.unit: r for r in cells}
         self._overviews = {r.unit: r for r in overviews}
@@ -198,6 +205,10 @@ class StoredTiles:
         """Content of a tile's file of a surface product; None where there is none."""
         record = self._files.get((product, str(tile)))
         return None if record is None else self._store.read_bytes(record.path)
+
+    def lanes(self) -> LaneDirections:
+        """Which way the lanes run; nowhere known for a product that does not need it."""
+        return LaneDirections.of_path([]) if self._drives is None else self._drives.lanes(self._store)
 
     def overview(self, tile: TileId, factor: int) -> Level | None:
         """Overview of a tile; made from its cells where none was stored with them."""
@@ -219,11 +230,13 @@ def _tasks(
     files: Sequence[OutputRecord],
 ) -> list[OutputTask]:
     tasks: list[OutputTask] = []
+    drives = Drives.of(plan) if product.needs_lanes else None
+    driven = [] if drives is None else [drives.key()]
     for output in product.outputs(list(summaries.values()), options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
-        key = key_of(_product_key(product, options, context), output.name, parts)
+        key = key_of(_product_key(product, options, context), output.name, parts, *driven)
         tasks.append(
             OutputTask(
                 plan.store,
@@ -236,6 +249,7 @@ def _tasks(
                 own,
                 tuple(overviews[r.unit] for r in own if r.unit in overviews),
                 read,
+                drives,
             )
         )
     return tasks

@@ -25,6 +25,7 @@ from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
+from roadscan.products.lane_direction import LaneDirections
 from roadscan.surfaces.tile import SurfaceTile
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
@@ -117,6 +118,9 @@ class LoadCells(Protocol):
     def file(self, product: str, tile: TileId) -> bytes | None:
         """Content of a tile's file of a surface product that this product `reads`, or None where there is none."""
 
+    def lanes(self) -> LaneDirections:
+        """Which way the lanes run, for a product that `needs_lanes`."""
+
 
 class TileFiles(ABC):
     """What the two kinds of product with one file a tile share."""
@@ -191,6 +195,8 @@ class SurveyProduct(ABC):
     default_cells: ClassVar[Cells] = "any"
     reads: ClassVar[tuple[str, ...]] = ()
     """Surface products whose files of the tiles it is made from; they are made wherever this product is."""
+    needs_lanes: ClassVar[bool] = False
+    """True for a product that asks which way the lanes run."""
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:

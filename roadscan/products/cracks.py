@@ -14,7 +14,6 @@ from roadscan.model.strict import Strict
 from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.crack_pieces import read_pieces
 from roadscan.products.geo_table import check_geo_table, write_geo_table
-from roadscan.products.lane_direction import lane_azimuths_rad
 from roadscan.surfaces.crack_network import Crack, join_cracks
 from roadscan.surfaces.cracks import CrackPiece
 
@@ -41,7 +40,8 @@ class Cracks(SurveyProduct):
 
     Whatever hangs together is one crack, however many tiles it crosses. A crack is longitudinal, transverse or diagonal
     by where most of its length runs, or an alligator crack if it closes enough polygons and has enough junctions per
-    square metre; `unknown` where no neighbouring tile tells the lane's direction. Width is that at half the depth.
+    square metre; `unknown` where nobody drove within 20 m: the lane
+    runs as the vehicle did nearest to a piece. Width is that at half the depth.
     """
 
     name: ClassVar[str] = "cracks"
@@ -49,6 +49,7 @@ class Cracks(SurveyProduct):
     options: ClassVar[type[Strict]] = CrackJoining
     default: ClassVar[bool] = False
     reads: ClassVar[tuple[str, ...]] = ("crack_pieces",)
+    needs_lanes: ClassVar[bool] = True
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
         """One file."""
@@ -64,9 +65,7 @@ class Cracks(SurveyProduct):
         path: Path,
     ) -> None:
         """Join the pieces of all tiles and write what is a crack, from south to north."""
-        azimuths = lane_azimuths_rad(sorted((t for t in tiles if t.tile in set(output.tiles)), key=lambda t: t.tile))
         pieces: list[CrackPiece] = []
-        lane: list[float] = []
         owner: list[str] = []
         cell_m = 0.0
         for tile in output.tiles:
@@ -74,9 +73,9 @@ class Cracks(SurveyProduct):
             own, own_cell_m = ([], 0.0) if content is None else read_pieces(content, context)
             cell_m = max(cell_m, own_cell_m)
             pieces += own
-            lane += [azimuths[tile]] * len(own)
             owner += [str(tile)] * len(own)
-        found = join_cracks(pieces, np.array(lane), cell_m, cast(CrackJoining, options))
+        lane = load_cells.lanes().at([p.line_m[len(p.line_m) // 2] for p in pieces])
+        found = join_cracks(pieces, lane, cell_m, cast(CrackJoining, options))
         rows = [_row(k, one, owner) for k, one in enumerate(found, start=1)]
         lines = np.array([one.line for one in found], dtype=object)
         write_geo_table(path, pa.Table.from_pylist(rows, COLUMNS), "line", lines, ["MultiLineString"], context)

@@ -1,41 +1,53 @@
-"""Which way the lane runs at each tile, from when the tiles were first seen."""
+"""Which way the lane runs: the direction in which a vehicle drove nearby."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from roadscan.model.ids import TileId
-from roadscan.products.base import TileSummary
+Float64 = npt.NDArray[np.float64]
 
-_TILES_AROUND = 4.0
-_WITHIN_S = 20.0
-
-
-def lane_azimuths_rad(tiles: Sequence[TileSummary]) -> dict[TileId, float]:
-    """Direction of travel at each tile, clockwise from map north, NaN where no neighbour tells.
-
-    It is the slope of place over time: the regression of the centres of the tiles up to 4 away on their first epochs,
-    of those that were seen within 20 s. Tiles side by side cancel out; on straights and wide bends it is good to a few
-    degrees.
-    """
-    if not tiles:
-        return {}
-    place = np.array([[t.tile.column, t.tile.row] for t in tiles], dtype=np.float64)
-    seconds = np.array([t.first_epoch_gps_ns - tiles[0].first_epoch_gps_ns for t in tiles]) * 1e-9
-    near = cKDTree(place).query_ball_point(place, _TILES_AROUND + 1e-9)
-    return {one.tile: _azimuth(k, place, seconds, np.sort(near[k])) for k, one in enumerate(tiles)}
+STEP_M: Final = 1.0
+"""Directions are those of steps about this long."""
+_LEAST_STEP_M: Final = 0.5
+"""Shorter ones are those of a vehicle that stands."""
+_LONGEST_STEP_M: Final = 50.0
+"""Longer ones are gaps between poses."""
+_FARTHEST_M: Final = 20.0
+"""A lane this far from every drive has no direction."""
 
 
-def _azimuth(
-    own: int, place: npt.NDArray[np.float64], seconds: npt.NDArray[np.float64], near: npt.NDArray[np.int64]
-) -> float:
-    near = near[np.abs(seconds[near] - seconds[own]) <= _WITHIN_S]
-    time = seconds[near] - seconds[near].mean()
-    if not (time != 0.0).any():
-        return float("nan")
-    east, north = time @ (place[near] - place[near].mean(axis=0))
-    return float(np.arctan2(east, north))
+@dataclass(frozen=True)
+class LaneDirections:
+    """Steps of all drives."""
+
+    place_m: Float64
+    """(k, 2) easting and northing of the middle of each step (m)."""
+    azimuth_rad: Float64
+    """(k,) its direction, clockwise from map north."""
+
+    @classmethod
+    def of_path(cls, path_m: npt.ArrayLike) -> Self:
+        """Steps from each to the next of places (n, 2) about :data:`STEP_M` apart, in the order driven."""
+        path = np.asarray(path_m, np.float64).reshape(-1, 2)
+        step = np.diff(path, axis=0)
+        length = np.hypot(*step.T)
+        own = (length >= _LEAST_STEP_M) & (length <= _LONGEST_STEP_M)
+        return cls((path[:-1] + 0.5 * step)[own], np.arctan2(step[own, 0], step[own, 1]))
+
+    def at(self, places_m: npt.ArrayLike) -> Float64:
+        """Directions (n,) at places (n, 2), those of the nearest steps; NaN where none is near."""
+        places = np.asarray(places_m, np.float64).reshape(-1, 2)
+        if not len(self.place_m) or not len(places):
+            return np.full(len(places), np.nan)
+        away, nearest = self._tree.query(places)
+        return np.where(away <= _FARTHEST_M, self.azimuth_rad[nearest], np.nan)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.place_m)

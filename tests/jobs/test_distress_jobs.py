@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import datetime as dt
 
+import numpy as np
 import pytest
 
+from roadscan.jobs.drives import Drives
+from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import StoredTiles, wanted_products
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext
+from roadscan.simulate.truth import load
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tiles.grid import TileGrid
 from tests.jobs.conftest import changed
@@ -40,3 +44,15 @@ def test_files_of_tiles_are_read_from_the_store(simulated):
     assert tiles.file("crack_pieces", TileId(3, 4)) == b"pieces"
     assert tiles.file("crack_pieces", TileId(3, 5)) is None
     assert tiles.file("pothole_pieces", TileId(3, 4)) is None
+
+
+def test_lanes_run_as_the_vehicle_drove(finished):
+    store = finished.store()
+    drives = Drives.of(plan_survey(Survey.load(finished.survey_file), store))
+    lanes = StoredTiles(store, (), (), ProductContext("s", "", drives.map, TileGrid(), (), DAY), (), drives).lanes()
+    truth = load(finished.survey_file.parent)
+    ahead = lanes.place_m + 0.1 * np.stack([np.sin(lanes.azimuth_rad), np.cos(lanes.azimuth_rad)], axis=-1)
+    before, after = (np.stack(truth.station_offset_m(*p.T), axis=-1) for p in (lanes.place_m, ahead))
+    step = after - before
+    assert len(step) > 30 and set(np.sign(step[:, 0])) == {-1.0, 1.0}  # there and back
+    assert np.degrees(np.abs(np.arctan(step[:, 1] / step[:, 0]))).max() < 3.0  # the driver steers

@@ -17,7 +17,7 @@ from roadscan.model.ids import TileId
 from roadscan.products.base import product_named
 from roadscan.products.crack_pieces import CrackPieces
 from roadscan.products.cracks import Cracks
-from roadscan.products.lane_direction import lane_azimuths_rad
+from roadscan.products.lane_direction import LaneDirections
 from roadscan.products.pothole_pieces import PotholePieces
 from roadscan.products.potholes import Potholes
 from roadscan.surfaces.tile import MEASURED, SurfaceTile
@@ -28,6 +28,8 @@ CELL_M = 0.005
 HALO = 200
 WEST, SOUTH = TileId(553_211, 6_020_119), TileId(553_212, 6_020_119)
 """Tiles of 1 m, side by side."""
+DRIVEN = LaneDirections.of_path([(WEST.column + x, WEST.row) for x in range(3)])
+"""A drive to the east."""
 DETECT = CrackDetection(max_width_m=0.02)
 
 
@@ -64,10 +66,13 @@ class Files:
         assert product == self.name
         return self.content.get(tile)
 
+    def lanes(self):
+        return DRIVEN
 
-def summaries(workshop, context, tiles, epoch=lambda tile: 0):
+
+def summaries(workshop, context, tiles):
     plain = workshop.survey([TileId(1, 1)], context, count=10).summaries[0]
-    return [dataclasses.replace(plain, tile=t, first_epoch_gps_ns=epoch(t)) for t in tiles]
+    return [dataclasses.replace(plain, tile=t) for t in tiles]
 
 
 def joined(product, options, files, tiles, context, path):
@@ -84,7 +89,7 @@ def context(workshop):
 
 @pytest.fixture(scope="module")
 def tiles(workshop, context):
-    return summaries(workshop, context, [SOUTH, WEST], lambda t: (t.column - WEST.column) * 10**8)
+    return summaries(workshop, context, [SOUTH, WEST])
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +134,9 @@ def test_columns_are_those_of_the_schema(name, tiles, context, tmp_path):
         def file(self, product, tile):
             return None
 
+        def lanes(self):
+            return DRIVEN
+
     path = tmp_path / "empty.parquet"
     assert len(joined(product, product.options(), Nothing(), tiles, context, path)) == 0
     written, expected = pq.read_schema(path), table_schema(name).arrow()
@@ -155,17 +163,13 @@ def test_coarse_cells_are_refused(context, tmp_path):
         CrackPieces().write(dataclasses.replace(whole, halo=20), DETECT, context, tmp_path / "x")
 
 
-def test_the_lane_runs_where_the_tiles_were_seen_one_after_the_other(workshop, context):
-    azimuth = math.radians(57.0)
-    along = np.arange(0.0, 300.0, 0.5)
-    seen = {}
-    for s in along:
-        for offset in (-1.8, 0.0, 1.8):
-            x = 1000 + s * math.sin(azimuth) + offset * math.cos(azimuth)
-            y = 2000 + s * math.cos(azimuth) - offset * math.sin(azimuth)
-            seen.setdefault(TileId(int(x // 10), int(y // 10)), int(s / 15 * 1e9))
-    found = lane_azimuths_rad(summaries(workshop, context, sorted(seen), seen.__getitem__))
-    off = np.abs(np.degrees(np.array(list(found.values())) - azimuth))
-    assert np.median(off) < 4.0 and off.max() < 20.0
-    (alone,) = lane_azimuths_rad(summaries(workshop, context, [WEST])).values()
-    assert math.isnan(alone)
+def test_the_lane_runs_as_the_vehicle_drove():
+    angle = np.radians(np.arange(0.0, 90.0, 0.5))  # a bend of 100 m, begun northwards; every metre or so
+    path = 1000.0 + 100.0 * np.stack([1.0 - np.cos(angle), np.sin(angle)], axis=-1)
+    standing = path[-1] + np.array([[0, 0.1], [0.2, 0], [0, 0], [0.1, 0.1], [0, 0]])
+    found = LaneDirections.of_path(np.concatenate([path, standing]))
+    assert len(found.azimuth_rad) == len(path) - 1
+    beside = path + 3.0 * np.stack([np.cos(angle), -np.sin(angle)], axis=-1)
+    np.testing.assert_allclose(found.at(beside[1:-1]), angle[1:-1], atol=np.radians(0.3))
+    assert np.isnan(found.at([[0.0, 0.0]])).all()
+    assert np.isnan(LaneDirections.of_path([]).at([[0.0, 0.0]])).all()

@@ -261,6 +261,8 @@ def load_trajectory(
         empty = np.zeros(0, np.int64)
         return Trajectory(source.world, empty, np.zeros((0, 3)), np.zeros((0, 4)), max_gap_s)
     rows = pa.concat_tables(parts)
+    epochs = rows.column("epoch_gps_ns").to_numpy()
+    rows = rows.filter((epochs >= wanted[:, 0].min()) & (epochs <= wanted[:, 1].max()))  # row groups hold minutes
     column = {name: rows.column(name).to_numpy() for name in _POSE_COLUMNS}
     trajectory = Trajectory.of(
         source.world,

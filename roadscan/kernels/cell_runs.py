@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import bare
 
 
-@kernel
+@bare
 def run_end(column, row, start, end):
     """First place behind the run that begins at `start`: cells of one row, each beside the one before.
 

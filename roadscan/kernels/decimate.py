@@ -9,7 +9,7 @@ import numpy as np
 
 from roadscan.kernels.cell_runs import run_end
 from roadscan.kernels.lanes import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import bare, bare_inlined, kernel
 
 ABSENT = np.int32(2**31 - 1)
 """Height of a place without a cell."""
@@ -19,7 +19,7 @@ LIGHT_STEPS = 64.0
 """Intensities are summed in sixty-fourths of a digital number."""
 
 
-@inlined
+@bare_inlined
 def count_upto(values, n, limit):
     """How many of the first `n` values (int32) are `limit` or less."""
     below = np.int32(0)
@@ -28,7 +28,7 @@ def count_upto(values, n, limit):
     return below
 
 
-@inlined
+@bare_inlined
 def value_of_rank(values, n, rank):
     """Value of `rank` (from 0) among the first `n` (int32): the least that more than `rank` of them do not exceed.
 
@@ -38,6 +38,7 @@ def value_of_rank(values, n, rank):
     for i in range(n):
         low = min(low, values[i])
         high = max(high, values[i] if values[i] != ABSENT else np.int32(-ABSENT))
+    high = high if rank > 0 else low
     while low < high:
         middle = np.int32(low + (np.int64(high) - np.int64(low)) // 2)
         reached = count_upto(values, n, middle) > rank
@@ -46,7 +47,7 @@ def value_of_rank(values, n, rank):
     return low
 
 
-@inlined
+@bare_inlined
 def median_step(heights, corner, edge, side, east_lag, north_lag, steps):
     """Lower median of the height differences of a patch's cells that lie so far apart, and how many there are."""
     width = side - east_lag
@@ -62,7 +63,7 @@ def median_step(heights, corner, edge, side, east_lag, north_lag, steps):
     return (value_of_rank(steps, k, (pairs - 1) // 2) if pairs else np.int32(0)), pairs
 
 
-@inlined
+@bare_inlined
 def slopes_of(heights, corner, edge, side, steps):
     """Slopes (µm a cell) of a patch towards east and north, each the median over pairs of cells half its side apart.
 
@@ -88,62 +89,81 @@ def slopes_of(heights, corner, edge, side, steps):
     return east, north, east_known and north_known
 
 
-@kernel
+@bare_inlined
+def _micrometres_at(height, base, out, at):
+    above = np.floor((height - base) * 1e6 + 0.5)
+    out[at] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
+
+
+@bare
 def _micrometres(height, base, out):
     for k in range(out.size):
-        above = np.floor((height[k] - base) * 1e6 + 0.5)
-        out[k] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
+        _micrometres_at(height[k], base, out, k)
 
 
-@kernel
+@bare
 def _light_steps(intensity, out):
     for k in range(out.size):
         out[k] = np.int32(intensity[k] * LIGHT_STEPS + 0.5)
 
 
-@kernel
-def fill_strip(column, row, height, intensity, count, start, base, first_row, heights, lights, counts):
+@bare
+def _copy(values, out):
+    for k in range(out.size):
+        out[k] = np.int32(values[k])
+
+
+@bare
+def fill_strip(column, row, height, intensity, count, start, base, first_row, rows, strip, listed):
     """Lay the cells from `start` on out in a strip, as far as its rows reach.
 
     Parameters
     ----------
-    column, row : (n,) uint16, sorted by row, column; height : (n,) float64, m; intensity : (n,) float32;
-        count : (n,) uint32.
-    base : float64, m, near most of the heights.
-    first_row : int, row of the strip's south.
-    heights : (rows, edge) int32, µm above `base`, `ABSENT` where no cell lies; lights : int32, sixty-fourths of a
-        digital number; counts : int32. Out; lights and counts mean nothing where no cell lies.
+    strip : heights, lights, counts, (rows · edge,) int32, out: µm above `base`, `ABSENT` where no cell lies;
+        sixty-fourths of a digital number; counts. Lights and counts mean nothing where no cell lies. And the edge.
+    listed : (edge // rows,) int32, out: the patches, as wide as the strip is high, that hold a cell, from the west.
+    Others as in :func:`decimate_cells`.
 
     Returns
     -------
-    The first cell north of the strip, and the strip's first and last column with a cell (first > last without any).
+    The first cell north of the strip, and how many patches hold a cell.
     """
-    rows, edge = heights.shape
-    flat_heights, flat_lights, flat_counts = heights.ravel(), lights.ravel(), counts.ravel()
-    flat_heights[:] = ABSENT
-    first, last = edge, np.int64(-1)
+    heights, lights, counts, edge = strip
+    heights[:] = ABSENT
+    listed[:] = 0
     i = start
     while i < row.size and row[i] < first_row + rows:
         end = run_end(column, row, i, row.size)
         west, at = np.int64(column[i]), (np.int64(row[i]) - first_row) * edge + np.int64(column[i])
         to = at + end - i
-        first, last = min(first, west), max(last, west + end - i - 1)
-        _micrometres(height[i:end], base, flat_heights[at:to])
-        _light_steps(intensity[i:end], flat_lights[at:to])
-        flat_counts[at:to] = count[i:end]
+        if end == i + 1:
+            _micrometres_at(height[i], base, heights, at)
+            lights[at] = np.int32(intensity[i] * LIGHT_STEPS + 0.5)
+            counts[at] = count[i]
+        else:
+            _micrometres(height[i:end], base, heights[at:to])
+            _light_steps(intensity[i:end], lights[at:to])
+            _copy(count[i:end], counts[at:to])
+        for patch in range(west // rows, (west + end - i - 1) // rows + 1):
+            listed[patch] = 1
         i = end
-    return i, first, last
+    found = 0
+    for patch in range(listed.size):
+        here = listed[patch]
+        listed[found] = patch
+        found += here
+    return i, found
 
 
-@inlined
+@bare_inlined
 def reach_of(mad, floor_um):
     """µm from the median within which a cell counts."""
     return np.int32(max(OUTLIER_SIGMAS * MAD_TO_SIGMA * mad, floor_um))
 
 
-@inlined
-def large_squares(strip, squares, south, per_patch, side, slopes, base, floor_um, scratch, out, written):
-    """Squares `squares` (first, end) of one row, one after another; returns how many are written by now."""
+@bare_inlined
+def large_squares(strip, patches, south, per_patch, side, slopes, base, floor_um, scratch, out, written):
+    """Squares of one row of some patches, one after another; returns how many are written by now."""
     heights, lights, counts, edge = strip
     residual, distance = scratch[0], scratch[1]
     out_column, out_height, out_intensity, out_cells, out_points, out_sloped = out
@@ -151,9 +171,10 @@ def large_squares(strip, squares, south, per_patch, side, slopes, base, floor_um
     middle = 0.5 * (side - 1)
     plain = np.int32(floor_um / (OUTLIER_SIGMAS * MAD_TO_SIGMA))  # a MAD up to this leaves the reach at its floor
     residual[:] = ABSENT
-    for square in range(squares[0], squares[1]):
+    for own in range(patches.size * per_patch):
+        p = own // per_patch
+        square = patches[p] * per_patch + own % per_patch
         corner = south * edge + square * side
-        p = (square - squares[0]) // per_patch
         east, north = slopes[p, 0], slopes[p, 1]
         for r in range(side):
             slant = north * (r - middle) - east * middle
@@ -188,19 +209,20 @@ def large_squares(strip, squares, south, per_patch, side, slopes, base, floor_um
     return written
 
 
-@inlined
-def small_squares(strip, squares, south, per_patch, side, slopes, base, floor_um, table, out, written):
+@bare_inlined
+def small_squares(strip, patches, south, per_patch, side, slopes, base, floor_um, table, out, written):
     """As `large_squares` for squares of up to 16 cells, sixteen of them side by side."""
     heights, lights, counts, edge = strip
-    residual, place, found, median, mad = table
+    residual, place, found, median, mad, square_of = table
     out_column, out_height, out_intensity, out_cells, out_points, out_sloped = out
     middle = 0.5 * (side - 1)
-    for first in range(squares[0], squares[1], LANES):
-        lanes = min(LANES, squares[1] - first)
+    for first in range(0, patches.size * per_patch, LANES):
+        lanes = min(LANES, patches.size * per_patch - first)
         found[:] = 0
         for lane in range(lanes):
-            corner = south * edge + (first + lane) * side
-            p = (first + lane - squares[0]) // per_patch
+            p = (first + lane) // per_patch
+            square_of[lane] = patches[p] * per_patch + (first + lane) % per_patch
+            corner = south * edge + square_of[lane] * side
             east, north = slopes[p, 0], slopes[p, 1]
             cells = 0
             for r in range(side):
@@ -226,59 +248,81 @@ def small_squares(strip, squares, south, per_patch, side, slopes, base, floor_um
                 used += counted
                 points += counts[place[lane, k]] * counted
                 light += lights[place[lane, k]] * counted
-            out_column[written] = first + lane
+            out_column[written] = square_of[lane]
             out_height[written] = base + 1e-6 * (median[lane] + total / used)
             out_intensity[written] = light / (LIGHT_STEPS * used)
             out_cells[written], out_points[written] = used, points
-            out_sloped[written] = slopes[(first + lane - squares[0]) // per_patch, 2] > 0
+            out_sloped[written] = slopes[(first + lane) // per_patch, 2] > 0
             written += 1
     return written
 
 
+@bare
+def decimate_strip(strip, patches, patch, side, base, floor_um, scratch, table, slopes, out, first_row, written):
+    """Squares of those patches of a strip that hold a cell; returns how many are written by now.
+
+    strip : as from :func:`fill_strip`; patches : (p,) int32; slopes : (p, 3)
+    float64, scratch; first_row : int, row of the strip's first squares. Others as in :func:`decimate_cells`.
+    """
+    out_column, out_row, out_height, out_intensity, out_cells, out_points, out_sloped = out
+    values = (out_column, out_height, out_intensity, out_cells, out_points, out_sloped)
+    edge, per_patch = strip[3], patch // side
+    for p in range(patches.size):
+        east, north, known = slopes_of(strip[0], patches[p] * patch, edge, patch, scratch[0])
+        slopes[p, 0], slopes[p, 1], slopes[p, 2] = east, north, np.float64(known)
+    for row in range(per_patch):
+        start = written
+        if side * side <= LANES:
+            written = small_squares(
+                strip, patches, row * side, per_patch, side, slopes, base, floor_um, table, values, written
+            )
+        else:
+            written = large_squares(
+                strip, patches, row * side, per_patch, side, slopes, base, floor_um, scratch, values, written
+            )
+        out_row[start:written] = first_row + row
+    return written
+
+
 @kernel
-def decimate_strip(
-    heights, lights, counts, first_patch, end_patch, patch, side, base, floor_um, scratch,
+def decimate_cells(
+    column, row, height, intensity, count, base, edge, patch, side, floor_um, heights, lights, counts, scratch,
     out_column, out_row, out_height, out_intensity, out_cells, out_points, out_sloped,
 ):  # fmt: skip
-    """Robust height at the centre of every square of a strip that holds a cell, in order of row and column.
+    """Robust height at the centre of every square of a tile that holds a cell, in order of row and column.
 
     Parameters
     ----------
-    heights, lights, counts : (patch, edge), from :func:`fill_strip`.
-    first_patch, end_patch : int, patches (of `patch`² cells) to look at, from the west.
-    patch, side : cells along an edge of a patch, which has one slope, and of a square, which divides it.
-    base : float64, m; floor_um : int, µm within which a residual always counts.
-    scratch : (2, at least patch², a multiple of 16) int32, overwritten.
-    out_column, out_row : (s,) uint16, of the square in the strip; out_height : (s,) float64, m; out_intensity : (s,)
-        float32; out_cells : (s,) uint32 and out_points : (s,) uint32, cells that count and their points;
+    column, row : (n,) uint16, sorted by row, column; height : (n,) float64, m; intensity : (n,) float32;
+        count : (n,) uint32.
+    base : float64, m, near most of the heights; floor_um : int, µm within which a residual always counts.
+    patch, side : cells along an edge of a patch, which has one slope and divides the tile, and of a square, which
+        divides the patch.
+    edge : int, cells along an edge of the tile; heights, lights, counts : (patch · edge,) int32, scratch.
+    scratch : (2, at least patch², a multiple of 16) int32, scratch.
+    out_column, out_row : (s,) uint16, of the square; out_height : (s,) float64, m; out_intensity : (s,) float32;
+        out_cells : (s,) uint32 and out_points : (s,) uint32, cells that count and their points;
         out_sloped : (s,) bool, False where the patch has too few cells for a slope. Out.
 
     Returns
     -------
     int, how many squares were written.
     """
-    edge, per_patch, patches = heights.shape[1], patch // side, end_patch - first_patch
-    strip = (heights.ravel(), lights.ravel(), counts.ravel(), edge)
-    slopes = np.empty((patches, 3))
-    for p in range(patches):
-        east, north, known = slopes_of(strip[0], (first_patch + p) * patch, edge, patch, scratch[0])
-        slopes[p, 0], slopes[p, 1], slopes[p, 2] = east, north, np.float64(known)
+    listed, slopes = np.empty(edge // patch, np.int32), np.empty((edge // patch, 3))
     table = (
         np.empty((LANES, LANES), np.int32), np.empty((LANES, LANES), np.int64),
-        np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32),
+        np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int32), np.empty(LANES, np.int64),
     )  # fmt: skip
-    out = (out_column, out_height, out_intensity, out_cells, out_points, out_sloped)
-    squares = (first_patch * per_patch, end_patch * per_patch)
-    written = 0
-    for row in range(per_patch):
-        start = written
-        if side * side <= LANES:
-            written = small_squares(
-                strip, squares, row * side, per_patch, side, slopes, base, floor_um, table, out, written
-            )
-        else:
-            written = large_squares(
-                strip, squares, row * side, per_patch, side, slopes, base, floor_um, scratch, out, written
-            )
-        out_row[start:written] = row
+    strip = (heights, lights, counts, edge)
+    out = (out_column, out_row, out_height, out_intensity, out_cells, out_points, out_sloped)
+    start, written = 0, 0
+    while start < row.size:
+        number = np.int64(row[start]) // patch
+        start, found = fill_strip(
+            column, row, height, intensity, count, start, base, number * patch, patch, strip, listed
+        )
+        written = decimate_strip(
+            strip, listed[:found], patch, side, base, floor_um, scratch, table, slopes, out,
+            number * (patch // side), written,
+        )  # fmt: skip
     return written

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.decimate import decimate_strip, fill_strip
+from roadscan.kernels.decimate import decimate_cells
 from roadscan.kernels.lanes import LANES
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
@@ -86,25 +86,14 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     column, row = np.empty(room, np.uint16), np.empty(room, np.uint16)
     height, intensity = np.empty(room, np.float64), np.empty(room, np.float32)
     used, points, sloped = np.empty(room, np.uint32), np.empty(room, np.uint32), np.empty(room, np.bool_)
-    heights, lights, counts = np.empty((3, patch, edge), np.int32)
+    heights, lights, counts = np.empty((3, patch * edge), np.int32)
     scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
     some = cells.height_robust_m[:: max(len(cells) // _SAMPLE, 1)]
     base = math.floor(float(np.median(some))) if len(cells) else 0.0
-    start, written = 0, 0
-    for first_row in range(0, edge, patch):
-        end, west, east = fill_strip(
-            cells.column, cells.row, cells.height_robust_m, cells.intensity_mean, cells.count,
-            start, base, first_row, heights, lights, counts,
-        )  # fmt: skip
-        if end == start:
-            continue
-        to = written + decimate_strip(
-            heights, lights, counts, west // patch, east // patch + 1, patch, side, base, FLOOR_UM, scratch,
-            column[written:], row[written:], height[written:], intensity[written:], used[written:], points[written:],
-            sloped[written:],
-        )  # fmt: skip
-        row[written:to] += np.uint16(first_row // side)
-        start, written = end, to
+    written = decimate_cells(
+        cells.column, cells.row, cells.height_robust_m, cells.intensity_mean, cells.count, base, edge, patch, side,
+        FLOOR_UM, heights, lights, counts, scratch, column, row, height, intensity, used, points, sloped,
+    )  # fmt: skip
     return Squares(
         column[:written], row[:written], height[:written], intensity[:written],
         used[:written], points[:written], sloped[:written],

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +47,7 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
     """
     if world == LOCAL_WORLD and frame.is_local:
         return _identity()
-    boxes = np.floor(positions_world_m / BOX_M).astype(np.int64)
+    boxes: npt.NDArray[Any] = np.floor(positions_world_m / BOX_M).astype(np.int64)
     enters = np.append(True, (np.diff(boxes, axis=0) != 0).any(axis=1))  # sorting all poses would take most of the time
     visited = np.unique(boxes[enters], axis=0)
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

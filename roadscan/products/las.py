@@ -19,9 +19,9 @@ from roadscan.products.base import Cells, ProductContext, Tile, TileProduct
 from roadscan.products.las_file import (
     ONE_OF_ONE,
     Axes,
+    Layout,
     axis,
     check_points,
-    new_header,
     rounding_errors,
     set_coordinates,
     write_points,
@@ -79,6 +79,7 @@ class Las(TileProduct):
     name: ClassVar[str] = "las"
     title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
     suffix: ClassVar[str] = ".laz"
+    version: ClassVar[int] = 2
     options: ClassVar[type[Strict]] = LasOptions
     default_cells: ClassVar[Cells] = "coarse"
     needs_points: ClassVar[bool] = True
@@ -98,9 +99,10 @@ class Las(TileProduct):
         settings = cast(LasOptions, options)
         points = _points_of(tile, settings, context)
         axes = _axes(points, settings.scale_m, context)
-        header = _header(points, axes, context)
-        record = _record(points, axes, header)
-        write_points(path, header, record, _facts(points, tile, axes, settings, context), settings.compress)
+        layout = _layout(points, axes, context)
+        records = _record(points, axes, layout.header).array
+        facts = _facts(points, tile, axes, settings, context)
+        write_points(path, layout, axes, records, facts, context.date, settings.compress)
 
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""
@@ -176,13 +178,10 @@ def _axes(points: TilePoints, scale_m: float, context: ProductContext) -> Axes:
     )
 
 
-def _header(points: TilePoints, axes: Axes, context: ProductContext) -> laspy.LasHeader:
-    header = new_header(7 if "red" in points.extra else 6, axes, context, Las.name)
-    for column in _further(points):
-        header.add_extra_dim(
-            laspy.ExtraBytesParams(_RENAMED.get(column, column), points.extra[column].dtype, "as recorded")
-        )
-    return header
+def _layout(points: TilePoints, axes: Axes, context: ProductContext) -> Layout:
+    further = tuple((_RENAMED.get(c, c), points.extra[c].dtype.str, "as recorded") for c in _further(points))
+    kind = 7 if "red" in points.extra else 6
+    return Layout(kind, further, tuple(one.scale for one in axes), context.map, Las.name)
 
 
 def _further(points: TilePoints) -> list[str]:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import functools
 import hashlib
+import io
 import json
 import math
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import laspy
+import lazrs
 import numpy as np
 import numpy.typing as npt
 from laspy.header import GpsTimeType
-from laspy.vlrs.known import WktCoordinateSystemVlr
+from laspy.vlrs.known import LasZipVlr, WktCoordinateSystemVlr
+from laspy.vlrs.vlrlist import VLRList
 from lazrs import LazrsError
 from pyproj.exceptions import CRSError
 
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, CrsError, StoreError
 from roadscan.points.cloud import QUANTA_PER_M
-from roadscan.products.base import ProductContext
 from roadscan.products.raster import SOFTWARE
 
 VLR_USER_ID: Final = "roadscan"
@@ -30,6 +34,13 @@ VLR_RECORD_ID: Final = 1
 
 ONE_OF_ONE: Final = 0x11
 """Return number and number of returns in the byte that holds both."""
+
+_VLR: Final = struct.Struct("<H16sHH32s")
+_ABOUT_FACTS: Final = b"survey, tile, rounding"
+_DATE, _POINT_DATA, _VLRS, _OFFSETS, _COUNTS = 90, 96, 100, 155, 247
+"""Places in the header of LAS 1.4."""
+_EXTRA_BYTES, _LEAST, _GREATEST = 192, 64, 88
+"""Of a further dimension: its description (LAS 1.4 R15, table 24), and places in it."""
 
 _CHUNK_POINTS: Final = 1_000_000
 _INT32_MAX: Final = 2**31 - 1
@@ -70,17 +81,44 @@ def rounding_errors(axes: Axes) -> dict[str, float]:
     return {name: round(one.error_max_m, 9) for name, one in zip("xyz", axes, strict=True)}
 
 
-def new_header(point_format: int, axes: Axes, context: ProductContext, product: str) -> laspy.LasHeader:
-    """Header of LAS 1.4 with scales, offsets, CRS and date, all of them the same whenever it is made."""
-    header = laspy.LasHeader(version="1.4", point_format=point_format)
-    header.scales = np.array([one.scale for one in axes])
-    header.offsets = np.array([one.offset for one in axes])
-    header.creation_date = context.date
+@dataclass(frozen=True)
+class Layout:
+    """What the files of a product share: kind of points, their steps, the CRS."""
+
+    point_format: int
+    further: tuple[tuple[str, str, str], ...]
+    """Further dimensions: name, NumPy type, description."""
+    scales: tuple[float, ...]
+    """Of the three coordinates."""
+    map: MapFrame
+    product: str
+    """Named in errors."""
+
+    @property
+    def header(self) -> laspy.LasHeader:
+        """Header of LAS 1.4 without a date or points; not to be changed."""
+        return _header(self)
+
+    @property
+    def records(self) -> np.dtype[np.void]:
+        """A point record as it lies in the file."""
+        kind: np.dtype[np.void] = self.header.point_format.dtype()
+        return kind
+
+
+@functools.lru_cache(maxsize=16)
+def _header(layout: Layout) -> laspy.LasHeader:
+    header = laspy.LasHeader(version="1.4", point_format=layout.point_format)
+    header.scales = np.array(layout.scales)
+    header.offsets = np.zeros(3)
+    header.creation_date = dt.date(2000, 1, 1)
     header.generating_software = SOFTWARE
     header.system_identifier = "OTHER"
     header.global_encoding.gps_time_type = GpsTimeType.STANDARD
     header.global_encoding.wkt = True
-    header.vlrs.append(WktCoordinateSystemVlr(_wkt1(context.map, product)))
+    header.vlrs.append(WktCoordinateSystemVlr(_wkt1(layout.map, layout.product)))
+    for name, kind, about in layout.further:
+        header.add_extra_dim(laspy.ExtraBytesParams(name, np.dtype(kind), about))
     return header
 
 
@@ -90,17 +128,82 @@ def set_coordinates(record: Any, axes: Axes) -> None:
         record[name] = one.stored
 
 
-def write_points(path: Path, header: laspy.LasHeader, record: Any, facts: Mapping[str, Any], compress: bool) -> None:
-    """Write a whole file: the points, and `facts` with a digest of the points in a variable-length record."""
-    digest = _Digest(header)
-    digest.add(record.array)
+def write_points(
+    path: Path,
+    layout: Layout,
+    axes: Axes,
+    records: npt.NDArray[np.void],
+    facts: Mapping[str, Any],
+    date: dt.date,
+    compress: bool,
+) -> None:
+    """Write a whole file: the points, and `facts` with a digest of the points in a variable-length record.
+
+    Parameters
+    ----------
+    records : (n,) of the layout's type, 1 or more.
+    date : stands as the date of creation, so that the same points give the same bytes.
+    """
+    offsets = [one.offset for one in axes]
+    digest = _Digest(layout.scales, offsets, [_wkt1(layout.map, layout.product)])
+    digest.add(records)
     stated = json.dumps({**facts, "blake2b": digest.text()}, sort_keys=True).encode("ascii")
-    header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, "survey, tile, rounding", stated))
-    backend = laspy.LazBackend.Lazrs if compress else None
+    head, laszip = _head(layout, compress)
     with path.open("wb") as stream:
-        writer = laspy.LasWriter(stream, header, do_compress=compress, laz_backend=backend, closefd=False)
-        writer.write_points(record)
-        writer.close()
+        stream.write(_filled(layout, head, len(laszip), axes, records, stated, date))
+        stream.write(_VLR.pack(0, VLR_USER_ID.encode(), VLR_RECORD_ID, len(stated), _ABOUT_FACTS) + stated + laszip)
+        if compress:
+            compressor = lazrs.LasZipCompressor(stream, _laz(layout))
+            compressor.compress_many(records.view(np.uint8))
+            compressor.done()
+        else:
+            stream.write(records.view(np.uint8).data)
+
+
+def _filled(
+    layout: Layout,
+    head: bytes,
+    laszip_bytes: int,
+    axes: Axes,
+    records: npt.NDArray[np.void],
+    stated: bytes,
+    date: dt.date,
+) -> bytearray:
+    """The head with what differs from file to file (LAS 1.4 R15, table 3)."""
+    filled = bytearray(head)
+    struct.pack_into("<HH", filled, _DATE, date.timetuple().tm_yday, date.year)
+    vlrs = struct.unpack_from("<I", head, _VLRS)[0] + 1 + (laszip_bytes > 0)
+    struct.pack_into("<II", filled, _POINT_DATA, len(head) + _VLR.size + len(stated) + laszip_bytes, vlrs)
+    ends = [float(edge) * a.scale + a.offset for a in axes for edge in (a.stored.max(), a.stored.min())]
+    struct.pack_into("<9d", filled, _OFFSETS, *(a.offset for a in axes), *ends)
+    returns = np.bincount(records["bit_fields"] & 15, minlength=16)[1:]
+    struct.pack_into("<16Q", filled, _COUNTS, records.size, *returns.tolist())
+    for number, (name, kind, _) in enumerate(layout.further):
+        at = len(head) + _EXTRA_BYTES * (number - len(layout.further))
+        code = {"u": "Q", "i": "q", "f": "d"}[np.dtype(kind).kind]
+        struct.pack_into(f"<{code}", filled, at + _LEAST, records[name].min().item())
+        struct.pack_into(f"<{code}", filled, at + _GREATEST, records[name].max().item())
+    return filled
+
+
+@functools.lru_cache(maxsize=16)
+def _head(layout: Layout, compress: bool) -> tuple[bytes, bytes]:
+    """Header and variable-length records as laspy writes them for no points, and the record that belongs to LAZ."""
+    header = layout.header
+    stream = io.BytesIO()
+    header.are_points_compressed = compress
+    header.write_to(stream)
+    last = VLRList()
+    if compress:
+        last.append(LasZipVlr(_laz(layout).record_data()))
+    laszip = io.BytesIO()
+    last.write_to(laszip)
+    return stream.getvalue(), laszip.getvalue()
+
+
+def _laz(layout: Layout) -> lazrs.LazVlr:
+    kind = layout.header.point_format
+    return lazrs.LazVlr.new_for_compression(kind.id, kind.num_extra_bytes)
 
 
 def check_points(path: Path) -> None:
@@ -136,10 +239,9 @@ def _wkt1(frame: MapFrame, product: str) -> str:
 class _Digest:
     """BLAKE2b (128 bits) of point records as they lie in a LAS file, and of what gives them their place."""
 
-    def __init__(self, header: laspy.LasHeader) -> None:
+    def __init__(self, scales: Sequence[float], offsets: Sequence[float], wkt: list[str]) -> None:
         self._state = hashlib.blake2b(digest_size=16)
-        wkt = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
-        self._state.update(repr((header.scales.tolist(), header.offsets.tolist(), wkt)).encode())
+        self._state.update(repr((list(scales), list(offsets), wkt)).encode())
 
     def add(self, records: npt.NDArray[np.void]) -> None:
         self._state.update(np.ascontiguousarray(records).view(np.uint8).data)
@@ -151,7 +253,8 @@ class _Digest:
 def _check_points(reader: laspy.LasReader, path: Path) -> None:
     header = reader.header
     stated = _stated_facts(header, path)
-    digest, count = _Digest(header), 0
+    wkt = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
+    digest, count = _Digest(header.scales.tolist(), header.offsets.tolist(), wkt), 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for chunk in _chunks(reader):
         count += len(chunk)

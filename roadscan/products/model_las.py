@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
-import laspy
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.model.strict import Strict
@@ -15,9 +15,9 @@ from roadscan.products.base import Cells, ProductContext, Tile, TileProduct
 from roadscan.products.las_file import (
     ONE_OF_ONE,
     Axes,
+    Layout,
     axis,
     check_points,
-    new_header,
     rounding_errors,
     set_coordinates,
     write_points,
@@ -25,6 +25,9 @@ from roadscan.products.las_file import (
 from roadscan.tiles.decimate import Squares, cells_per_square, decimate
 
 _UNCLASSIFIED = 1
+_WITHHELD = np.uint8(4)
+"""Among the flags of a point."""
+_FURTHER = (("cells", "u2", "cells that count"), ("points", "u2", "readings in them"))
 _MOST = 65_535
 
 
@@ -68,6 +71,7 @@ class ModelLas(TileProduct):
     name: ClassVar[str] = "model_las"
     title: ClassVar[str] = "pavement surface every 100 mm, without stones and cracks (LAS 1.4 or LAZ), for CAD"
     suffix: ClassVar[str] = ".laz"
+    version: ClassVar[int] = 2
     options: ClassVar[type[Strict]] = ModelLasOptions
     default_cells: ClassVar[Cells] = "fine"
 
@@ -85,10 +89,8 @@ class ModelLas(TileProduct):
         side = self._side(settings, context)
         squares = decimate(tile.cells, side, context.grid.cell_m)
         axes = self._axes(squares, tile, side, settings, context)
-        header = new_header(6, axes, context, self.name)
-        header.add_extra_dim(laspy.ExtraBytesParams("cells", np.uint16, "cells that count"))
-        header.add_extra_dim(laspy.ExtraBytesParams("points", np.uint16, "readings in them"))
-        record = _record(squares, axes, header, settings.min_cover * side * side)
+        layout = Layout(6, _FURTHER, tuple(one.scale for one in axes), context.map, self.name)
+        records = _records(squares, axes, layout, settings.min_cover * side * side)
         facts = {
             "survey": context.survey_id,
             "tile": str(tile.cells.tile),
@@ -97,7 +99,7 @@ class ModelLas(TileProduct):
             "min_cover": settings.min_cover,
             "rounding_error_max_m": rounding_errors(axes),
         }
-        write_points(path, header, record, facts, settings.compress)
+        write_points(path, layout, axes, records, facts, context.date, settings.compress)
 
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""
@@ -128,12 +130,12 @@ class ModelLasFine(ModelLas):
     default: ClassVar[bool] = False
 
 
-def _record(squares: Squares, axes: Axes, header: laspy.LasHeader, enough_cells: float) -> Any:
-    record = laspy.ScaleAwarePointRecord.zeros(len(squares), header=header)
-    set_coordinates(record, axes)
-    record["intensity"] = np.clip(np.rint(squares.intensity), 0, 65_535).astype(np.uint16)
-    record.array["classification"] = _UNCLASSIFIED
-    record.array["bit_fields"] = ONE_OF_ONE
-    record["withheld"] = (squares.cells < enough_cells) | ~squares.sloped
-    record["cells"], record["points"] = np.minimum(squares.cells, _MOST), np.minimum(squares.points, _MOST)
-    return record
+def _records(squares: Squares, axes: Axes, layout: Layout, enough_cells: float) -> npt.NDArray[np.void]:
+    records = np.zeros(len(squares), layout.records)
+    set_coordinates(records, axes)
+    records["intensity"] = np.clip(np.rint(squares.intensity), 0, 65_535).astype(np.uint16)
+    records["classification"] = _UNCLASSIFIED
+    records["bit_fields"] = ONE_OF_ONE
+    records["classification_flags"] = _WITHHELD * ((squares.cells < enough_cells) | ~squares.sloped)
+    records["cells"], records["points"] = np.minimum(squares.cells, _MOST), np.minimum(squares.points, _MOST)
+    return records

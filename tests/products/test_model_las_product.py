@@ -50,6 +50,10 @@ def test_laspy_finds_a_point_at_the_centre_of_each_square(model, workshop, place
     assert set(file.classification) == {1} and not file.gps_time.any() and not file.point_source_id.any()
     assert np.all(np.asarray(file.return_number) == 1) and np.all(np.asarray(file.number_of_returns) == 1)
     assert np.array_equal(np.asarray(file.withheld) == 1, (squares.cells < 4) | ~squares.sloped)
+    stated = file.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs
+    assert [(one.min[0], one.max[0]) for one in stated] == [
+        (file[name].min(), file[name].max()) for name in ("cells", "points")
+    ]
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +46,7 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
     """
     if world == LOCAL_WORLD and frame.is_local:
         return _identity()
-    boxes: npt.NDArray[Any] = np.floor(positions_world_m / BOX_M).astype(np.int64)
+    boxes = np.floor(positions_world_m / BOX_M).astype(np.int64)
     enters = np.append(True, (np.diff(boxes, axis=0) != 0).any(axis=1))  # sorting all poses would take most of the time
     visited = np.unique(boxes[enters], axis=0)
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -59,7 +58,7 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
     return Charts(
         lattice=np.array([BOX_M, *first], dtype=np.float64),
         table=table,
-        centres=(unique + 0.5) * BOX_M,
+        centres=((unique + 0.5) * BOX_M).astype(np.float64),
         coefficients=np.stack(made),
     )
 

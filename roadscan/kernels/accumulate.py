@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.georeference import KEPT
-from roadscan.kernels.line_access import VECTOR, fetch_line, store_heights
+from roadscan.kernels.line_access import STORES_SOME, VECTOR, fetch_line, store_heights
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.runs import find_runs, sum_up
 
@@ -30,6 +30,8 @@ SLOTS = 28
 """Heights of a line."""
 HEADERS = 8
 """Numbers of 64 bits in a line; the last one is its header."""
+LAST = SLOTS if STORES_SOME else LINE - VECTOR
+"""Heights that a line may hold already when a run is stored in it."""
 FARTHEST = 32_000
 """Largest difference (quanta) between a height and the base of its line."""
 NOWHERE = -(1 << 30)
@@ -103,7 +105,7 @@ def line_with_room(own, size, low, high, word, heads, bases, chain):
         header = heads[line * HEADERS + HEADERS - 1]
         used = np.int64(header & np.uint64(COUNTS))
         base = np.int64(bases[line])
-        fits = (used + size <= SLOTS) & (used <= LINE - VECTOR) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+        fits = (used + size <= SLOTS) & (used <= LAST) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
         if fits & ((used == 0) | (header & np.uint64(WORDS << WORD_SHIFT) == word)):
             return line
         line = np.int64(chain[line])
@@ -231,7 +233,7 @@ def accumulate(
             at = line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
             header = heads[at]
             used = header & np.uint64(COUNTS)
-            fits = (used + size <= np.uint64(SLOTS)) & (used <= np.uint64(LINE - VECTOR))
+            fits = (used + size <= np.uint64(SLOTS)) & (used <= np.uint64(LAST))
             fits &= (low - base >= -FARTHEST) & (high - base <= FARTHEST)
             if not (fits & (header & np.uint64(WORDS << WORD_SHIFT) == word)):
                 other = line_of_run(own, heights, first, first + size, word, heads, bases, chain, free, spare, held)
@@ -246,8 +248,8 @@ def accumulate(
                 base, at = np.int64(bases[line]), line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
                 header = heads[at]
                 used = header & np.uint64(COUNTS)
-            # What is stored beyond the run's heights is overwritten by the next run, or by the header.
-            store_heights(heights, first, np.int32(base), lines, line * np.uint64(LINE) + used)
+            # What is stored beyond the run's heights, if anything, is overwritten by the next run, or by the header.
+            store_heights(heights, first, size, np.int32(base), lines, line * np.uint64(LINE) + used)
             shine = np.uint64(gain) * np.uint64(sums[first + size] - sums[first])
             heads[at] = (header + size + (shine << np.uint64(LIGHT_SHIFT))) | mark
             first += size

@@ -20,6 +20,7 @@ import numpy as np
 from roadscan.kernels.georeference import KEPT
 from roadscan.kernels.line_access import STORES_SOME, VECTOR, fetch_line, store_heights
 from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.run_lines import AT_ONCE, find_known_lines, lowest_bit
 from roadscan.kernels.runs import find_runs, sum_up
 
 LANES = 16
@@ -36,6 +37,8 @@ FARTHEST = 32_000
 """Largest difference (quanta) between a height and the base of its line."""
 NOWHERE = -(1 << 30)
 """Column of a reading that is not to be counted: outside every tile."""
+AHEAD = 12
+"""Runs whose lines are fetched before their turn comes."""
 PIECE = 1024
 """Readings worked on together: their working arrays stay in the first cache."""
 
@@ -57,7 +60,7 @@ def work_arrays(tiles: int) -> tuple[Any, ...]:
         np.zeros(PIECE + VECTOR, np.int32),
         np.empty(PIECE + 1, np.uint32),
         np.empty(PIECE + 1, np.uint32),
-        np.empty(PIECE + 1, np.int32),
+        np.empty(PIECE + AT_ONCE, np.int32),
         np.zeros(tiles, np.uint8),
     )
 
@@ -160,29 +163,34 @@ def tile_at(x, y, edge, tile_rows):
 
 @bare
 def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells):
-    """First line of each run's cell, −1 outside the active tiles; cells : (n + 1,) int32, out. Takes new groups."""
-    lines, heads, bases, chain, free, _, held = pool
+    """First line of each run's cell, −1 outside the active tiles; cells : (n + 16,) int32, out. Takes new groups."""
+    _, heads, bases, chain, free, _, held = pool
     per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
     table = groups.reshape(-1)
-    west, south, tile = np.int64(-(1 << 40)), np.int64(-(1 << 40)), np.int64(-1)
-    for run in range(runs):
-        first = np.uint64(starts[run])
-        x, y = np.int64(column[first]), np.int64(row[first])
-        if not (west <= x < west + edge and south <= y < south + edge):
-            west, south, tile = tile_at(x, y, edge, tile_rows)
-            if tile >= 0:
-                touched[tile] = 1
-        if tile < 0:
-            cells[run] = -1
-            continue
-        place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
-        found = table[place]
-        if found < 0:
-            found = new_group(heads, bases, chain, free, held, heights[first])
-            table[place] = found
-        line = np.uint64(found) * np.uint64(LANES) + np.uint64((x - west) & 15)
-        fetch_line(lines, line * np.uint64(LINE))
-        cells[run] = line
+    west, south, tile = np.int64(NOWHERE), np.int64(NOWHERE), np.int64(-1)
+    block = np.uint64(0)
+    while block < runs:
+        own = (np.int32(west), np.int32(south), np.int32(edge if tile >= 0 else 0), np.int32(per_row))
+        at = np.uint64(max(tile, 0) * per_tile)
+        unknown = find_known_lines(column, row, starts, block, runs, own, np.int32(NOWHERE), table, at, cells)
+        while unknown:
+            run = block + lowest_bit(unknown)
+            unknown &= unknown - np.uint64(1)
+            first = np.uint64(starts[run])
+            x, y = np.int64(column[first]), np.int64(row[first])
+            if not (west <= x < west + edge and south <= y < south + edge):
+                west, south, tile = tile_at(x, y, edge, tile_rows)
+                if tile >= 0:
+                    touched[tile] = 1
+            if tile < 0:
+                continue
+            place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
+            found = table[place]
+            if found < 0:
+                found = new_group(heads, bases, chain, free, held, heights[first])
+                table[place] = found
+            cells[run] = found * LANES + ((x - west) & 15)
+        block += np.uint64(AT_ONCE)
 
 
 @bare
@@ -222,6 +230,7 @@ def accumulate(
     find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells)
     counted = np.int64(0)
     for run in range(runs):
+        fetch_line(lines, np.uint64(cells[run + np.uint64(AHEAD)]) * np.uint64(LINE))
         if cells[run] < 0:
             continue
         own = np.uint64(cells[run])

@@ -16,13 +16,16 @@ from roadscan.kernels.accumulate import (
     LINE,
     MARK_SHIFT,
     PASSES,
+    SLOTS,
     WORD_SHIFT,
     WORDS,
 )
-from roadscan.kernels.lanes import REACH, statistics_of_8, statistics_of_32, statistics_of_64
+from roadscan.kernels.lanes import REACH, statistics_of_64
 from roadscan.kernels.line_access import fetch_line
-from roadscan.kernels.open_group import open_group
+from roadscan.kernels.line_statistics import line_statistics_of_8, line_statistics_of_28
+from roadscan.kernels.open_group import chained_lanes, open_group, put_apart
 from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.run_lines import lowest_bit
 from roadscan.kernels.store_group import store_group
 
 AHEAD = 2
@@ -35,17 +38,8 @@ AT_ONCE = 64
 
 def work_arrays(most: int) -> tuple[Any, ...]:
     """Arrays that `finish_cells` works in; `most` : heights that a cell may have."""
-    table, rows = np.zeros((AT_ONCE, LANES), np.int32), np.zeros((4, LANES), np.int32)
-    return table, *rows, np.zeros((STATISTICS, LANES)), np.empty(most, np.int64)
-
-
-@bare_inlined
-def is_chained(first_line, chain):
-    """True if a cell of the group has more than one line."""
-    longest = np.int32(-1)
-    for lane in range(LANES):
-        longest = max(longest, chain[first_line + lane])
-    return longest >= 0
+    pairs, table = np.zeros((SLOTS // 2, LANES), np.int32), np.zeros((AT_ONCE, LANES), np.int32)
+    return pairs, table, *np.zeros((4, LANES), np.int32), np.zeros((STATISTICS, LANES)), np.empty(most, np.int64)
 
 
 @bare
@@ -64,26 +58,35 @@ def find_groups(groups, chain, found):
         count += np.uint64(groups[group] >= 0)
     for k in range(count):
         first_line = np.int64(groups[found[k]]) * LANES
-        if is_chained(first_line, chain):
-            for lane in range(LANES):
-                lines, line = 0, first_line + lane
-                while line >= 0:
-                    lines += 1
-                    line = np.int64(chain[line])
-                most = max(most, lines)
+        longer = chained_lanes(chain, np.uint64(first_line))
+        while longer:
+            lines, line = 0, first_line + np.int64(lowest_bit(longer))
+            while line >= 0:
+                lines += 1
+                line = np.int64(chain[line])
+            most = max(most, lines)
+            longer &= longer - np.uint64(1)
     for k in range(np.uint64(AHEAD)):
         found[count + k] = found[count - np.uint64(1)] if count > 0 else 0
     return np.int64(count), most
 
 
 @bare_inlined
-def add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks):
+def add_chains(first_line, longer, lines, heads, bases, chain, heights, counts, light, marks):
     """Heights of the further lines of a group's cells, relative to the base of the cell's first line.
 
+    longer : uint64, a bit for each cell that has further lines.
     heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out; light
     only serves cells of up to AT_ONCE heights: that of fuller ones may not fit.
     """
-    for lane in range(LANES):
+    unseen = longer
+    while unseen:
+        further = np.uint64(chain[first_line + np.int64(lowest_bit(unseen))])
+        fetch_line(lines, further * np.uint64(LINE))
+        unseen &= unseen - np.uint64(1)
+    while longer:
+        lane = np.int64(lowest_bit(longer))
+        longer &= longer - np.uint64(1)
         line = np.int64(chain[first_line + lane])
         while line >= 0:
             header = heads[line * HEADERS + HEADERS - 1]
@@ -184,10 +187,11 @@ def write_passes(first_line, marks, numbers, heads, chain, written, pass_ids):
 
 
 @bare_inlined
-def release(element, chain, free, spare, held):
+def release(element, longer, chain, free, spare, held):
     """Give a group's element and the further lines of its cells back."""
-    for lane in range(LANES):
-        line = np.int64(chain[element * LANES + lane])
+    while longer:
+        line = np.int64(chain[element * LANES + np.int64(lowest_bit(longer))])
+        longer &= longer - np.uint64(1)
         while line >= 0:
             spare[held[1]] = line
             held[1] += 1
@@ -220,7 +224,7 @@ def finish_cells(
     cells, ids : int, how many cells and pass ids were written.
     """
     lines, heads, bases, chain, free, spare, held = pool
-    heights, counts, light, marks, own_bases, out, many = work
+    pairs, heights, counts, light, marks, own_bases, out, many = work
     per_row = (edge + LANES - 1) // LANES
     cell, written = 0, 0
     for k in range(taken):
@@ -232,17 +236,19 @@ def finish_cells(
         fetch_line(chain, later // np.uint64(LINE))
         fetch_line(bases, later // np.uint64(LINE))
         first_line = element * LANES
-        open_group(lines, np.uint64(first_line * LINE), heights, counts, light, marks)
-        if is_chained(first_line, chain):
-            add_chains(first_line, lines, heads, bases, chain, heights, counts, light, marks)
+        open_group(lines, np.uint64(first_line * LINE), pairs, counts, light, marks)
+        longer = chained_lanes(chain, np.uint64(first_line))
+        if longer:
+            put_apart(pairs, heights)
+            add_chains(first_line, longer, lines, heads, bases, chain, heights, counts, light, marks)
         most, least = np.int32(0), counts[0]
         for lane in range(LANES):
             most, least = max(most, counts[lane]), min(least, counts[lane])
             own_bases[lane] = bases[first_line + lane]
-        if most <= 8:
-            statistics_of_8(heights, counts, light, own_bases, floor, quantum_m, out)
-        elif most <= 32:
-            statistics_of_32(heights, counts, light, own_bases, floor, quantum_m, out)
+        if most <= 8 and not longer:
+            line_statistics_of_8(pairs, counts, light, own_bases, floor, quantum_m, out)
+        elif not longer:
+            line_statistics_of_28(pairs, counts, light, own_bases, floor, quantum_m, out)
         elif most <= AT_ONCE:
             statistics_of_64(heights, counts, light, own_bases, floor, quantum_m, out)
         else:
@@ -257,7 +263,7 @@ def finish_cells(
             )  # fmt: skip
             cell += LANES
             written += LANES
-            release(element, chain, free, spare, held)
+            release(element, longer, chain, free, spare, held)
             groups[group] = -1
             continue
         for lane in range(LANES):
@@ -270,7 +276,7 @@ def finish_cells(
                 pass_offsets[cell] = written
                 written = write_passes(first_line + lane, marks[lane], numbers, heads, chain, written, pass_ids)
                 cell += 1
-        release(element, chain, free, spare, held)
+        release(element, longer, chain, free, spare, held)
         groups[group] = -1
     pass_offsets[cell] = written
     return cell, written

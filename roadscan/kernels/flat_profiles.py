@@ -143,11 +143,11 @@ def place_profile(
 @bare
 def count_out_of_range(raw, raw_limits):
     """How many readings have no return, and how many have one that is too near or too far."""
-    silent, within = 0, 0
+    silent, within = np.uint32(0), np.uint32(0)
     for j in range(raw.size):
-        silent += raw[j] == 0
-        within += (raw[j] != 0) & (raw[j] >= raw_limits[0]) & (raw[j] <= raw_limits[1])
-    return silent, raw.size - silent - within
+        silent = np.uint32(silent + np.uint32(raw[j] == 0))
+        within = np.uint32(within + np.uint32((raw[j] != 0) & (raw[j] >= raw_limits[0]) & (raw[j] <= raw_limits[1])))
+    return np.int64(silent), raw.size - np.int64(silent) - np.int64(within)
 
 
 @bare

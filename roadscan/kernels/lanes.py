@@ -149,18 +149,47 @@ def _medians(n):
     return bare(medians)
 
 
+def reach_of(lanes, away, floor):
+    """Distance from the median up to which heights count: the larger of REACH · away and the floor, whole quanta."""
+    b, double = lanes.b, ir.VectorType(_F64, LANES // 2)
+    reach = []
+    for half in lanes.halves(away, _F64):
+        far = b.fmul(lanes.all(REACH, double), half)
+        far = instruction(b, "llvm.floor.v8f64", double, b.select(b.fcmp_ordered(">", far, floor), far, floor))
+        reach.append(b.fptosi(far, ir.VectorType(I32, LANES // 2)))
+    return vectors.picked(b, *reach, range(LANES))
+
+
+def write_statistics(lanes, out, quantum, bases, size, light, centre, low, high, used, sums):
+    """Write the statistics of sixteen cells, see :func:`statistics_of`, as rows of the argument `out`.
+
+    bases, size, light, centre, low, high, used : rows of int32: the cells' bases, heights and sums of intensities, the
+    medians, lowest and highest heights as differences from the median, heights near the median.
+    sums : of the differences from the median, of their squares, and of those near it: each as two halves of int64.
+    """
+    b, double = lanes.b, ir.VectorType(_F64, LANES // 2)
+    medians, lows, highs = (lanes.halves(row) for row in (b.add(centre, bases), low, high))
+    sizes, useds, lights = (lanes.halves(row, _F64) for row in (size, used, light))
+    for k in range(2):
+        middle, total, square, close = (b.sitofp(v[k], double) for v in (medians, *sums))
+        average = b.fdiv(total, sizes[k])
+        lanes.store(out, b.fmul(b.fadd(middle, average), quantum), k)
+        lanes.store(out, b.fmul(b.fadd(middle, b.fdiv(close, useds[k])), quantum), 2 + k)
+        lanes.store(out, b.fmul(b.sitofp(b.add(medians[k], lows[k]), double), quantum), 4 + k)
+        lanes.store(out, b.fmul(b.sitofp(b.add(medians[k], highs[k]), double), quantum), 6 + k)
+        variance = b.fsub(b.fdiv(square, sizes[k]), b.fmul(average, average))
+        variance = b.select(b.fcmp_ordered(">", variance, lanes.all(0, double)), variance, lanes.all(0, double))
+        lanes.store(out, b.fmul(instruction(b, "llvm.sqrt.v8f64", double, variance), quantum), 8 + k)
+        lanes.store(out, b.fdiv(lights[k], sizes[k]), 10 + k)
+
+
 def _statistics(n):
     def write(lanes):
         b = lanes.b
         raw, there, centre, away = lanes.medians(n, 0, 1)
         double, wide = (ir.VectorType(kind, LANES // 2) for kind in (_F64, I64))
         least, quantum = (everywhere(b, double, lanes.data[k]) for k in (4, 5))
-        reach = []
-        for half in lanes.halves(away, _F64):
-            far = b.fmul(lanes.all(REACH, double), half)
-            far = instruction(b, "llvm.floor.v8f64", double, b.select(b.fcmp_ordered(">", far, least), far, least))
-            reach.append(b.fptosi(far, ir.VectorType(I32, LANES // 2)))
-        farthest = vectors.picked(b, *reach, range(LANES))
+        farthest = reach_of(lanes, away, least)
         total, squares, near = ([lanes.all(0, wide)] * 2 for _ in range(3))
         used, low, high = lanes.all(0), lanes.all(LARGEST), lanes.all(-int(LARGEST))
         for row, own in zip(raw, there, strict=True):
@@ -174,19 +203,10 @@ def _statistics(n):
             total = [b.add(t, p) for t, p in zip(total, parts, strict=True)]
             squares = [b.add(t, b.mul(p, p)) for t, p in zip(squares, parts, strict=True)]
             near = [b.add(t, p) for t, p in zip(near, lanes.halves(close), strict=True)]
-        medians, lows, highs = (lanes.halves(row) for row in (b.add(centre, lanes.load(3)), low, high))
-        sizes, useds, lights = (lanes.halves(row, _F64) for row in (lanes.load(1), used, lanes.load(2)))
-        for k in range(2):
-            middle, sums, square, close = (b.sitofp(v[k], double) for v in (medians, total, squares, near))
-            average = b.fdiv(sums, sizes[k])
-            lanes.store(6, b.fmul(b.fadd(middle, average), quantum), k)
-            lanes.store(6, b.fmul(b.fadd(middle, b.fdiv(close, useds[k])), quantum), 2 + k)
-            lanes.store(6, b.fmul(b.sitofp(b.add(medians[k], lows[k]), double), quantum), 4 + k)
-            lanes.store(6, b.fmul(b.sitofp(b.add(medians[k], highs[k]), double), quantum), 6 + k)
-            variance = b.fsub(b.fdiv(square, sizes[k]), b.fmul(average, average))
-            variance = b.select(b.fcmp_ordered(">", variance, lanes.all(0, double)), variance, lanes.all(0, double))
-            lanes.store(6, b.fmul(instruction(b, "llvm.sqrt.v8f64", double, variance), quantum), 8 + k)
-            lanes.store(6, b.fdiv(lights[k], sizes[k]), 10 + k)
+        bases, size, light = lanes.load(3), lanes.load(1), lanes.load(2)
+        write_statistics(
+            lanes, 6, quantum, bases, size, light, centre, low, high, used, (total, squares, near)
+        )  # fmt: skip
 
     @intrinsic
     def written(typingctx, heights, counts, light, bases, floor, quantum_m, out):
@@ -206,7 +226,7 @@ def _medians_by_numpy(heights, counts, median, deviation):
         deviation[lane] = np.sort(np.abs(own - median[lane]))[(own.size - 1) // 2]
 
 
-def _statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
+def statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
     median, away = np.zeros(LANES, np.int32), np.zeros(LANES, np.int32)
     _medians_by_numpy(heights, counts, median, away)
     for lane in np.flatnonzero(counts):
@@ -238,8 +258,8 @@ def statistics_of(n: int) -> Kernel:
     3 · 1.4826 · MAD; quantum_m, float64; out (6, 16) float64: mean, robust, lowest and highest height, standard
     deviation of the heights (m), mean intensity. The robust height is the mean of those within reach of the median.
     """
-    return _statistics_by_numpy if numba.config.DISABLE_JIT else _statistics(n)
+    return statistics_by_numpy if numba.config.DISABLE_JIT else _statistics(n)
 
 
 medians_of_16 = medians_of(16)
-statistics_of_8, statistics_of_32, statistics_of_64 = (statistics_of(n) for n in (8, 32, 64))
+statistics_of_64 = statistics_of(64)

@@ -1,6 +1,7 @@
 """The sixteen lines of a group → a table of heights with a column for each cell, and what the headers say.
 
-A line is a cell's; statistics want rows that hold one height of every cell. So the lines are turned in registers.
+A line is a cell's; statistics want rows that hold heights of every cell. So the lines are turned in registers, two
+heights at a time.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from numba.extending import intrinsic
 
 from roadscan.kernels.accumulate import COUNTS, LANES, LIGHT_SHIFT, LIGHTS, LINE, MARK_SHIFT, SLOTS
 from roadscan.kernels.lanes import generator
+from roadscan.kernels.line_statistics import heights_of
 from roadscan.kernels.options import Kernel
-from roadscan.kernels.vectors import I32, I64, load, picked
+from roadscan.kernels.vectors import I16, I32, I64, constant, load, picked, start
 
 _LINE = ir.VectorType(I32, LANES)
 
@@ -31,32 +33,68 @@ def _write(lanes):
     b = lanes.b
     first = b.bitcast(b.gep(lanes.data[0], [lanes.data[1]]), _LINE.as_pointer())
     rows = _turned(b, [load(b, b.gep(first, [I64(k)]), _LINE) for k in range(LANES)])
-    sixteen = lanes.all(16)
     for k in range(SLOTS // 2):
-        lanes.store(2, b.ashr(b.shl(rows[k], sixteen), sixteen), 2 * k)
-        lanes.store(2, b.ashr(rows[k], sixteen), 2 * k + 1)
+        lanes.store(2, rows[k], k)
     low, high = rows[-2:]
     lanes.store(3, b.and_(low, lanes.all(COUNTS)))
     lanes.store(4, b.and_(b.lshr(low, lanes.all(LIGHT_SHIFT)), lanes.all(LIGHTS)))
     lanes.store(5, b.lshr(high, lanes.all(MARK_SHIFT - 32)))
 
 
+def _write_apart(lanes):
+    b, sixteen = lanes.b, lanes.all(16)
+    for k in range(SLOTS // 2):
+        row = lanes.load(0, k)
+        lanes.store(1, b.ashr(b.shl(row, sixteen), sixteen), 2 * k)
+        lanes.store(1, b.ashr(row, sixteen), 2 * k + 1)
+
+
 @intrinsic
-def _opened(typingctx, lines, first, heights, counts, light, marks):
-    return types.void(lines, first, heights, counts, light, marks), generator(_write)
+def _opened(typingctx, lines, first, pairs, counts, light, marks):
+    return types.void(lines, first, pairs, counts, light, marks), generator(_write)
 
 
-def _opened_by_numpy(lines, first, heights, counts, light, marks):
+@intrinsic
+def _put_apart(typingctx, pairs, heights):
+    return types.void(pairs, heights), generator(_write_apart)
+
+
+@intrinsic
+def _chained(typingctx, chain, first):
+    def write(context, builder, signature, arguments):
+        own = load(builder, builder.gep(start(context, builder, signature, arguments, 0), [arguments[1]]), _LINE)
+        longer = builder.icmp_signed(">=", own, constant(_LINE, [0] * LANES))
+        return builder.zext(builder.bitcast(longer, I16), I64)
+
+    return types.uint64(chain, first), write
+
+
+def _opened_by_numpy(lines, first, pairs, counts, light, marks):
     own = lines[int(first) : int(first) + LANES * LINE].reshape(LANES, LINE)
-    heights[:SLOTS] = own[:, :SLOTS].T
+    pairs[:] = np.ascontiguousarray(own[:, :SLOTS]).view(np.int32).T
     header = np.ascontiguousarray(own[:, SLOTS:]).view(np.uint64)[:, 0].astype(object)
     counts[:] = [h & COUNTS for h in header]
     light[:] = [h >> LIGHT_SHIFT & LIGHTS for h in header]
     marks[:] = [h >> MARK_SHIFT for h in header]
 
 
-open_group: Kernel = _opened_by_numpy if numba.config.DISABLE_JIT else _opened
-"""open_group(lines, first, heights, counts, light, marks): the lines of a group, see ``kernels.accumulate``.
+def _put_apart_by_numpy(pairs, heights):
+    heights[:SLOTS] = heights_of(pairs)
 
-lines : (m,) int16; first : uint64, where the group begins; heights : (≥ SLOTS, LANES) int32, out, relative to the
-bases; counts, light, marks : (LANES,) int32, out: heights, sum of intensities and passes of each line."""
+
+def _chained_by_numpy(chain, first):
+    return np.uint64(sum(1 << k for k in range(LANES) if chain[int(first) + k] >= 0))
+
+
+open_group: Kernel = _opened_by_numpy if numba.config.DISABLE_JIT else _opened
+"""open_group(lines, first, pairs, counts, light, marks): the lines of a group, see ``kernels.accumulate``.
+
+lines : (m,) int16; first : uint64, where the group begins; pairs : (SLOTS / 2, LANES) int32, out, two heights each,
+relative to the bases, see ``kernels.line_statistics``; counts, light, marks : (LANES,) int32, out: heights, sum of
+intensities and passes of each line."""
+
+put_apart: Kernel = _put_apart_by_numpy if numba.config.DISABLE_JIT else _put_apart
+"""put_apart(pairs, heights): each height of the pairs of `open_group` as a number of its own: (≥ SLOTS, LANES) int32."""
+
+chained_lanes: Kernel = _chained_by_numpy if numba.config.DISABLE_JIT else _chained
+"""chained_lanes(chain, first): a bit for each of sixteen cells that has more than one line; first : uint64."""

@@ -227,6 +227,7 @@ def _medians_by_numpy(heights, counts, median, deviation):
 
 
 def statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
+    """As the kernel of :func:`statistics_of`."""
     median, away = np.zeros(LANES, np.int32), np.zeros(LANES, np.int32)
     _medians_by_numpy(heights, counts, median, away)
     for lane in np.flatnonzero(counts):

@@ -94,7 +94,7 @@ relative to the bases, see ``kernels.line_statistics``; counts, light, marks : (
 intensities and passes of each line."""
 
 put_apart: Kernel = _put_apart_by_numpy if numba.config.DISABLE_JIT else _put_apart
-"""put_apart(pairs, heights): each height of the pairs of `open_group` as a number of its own: (≥ SLOTS, LANES) int32."""
+"""put_apart(pairs, heights): each height of the pairs of `open_group` as a number; heights : (≥ SLOTS, LANES) int32."""
 
 chained_lanes: Kernel = _chained_by_numpy if numba.config.DISABLE_JIT else _chained
 """chained_lanes(chain, first): a bit for each of sixteen cells that has more than one line; first : uint64."""

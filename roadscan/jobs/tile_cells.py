@@ -20,7 +20,7 @@ from roadscan.jobs.tile_fates import Fates
 from roadscan.jobs.tile_plan import TileTask
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import LanePass, TileId
-from roadscan.points.place import passes_of
+from roadscan.points.place import pass_numbers
 from roadscan.tables.profiles import ProfileReader
 from roadscan.tables.returns import ReturnsReader
 from roadscan.tables.schema import table_schema
@@ -225,10 +225,7 @@ class _Source:
 
     def _passes(self, epochs: npt.NDArray[np.int64], accumulator: Accumulator) -> npt.NDArray[np.int32]:
         """Index of each epoch's pass among the accumulator's, −1 for none."""
-        ids = passes_of(epochs, self.passes)
-        index = np.searchsorted(accumulator.passes, ids).astype(np.int32)
-        index[ids == 0] = -1
-        return index
+        return pass_numbers(epochs, self.passes, accumulator.passes)
 
 
 def _pool() -> Pool:

@@ -399,6 +399,22 @@ def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[n
     return out
 
 
+def pass_numbers(
+    epochs_gps_ns: Int64, passes: Sequence[LanePass], ids: npt.NDArray[np.uint16]
+) -> npt.NDArray[np.int32]:
+    """Index of each epoch's pass among `ids` (p,), which are ascending, (n,), −1 where none; as :func:`passes_of`."""
+    out = np.full(epochs_gps_ns.size, -1, dtype=np.int32)
+    in_order = bool((epochs_gps_ns[1:] >= epochs_gps_ns[:-1]).all())
+    for one in passes:
+        number = int(np.searchsorted(ids, one.pass_id))
+        if in_order:
+            first, end = np.searchsorted(epochs_gps_ns, (one.start_gps_ns, one.end_gps_ns))
+            out[first:end] = number
+        else:
+            out[(epochs_gps_ns >= one.start_gps_ns) & (epochs_gps_ns < one.end_gps_ns)] = number
+    return out
+
+
 def _numpy(batch: pa.RecordBatch, column: str) -> npt.NDArray[Any]:
     values: npt.NDArray[Any] = batch.column(column).to_numpy(zero_copy_only=False)
     return values

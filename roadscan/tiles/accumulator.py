@@ -10,20 +10,27 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels import cells as finishing
-from roadscan.kernels.accumulate import LANES, LINE, SLOTS, work_arrays
-from roadscan.kernels.by_cell import order_arrays
+from roadscan.kernels.accumulate import LANES, LINE, PIECE, SLOTS, accumulate_cells, work_arrays
 from roadscan.kernels.cells import AHEAD, find_groups, finish_cells
+from roadscan.kernels.georeference import FATES
+from roadscan.kernels.line_access import VECTOR
+from roadscan.kernels.pile_cells import finish_piles, row_arrays
+from roadscan.kernels.row_piles import sizes_of_rows, take_piles
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import QUANTUM_M
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.piles import Piles
 
 ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""
 
 MOST_BYTES: Final = 800 << 20
 """Memory that the cells of begun tiles may take."""
+
+_PILES: Final = 1 / 3
+"""Share of that which readings may take that are not counted yet."""
 
 _FIRST_ELEMENTS: Final = 4096
 _COLUMNS: Final = (
@@ -50,7 +57,7 @@ class Pool:
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
         self._columns: list[npt.NDArray[Any]] = []
-        self._order: tuple[npt.NDArray[Any], ...] = order_arrays(0)
+        self.piles = Piles()
         self._make(_FIRST_ELEMENTS)
 
     @property
@@ -97,16 +104,11 @@ class Pool:
                 self._columns[k] = np.empty(size * 5 // 4, kind)
         return tuple(array[:size] for array, size in zip(self._columns, sizes, strict=True))
 
-    def order(self, readings: int) -> tuple[npt.NDArray[Any], ...]:
-        """Arrays for so many readings, as ``kernels.by_cell`` takes them; kept for the next ones."""
-        if self._order[0].size < readings:
-            self._order = order_arrays(readings)
-        return self._order
-
     def clear(self) -> None:
         """Take all elements back."""
         self.held[:] = 0
         self.free[:] = np.arange(self.size, dtype=np.int32)
+        self.piles.clear()
 
     def _make(self, size: int) -> None:
         self.lines = _aligned(size * LANES * LINE, np.int16)
@@ -155,6 +157,7 @@ class Accumulator:
         self._pool = Pool() if pool is None else pool
         self._unused: list[int] = []
         self._groups = np.empty((0, self._groups_per_tile), np.int32)
+        self._ends = np.empty((0, grid.cells_per_edge), np.int32)
         self.spans = np.empty((0, 2), np.int64)
         self.sigmas = np.empty((0, 2), np.float64)
         self._work = work_arrays(0)
@@ -181,10 +184,6 @@ class Accumulator:
             self.tile_rows[tile.row - self._south, tile.column - self._west] = row
             self.spans[row], self.sigmas[row] = _NEVER, -1.0
 
-    def order(self, readings: int) -> tuple[Any, ...]:
-        """Arrays in which so many readings are put into the order of their cells: the same ones every time."""
-        return self._pool.order(readings)
-
     def run(self, kernel: Callable[..., int], items: int, elements: int) -> None:
         """Call `kernel` with the pool and the item to begin with until it has done all items.
 
@@ -200,27 +199,75 @@ class Accumulator:
             if not self._pool.make_room(elements, self._most_bytes):
                 raise PoolExhaustedError(f"the cells of the tiles in work take more than {self._most_bytes >> 20} MB")
 
+    def pile(self, kernel: Callable[..., int], items: int, blocks: int) -> None:
+        """Call `kernel` with the piles and the item to begin with until it has done all items.
+
+        The kernel stops before an item for which there may be too few free `blocks`. Then the piles get more memory;
+        where they have their share, what lies on them is counted.
+        """
+        piles, done = self._pool.piles, 0
+        while True:
+            done = kernel(self._ends, piles.arrays, done)
+            if done >= items:
+                return
+            if not piles.make_room(blocks, int(_PILES * self._most_bytes)):
+                for along, across in np.argwhere(self.tile_rows >= 0).tolist():
+                    self._count_piles(along, across)
+                piles.make_room(blocks, int(_PILES * self._most_bytes))
+
     def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
         """Cells of a tile, which becomes inactive; None where no reading fell into it.
 
         The next tile that is finished overwrites them: fresh memory would cost as much as the statistics.
         """
-        row = self._row(tile)
-        self.tile_rows[tile.row - self._south, tile.column - self._west] = -1
-        self._unused.append(row)
+        row, along, across = self._row(tile), tile.row - self._south, tile.column - self._west
         taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
-        if taken == 0:
+        piled, most_piled = self._sizes(row)
+        if taken and piled:
+            self._count_piles(along, across)
+            taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
+        self.tile_rows[along, across] = -1
+        self._unused.append(row)
+        if taken:
+            cells = self._cells(tile, self._groups[row], taken, most_lines * SLOTS)
+        elif piled:
+            cells = self._piled_cells(tile, row, piled, most_piled)
+        else:
             return None
-        cells = self._cells(tile, self._groups[row], taken, most_lines * SLOTS)
         (first, last), (horizontal, down) = self.spans[row].tolist(), self.sigmas[row].tolist()
         return cells, TileEvidence(first, last, horizontal, down)
 
     def drop(self) -> None:
         """Forget all active tiles."""
         self._groups[:] = -1
+        self._ends[:] = 0
         self.tile_rows[:] = -1
         self._unused = list(range(len(self._groups)))
         self._pool.clear()
+
+    def _sizes(self, row: int) -> tuple[int, int]:
+        """Readings on the piles of a tile, and on its largest one."""
+        piles = self._pool.piles
+        total, most = sizes_of_rows(self._ends[row], piles.before, piles.sizes)
+        return int(total), int(most)
+
+    def _count_piles(self, along: int, across: int) -> None:
+        """Count what lies on the piles of a tile, by its place in the box, into its cells."""
+        row, edge = int(self.tile_rows[along, across]), self.grid.cells_per_edge
+        n, _ = self._sizes(row)
+        column, rows, passes = (np.empty(n, np.int32) for _ in range(3))
+        heights, intensity = np.zeros(n + VECTOR, np.int32), np.empty(n, np.uint16)
+        west, south = across * edge, along * edge
+        take_piles(self._ends[row], self._pool.piles.arrays, west, south, column, rows, heights, passes, intensity)
+        told = np.zeros(FATES, np.int64)  # they were told when they were piled up
+
+        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
+            done: int = accumulate_cells(
+                column, rows, heights, passes, intensity, edge, tile_rows, groups, pool, work, told, first
+            )
+            return done
+
+        self.run(count, n, 2 * PIECE)
 
     def _row(self, tile: TileId) -> int:
         return int(self.tile_rows[tile.row - self._south, tile.column - self._west])
@@ -228,6 +275,7 @@ class Accumulator:
     def _add_rows(self, more: int) -> None:
         before = len(self._groups)
         self._groups = np.concatenate([self._groups, np.full((more, self._groups_per_tile), -1, np.int32)])
+        self._ends = np.concatenate([self._ends, np.zeros((more, self._ends.shape[1]), np.int32)])
         self.spans = np.concatenate([self.spans, np.zeros((more, 2), np.int64)])
         self.sigmas = np.concatenate([self.sigmas, np.zeros((more, 2))])
         self._unused += range(before, before + more)
@@ -235,12 +283,23 @@ class Accumulator:
 
     def _cells(self, tile: TileId, groups: npt.NDArray[np.int32], taken: int, most: int) -> TileCells:
         columns = self._pool.columns(taken * LANES, self.passes.size)
-        column, row, count, mean, robust, low, high, deviation, bright, offsets, ids = columns
         cells, written = finish_cells(
             groups, self._found, taken, self.grid.cells_per_edge, self._pool.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M,
-            self.passes, finishing.work_arrays(most),
-            *columns,
+            self.passes, finishing.work_arrays(most), *columns,
         )  # fmt: skip
+        return self._of_columns(tile, columns, cells, written)
+
+    def _piled_cells(self, tile: TileId, row: int, readings: int, most: int) -> TileCells:
+        edge = self.grid.cells_per_edge
+        columns = self._pool.columns(min(readings, edge * edge), self.passes.size)
+        cells, written = finish_piles(
+            self._ends[row], self._pool.piles.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M, self.passes,
+            row_arrays(edge, self.passes.size, most), *columns,
+        )  # fmt: skip
+        return self._of_columns(tile, columns, cells, written)
+
+    def _of_columns(self, tile: TileId, columns: tuple[npt.NDArray[Any], ...], cells: int, written: int) -> TileCells:
+        column, row, count, mean, robust, low, high, deviation, bright, offsets, ids = columns
         offsets = offsets[: cells + 1]
         return TileCells(
             tile=tile,

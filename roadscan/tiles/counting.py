@@ -8,10 +8,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.accumulate import PIECE, accumulate_cells
-from roadscan.kernels.by_cell import into_order
 from roadscan.kernels.flat_profiles import accumulate_profiles
-from roadscan.kernels.placed_cells import find_mirror, find_returns
+from roadscan.kernels.piled_readings import pile_mirror, pile_returns
+from roadscan.kernels.placing import CHUNK
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.flat_profiles import FlatProfiles, flat_profiles
 from roadscan.points.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement
@@ -79,12 +78,12 @@ class Counting:
     ) -> None:
         """Count n returns; all arrays are (n,), `passes` as in :meth:`profiles`."""
         for rows, mounting in self.placement.mountings.pieces(pose_epochs_gps_ns):
-            poses, order = self.placement.poses(mounting), self.accumulator.order(rows.stop - rows.start)
-            found = find_returns(
-                epochs_gps_ns[rows], pose_epochs_gps_ns[rows], *(axis[rows] for axis in xyz_sensor_m), passes[rows],
-                poses, *self._place, *order[:4], self.fates,
-            )  # fmt: skip
-            self._count(found, order, passes[rows], intensity[rows], _SIXTEEN_BITS)
+            arrays: tuple[npt.NDArray[Any], ...] = (
+                epochs_gps_ns[rows],
+                pose_epochs_gps_ns[rows],
+                *(axis[rows] for axis in xyz_sensor_m),
+            )
+            self._returns(self.placement.poses(mounting), arrays, intensity[rows], passes[rows])
 
     @property
     def _cells(self) -> tuple[tuple[int, int], int, int]:
@@ -96,8 +95,8 @@ class Counting:
         """Limits and cells, active tiles and what is noted of them."""
         held = self.accumulator
         return (
-            self.placement.limits, float(QUANTA_PER_M), *self._cells,
-            held.tile_rows, held.spans, held.sigmas, self.placement.interval_sigmas_m,
+            self.placement.limits, float(QUANTA_PER_M), held.corner_quanta, held.grid.cell_quanta, held.tile_rows,
+            held.spans, held.sigmas, self.placement.interval_sigmas_m,
         )  # fmt: skip
 
     def _flat(self, flat: FlatProfiles, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
@@ -111,27 +110,26 @@ class Counting:
 
         self.accumulator.run(count, epochs.size, 2 * raw.shape[1])
 
+    def _returns(self, poses: Any, arrays: tuple[npt.NDArray[Any], ...], intensity: Any, passes: Int32) -> None:
+        def pile(ends: Any, piles: Any, first: int) -> int:
+            done: int = pile_returns(
+                *arrays, intensity, _SIXTEEN_BITS, passes, poses, *self._place, ends, piles, self.fates, first
+            )
+            return done
+
+        self.accumulator.pile(pile, passes.size, CHUNK)
+
     def _mirror(self, geometry: ScanGeometry, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
         m = geometry.readings
         readings = np.arange(epochs.size * m)
         own_epochs = geometry.reading_epochs(epochs[readings // m], readings % m)
-        order = self.accumulator.order(own_epochs.size)
-        found = find_mirror(
-            epochs, own_epochs, raw, passes, *geometry.rays(), (geometry.range_offset_m, geometry.range_step_m),
-            geometry.reading_period_ns, poses, *self._place, *order[:4], self.fates,
-        )  # fmt: skip
-        self._count(found, order, passes, bright.reshape(-1), _EIGHT_BITS)
+        scale = geometry.range_offset_m, geometry.range_step_m
 
-    def _count(self, found: int, order: Any, passes: Int32, intensity: Any, gain: np.uint32) -> None:
-        """Count readings that were found, in the order of their cells."""
-        into_order(found, order, passes, intensity, gain)
-        column, row, heights, of_pass, bright = order[7:]
-
-        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
-            done: int = accumulate_cells(
-                column[:found], row[:found], heights, of_pass, bright,
-                self.accumulator.grid.cells_per_edge, tile_rows, groups, pool, work, self.fates, first,
+        def pile(ends: Any, piles: Any, first: int) -> int:
+            done: int = pile_mirror(
+                epochs, own_epochs, raw, *geometry.rays(), scale, geometry.reading_period_ns, bright.reshape(-1),
+                _EIGHT_BITS, passes, poses, *self._place, ends, piles, self.fates, first,
             )  # fmt: skip
             return done
 
-        self.accumulator.run(count, found, 2 * PIECE)
+        self.accumulator.pile(pile, epochs.size, max(CHUNK, m))

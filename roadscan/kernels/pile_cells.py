@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.cells import AT_ONCE, STATISTICS, kth_smallest
-from roadscan.kernels.lanes import LANES, REACH, statistics_of_8, statistics_of_32, statistics_of_64
+from roadscan.kernels.lanes import LANES, REACH, statistics_of, statistics_of_64
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.row_piles import COLUMN, LIGHT, LIGHT_SHIFT, free_row, last_block, size_of
+
+statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
 
 WORD = 64
 """Passes that a word of marks names."""

@@ -25,7 +25,8 @@ _LENGTHS: Final = (
 )  # fmt: skip
 
 COLUMNS: Final = pa.schema(
-    [pa.field("crack", pa.int32(), nullable=False), pa.field("type", pa.string(), nullable=False)]
+    [pa.field(name, pa.int32(), nullable=False) for name in ("crack", "network")]
+    + [pa.field("type", pa.string(), nullable=False)]
     + [pa.field(name, pa.float64(), nullable=False) for name in _LENGTHS]
     + [pa.field(name, pa.int32(), nullable=False) for name in _COUNTS]
     + [pa.field(name, pa.float64(), nullable=name == "lane_angle_deg") for name in _ANGLES]
@@ -36,12 +37,12 @@ COLUMNS: Final = pa.schema(
 
 
 class Cracks(SurveyProduct):
-    """GeoParquet 1.1 of the table ``cracks``: a row a crack with all its branches, as a MultiLineString.
+    """GeoParquet 1.1 of the table ``cracks``: a row a crack with its branches, as a MultiLineString.
 
-    Whatever hangs together is one crack, however many tiles it crosses. A crack is longitudinal, transverse or diagonal
-    by where most of its length runs, or an alligator crack if it closes enough polygons and has enough junctions per
-    square metre; `unknown` where nobody drove within 20 m: the lane
-    runs as the vehicle did nearest to a piece. Width is that at half the depth.
+    Whatever hangs together is one network, however many tiles it crosses. Where cracks of different types meet, each is
+    a row with the number of their network: an alligator crack, where it closes enough polygons and has enough junctions
+    per square metre; else longitudinal, transverse or diagonal by where most of its length runs; `unknown` where nobody
+    drove within 20 m: the lane runs as the vehicle did nearest to a piece. Width is that at half the depth.
     """
 
     name: ClassVar[str] = "cracks"
@@ -92,6 +93,7 @@ def _row(number: int, one: Crack, owner: Sequence[str]) -> dict[str, Any]:
     return {
         **figures,
         "crack": number,
+        "network": one.network,
         "type": one.kind,
         "lane_angle_deg": None if np.isnan(angle) else angle,
         "easting_m": middle.x,

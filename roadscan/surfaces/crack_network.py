@@ -1,12 +1,11 @@
-"""Pieces of cracks joined to cracks: whatever hangs together, over all tiles, with its figures and its type."""
+"""Pieces of cracks joined over all tiles to networks, and these parted into cracks with their figures and types."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +14,19 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.model.distress import CrackJoining
+from roadscan.surfaces.crack_parts import Network, components, grouped, parts_of
 from roadscan.surfaces.cracks import CrackPiece
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unknown"]
 
+_KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")
+"""By the types of ``crack_parts``."""
 _CHORD_M = 0.1
 """Directions are those of chords about this long."""
+_BESIDE_NET_M = 0.25
+"""What hangs on a net and reaches no farther is its fringe."""
 _LEAST_SHARE = 0.6
 """What has the cross-section of a crack over less of its length is an edge or a row of pits."""
 _ONE_NODE_CELLS = 4.0
@@ -31,8 +35,10 @@ _ONE_NODE_CELLS = 4.0
 
 @dataclass(frozen=True)
 class Crack:
-    """A crack with all its branches."""
+    """A crack: a part of a network of one type, with its branches."""
 
+    network: int
+    """Number of the network that it is a part of, from 1; parts that meet have the same."""
     kind: CrackType
     length_m: float
     """Along all branches (m)."""
@@ -46,11 +52,13 @@ class Crack:
     covered_m2: float
     """Convex hull of its line (m²)."""
     junctions: int
+    """Places on it where three or more branches meet, of whatever type."""
     ends: int
+    """Places where it ends free."""
     measured_share: float
     """Share of the length that has the cross-section of a crack."""
     polygons: int
-    """Pieces of ground that it closes in."""
+    """Pieces of ground that it closes in by itself."""
     azimuth_deg: float
     """Mean direction, clockwise from map north, 0 to 180 (degrees)."""
     lane_angle_deg: float
@@ -68,7 +76,7 @@ class Crack:
 def join_cracks(
     pieces: Sequence[CrackPiece], lane_azimuth_rad: npt.ArrayLike, cell_m: float, config: CrackJoining
 ) -> list[Crack]:
-    """Cracks of all pieces that are long and deep enough, from south to north.
+    """Cracks of all networks that are long and deep enough, each as parts of one type, from south to north.
 
     Parameters
     ----------
@@ -82,16 +90,65 @@ def join_cracks(
     names = sorted({node for one in pieces for node in (one.start, one.end)})
     number = {name: k for k, name in enumerate(names)}
     ends = np.array([[number[one.start], number[one.end]] for one in pieces])
-    _, network = _networks(ends, len(names))
-    order = np.argsort(network[ends[:, 0]], kind="stable")
-    cuts = np.flatnonzero(np.diff(network[ends[order, 0]])) + 1
-    found = [_crack(own, pieces, ends, azimuth, cell_m, config) for own in np.split(order, cuts)]
-    return sorted((c for c in found if _is_crack(c, config)), key=lambda c: c.line.bounds[1::-1])
+    nodes = _Nodes.of(ends, np.array([p.length_m for p in pieces]), len(names), cell_m)
+    turned = _Turned.of(pieces, azimuth, config)
+    networks = grouped(np.arange(len(pieces)), components(ends))
+    whole = [own for own in networks if _is_crack([pieces[k] for k in own.tolist()], config)]
+    found = [_parts(own, pieces, nodes, turned, config) for own in whole]
+    found.sort(key=lambda parts: min(c.line.bounds[1::-1] for c in parts))
+    numbered = [replace(c, network=k) for k, parts in enumerate(found, start=1) for c in parts]
+    return sorted(numbered, key=lambda c: c.line.bounds[1::-1])
 
 
-def _is_crack(one: Crack, config: CrackJoining) -> bool:
-    long, deep = one.length_m >= config.min_length_m, one.depth_mean_m >= config.min_depth_m
-    return long and deep and one.measured_share >= _LEAST_SHARE
+def _is_crack(network: Sequence[CrackPiece], config: CrackJoining) -> bool:
+    length, measured = sum(p.length_m for p in network), sum(p.measured_m for p in network)
+    deep = sum(p.depth_sum_m2 for p in network) >= config.min_depth_m * measured
+    return length >= config.min_length_m and measured > 0.0 and deep and measured >= _LEAST_SHARE * length
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Nodes where pieces end; junctions closer than a few cells are one."""
+
+    ends: Int64
+    """(n, 2) of each piece."""
+    apart: Int64
+    """(n, 2) the same with all junctions apart."""
+    degree: Int64
+    """Ends that meet at a node, those of pieces within it left out."""
+
+    @classmethod
+    def of(cls, ends: Int64, length_m: Float64, nodes: int, cell_m: float) -> _Nodes:
+        degree = np.bincount(ends.ravel(), minlength=nodes)
+        inner = (length_m < _ONE_NODE_CELLS * cell_m) & (degree[ends] >= 3).all(axis=1)
+        _, merged = _networks(ends[inner], nodes) if inner.any() else (0, np.arange(nodes))
+        return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes))
+
+    def figures(self, own: Int64) -> tuple[int, int, int]:
+        """Junctions and free ends on some pieces, and polygons that they close."""
+        nodes = np.unique(self.ends[own])
+        degree = self.degree[nodes]
+        apart = self.apart[own]
+        polygons = own.size - np.unique(apart).size + np.unique(components(apart)).size
+        return int((degree >= 3).sum()), int((degree == 1).sum()), polygons
+
+
+@dataclass(frozen=True)
+class _Turned:
+    """Directions of each piece (n,)."""
+
+    turning: npt.NDArray[np.complex128]
+    """Sum of the lengths of its chords, each with twice its azimuth."""
+    to_lane: npt.NDArray[np.complex128]
+    """The same with twice the angle to the lane."""
+    parts_m: Float64
+    """(n, 3) lengths along, across and aslant the lane; 0 where it is not known."""
+
+    @classmethod
+    def of(cls, pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackJoining) -> _Turned:
+        rows = [_directions(p, lane, config) for p, lane in zip(pieces, azimuth.tolist(), strict=True)]
+        turning, to_lane, parts = (np.array(column) for column in zip(*rows, strict=True))
+        return cls(turning, to_lane, parts)
 
 
 def _networks(ends: Int64, nodes: int) -> tuple[int, Int64]:
@@ -101,83 +158,82 @@ def _networks(ends: Int64, nodes: int) -> tuple[int, Int64]:
     return int(count), np.asarray(of_node, dtype=np.int64)
 
 
-def _crack(
-    own: Int64,
-    pieces: Sequence[CrackPiece],
-    ends: Int64,
-    azimuth: Float64,
-    cell_m: float,
-    config: CrackJoining,
-) -> Crack:
+def _parts(
+    own: Int64, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned, config: CrackJoining
+) -> list[Crack]:
+    """Cracks of a network."""
+    lines = [pieces[k].line_m for k in own.tolist()]
+    shapes = np.array([shapely.LineString(line) for line in lines], object)
+    outwards = np.array([[_outwards(line[::-1]), _outwards(line)] for line in lines])
+    length = np.array([pieces[k].length_m for k in own.tolist()])
+    whole = Network(nodes.ends[own], length, outwards, turned.parts_m[own])
+
+    def is_net(rows: Int64) -> bool:
+        junctions, _, polygons = nodes.figures(own[rows])
+        covered = shapely.convex_hull(shapely.multilinestrings(shapes[rows])).area
+        return polygons >= config.alligator_polygons and junctions >= config.alligator_nodes_per_m2 * covered
+
+    def within(net: Int64, rows: Int64) -> npt.NDArray[np.bool_]:
+        ground = shapely.buffer(shapely.convex_hull(shapely.multilinestrings(shapes[net])), _BESIDE_NET_M)
+        middle = np.array([lines[k][len(lines[k]) // 2] for k in rows.tolist()])
+        return np.asarray(shapely.intersects_xy(ground, *middle.T))
+
+    found = parts_of(whole, is_net, within, config.min_length_m)
+    return [_crack(own[rows], _KINDS[kind], pieces, nodes, turned) for kind, rows in found]
+
+
+def _outwards(line_m: Float64) -> Float64:
+    """Unit vector out of a line at its end, by a chord."""
+    along = np.cumsum(np.hypot(*np.diff(line_m[::-1], axis=0).T))
+    back = line_m[-1] - line_m[-2 - min(int(np.searchsorted(along, _CHORD_M)), len(line_m) - 2)]
+    size = float(np.hypot(*back))
+    return np.asarray(back / size) if size > 0.0 else np.zeros(2)
+
+
+def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned) -> Crack:
     mine = [pieces[k] for k in own.tolist()]
     length, measured = sum(p.length_m for p in mine), sum(p.measured_m for p in mine)
     width_sum, depth_sum = sum(p.width_sum_m2 for p in mine), sum(p.depth_sum_m2 for p in mine)
     line = shapely.line_merge(shapely.multilinestrings([shapely.LineString(p.line_m) for p in mine]))
     line = line if line.geom_type == "MultiLineString" else shapely.multilinestrings([line])
-    covered = float(shapely.convex_hull(line).area)
-    junctions, ends_free, polygons = _shape(ends[own], np.array([p.length_m for p in mine]), cell_m)
-    direction, lane_angle, parts = _directions(mine, azimuth[own], config)
+    parts = turned.parts_m[own].sum(axis=0)
+    junctions, ends, polygons = nodes.figures(own)
     return Crack(
-        _kind(junctions, polygons, covered, parts, config),
-        length,
-        width_sum / measured if measured > 0 else math.nan,
-        max(p.width_max_m for p in mine),
-        depth_sum / measured if measured > 0 else math.nan,
-        max(p.depth_max_m for p in mine),
-        width_sum * (length / measured) if measured > 0 else math.nan,
-        covered,
-        junctions,
-        ends_free,
-        measured / length,
-        polygons,
-        direction,
-        lane_angle,
-        *parts,
-        line,
-        own,
+        network=0,
+        kind=kind,
+        length_m=length,
+        width_mean_m=width_sum / measured if measured > 0 else math.nan,
+        width_max_m=max(p.width_max_m for p in mine),
+        depth_mean_m=depth_sum / measured if measured > 0 else math.nan,
+        depth_max_m=max(p.depth_max_m for p in mine),
+        area_m2=width_sum * (length / measured) if measured > 0 else math.nan,
+        covered_m2=float(shapely.convex_hull(line).area),
+        junctions=junctions,
+        ends=ends,
+        measured_share=measured / length if length > 0 else 0.0,
+        polygons=polygons,
+        azimuth_deg=math.degrees(np.angle(turned.turning[own].sum()) / 2) % 180.0,
+        lane_angle_deg=abs(math.degrees(np.angle(turned.to_lane[own].sum()) / 2)),
+        longitudinal_m=float(parts[0]),
+        transverse_m=float(parts[1]),
+        diagonal_m=float(parts[2]),
+        line=line,
+        pieces=own,
     )
 
 
-def _kind(
-    junctions: int, polygons: int, covered_m2: float, parts: tuple[float, float, float], config: CrackJoining
-) -> CrackType:
-    if polygons >= config.alligator_polygons and junctions >= config.alligator_nodes_per_m2 * covered_m2:
-        return "alligator"
-    kinds: tuple[CrackType, ...] = ("longitudinal", "transverse", "diagonal")
-    return kinds[int(np.argmax(parts))] if sum(parts) > 0.0 else "unknown"
-
-
-def _shape(ends: Int64, length_m: Float64, cell_m: float) -> tuple[int, int, int]:
-    """Junctions, free ends, polygons of a network."""
-    nodes, local = np.unique(ends, return_inverse=True)
-    local = local.reshape(ends.shape)
-    polygons = len(ends) - nodes.size + 1
-    degree = np.bincount(local.ravel(), minlength=nodes.size)
-    short = (length_m < _ONE_NODE_CELLS * cell_m) & (degree[local] >= 3).all(axis=1)
-    _, merged = _networks(local[short], nodes.size) if short.any() else (0, np.arange(nodes.size))
-    kept = merged[local[~short]]
-    counted = Counter(kept.ravel().tolist())
-    return sum(n >= 3 for n in counted.values()), sum(n == 1 for n in counted.values()), polygons
-
-
-def _directions(
-    pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackJoining
-) -> tuple[float, float, tuple[float, float, float]]:
-    """Azimuth and angle to the lane (degrees) of the whole, and lengths along, across and aslant (m)."""
-    turning, to_lane, parts = 0j, 0j, np.zeros(3)
+def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:
+    """Sums over the chords of a piece, of :class:`_Turned`."""
+    count = max(1, round(one.length_m / _CHORD_M))
+    picked = one.line_m[np.unique(np.linspace(0, len(one.line_m) - 1, count + 1).round().astype(np.int64))]
+    chord = np.diff(picked, axis=0)
+    size = np.hypot(*chord.T)
+    angle = np.arctan2(chord[:, 0], chord[:, 1])
+    off = np.abs((angle - lane + np.pi / 2) % np.pi - np.pi / 2)
     limit = math.radians(config.lane_angle_deg)
-    for one, lane in zip(pieces, azimuth.tolist(), strict=True):
-        count = max(1, round(one.length_m / _CHORD_M))
-        picked = one.line_m[np.unique(np.linspace(0, len(one.line_m) - 1, count + 1).round().astype(np.int64))]
-        chord = np.diff(picked, axis=0)
-        size = np.hypot(*chord.T)
-        angle = np.arctan2(chord[:, 0], chord[:, 1])
-        turning += complex((size * np.exp(2j * angle)).sum())
-        to_lane += complex((size * np.exp(2j * (angle - lane))).sum())
-        off = np.abs((angle - lane + np.pi / 2) % np.pi - np.pi / 2)
-        along, across = off <= limit, off >= np.pi / 2 - limit
-        share = size * (one.length_m / max(size.sum(), 1e-12))
-        if not math.isnan(lane):
-            parts += [share[along].sum(), share[across].sum(), share[~along & ~across].sum()]
-    azimuth_deg = math.degrees(np.angle(turning) / 2) % 180.0
-    return azimuth_deg, abs(math.degrees(np.angle(to_lane) / 2)), (float(parts[0]), float(parts[1]), float(parts[2]))
+    along, across = off <= limit, off >= np.pi / 2 - limit
+    share = size * (one.length_m / max(size.sum(), 1e-12))
+    known = 0.0 if math.isnan(lane) else 1.0
+    parts = [known * float(share[own].sum()) for own in (along, across, ~along & ~across)]
+    turning, to_lane = (complex((size * np.exp(2j * a)).sum()) for a in (angle, angle - lane))
+    return turning, to_lane, parts

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import shapely
 from scipy.ndimage import distance_transform_edt, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from roadscan.kernels.cross_sections import cross_sections
 from roadscan.model.distress import CrackDetection, CrackJoining
@@ -15,6 +17,7 @@ from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.crack_network import join_cracks
+from roadscan.surfaces.crack_parts import bridges
 from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells, sharpened
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.skeleton_graph import SkeletonGraph, pruned
@@ -85,12 +88,14 @@ def test_a_crack_of_5_mm_by_3_mm_is_found_where_it_is(branched):
 
 
 def test_its_figures_are_those_of_the_simulator(branched):
-    (one,) = branched[2]
-    assert one.depth_mean_m == pytest.approx(0.003, rel=0.1)
-    assert one.width_mean_m == pytest.approx(0.541 * 0.005, abs=2 * CELL_M)  # (1 - u²)² = 1/2
-    assert (one.junctions, one.ends, one.polygons) == (1, 3, 0)
-    assert one.depth_max_m >= one.depth_mean_m and one.width_max_m >= one.width_mean_m
-    assert one.area_m2 == pytest.approx(one.length_m * one.width_mean_m)
+    one, branch = sorted(branched[2], key=lambda c: -c.length_m)
+    for crack in (one, branch):
+        assert crack.depth_mean_m == pytest.approx(0.003, rel=0.1)
+        assert crack.width_mean_m == pytest.approx(0.541 * 0.005, abs=2 * CELL_M)  # (1 - u²)² = 1/2
+        assert crack.depth_max_m >= crack.depth_mean_m and crack.width_max_m >= crack.width_mean_m
+        assert crack.area_m2 == pytest.approx(crack.length_m * crack.width_mean_m)
+    assert (one.junctions, one.ends, one.polygons) == (1, 2, 0)
+    assert (branch.kind, branch.junctions, branch.ends, branch.network) == ("transverse", 1, 1, one.network)
 
 
 def test_a_clean_road_with_stains_has_none():
@@ -188,15 +193,71 @@ def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
     ] == figures
 
 
-def test_short_pieces_count_when_they_join():
-    def piece(a, b):
-        line = np.array([[0.01 * a, 5.0], [0.01 * b, 5.0]])
-        return CrackPiece(
-            line, (500, a), (500, b), *[float(v) for v in (0.01 * (b - a), 0.01 * (b - a))], 1e-5, 0.004, 1e-4, 0.01
-        )
+def piece(start, end):
+    """A straight piece of 1 cm cells, from (row, column) to (row, column)."""
+    a, b = np.array(start[::-1]) * 0.01, np.array(end[::-1]) * 0.01
+    length = float(np.hypot(*(b - a)))
+    line = a + np.linspace(0, 1, max(int(length / 0.02), 2))[:, None] * (b - a)
+    return CrackPiece(line, start, end, length, length, 0.004 * length, 0.004, 0.01 * length, 0.01)
 
-    assert join_cracks([piece(0, 8)], 0.0, 0.01, JOINING) == []
-    (one,) = join_cracks([piece(8, 16), piece(0, 8)], 0.0, 0.01, JOINING)
+
+def kinds(pieces, lane=0.0):
+    """Type, length (cm) and network of the cracks that pieces make, for a lane to the north."""
+    found = join_cracks(pieces, lane, 0.01, JOINING)
+    assert sorted(k for c in found for k in c.pieces.tolist()) == list(range(len(pieces)))  # each in one
+    return sorted((c.kind, round(100 * c.length_m), c.network) for c in found)
+
+
+def test_cracks_that_meet_are_parts_of_a_network():
+    along = [piece((0, 100), (90, 100)), piece((90, 100), (92, 101)), piece((92, 101), (200, 100))]  # a tile's border
+    across = [piece((90, 100), (90, 20)), piece((92, 101), (92, 190))]
+    assert kinds(along + across) == [("longitudinal", 200, 1), ("transverse", 169, 1)]
+    spur = piece((92, 101), (84, 107))  # too short for a crack of its own
+    assert kinds([*along, *across, spur]) == [("longitudinal", 210, 1), ("transverse", 169, 1)]
+    apart = [piece((0, 900), (0, 960))]
+    assert kinds(along + across + apart) == [("longitudinal", 200, 1), ("transverse", 60, 2), ("transverse", 169, 1)]
+    assert kinds(along + across, float("nan")) == [("unknown", 369, 1)]
+
+
+def test_a_crack_keeps_its_type_where_branches_leave_it():
+    stations = range(0, 200, 40)
+    wandering = [piece((s, 100 + 12 * (k % 2)), (s + 40, 112 - 12 * (k % 2))) for k, s in enumerate(stations)]
+    steep = piece((200, 112), (222, 133))  # 44°, and goes on
+    sides = [piece((s, 100 + 12 * (k % 2)), (s, 160)) for k, s in enumerate(stations) if k]
+    found = kinds([*wandering, steep, *sides])
+    assert [f[0] for f in found] == ["longitudinal"] + 4 * ["transverse"]
+    assert found[0][1] == pytest.approx(5 * 41.8 + 30.4, abs=2)
+
+
+def test_a_net_is_parted_from_the_crack_that_runs_into_it():
+    posts = [(r, c) for r in (0, 30, 60) for c in (0, 30, 60)]
+    mesh = [piece((r, c), (r, c + 30)) for r, c in posts if c < 60]
+    mesh += [piece((r, c), (r + 30, c)) for r, c in posts if r < 60]
+    dead_end = piece((30, 30), (42, 44))
+    into = [piece((60, 30), (160, 30)), piece((160, 30), (300, 32))]
+    far = [piece(a, b) for a, b in (((300, 32), (340, 32)), ((340, 32), (340, 70)), ((340, 70), (300, 32)))]
+    found = kinds([*mesh, dead_end, *into, *far])
+    assert ("alligator", 378, 1) in found
+    assert [f[0] for f in found if f[0] != "alligator"] == ["longitudinal"]  # one polygon is no net
+    (net,) = [c for c in join_cracks([*mesh, *into], 0.0, 0.01, JOINING) if c.kind == "alligator"]
+    assert net.polygons == len(shapely.polygonize([shapely.LineString(p.line_m) for p in mesh]).geoms) == 4
+
+
+def test_bridges_are_those_without_which_a_network_falls_apart():
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        ends = rng.integers(0, 14, (16, 2))
+        found = bridges(ends)
+        sets = lambda rows: connected_components(  # noqa: E731
+            coo_array((np.ones(len(rows)), tuple(rows.T)), shape=(14, 14)), directed=False
+        )[0]
+        expected = [sets(np.delete(ends, k, axis=0)) > sets(ends) for k in range(16)]
+        assert found.tolist() == expected
+
+
+def test_short_pieces_count_when_they_join():
+    assert join_cracks([piece((500, 0), (500, 8))], 0.0, 0.01, JOINING) == []
+    (one,) = join_cracks([piece((500, 8), (500, 16)), piece((500, 0), (500, 8))], 0.0, 0.01, JOINING)
     assert one.length_m == pytest.approx(0.16) and one.line.length == pytest.approx(0.16)
     assert sorted(one.pieces.tolist()) == [0, 1]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.bit_words import appended
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import bare, bare_inlined, kernel
 
 SEGMENT = 16
 _SHORTEST_GAP = 4
@@ -38,7 +38,7 @@ def room_words(size: int) -> int:
     return (size * _MOST_BITS // 8 + 512) // 8
 
 
-@kernel
+@bare
 def _segments(words, rest, literals):
     """List the segments whose bytes are coded one by one; returns how many, and Adler-32's two sums over all bytes.
 
@@ -79,7 +79,7 @@ def _segments(words, rest, literals):
     return found, low, high
 
 
-@inlined
+@bare_inlined
 def _length_symbol(run):
     """Symbol of a match of 3 to 258 bytes, its further bits, and how many these are."""
     if run == _LONGEST_RUN:
@@ -156,7 +156,7 @@ def _code(counts, entries):
                 following += 1
 
 
-@kernel
+@bare
 def _head(entries, words):
     """Write zlib's header and the block's code: (word to go on with, its index, its bits)."""
     word, used, to = _U(0), _U(0), _U(0)
@@ -205,13 +205,13 @@ def _pair_up(entries, pairs):
             row[s] = bits[s] | (own << lengths[s]) | ((lengths[s] + size) << np.uint32(_PAIR_BITS))
 
 
-@inlined
+@bare_inlined
 def _one(entries, symbol):
     entry = _U(entries[symbol])
     return entry & _U(0xFFFF), entry >> _U(16)
 
 
-@kernel
+@bare
 def _run(run, entries, words, word, to, used):
     """Write zeros, which follow a zero."""
     while run > 2:
@@ -228,7 +228,7 @@ def _run(run, entries, words, word, to, used):
     return word, to, used
 
 
-@kernel
+@bare
 def _pack(data, pixels, literals, entries, pairs, words):
     """Write the head, all bytes and the block's end; returns the bits written."""
     word, to, used = _head(entries, words)

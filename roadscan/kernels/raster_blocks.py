@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.cell_runs import run_end
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import bare
 
 EMPTY_LINE = (0x7F, 0xC0 - 0x7F, 0x100 - 0xC0, 0)
 """Where the planes of a line of NaN begin; all else in it is 0."""
 
 
-@kernel
+@bare
 def cut_lines(column, starts, width, cuts):
     """Find the first cell of each line at or beyond the west of each block of `width` columns.
 
@@ -34,28 +33,40 @@ def cut_lines(column, starts, width, cuts):
             cuts[block, line] = start = low
 
 
-@kernel
+@bare
 def round_values(values, per_step, step, rounded):
     """Round (n,) values of any kind to multiples of `step`; rounded (n,) float32, out."""
     for k in range(rounded.size):
         rounded[k] = np.rint(values[k] * per_step) * step
 
 
-@kernel
+@bare
+def _copy(values, out):
+    for i in range(out.size):
+        out[i] = values[i]
+
+
+@bare
+def _scatter(column, values, west, line):
+    for i in range(column.size):
+        line[np.uint64(np.int64(column[i]) - west)] = values[i]
+
+
+@bare
 def _subtract(bytes_, before, differences):
     for i in range(differences.size):
         differences[i] = bytes_[i] - before[i]
 
 
-@kernel
+@bare
 def _pick(words, shift, plane):
     """One byte of each word."""
     for x in range(plane.size):
         plane[x] = np.uint8((words[x] >> shift) & np.uint32(255))
 
 
-@kernel
-def encode_block(column, row, values, first, last, west, out, line, differences):
+@bare
+def encode_block(column, values, first, last, west, out, line, pixels, differences, by_byte):
     """Write one block of float32 pixels as TIFF's floating-point predictor wants it (TIFF Technical Note 3).
 
     Of each line of pixels the most significant bytes come first, then the next, down to the least; then every
@@ -63,19 +74,17 @@ def encode_block(column, row, values, first, last, west, out, line, differences)
 
     Parameters
     ----------
-    column, row : (n,) uint16, cells of a raster, sorted by row, column; values : (n,) float32.
+    column : (n,) uint16, of the cells of a raster, which are sorted by row, column; values : (n,) float32.
     first, last : (lines,) int64, the first cell of each line of the block, from the north, and the first beyond it.
     west : int, column of the block's first pixel.
     out : (lines · width · 4,) uint8, out.
-    line : (width,) float32 and differences : (width,) uint32, scratch.
+    line : (width,) float32 and differences : (width,) uint32, scratch; pixels, by_byte : uint8, the same memory.
 
     Returns
     -------
     int, cells in the block; all other pixels are NaN.
     """
     width = line.size
-    pixels = line.view(np.uint8)
-    by_byte = differences.view(np.uint8)
     filled = 0
     line[:] = np.nan
     for y in range(first.size):
@@ -88,11 +97,11 @@ def encode_block(column, row, values, first, last, west, out, line, differences)
                 coded[plane * width] = EMPTY_LINE[plane]
             continue
         filled += n
-        while start < end:
-            following = end if column[end - 1] - column[start] == end - 1 - start else run_end(column, row, start, end)
+        if column[end - 1] - column[start] == n - 1:
             at = np.int64(column[start]) - west
-            line[at : at + following - start] = values[start:following]
-            start = following
+            _copy(values[start:end], line[at : at + n])
+        else:
+            _scatter(column[start:end], values[start:end], west, line)
         _subtract(pixels[4:], pixels[:-4], by_byte[4:])
         for plane in range(4):
             _pick(differences, np.uint32(24 - 8 * plane), coded[plane * width : (plane + 1) * width])

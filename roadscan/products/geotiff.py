@@ -136,6 +136,7 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Pac
     starts = np.append(np.searchsorted(image.row, np.arange(image.edge, dtype=np.uint16)), len(image.row))
     out, differences = np.empty(edge * edge * 4, np.uint8), np.empty(edge, np.uint32)
     line = np.empty(edge, np.float32)
+    lines = line, line.view(np.uint8), differences, differences.view(np.uint8)
     cuts = np.empty((across + 1, across * edge), np.int64)
     cuts[:, image.edge :] = 0
     cut_lines(image.column, starts, edge, cuts[:, : image.edge])
@@ -152,7 +153,7 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Pac
                 if (first == last).all():
                     blocks.append(None)
                     continue
-                encode_block(image.column, image.row, rounded, first, last, block * edge, out, line, differences)
+                encode_block(image.column, rounded, first, last, block * edge, out, *lines)
                 blocks.append(packer.pack(out))
     return Page(layout(image.edge, image.edge, edge, len(bands), reduced), blocks)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -10,16 +11,20 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.jobs.readings import Ground, RawSlice, geometry_of, load_trajectory
+from roadscan.jobs.readings import Ground, RawSlice, ReadingSource, geometry_of, load_trajectory
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import NavigationError, StoreError
+from roadscan.model.gpstime import NS_PER_S
 from roadscan.points.charts import charts_along
 from roadscan.points.reach import RangeSpans, Reach, Touched, joined
 from roadscan.points.readings import ScanGeometry
+from roadscan.tables.profiles import ProfileReader
 from roadscan.tables.store import Store
 
 _SPAN_COLUMNS = ["range_low", "range_high"]
 _CHUNK_READINGS = 1 << 22
+_WINDOW_NS = 120 * NS_PER_S
+_KEPT = threading.local()
 
 
 def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
@@ -36,7 +41,7 @@ def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
         rows = file.read_row_groups(list(one.groups), columns=["epoch_gps_ns", *stored], use_threads=False)
         spans = _stored_spans(rows, geometry)
         if reach.is_loose(spans, geometry):
-            spans = _read_spans(file, one.groups, counts, geometry)
+            spans = _read_spans(store, one, counts, geometry)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     return reach.profiles(_on_time(one, rows.column("epoch_gps_ns").to_numpy()), spans, starts, geometry)
 
@@ -51,13 +56,24 @@ def group_spans(store: Store, one: RawSlice) -> npt.NDArray[np.int64]:
 
 
 def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
-    """Poses around a slice and how far its readings count; None without any pose."""
-    source = one.source
+    """Poses around a slice and how far its readings count; None without any pose.
+
+    They are those of the minutes that it lies in, and kept for the next slice: files may hold seconds.
+    """
+    spans = [(a // _WINDOW_NS * _WINDOW_NS, -(-b // _WINDOW_NS) * _WINDOW_NS) for a, b in one.spans]
+    wanted = (store.root, one.source.key, ground, spans)
+    kept: tuple[object, Reach | None] | None = getattr(_KEPT, "reach", None)
+    if kept is None or kept[0] != wanted:
+        kept = _KEPT.reach = (wanted, _loaded(store, ground, one.source, spans))
+    return kept[1]
+
+
+def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence[tuple[int, int]]) -> Reach | None:
     if source.trajectory is None:
         raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
     if ground.grids is not None:
         add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
-    trajectory = load_trajectory(store, source.trajectory, one.spans, ground.max_gap_s)
+    trajectory = load_trajectory(store, source.trajectory, spans, ground.max_gap_s)
     if trajectory.epochs_gps_ns.size == 0:
         return None
     return Reach(
@@ -95,16 +111,14 @@ def _stored_spans(rows: pa.Table, geometry: ScanGeometry) -> RangeSpans:
     return RangeSpans.of_profiles(low, high, geometry)
 
 
-def _read_spans(
-    file: pq.ParquetFile, groups: Sequence[int], counts: Sequence[int], geometry: ScanGeometry
-) -> RangeSpans:
+def _read_spans(store: Store, one: RawSlice, counts: Sequence[int], geometry: ScanGeometry) -> RangeSpans:
     """Spans of ranges of the parts of each profile, from the readings."""
     step = max(_CHUNK_READINGS // (max(counts) * geometry.readings), 1)
-    parts: list[RangeSpans] = []
-    for start in range(0, len(groups), step):
-        rows = file.read_row_groups(list(groups[start : start + step]), columns=["range"], use_threads=False)
-        flat = rows.column("range").combine_chunks().flatten().to_numpy()
-        parts.append(RangeSpans.of_ranges(flat.reshape(rows.num_rows, geometry.readings)))
+    reader = ProfileReader(store, one.file)
+    parts = [
+        RangeSpans.of_ranges(reader.read(one.groups[start : start + step]).range)
+        for start in range(0, len(one.groups), step)
+    ]
     low, high = (np.concatenate([getattr(p, name) for p in parts]) for name in ("low", "high"))
     return RangeSpans(low, high, parts[0].block_readings)
 

@@ -40,7 +40,7 @@ from .conftest import Lines, Simulated, changed, outputs, small_scene
 SURFACES = tuple(s for s in STAGES if s.name == "surfaces")
 CELLS: dict[str, object] = {"method": "cells", "sigma_m": 0.004}
 POINTS: dict[str, object] = {"method": "points", "sigma_m": 0.006, "cell_m": (0.03, 0.04)}
-POTHOLE = {"station_m": 6.0, "offset_m": 1.4, "radius_m": 0.3, "depth_m": 0.05}
+POTHOLE = {"station_m": 3.9, "offset_m": 2.5, "radius_m": 0.3, "depth_m": 0.05}
 MADE = {"make": ["surface", "surface_pictures"], "options": {}}
 
 
@@ -342,6 +342,32 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     assert verify_store(points.store) == []
     assert points.run(points.survey(None, {"make": [], "options": {}})) == ([], {})
     assert not points.store.files("tables/regions")
+
+
+def test_workers_change_no_byte_of_cracks_and_potholes(points: Reconstructed, tmp_path: Path) -> None:
+    scene = load(points.simulated.survey_file.parent).scene
+    place, azimuth = scene.map, np.radians(scene.map.azimuth_deg)
+    station, offset = POTHOLE["station_m"], POTHOLE["offset_m"]  # on the border of two tiles
+    east = place.easting_m + station * np.sin(azimuth) + offset * np.cos(azimuth)
+    north = place.northing_m + station * np.cos(azimuth) - offset * np.sin(azimuth)
+    layer = tmp_path / "hole.gpkg"
+    geopandas.GeoDataFrame(geometry=[shapely.Point(east, north).buffer(0.9)], crs=place.crs).to_file(layer)
+    finely = {**UNSMOOTHED, "cell_m": [0.007, 0.007], "regions": "polygons", "polygons": str(layer)}
+    options = {"crack_pieces": {"max_width_m": 0.02, "spur_m": 0.0}}
+    survey = points.survey(finely, {"make": ["cracks", "potholes"], "options": options})
+    stages = [s for s in STAGES if s.name in ("surfaces", "products")]
+    made = []
+    for compute in (Inline(), TwoThreads()):
+        points.forget()
+        manifest = Manifest(points.store)
+        for name in ("cracks", "potholes"):
+            manifest.forget(name, list(manifest.of(name)))
+        run_stages(Run(survey, points.store, compute, None, Lines()), stages)
+        made.append({p: b for p, b in outputs(points.store).items() if "pieces" in p or p.startswith("products/")})
+    assert made[0] == made[1] and len(made[0]) > 4
+    (hole,) = query(points.store, "SELECT * FROM potholes").to_pylist()
+    assert np.hypot(hole["easting_m"] - east, hole["northing_m"] - north) < 0.1
+    assert len(hole["tiles"].split()) == 2
 
 
 def test_polygons_beside_the_survey_are_an_error(points: Reconstructed, tmp_path: Path) -> None:

@@ -23,9 +23,13 @@ PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
 _TYPE: Final = thrift.i32(0)
 """Of a data page."""
 _LENGTH_BYTES: Final = 4
-_SIZES_AND_CRC: Final = re.compile(rb".{3}([\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.).([\x80-\xFF]{0,4}.)", re.DOTALL)
+_SIZES_AND_CRC: Final = re.compile(
+    rb"\x15\x00" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
+)
 """A page's type, its bytes before and after it was compressed, its CRC, each behind the byte that names the field."""
 _LONGEST_HEADER: Final = 64
+_LIMIT: Final = 1 << 31
+"""Of a number of 32 bits."""
 
 Bools = np.ndarray[Any, np.dtype[np.bool_]]
 
@@ -71,6 +75,14 @@ def _about(values: int, encoding: int) -> thrift.Value:
     return thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
 
 
+@functools.lru_cache(maxsize=64)
+def _rest(values: int, encoding: int) -> bytes:
+    """What follows the sizes and the CRC-32 in a header."""
+    header = page_header(0, 0, values, encoding)
+    found = _SIZES_AND_CRC.match(header)
+    return header[found.end() :] if found else b""
+
+
 class PageHeader(NamedTuple):
     """What the header of a column chunk's one page says."""
 
@@ -87,12 +99,13 @@ def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -
     found = _SIZES_AND_CRC.match(head)
     if found is None:
         return None
-    raw, size, crc = _number(found[1]), _number(found[2]), _number(found[3]) % (1 << 32)
-    length = chunk.size - size
-    known = raw >= 0 and size >= 0 and 0 < length <= len(head)
-    if not known or head[:length] != page_header(size, crc, values, encoding, raw):
+    raw, size, crc = (_number(varint) for varint in found.groups())
+    rest = _rest(values, encoding)
+    length = found.end() + len(rest)
+    known = 0 <= raw < _LIMIT and 0 <= size < _LIMIT and -_LIMIT <= crc < _LIMIT
+    if not known or length + size != chunk.size or head[found.end() : length] != rest:
         return None
-    return PageHeader(length, crc, raw)
+    return PageHeader(length, crc % (1 << 32), raw)
 
 
 def _number(varint: bytes) -> int:

@@ -1,4 +1,8 @@
-"""Piles of a tile's rows → statistics of its cells, equal to the bit with those of ``kernels.cells``."""
+"""Piles of a tile's rows → statistics of its cells, equal to the bit with those of ``kernels.cells``.
+
+Cells of about as many readings are put side by side, wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
+readings go through ``kernels.lanes`` together. Fuller ones are taken one by one.
+"""
 
 from __future__ import annotations
 
@@ -7,122 +11,175 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.cells import AT_ONCE, STATISTICS, kth_smallest
 from roadscan.kernels.lanes import LANES, REACH, statistics_of, statistics_of_64
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.row_piles import COLUMN, LIGHT, LIGHT_SHIFT, free_row, last_block, size_of
+from roadscan.kernels.selection import BINS, smallest
 
 statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
 
+SHORT, MEDIUM, LONG = 8, 32, 64
+"""Readings of the fullest cells that are taken side by side, by table."""
 WORD = 64
 """Passes that a word of marks names."""
+COUNT_SHIFT = np.int64(40)
+"""A cell's readings and the sum of their intensities are one number, the intensities in so many bits …"""
+MOST = 1 << 23
+"""… which does for rows of fewer readings."""
+_LIGHTS = np.int64((1 << 40) - 1)
+_COUNT, _LIGHT, _BASE, _TARGET = range(4)
+_MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)
 
 
 def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
     """Arrays that a row of `edge` cells with up to `most` readings of so many passes is worked on in."""
-    return (
-        np.zeros(edge, np.int32), np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64),
-        np.empty(edge, np.int32), np.empty(edge, np.int32), np.empty(most, np.int32),
-        np.zeros((AT_ONCE, LANES), np.int32), *(np.zeros(LANES, np.int32) for _ in range(3)),
-        np.zeros((STATISTICS, LANES)), np.empty(most, np.int32),
+    tables = tuple(np.zeros((n, LANES), np.int32) for n in (SHORT, MEDIUM, LONG))
+    own = tuple(np.zeros((4, LANES), np.int32) for _ in tables)
+    row = (
+        np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64), np.empty(edge, np.int32),
+        np.empty(edge + 1, np.int32), np.empty(most, np.int32),
     )  # fmt: skip
+    select = np.empty(most, np.int32), np.empty(BINS, np.int32), np.empty(most + 1, np.int32)
+    return row, tables, own, np.zeros(len(tables), np.int64), np.zeros((6, LANES)), select
 
 
 @bare
-def sort_row(end, piles, counts, light, marks, starts, used, heights):
+def mark_row(end, piles, marks):
+    """Note the passes of a row's cells; marks : (edge, w) uint64, in/out, zeros. See :func:`sort_row`."""
+    records, before, sizes, owners, _, _ = piles
+    block = last_block(end)
+    while block >= 0:
+        word, mark = np.int64(owners[block]) // WORD, np.uint64(1) << np.uint64(np.int64(owners[block]) % WORD)
+        for k in range(size_of(block, end, sizes)):
+            marks[records[block * LONG + k] & COLUMN, word] |= mark
+        block = np.int64(before[block])
+
+
+@bare
+def sort_row(end, piles, sums, ends, used, heights):
     """Heights of a row cell by cell, in the order of the cells; returns how many cells have one.
 
     Parameters
     ----------
     end : int32, of the row's pile; piles : see ``row_piles.put_on_piles``.
-    counts : (edge,) int32, light : (edge,) int64, marks : (edge, w) uint64, in/out, zeros: readings, sum of intensities
-    and passes of each cell.
-    starts : (edge,) int32, out, end of each cell's heights; used : (edge,) int32, out, cells that have some, ascending.
+    sums : (edge,) int64, in/out, zeros: readings of each cell above COUNT_SHIFT, below it the sum of their intensities.
+    ends : (edge,) int32, out, end of each cell's heights; used : (edge + 1,) int32, out, cells that have some.
     heights : (≥ readings,) int32, out.
     """
-    records, before, sizes, owners, _, _ = piles
+    records, before, sizes, _, _, _ = piles
+    one = np.int64(1) << COUNT_SHIFT
     block = last_block(end)
     while block >= 0:
-        first, word = np.uint64(block) * np.uint64(64), np.int64(owners[block]) // WORD
-        mark = np.uint64(1) << np.uint64(np.int64(owners[block]) % WORD)
+        first = np.uint64(block) * np.uint64(LONG)
         for k in range(np.uint64(size_of(block, end, sizes))):
             record = records[first + np.uint64(k)]
-            cell = record & COLUMN
-            counts[cell] += np.int32(1)
-            light[cell] += np.int64((record >> LIGHT_SHIFT) & LIGHT)
-            marks[cell, word] |= mark
+            sums[record & COLUMN] += one + np.int64((record >> LIGHT_SHIFT) & LIGHT)
         block = np.int64(before[block])
     cells, at = 0, np.int32(0)
-    for cell in range(counts.size):
-        if counts[cell]:
-            used[cells], starts[cell] = cell, at
-            cells += 1
-            at += counts[cell]
+    for cell in range(sums.size):
+        used[cells], ends[cell] = cell, at
+        cells += sums[cell] != 0
+        at += np.int32(sums[cell] >> COUNT_SHIFT)
     block = last_block(end)
     while block >= 0:
-        first = np.uint64(block) * np.uint64(64)
+        first = np.uint64(block) * np.uint64(LONG)
         for k in range(np.uint64(size_of(block, end, sizes))):
             record = records[first + np.uint64(k)]
             cell = record & COLUMN
-            heights[np.uint64(starts[cell])] = np.int32(np.int64(record) >> np.int64(32))
-            starts[cell] += np.int32(1)
+            at = ends[cell]
+            heights[np.uint64(at)] = np.int32(np.int64(record) >> np.int64(32))
+            ends[cell] = at + np.int32(1)
         block = np.int64(before[block])
     return cells
 
 
 @bare
-def statistics_of_long(heights, light, floor, quantum_m, work, out, lane):
-    """Statistics of one cell of n readings, as ``lanes.statistics_of``, into out[:, lane].
-
-    heights : (n,) int32; light : int64, sum of intensities; work : (≥ n,) int32.
-    """
-    n, base = heights.size, np.int64(heights[0])
-    for k in range(n):
-        work[k] = np.int32(heights[k] - base)
-    median = np.int64(kth_smallest(work, n, (n - 1) // 2))
-    total, squares, low, high = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
-    for k in range(n):
-        d = np.int64(heights[k]) - base - median
-        low, high = min(low, d), max(high, d)
-        total += d
-        squares += d * d
-        work[k] = np.int32(abs(d))
-    reach = np.int64(math.floor(max(REACH * kth_smallest(work, n, (n - 1) // 2), floor)))
-    used, near = 0, np.int64(0)
-    for k in range(n):
-        d = np.int64(heights[k]) - base - median
-        inside = (d <= reach) & (d >= -reach)
-        used += inside
-        near += d * inside
-    middle, average = median + base, total / n
-    out[0, lane] = (middle + average) * quantum_m
-    out[1, lane] = (middle + near / used) * quantum_m
-    out[2, lane] = (middle + low) * quantum_m
-    out[3, lane] = (middle + high) * quantum_m
-    out[4, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
-    out[5, lane] = light / n
+def differences(heights, base, out):
+    """Heights (n,) int32 above a base → out (≥ n,) int32."""
+    for k in range(heights.size):
+        out[k] = heights[k] - base
 
 
 @bare
-def fill_table(cells, counts, light, starts, heights, table, own_counts, own_light, bases):
-    """Heights of up to sixteen cells side by side, relative to the first of each; returns the most that a cell has.
+def distances(heights, middle, out):
+    """Distances of heights (n,) int32 from another → out (≥ n,) int32."""
+    for k in range(heights.size):
+        out[k] = abs(heights[k] - middle)
 
-    Cells of more than `AT_ONCE` heights, and lanes without a cell, get none.
+
+@bare
+def sums_of(heights, middle, reach):
+    """Of (n,) int32 less another: sum, sum of squares, number within reach, and their sum."""
+    total, squares, used, near = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    for k in range(heights.size):
+        d = np.int64(heights[k]) - middle
+        inside = np.int64((d <= reach) & (d >= -reach))
+        total += d
+        squares += d * d
+        used += inside
+        near += d * inside
+    return total, squares, used, near
+
+
+@bare
+def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
+    """Statistics of one cell of n readings, as ``lanes.statistics_of``, into out[:, lane].
+
+    heights : (n,) int32; light : int64, sum of intensities; select : work, see :func:`row_arrays`.
     """
-    most = np.int32(0)
-    for lane in range(LANES):
-        own_counts[lane] = 0
-        if lane < cells.size:
-            cell = np.uint64(cells[lane])
-            n = counts[cell]
-            if n <= AT_ONCE:
-                first = np.uint64(starts[cell] - n)
-                base = heights[first]
-                own_counts[lane], own_light[lane], bases[lane] = n, np.int32(light[cell]), base
-                most = max(most, n)
-                for k in range(np.uint64(n)):
-                    table[k, lane] = heights[first + np.uint64(k)] - base
-    return most
+    work, bins, found = select
+    n, base = heights.size, heights[0]
+    differences(heights, base, work)
+    median = smallest(work[:n], (n - 1) // 2, bins, found)
+    middle = np.int64(base) + median
+    distances(heights, np.int32(middle), work)
+    low, high = np.int64(heights[0]), np.int64(heights[0])
+    for k in range(n):
+        low, high = min(low, np.int64(heights[k])), max(high, np.int64(heights[k]))
+    reach = np.int64(math.floor(max(REACH * smallest(work[:n], (n - 1) // 2, bins, found), floor)))
+    total, squares, used, near = sums_of(heights, middle, reach)
+    average = total / n
+    out[_MEAN, lane] = (middle + average) * quantum_m
+    out[_ROBUST, lane] = (middle + near / used) * quantum_m
+    out[_LOW, lane] = low * quantum_m
+    out[_HIGH, lane] = high * quantum_m
+    out[_DEVIATION, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
+    out[_BRIGHT, lane] = light / n
+
+
+@bare
+def put_aside(heights, light, target, table, own, lane):
+    """Put a cell's heights (n,) int32 into a lane of a table."""
+    base = heights[0]
+    own[_COUNT, lane], own[_LIGHT, lane] = heights.size, np.int32(light)
+    own[_BASE, lane], own[_TARGET, lane] = base, target
+    for k in range(np.uint64(heights.size)):
+        table[k, lane] = heights[k] - base
+
+
+@bare_inlined
+def write_out(out, lane, cell, columns):
+    """Write the statistics of a lane to a cell's place."""
+    mean, robust, low, high, deviation, bright = columns
+    mean[cell], robust[cell], low[cell], high[cell] = out[0, lane], out[1, lane], out[2, lane], out[3, lane]
+    deviation[cell], bright[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])
+
+
+@bare
+def finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns):
+    """Statistics of the cells in a table, to their places; the table is empty then."""
+    own = owns[kind]
+    for lane in range(lanes[kind], LANES):
+        own[_COUNT, lane] = 0
+    if kind == 0:
+        statistics_of_8(tables[0], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    elif kind == 1:
+        statistics_of_32(tables[1], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    else:
+        statistics_of_64(tables[2], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    for lane in range(lanes[kind]):
+        write_out(out, lane, np.int64(own[_TARGET, lane]), columns)
+    lanes[kind] = 0
 
 
 @bare_inlined
@@ -137,46 +194,52 @@ def write_marked(marks, numbers, written, pass_ids):
 
 @bare
 def finish_piles(
-    ends, piles, floor, quantum_m, numbers, work,
+    pile_ends, piles, floor, quantum_m, numbers, work,
     column, row, count, mean, robust, low, high, deviation, bright, pass_offsets, pass_ids,
 ):  # fmt: skip
     """Statistics of all cells of a tile that hold a reading, in order of row and column; its blocks are given back.
 
     Parameters
     ----------
-    ends : (edge,) int32, in/out, of the tile; piles : see ``row_piles.put_on_piles``.
+    pile_ends : (edge,) int32, in/out, of the tile; piles : see ``row_piles.put_on_piles``. No row has `MOST` readings.
     work : as :func:`row_arrays` makes them.
     Others, and what is returned, as in ``cells.finish_cells``.
     """
-    counts, light, marks, starts, used, heights, table, own_counts, own_light, bases, out, many = work
+    (sums, marks, ends, used, heights), tables, owns, lanes, out, select = work
+    columns = mean, robust, low, high, deviation, bright
     cell, written = 0, 0
-    for y in range(ends.size):
-        if ends[y] == 0:
+    for y in range(pile_ends.size):
+        if pile_ends[y] == 0:
             continue
-        cells = sort_row(ends[y], piles, counts, light, marks, starts, used, heights)
-        for first in range(0, cells, LANES):
-            own = used[first : min(first + LANES, cells)]
-            most = fill_table(own, counts, light, starts, heights, table, own_counts, own_light, bases)
-            if most > 32:
-                statistics_of_64(table, own_counts, own_light, bases, floor, quantum_m, out)
-            elif most > 8:
-                statistics_of_32(table, own_counts, own_light, bases, floor, quantum_m, out)
-            elif most > 0:
-                statistics_of_8(table, own_counts, own_light, bases, floor, quantum_m, out)
-            for lane in range(own.size):
-                x = np.int64(own[lane])
-                n = np.int64(counts[x])
-                if n > AT_ONCE:
-                    end = np.int64(starts[x])
-                    statistics_of_long(heights[end - n : end], light[x], floor, quantum_m, many, out, lane)
-                column[cell], row[cell], count[cell] = x, y, n
-                mean[cell], robust[cell], low[cell], high[cell] = out[0, lane], out[1, lane], out[2, lane], out[3, lane]
-                deviation[cell], bright[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])
-                pass_offsets[cell] = written
+        cells = sort_row(pile_ends[y], piles, sums, ends, used, heights)
+        if numbers.size > 1:
+            mark_row(pile_ends[y], piles, marks)
+        for k in range(cells):
+            x = np.int64(used[k])
+            n, light, end = sums[x] >> COUNT_SHIFT, sums[x] & _LIGHTS, np.int64(ends[x])
+            own = heights[end - n : end]
+            if n > LONG:
+                statistics_of_full(own, light, floor, quantum_m, select, out, 0)
+                write_out(out, 0, cell, columns)
+            else:
+                kind = (n > SHORT) + (n > MEDIUM)
+                put_aside(own, light, cell, tables[kind], owns[kind], lanes[kind])
+                lanes[kind] += 1
+                if lanes[kind] == LANES:
+                    finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns)
+            column[cell], row[cell], count[cell], pass_offsets[cell] = x, y, n, written
+            if numbers.size > 1:
                 written = write_marked(marks[x], numbers, written, pass_ids)
-                counts[x], light[x], marks[x] = 0, 0, 0
-                cell += 1
-        free_row(ends[y], piles[1], piles[4], piles[5])
-        ends[y] = 0
+                marks[x] = 0
+            else:
+                pass_ids[written] = numbers[0]
+                written += 1
+            sums[x] = 0
+            cell += 1
+        free_row(pile_ends[y], piles[1], piles[4], piles[5])
+        pile_ends[y] = 0
+    for kind in range(3):
+        if lanes[kind]:
+            finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns)
     pass_offsets[cell] = written
     return cell, written

@@ -14,7 +14,7 @@ from roadscan.kernels.accumulate import LANES, LINE, PIECE, SLOTS, accumulate_ce
 from roadscan.kernels.cells import AHEAD, find_groups, finish_cells
 from roadscan.kernels.georeference import FATES
 from roadscan.kernels.line_access import VECTOR
-from roadscan.kernels.pile_cells import finish_piles, row_arrays
+from roadscan.kernels.pile_cells import MOST, finish_piles, row_arrays
 from roadscan.kernels.row_piles import sizes_of_rows, take_piles
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
@@ -223,7 +223,7 @@ class Accumulator:
         row, along, across = self._row(tile), tile.row - self._south, tile.column - self._west
         taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
         piled, most_piled = self._sizes(row)
-        if taken and piled:
+        if (taken and piled) or most_piled >= MOST:
             self._count_piles(along, across)
             taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
         self.tile_rows[along, across] = -1

@@ -43,7 +43,7 @@ from roadscan.kernels.poses import attitude_at, find_interval, interval, positio
 
 STEP_NS = 5_000_000
 """Longest pose step: one an interval of a trajectory at 200 Hz."""
-CHUNK = 2048
+CHUNK = 512
 """Readings placed at once: their buffers stay in a core's own cache."""
 
 FIRST_EPOCH, END_EPOCH = np.iinfo(np.int64).min, np.iinfo(np.int64).max

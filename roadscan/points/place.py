@@ -403,6 +403,10 @@ def pass_numbers(
     epochs_gps_ns: Int64, passes: Sequence[LanePass], ids: npt.NDArray[np.uint16]
 ) -> npt.NDArray[np.int32]:
     """Index of each epoch's pass among `ids` (p,), which are ascending, (n,), −1 where none; as :func:`passes_of`."""
+    if epochs_gps_ns.size and len(passes) == 1:
+        low, high, only = epochs_gps_ns.min(), epochs_gps_ns.max(), passes[0]
+        if only.start_gps_ns <= low and high < only.end_gps_ns:
+            return np.full(epochs_gps_ns.size, np.searchsorted(ids, only.pass_id), dtype=np.int32)
     out = np.full(epochs_gps_ns.size, -1, dtype=np.int32)
     in_order = bool((epochs_gps_ns[1:] >= epochs_gps_ns[:-1]).all())
     for one in passes:

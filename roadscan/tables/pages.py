@@ -20,8 +20,10 @@ import numpy.typing as npt
 from roadscan.tables import thrift
 
 PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
-_TYPE: Final = thrift.i32(0)
-"""Of a data page."""
+_NUMBER: Final = b"\x15"
+"""The next field, a number of 32 bits."""
+_DATA_PAGE: Final = _NUMBER + b"\x00"
+"""The first field of a page's header: its type."""
 _LENGTH_BYTES: Final = 4
 _SIZES_AND_CRC: Final = re.compile(
     rb"\x15\x00" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
@@ -59,20 +61,16 @@ def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None
 
     The CRC-32 is over levels and values as they are stored.
     """
-    stored = thrift.i32(size)
-    fields = {
-        1: _TYPE,
-        2: stored if raw is None else thrift.i32(raw),
-        3: stored,
-        4: thrift.i32(crc - (1 << 32) if crc >> 31 else crc),
-        5: _about(values, encoding),
-    }
-    return thrift.struct(fields).content
+    signed = crc - (1 << 32) if crc >> 31 else crc
+    sizes = _NUMBER + thrift.zigzag(size if raw is None else raw) + _NUMBER + thrift.zigzag(size)
+    return _DATA_PAGE + sizes + _NUMBER + thrift.zigzag(signed) + _about(values, encoding)
 
 
 @functools.lru_cache(maxsize=64)
-def _about(values: int, encoding: int) -> thrift.Value:
-    return thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
+def _about(values: int, encoding: int) -> bytes:
+    """What ends the header of a page: its fifth field, a struct, and the mark that no field follows."""
+    own = thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
+    return thrift.struct({1: own}).content
 
 
 @functools.lru_cache(maxsize=64)

@@ -15,7 +15,7 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mountings, Sensor
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import charts_along
-from roadscan.points.place import EVERYWHERE, HeightLimits, Placement, Window, passes_of
+from roadscan.points.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
 from roadscan.points.readings import ScanGeometry
 
 TILE_QUANTA = 1_000_000
@@ -193,6 +193,16 @@ def test_passes_are_half_open_spans() -> None:
 
     passes = [LanePass(PassId(7), RunId("r"), 10, 20), LanePass(PassId(9), RunId("r"), 20, 30)]
     assert passes_of(np.array([9, 10, 19, 20, 29, 30]), passes).tolist() == [0, 7, 7, 9, 9, 0]
+    for epochs in (
+        np.array([9, 10, 19, 20, 29, 30]),
+        np.array([30, 9, 20, 10, 19, 29]),
+        np.array([11, 12]),
+        np.array([], int),
+    ):
+        for some in (passes, passes[:1]):
+            ids = np.array([3, 7, 9], np.uint16)
+            wanted = [list(ids).index(k) if k else -1 for k in passes_of(epochs, some)]
+            assert pass_numbers(epochs, some, ids).tolist() == wanted
 
 
 def test_each_reading_is_placed_by_the_mounting_of_its_epoch() -> None:

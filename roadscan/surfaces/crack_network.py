@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.model.distress import CrackJoining
+from roadscan.surfaces.crack_gaps import bridges_of, outwards
 from roadscan.surfaces.crack_parts import Network, components, grouped, parts_of
 from roadscan.surfaces.cracks import CrackPiece
 
@@ -70,7 +71,7 @@ class Crack:
     line: Any
     """shapely MultiLineString on the map (m)."""
     pieces: Int64
-    """Which pieces it is made of."""
+    """Which pieces it is made of, gaps left out."""
 
 
 def join_cracks(
@@ -87,6 +88,10 @@ def join_cracks(
     if not pieces:
         return []
     azimuth = np.broadcast_to(np.asarray(lane_azimuth_rad, np.float64), (len(pieces),))
+    seen, bridges = len(pieces), bridges_of(pieces, config.bridge_m, cell_m)
+    beside = {name: k for k, one in enumerate(pieces) for name in (one.start, one.end)}
+    azimuth = np.concatenate([azimuth, azimuth[[beside[one.start] for one in bridges]]])
+    pieces = [*pieces, *bridges]
     names = sorted({node for one in pieces for node in (one.start, one.end)})
     number = {name: k for k, name in enumerate(names)}
     ends = np.array([[number[one.start], number[one.end]] for one in pieces])
@@ -96,7 +101,9 @@ def join_cracks(
     whole = [own for own in networks if _is_crack([pieces[k] for k in own.tolist()], config)]
     found = [_parts(own, pieces, nodes, turned, config) for own in whole]
     found.sort(key=lambda parts: min(c.line.bounds[1::-1] for c in parts))
-    numbered = [replace(c, network=k) for k, parts in enumerate(found, start=1) for c in parts]
+    numbered = [
+        replace(c, network=k, pieces=c.pieces[c.pieces < seen]) for k, parts in enumerate(found, start=1) for c in parts
+    ]
     return sorted(numbered, key=lambda c: c.line.bounds[1::-1])
 
 
@@ -164,9 +171,9 @@ def _parts(
     """Cracks of a network."""
     lines = [pieces[k].line_m for k in own.tolist()]
     shapes = np.array([shapely.LineString(line) for line in lines], object)
-    outwards = np.array([[_outwards(line[::-1]), _outwards(line)] for line in lines])
+    out = np.array([[outwards(line[::-1]), outwards(line)] for line in lines])
     length = np.array([pieces[k].length_m for k in own.tolist()])
-    whole = Network(nodes.ends[own], length, outwards, turned.parts_m[own])
+    whole = Network(nodes.ends[own], length, out, turned.parts_m[own])
 
     def is_net(rows: Int64) -> bool:
         junctions, _, polygons = nodes.figures(own[rows])
@@ -180,14 +187,6 @@ def _parts(
 
     found = parts_of(whole, is_net, within, config.min_length_m)
     return [_crack(own[rows], _KINDS[kind], pieces, nodes, turned) for kind, rows in found]
-
-
-def _outwards(line_m: Float64) -> Float64:
-    """Unit vector out of a line at its end, by a chord."""
-    along = np.cumsum(np.hypot(*np.diff(line_m[::-1], axis=0).T))
-    back = line_m[-1] - line_m[-2 - min(int(np.searchsorted(along, _CHORD_M)), len(line_m) - 2)]
-    size = float(np.hypot(*back))
-    return np.asarray(back / size) if size > 0.0 else np.zeros(2)
 
 
 def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned) -> Crack:

@@ -243,6 +243,20 @@ def test_a_net_is_parted_from_the_crack_that_runs_into_it():
     assert net.polygons == len(shapely.polygonize([shapely.LineString(p.line_m) for p in mesh]).geoms) == 4
 
 
+def test_gaps_between_ends_that_face_one_another_are_closed():
+    one, other = piece((0, 0), (100, 4)), piece((108, 4), (200, 8))
+    (crack,) = join_cracks([one, other], 0.0, 0.01, JOINING)
+    assert crack.length_m == pytest.approx(one.length_m + 0.08 + other.length_m, abs=0.002)
+    assert crack.pieces.tolist() == [0, 1] and len(crack.line.geoms) == 1
+    assert crack.depth_mean_m == pytest.approx(0.01) and crack.measured_share == pytest.approx(0.96, abs=0.005)
+    far, beside, across = piece((112, 4), (200, 8)), piece((104, 14), (200, 23)), piece((105, 0), (105, 60))
+    for another in (far, beside, across):
+        assert len(join_cracks([one, another], 0.0, 0.01, JOINING)) == 2
+    assert len(join_cracks([one, other], 0.0, 0.01, CrackJoining(bridge_m=0.0))) == 2
+    third = piece((109, 5), (150, 30))  # farther from the end: only one goes on
+    assert len(join_cracks([third, one, other], 0.0, 0.01, JOINING)) == 2
+
+
 def test_bridges_are_those_without_which_a_network_falls_apart():
     rng = np.random.default_rng(8)
     for _ in range(20):

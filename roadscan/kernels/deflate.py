@@ -19,14 +19,16 @@ _SHORTEST_GAP = 4
 """Segments of zeros; shorter runs are coded byte by byte."""
 _SAMPLE = 1024
 """About so many segments are counted for the code."""
-_SYMBOLS, _END, _LONGEST = 286, 256, 285
+SYMBOLS, END, _LONGEST = 286, 256, 285
+_DISTANCE = np.ones(1, np.uint8)
+"""Bits of the code of a distance: there is one, 1."""
 _MOST_BITS = 13
 """Of a code: two of them and their length fit in 32 bits."""
 _PAIR_BITS = 27
 PAIRS = 1 << 16
 _PAIR, _PAIR_MASK = np.uint64(0xFFFF), np.uint32((1 << _PAIR_BITS) - 1)
 _LONGEST_RUN = 258
-_ADLER = 65_521
+ADLER = 65_521
 _U = np.uint64
 _LANES, _ONES = _U(0x00FF_00FF_00FF_00FF), _U(0x0001_0001_0001_0001)
 _FALLING_EVEN, _FALLING_ODD = _U(0x0008_0006_0004_0002), _U(0x0007_0005_0003_0001)
@@ -80,7 +82,7 @@ def _segments(words, rest, literals):
 
 
 @bare_inlined
-def _length_symbol(run):
+def length_symbol(run):
     """Symbol of a match of 3 to 258 bytes, its further bits, and how many these are."""
     if run == _LONGEST_RUN:
         return _LONGEST, 0, 0
@@ -108,29 +110,29 @@ def _count(data, literals, counts):
             counts[0] += SEGMENT * gap
         else:
             counts[_LONGEST] += SEGMENT * gap // _LONGEST_RUN
-            counts[_length_symbol(max(SEGMENT * gap % _LONGEST_RUN, 3))[0]] += 1
+            counts[length_symbol(max(SEGMENT * gap % _LONGEST_RUN, 3))[0]] += 1
     total = 0
-    for s in range(_SYMBOLS):
+    for s in range(SYMBOLS):
         if s < 256:
             counts[s] += four[s] + four[256 + s] + four[512 + s] + four[768 + s]
         total += counts[s]
     least = (total >> (_MOST_BITS - 1)) + 1
-    for s in range(_SYMBOLS):
+    for s in range(SYMBOLS):
         counts[s] += least
 
 
 @kernel
-def _code(counts, entries):
+def code(counts, entries):
     """Write each symbol's code, first bit lowest, and above 16 bits of it its length.
 
     Lengths are those of Shannon (1948), shortened where most is won until the code is complete.
     """
     total = 0
-    for s in range(_SYMBOLS):
+    for s in range(SYMBOLS):
         total += counts[s]
-    lengths = np.empty(_SYMBOLS, np.int64)
+    lengths = np.empty(SYMBOLS, np.int64)
     room = 1 << _MOST_BITS
-    for s in range(_SYMBOLS):
+    for s in range(SYMBOLS):
         length = 1
         while (counts[s] << length) < total:
             length += 1
@@ -138,7 +140,7 @@ def _code(counts, entries):
         room -= 1 << (_MOST_BITS - length)
     share = 32
     while room > 0:
-        for s in range(_SYMBOLS):
+        for s in range(SYMBOLS):
             price = 1 << (_MOST_BITS - lengths[s])
             if price <= room and 16 * (counts[s] << lengths[s]) >= share * total and lengths[s] > 1:
                 lengths[s] -= 1
@@ -147,7 +149,7 @@ def _code(counts, entries):
     following = 0
     for length in range(1, _MOST_BITS + 1):
         following <<= 1
-        for s in range(_SYMBOLS):
+        for s in range(SYMBOLS):
             if lengths[s] == length:
                 code = 0
                 for bit in range(length):
@@ -157,10 +159,13 @@ def _code(counts, entries):
 
 
 @bare
-def _head(entries, words):
-    """Write zlib's header and the block's code: (word to go on with, its index, its bits)."""
+def head(entries, distances, words):
+    """Write zlib's header and the block's code: (word to go on with, its index, its bits).
+
+    distances : (codes,) uint8, lengths of the codes of distances, 0 or 1 bit.
+    """
     word, used, to = _U(0), _U(0), _U(0)
-    for k in range(6 + 19 + _SYMBOLS + 1):
+    for k in range(6 + 19 + SYMBOLS + distances.size):
         if k == 0:
             bits, count = _U(0x0178), _U(16)  # deflate, a window of 32 KiB, fast
         elif k == 1:
@@ -168,9 +173,9 @@ def _head(entries, words):
         elif k == 2:
             bits, count = _U(2), _U(2)  # with its own code
         elif k == 3:
-            bits, count = _U(_SYMBOLS - 257), _U(5)
+            bits, count = _U(SYMBOLS - 257), _U(5)
         elif k == 4:
-            bits, count = _U(0), _U(5)  # one distance
+            bits, count = _U(distances.size - 1), _U(5)
         elif k == 5:
             bits, count = _U(19 - 4), _U(4)
         elif k < 6 + 3:
@@ -179,7 +184,7 @@ def _head(entries, words):
             bits, count = _U(4), _U(3)
         else:
             s = k - 6 - 19
-            length = _U(entries[s] >> 16) if s < _SYMBOLS else _U(1)
+            length = _U(entries[s] >> 16) if s < SYMBOLS else _U(distances[s - SYMBOLS])
             bits = (
                 ((length & _U(1)) << _U(3))
                 | ((length & _U(2)) << _U(1))
@@ -206,7 +211,8 @@ def _pair_up(entries, pairs):
 
 
 @bare_inlined
-def _one(entries, symbol):
+def coded(entries, symbol):
+    """A symbol's code, first bit lowest, and how many bits it has."""
     entry = _U(entries[symbol])
     return entry & _U(0xFFFF), entry >> _U(16)
 
@@ -217,21 +223,21 @@ def _run(run, entries, words, word, to, used):
     while run > 2:
         piece = min(run, _LONGEST_RUN)
         run -= piece
-        symbol, more, count = _length_symbol(piece)
-        bits, size = _one(entries, symbol)
+        symbol, more, count = length_symbol(piece)
+        bits, size = coded(entries, symbol)
         words[to], word, used, full = appended(word, used, bits | (_U(more) << size), size + _U(count) + _U(1))
         to += full  # the distance of 1 is a single bit, 0
     for _ in range(run):
-        bits, size = _one(entries, 0)
+        bits, size = coded(entries, 0)
         words[to], word, used, full = appended(word, used, bits, size)
         to += full
     return word, to, used
 
 
 @bare
-def _pack(data, pixels, literals, entries, pairs, words):
+def _pack(data, pixels, literals, entries, distances, pairs, words):
     """Write the head, all bytes and the block's end; returns the bits written."""
-    word, to, used = _head(entries, words)
+    word, to, used = head(entries, distances, words)
     following = 0
     for j in range(literals.size):
         k = np.int64(literals[j])
@@ -251,7 +257,7 @@ def _pack(data, pixels, literals, entries, pairs, words):
     whole = data.size // SEGMENT * SEGMENT
     word, to, used = _run(whole - SEGMENT * following, entries, words, word, to, used)
     for i in range(whole, data.size + 1):
-        bits, size = _one(entries, np.int64(data[i]) if i < data.size else _END)
+        bits, size = coded(entries, np.int64(data[i]) if i < data.size else END)
         words[to], word, used, full = appended(word, used, bits, size)
         to += full
     words[to] = word
@@ -267,12 +273,12 @@ def deflate(data: Any, words: Any, segments: Any, pairs: Any, out: Any) -> bytes
     segments : (n // SEGMENT,) int32, scratch; pairs : (PAIRS,) uint32, scratch.
     out : uint64, room_words(n) or more, scratch.
     """
-    counts, entries = np.empty(_SYMBOLS, np.int64), np.empty(_SYMBOLS, np.uint32)
+    counts, entries = np.empty(SYMBOLS, np.int64), np.empty(SYMBOLS, np.uint32)
     found, low, high = _segments(words, data[8 * words.size :], segments)
     literals = segments[:found]
     _count(data, literals, counts)
-    _code(counts, entries)
+    code(counts, entries)
     _pair_up(entries, pairs)
-    bits = _pack(data, words, literals, entries, pairs, out)
+    bits = _pack(data, words, literals, entries, _DISTANCE, pairs, out)
     stream: bytes = out.view(np.uint8)[: (bits + 7) // 8].tobytes()
-    return stream + (int(high) % _ADLER << 16 | int(low) % _ADLER).to_bytes(4, "big")
+    return stream + (int(high) % ADLER << 16 | int(low) % ADLER).to_bytes(4, "big")

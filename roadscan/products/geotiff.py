@@ -17,13 +17,14 @@ from pydantic import Field
 from rasterio.io import MemoryFile
 from rasterio.transform import Affine
 
-from roadscan.kernels.raster_blocks import cut_lines, encode_block, round_values
+from roadscan.kernels.raster_blocks import cut_lines, round_values
 from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.products import raster
 from roadscan.products.base import ProductContext, Tile, TileProduct
 from roadscan.products.packer import Packer
+from roadscan.products.pixel_blocks import DenseBlocks, ScatteredBlocks
 from roadscan.products.quantities import Quantity, band_of
 from roadscan.products.raster import Band, CellBox
 from roadscan.products.tiff import Page, Tag, check_tiff, digest_item, tiff_parts
@@ -43,6 +44,7 @@ BLOCK: Final = 512
 """Largest edge of a block (pixels)."""
 
 _SMALLEST_OVERVIEW: Final = 32
+_SAMPLE: Final = 4096
 
 
 class GeoTiffOptions(Strict):
@@ -61,12 +63,15 @@ class GeoTiff(TileProduct):
     Overviews have pixels of 2, 8 and 32 cells, or the numbers nearest to these that divide the tile (10, 40 and
     200 mm for 10 m tiles of 5 mm cells), while they are 32 pixels or more: the mean of the cells' heights, the mean
     intensity of all points, the mean number of points a cell that holds one.
+
+    Images are DEFLATE in blocks of up to 512 pixels, those without a cell left out; where most cells have none beside
+    them, as those of a scanner with few readings, without a predictor, so that a block costs by cell and not by pixel.
     """
 
     name: ClassVar[str] = "geotiff"
     title: ClassVar[str] = "cells of a tile as a GeoTIFF (height, intensity, count) with overviews, for GIS"
     suffix: ClassVar[str] = ".tif"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     options: ClassVar[type[Strict]] = GeoTiffOptions
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
@@ -134,14 +139,15 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Pac
     edge = min(BLOCK, -(-image.edge // 16) * 16)
     across = -(-image.edge // edge)
     starts = np.append(np.searchsorted(image.row, np.arange(image.edge, dtype=np.uint16)), len(image.row))
-    out, differences = np.empty(edge * edge * 4, np.uint8), np.empty(edge, np.uint32)
-    line = np.empty(edge, np.float32)
-    lines = line, line.view(np.uint8), differences, differences.view(np.uint8)
     cuts = np.empty((across + 1, across * edge), np.int64)
     cuts[:, image.edge :] = 0
     cut_lines(image.column, starts, edge, cuts[:, : image.edge])
     cuts[:, : image.edge] = cuts[:, : image.edge][:, ::-1].copy()  # from the north
     rounded = np.empty(len(image.row), np.float32)
+    scattered = _is_scattered(image)
+    make = (
+        ScatteredBlocks(image.column, rounded, edge) if scattered else DenseBlocks(image.column, rounded, edge, packer)
+    )
     blocks: list[Any] = []
     for (values, factor), quantity in zip(image.bands, bands, strict=True):
         step = STEPS[quantity]
@@ -150,17 +156,25 @@ def _page(image: _Image, bands: tuple[Quantity, ...], reduced: bool, packer: Pac
             own = slice(strip * edge, (strip + 1) * edge)
             for block in range(across):
                 first, last = cuts[block, own], cuts[block + 1, own]
-                if (first == last).all():
-                    blocks.append(None)
-                    continue
-                encode_block(image.column, rounded, first, last, block * edge, out, *lines)
-                blocks.append(packer.pack(out))
-    return Page(layout(image.edge, image.edge, edge, len(bands), reduced), blocks)
+                blocks.append(None if (first == last).all() else make.block(first, last, block * edge))
+    return Page(layout(image.edge, image.edge, edge, len(bands), reduced, predicted=not scattered), blocks)
+
+
+def _is_scattered(image: _Image) -> bool:
+    """True where fewer than half of the pixels have one beside them, by a sample."""
+    own = np.arange(1, len(image.row), 1 + len(image.row) // _SAMPLE)
+    beside = (image.column[own] == image.column[own - 1] + 1) & (image.row[own] == image.row[own - 1])
+    return bool(2 * np.count_nonzero(beside) < own.size)
 
 
 @functools.lru_cache(maxsize=64)
-def layout(width: int, height: int, block: int, bands: int, reduced: bool) -> tuple[Tag, ...]:
-    """Tags of an image of float32 bands, each in square blocks of its own (`block` pixels), NaN where nothing lies."""
+def layout(
+    width: int, height: int, block: int, bands: int, reduced: bool, *, predicted: bool = True
+) -> tuple[Tag, ...]:
+    """Tags of an image of float32 bands, each in square blocks of its own (`block` pixels), NaN where nothing lies.
+
+    `predicted`: the blocks' bytes are by significance and differenced (TIFF Technical Note 3), not as in memory.
+    """
     return (
         Tag(254, "I", [1 if reduced else 0]),
         Tag(256, "I", [width]),
@@ -170,7 +184,7 @@ def layout(width: int, height: int, block: int, bands: int, reduced: bool) -> tu
         Tag(262, "H", [1]),
         Tag(277, "H", [bands]),
         Tag(284, "H", [2]),  # each band in blocks of its own
-        Tag(317, "H", [3]),
+        Tag(317, "H", [3 if predicted else 1]),
         Tag(322, "I", [block]),
         Tag(323, "I", [block]),
         *([Tag(338, "H", [0] * (bands - 1))] if bands > 1 else []),

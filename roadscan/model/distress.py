@@ -18,7 +18,7 @@ class CrackDetection(Strict):
     """… and goes on as long as it lies deeper by this many …"""
     min_valley_m: float = Field(default=0.0004, ge=0.0)
     """… and by this much (m), as the mean over the cells of the line: a crack narrower than a cell looks shallow."""
-    nearby_share: float = Field(default=0.4, ge=0.0, lt=1.0)
+    nearby_share: float = Field(default=0.25, ge=0.0, lt=1.0)
     """A cell is no crack if its line is less than this share as deep as the deepest within the length of a line."""
     spur_m: float = Field(default=0.04, ge=0.0, le=0.5)
     """Side branches shorter than this (m) are frays of a crack's wall, and left out."""

@@ -6,7 +6,7 @@
 3. *Strokes*: where others meet, the two that go on most nearly straight are one, then the next two. So a crack keeps
    its type where side branches leave it.
 4. *Types* are those of most of a stroke's length. Strokes of one type that meet are one part; what is shorter than a
-   crack has to be goes with the longest part that it meets.
+   crack has to be goes with the longest part that it meets, and what is short and meets a net alone with that.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ NET: Final = 3
 """Type of a net; 0, 1, 2 run along, across and aslant the lane."""
 UNKNOWN: Final = 4
 
+_FRINGE_M: Final = 0.5
+"""What is shorter and meets nothing but a net is its fringe."""
 _STRAIGHT_RAD: Final = math.radians(45.0)
 """Branches that turn by less at a junction go on."""
 
@@ -141,11 +143,13 @@ def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: flo
     while True:
         length = np.bincount(part, whole.length_m, len(kinds))
         present = np.flatnonzero(np.bincount(part, minlength=len(kinds)))
-        for number in sorted(present[length[present] < least_m].tolist(), key=lambda k: (length[k], k)):
+        few = present[length[present] < max(least_m, _FRINGE_M)].tolist()
+        for number in sorted((k for k in few if kinds[k] != NET), key=lambda k: (length[k], k)):
             nodes = np.unique(whole.ends[part == number])
             beside = np.unique(part[np.isin(whole.ends, nodes).any(axis=1)])
             beside = beside[beside != number]
-            if beside.size:
+            of_nets = all(kinds[k] == NET for k in beside.tolist())
+            if beside.size and (length[number] < least_m or of_nets):
                 part[part == number] = beside[np.argmax(length[beside])]
                 break
         else:

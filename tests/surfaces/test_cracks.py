@@ -238,6 +238,8 @@ def test_a_net_is_parted_from_the_crack_that_runs_into_it():
     far = [piece(a, b) for a, b in (((300, 32), (340, 32)), ((340, 32), (340, 70)), ((340, 70), (300, 32)))]
     found = kinds([*mesh, dead_end, *into, *far])
     assert ("alligator", 378, 1) in found
+    assert kinds([*mesh, piece((0, 60), (0, 105))]) == [("alligator", 405, 1)]  # its fringe
+    assert kinds([*mesh, piece((0, 60), (0, 115))]) == [("alligator", 360, 1), ("transverse", 55, 1)]
     assert [f[0] for f in found if f[0] != "alligator"] == ["longitudinal"]  # one polygon is no net
     (net,) = [c for c in join_cracks([*mesh, *into], 0.0, 0.01, JOINING) if c.kind == "alligator"]
     assert net.polygons == len(shapely.polygonize([shapely.LineString(p.line_m) for p in mesh]).geoms) == 4

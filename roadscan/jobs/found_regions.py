@@ -116,21 +116,32 @@ def _pieces(
     rate = geometry.readings * min(sum(f.rows for f in files) / seconds, NS_PER_S / _EVERY_NS)
     length = _length_ns(rate)
     common = [surface_version(), source.key, *road_key(source), settings.model_dump(mode="json"), length]
-    for number in sorted({n for a, b in (every // length).tolist() for n in range(a, b + 1)}):
+    near: dict[int, list[tuple[DataFile, npt.NDArray[np.int64]]]] = {}
+    for file, spans in held:
+        for number in sorted({n for a, b in _numbers(spans, length) for n in range(a, b + 1)}):
+            near.setdefault(number, []).append((file, spans))
+    numbers = {n for a, b in (every // length).tolist() for n in range(a, b + 1)}
+    for number in sorted(numbers):
         start, end = number * length, (number + 1) * length
         slices: list[RawSlice] = []
         inputs: list[Any] = []
-        for file, spans in held:
-            near = np.flatnonzero((spans[:, 1] >= start - _MARGIN_NS) & (spans[:, 0] < end + _MARGIN_NS))
-            if near.size:
-                whole = (int(spans[near].min()), int(spans[near].max()))
-                share = file.bytes * near.size // len(spans)
-                slices.append(RawSlice(source, file.path, tuple(near.tolist()), (whole,), share))
-                inputs.append([file.digest, near.tolist()])
+        for file, spans in near[number]:
+            groups = np.flatnonzero((spans[:, 1] >= start - _MARGIN_NS) & (spans[:, 0] < end + _MARGIN_NS))
+            if groups.size:
+                whole = (int(spans[groups].min()), int(spans[groups].max()))
+                share = file.bytes * groups.size // len(spans)
+                slices.append(RawSlice(source, file.path, tuple(groups.tolist()), (whole,), share))
+                inputs.append([file.digest, groups.tolist()])
         work, key = round(rate * length / NS_PER_S), key_of(common, start, inputs)
         yield RegionPiece(
             plan.store, plan.ground, context, settings, source, tuple(slices), start, end, work, key
         )  # fmt: skip
+
+
+def _numbers(spans: npt.NDArray[np.int64], length: int) -> list[list[int]]:
+    """First and last number of the pieces that spans (k, 2) may touch with their margins."""
+    found: list[list[int]] = ((spans + np.array([-_MARGIN_NS, _MARGIN_NS])) // length).tolist()
+    return found
 
 
 def _length_ns(readings_a_second: float) -> int:

@@ -27,20 +27,20 @@ COUNT_SHIFT = np.int64(40)
 MOST = 1 << 23
 """… which does for rows of fewer readings."""
 _LIGHTS = np.int64((1 << 40) - 1)
-_COUNT, _LIGHT, _BASE, _TARGET = range(4)
+_NUMBERS = 4
+_COUNT, _LIGHT, _BASE, _TARGET = range(_NUMBERS)
 _MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)
 
 
 def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
     """Arrays that a row of `edge` cells with up to `most` readings of so many passes is worked on in."""
-    tables = tuple(np.zeros((n, LANES), np.int32) for n in (SHORT, MEDIUM, LONG))
-    own = tuple(np.zeros((4, LANES), np.int32) for _ in tables)
+    table, own = np.zeros((SHORT + MEDIUM + LONG, LANES), np.int32), np.zeros((3 * _NUMBERS, LANES), np.int32)
     row = (
         np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64), np.empty(edge, np.int32),
         np.empty(edge + 1, np.int32), np.empty(most, np.int32),
     )  # fmt: skip
     select = np.empty(most, np.int32), np.empty(BINS, np.int32), np.empty(most + 1, np.int32)
-    return row, tables, own, np.zeros(len(tables), np.int64), np.zeros((6, LANES)), select
+    return row, table, own, np.zeros(3, np.int64), np.zeros((6, LANES)), select
 
 
 @bare
@@ -147,14 +147,15 @@ def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
     out[_BRIGHT, lane] = light / n
 
 
-@bare
-def put_aside(heights, light, target, table, own, lane):
-    """Put a cell's heights (n,) int32 into a lane of a table."""
-    base = heights[0]
-    own[_COUNT, lane], own[_LIGHT, lane] = heights.size, np.int32(light)
-    own[_BASE, lane], own[_TARGET, lane] = base, target
-    for k in range(np.uint64(heights.size)):
-        table[k, lane] = heights[k] - base
+@bare_inlined
+def put_aside(heights, first, n, light, target, kind, table, own, lane):
+    """Put the n heights of a cell from `first` on into a lane of the part of the table for its kind."""
+    base, at = heights[np.uint64(first)], np.uint64(0 if kind == 0 else (SHORT if kind == 1 else SHORT + MEDIUM))
+    numbers = np.uint64(_NUMBERS * kind)
+    own[numbers + np.uint64(_COUNT), lane], own[numbers + np.uint64(_LIGHT), lane] = n, np.int32(light)
+    own[numbers + np.uint64(_BASE), lane], own[numbers + np.uint64(_TARGET), lane] = base, target
+    for k in range(np.uint64(n)):
+        table[at + k, lane] = heights[np.uint64(first) + k] - base
 
 
 @bare_inlined
@@ -166,17 +167,18 @@ def write_out(out, lane, cell, columns):
 
 
 @bare
-def finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns):
-    """Statistics of the cells in a table, to their places; the table is empty then."""
-    own = owns[kind]
+def finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns):
+    """Statistics of the cells in a part of the table, to their places; it is empty then."""
+    own = owns[_NUMBERS * kind : _NUMBERS * (kind + 1)]
     for lane in range(lanes[kind], LANES):
         own[_COUNT, lane] = 0
     if kind == 0:
-        statistics_of_8(tables[0], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+        statistics_of_8(table[:SHORT], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
     elif kind == 1:
-        statistics_of_32(tables[1], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+        rows = table[SHORT : SHORT + MEDIUM]
+        statistics_of_32(rows, own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
     else:
-        statistics_of_64(tables[2], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+        statistics_of_64(table[SHORT + MEDIUM :], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
     for lane in range(lanes[kind]):
         write_out(out, lane, np.int64(own[_TARGET, lane]), columns)
     lanes[kind] = 0
@@ -205,7 +207,7 @@ def finish_piles(
     work : as :func:`row_arrays` makes them.
     Others, and what is returned, as in ``cells.finish_cells``.
     """
-    (sums, marks, ends, used, heights), tables, owns, lanes, out, select = work
+    (sums, marks, ends, used, heights), table, owns, lanes, out, select = work
     columns = mean, robust, low, high, deviation, bright
     cell, written = 0, 0
     for y in range(pile_ends.size):
@@ -217,16 +219,15 @@ def finish_piles(
         for k in range(cells):
             x = np.int64(used[k])
             n, light, end = sums[x] >> COUNT_SHIFT, sums[x] & _LIGHTS, np.int64(ends[x])
-            own = heights[end - n : end]
             if n > LONG:
-                statistics_of_full(own, light, floor, quantum_m, select, out, 0)
+                statistics_of_full(heights[end - n : end], light, floor, quantum_m, select, out, 0)
                 write_out(out, 0, cell, columns)
             else:
                 kind = (n > SHORT) + (n > MEDIUM)
-                put_aside(own, light, cell, tables[kind], owns[kind], lanes[kind])
+                put_aside(heights, end - n, n, light, cell, kind, table, owns, np.uint64(lanes[kind]))
                 lanes[kind] += 1
                 if lanes[kind] == LANES:
-                    finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns)
+                    finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns)
             column[cell], row[cell], count[cell], pass_offsets[cell] = x, y, n, written
             if numbers.size > 1:
                 written = write_marked(marks[x], numbers, written, pass_ids)
@@ -240,6 +241,6 @@ def finish_piles(
         pile_ends[y] = 0
     for kind in range(3):
         if lanes[kind]:
-            finish_table(kind, tables, owns, lanes, floor, quantum_m, out, columns)
+            finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns)
     pass_offsets[cell] = written
     return cell, written

@@ -14,11 +14,14 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.georeference import CLASS_KEPT, KEPT, OUTSIDE
+from roadscan.kernels.line_access import fetch_line
 from roadscan.kernels.options import bare, bare_inlined
 
 BLOCK = 64
 """Readings of a block."""
 _BITS = 6
+_LINE = 8
+"""Readings of a line of the cache, which is fetched while the one before it is filled."""
 COLUMN, LIGHT_SHIFT, LIGHT, HEIGHT_SHIFT = np.uint64(0xFFFF), np.uint64(16), np.uint64(0xFFFF), np.uint64(32)
 
 TAKEN, PASS = 0, 1
@@ -118,6 +121,7 @@ def put_on_piles(
         light = np.uint64(gain) * np.uint64(intensity[i])
         level = np.uint64(np.uint32(np.int32(height[i])))
         records[np.uint64(end)] = np.uint64(column[i]) | (light << LIGHT_SHIFT) | (level << HEIGHT_SHIFT)
+        fetch_line(records, np.uint64(end + _LINE))
         flat[pile] = np.int32(end + 1)
         found += 1
     return found

@@ -4,9 +4,10 @@
 identified" (Yu and others 2007, 3.2.3). Here that is a rule. The stretch is cut into square patches. A patch's
 roughness is the root mean square of its heights about the plane that fits it and its neighbours along the road,
 `level_patches` in all, so grade, crossfall, crown, ruts and long waves do not count. It is compared with the street's
-own: the median of all patches within the same section. A patch stands out where its roughness exceeds `factor` times
-that and `least_m`, on the surface before the median (narrow cracks) or after it (potholes in noisy ranges). Patches
-that touch, or lie within `join_m`, are one region; its box along and across the road, padded, is its outline.
+own: the median of all patches within the same section, or of those at about the same offset in it, where that is more.
+A patch stands out where its roughness exceeds `factor` times that and `least_m`, on the surface before the median
+(narrow cracks) or after it (potholes in noisy ranges). Patches that touch, or lie within `join_m`, are one region; its
+box along and across the road, padded, is its outline.
 
 Patches and sections are counted from multiples of their own length along the stretch.
 """
@@ -34,6 +35,8 @@ STATED: Final = "stated"
 
 _FEWEST: Final = 12
 """Nodes that a patch needs."""
+_BESIDE: Final = 4
+"""Patches to either side that have about the same offset: a crack along the road is far narrower."""
 
 
 @dataclass(frozen=True)
@@ -133,13 +136,17 @@ class _Patches:
         return rough
 
     def street_m(self, rough_m: Float64, section_m: float) -> Float64:
-        """Median roughness (rows, 1) of each row's section; 0 where there is none."""
+        """Roughness (rows, columns) of the street around each patch; 0 where there is none.
+
+        The median of the section, or, where that is more, of the patches at about the same offset: a scanner's noise in
+        height is largest below it, and far aside its readings are few.
+        """
         section = ((self.first_row + np.arange(self.shape[0])) * self.edge_m // section_m).astype(int)
-        own = np.zeros((self.shape[0], 1))
+        own = np.zeros(self.shape)
         for one in np.unique(section):
-            values = rough_m[section == one]
-            values = values[np.isfinite(values)]
-            own[section == one] = np.median(values) if values.size else 0.0
+            rough = rough_m[section == one]
+            beside = [rough[:, max(k - _BESIDE, 0) : k + _BESIDE + 1] for k in range(self.shape[1])]
+            own[section == one] = np.maximum(_median(rough), [_median(part) for part in beside])
         return own
 
     def box_m(self, where: tuple[slice, slice], pad_m: float, roughness_m: float) -> tuple[float, ...]:
@@ -150,6 +157,12 @@ class _Patches:
             (self.first_column + columns.start) * self.edge_m - pad_m,
             (self.first_column + columns.stop) * self.edge_m + pad_m, roughness_m,
         )  # fmt: skip
+
+
+def _median(values: Float64) -> float:
+    """Median of the numbers there are, 0 without any."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def _planes(sums: Float64) -> Float64:

@@ -138,6 +138,17 @@ def test_regions_are_found_where_the_road_is_broken_and_nowhere_else() -> None:
     assert found[0].roughness_m > 0.01
 
 
+def test_noise_that_is_largest_below_the_scanner_is_no_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    easting, northing, height, classes, path = street(profiles=500)
+    angle = np.radians(60.0 - np.arange(241) / 2.0)
+    # Of ranges, so that heights far aside have less of it; the road there is read less often.
+    height += 0.008 * np.cos(angle) ** 2 * np.random.default_rng(2).standard_normal(height.shape)
+    model = coarse_model(Stretch.of_points(easting, northing, height, classes, path), CoarseSettings())
+    assert find_regions(model, RegionSettings(factor=2.0)) == []
+    monkeypatch.setattr("roadscan.surfaces.regions._BESIDE", 1000)  # the street as a whole
+    assert find_regions(model, RegionSettings(factor=2.0)) != []
+
+
 def test_regions_that_the_user_states() -> None:
     (one,) = stated_regions([[(0.0, 0.0), (4.0, 0.0), (4.0, 2.0)]])
     assert one.origin == STATED

@@ -18,6 +18,7 @@ import laspy
 import lazrs
 import numpy as np
 import numpy.typing as npt
+from blake3 import blake3
 from laspy.header import GpsTimeType
 from laspy.vlrs.known import LasZipVlr, WktCoordinateSystemVlr
 from laspy.vlrs.vlrlist import VLRList
@@ -147,7 +148,7 @@ def write_points(
     offsets = [one.offset for one in axes]
     digest = _Digest(layout.scales, offsets, [_wkt1(layout.map, layout.product)])
     digest.add(records)
-    stated = json.dumps({**facts, "blake2b": digest.text()}, sort_keys=True).encode("ascii")
+    stated = json.dumps({**facts, "blake3": digest.text()}, sort_keys=True).encode("ascii")
     head, laszip = _head(layout, compress)
     with path.open("wb") as stream:
         stream.write(_filled(layout, head, len(laszip), axes, records, stated, date))
@@ -237,24 +238,29 @@ def _wkt1(frame: MapFrame, product: str) -> str:
 
 
 class _Digest:
-    """BLAKE2b (128 bits) of point records as they lie in a LAS file, and of what gives them their place."""
+    """BLAKE3 (128 bits) of point records as they lie in a LAS file, and of what gives them their place.
 
-    def __init__(self, scales: Sequence[float], offsets: Sequence[float], wkt: list[str]) -> None:
-        self._state = hashlib.blake2b(digest_size=16)
+    Files of older versions state BLAKE2b.
+    """
+
+    def __init__(self, scales: Sequence[float], offsets: Sequence[float], wkt: list[str], name: str = "blake3") -> None:
+        self._state = blake3() if name == "blake3" else hashlib.blake2b(digest_size=16)
         self._state.update(repr((list(scales), list(offsets), wkt)).encode())
 
     def add(self, records: npt.NDArray[np.void]) -> None:
         self._state.update(np.ascontiguousarray(records).view(np.uint8).data)
 
     def text(self) -> str:
-        return self._state.hexdigest()
+        digest: bytes = self._state.digest(length=16) if isinstance(self._state, blake3) else self._state.digest()
+        return digest.hex()
 
 
 def _check_points(reader: laspy.LasReader, path: Path) -> None:
     header = reader.header
     stated = _stated_facts(header, path)
     wkt = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
-    digest, count = _Digest(header.scales.tolist(), header.offsets.tolist(), wkt), 0
+    name = "blake2b" if "blake2b" in stated else "blake3"
+    digest, count = _Digest(header.scales.tolist(), header.offsets.tolist(), wkt, name), 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for chunk in _chunks(reader):
         count += len(chunk)
@@ -265,7 +271,7 @@ def _check_points(reader: laspy.LasReader, path: Path) -> None:
         raise StoreError(f"{count} points", expected=f"the {header.point_count} of the header", file=path)
     if not (np.allclose(low, header.mins, atol=1e-9) and np.allclose(high, header.maxs, atol=1e-9)):
         raise StoreError("points lie outside the header's box", change="make the file again", file=path)
-    if digest.text() != stated.get("blake2b"):
+    if digest.text() != stated.get(name):
         raise StoreError("the points do not match their digest", change="make the file again", file=path)
 
 

@@ -78,7 +78,7 @@ class GeoTiff(TileProduct):
         """Write the tile's bands; only blocks that hold a cell are made."""
         bands = cast(GeoTiffOptions, options).bands
         images = [_image(tile.cells, bands, context), *_overviews(tile, bands, context)]
-        packer = Packer()
+        packer = Packer.of_thread()
         pages = [_page(image, bands, number > 0, packer) for number, image in enumerate(images)]
         place = CellBox.around([tile.cells.tile], context.grid).transform(context)
         about = description(tile.cells.tile, place, [band_of(b, context) for b in bands], context)

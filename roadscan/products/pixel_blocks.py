@@ -23,7 +23,7 @@ class DenseBlocks:
     ) -> None:
         """Of cells (n,) by row and column; `values` may change from block to block."""
         self._column, self._values, self._packer = column, values, packer
-        self._out = np.empty(edge * edge * 4, np.uint8)
+        self._out = packer.data(edge * edge * 4)
         line, differences = np.empty(edge, np.float32), np.empty(edge, np.uint32)
         self._lines = line, line.view(np.uint8), differences, differences.view(np.uint8)
 

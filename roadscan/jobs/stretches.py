@@ -15,7 +15,10 @@ _SQUARE_M = 100.0
 _SQUARES = 15
 """Squares that one task computes at most: a kilometre of road oblique to the grid, one and a half along it."""
 
-_SHARES = (4, 2, 1)
+_SQUARES_A_TASK = 4
+"""Squares of a task at least, of less than 100 m where there are few: tasks have about as many readings each."""
+
+_SHARES = (8, 4, 2, 1)
 """Tasks a worker, where there are few squares: several, so that no worker waits long for the last one …"""
 
 _MOST_READ = 1.15
@@ -42,7 +45,7 @@ def cut_stretches(tiles: DrivenTiles, numbers: Int64, size_m: float, workers: in
     numbers = np.sort(numbers)
     edge = max(1, round(_SQUARE_M / size_m))
     square = _squares(tiles, numbers, edge)
-    while edge > 1 and int(square.max()) < _SHARES[0] * workers:
+    while edge > 1 and int(square.max()) < _SQUARES_A_TASK * _SHARES[0] * workers:
         edge //= 2
         square = _squares(tiles, numbers, edge)
     first = tiles.first_epoch_gps_ns[numbers]

@@ -5,6 +5,7 @@ Arrow reads what the footer lists. A damaged or truncated list would leave out r
 
 from __future__ import annotations
 
+import itertools
 import mmap
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import pyarrow as pa
 
 _FIRST_MESSAGE = 8
 """Byte behind the file's mark."""
+_MESSAGES = 16
+"""Messages that are looked at before their pages are given back."""
 
 
 class MappedBatches:
@@ -24,30 +27,39 @@ class MappedBatches:
     """
 
     def __init__(self, path: Path) -> None:
-        with path.open("rb") as stream:
-            self._pages = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._pages = _mapped(path)
         self.reader = pa.ipc.open_file(pa.BufferReader(pa.py_buffer(self._pages)))
 
     def release(self) -> None:
-        """Give the pages read so far back; views stay good, a page that is asked for again is mapped again.
-
-        Without this, the process would seem to hold all of the log that it has passed.
-        """
-        if hasattr(mmap, "MADV_DONTNEED"):
-            self._pages.madvise(mmap.MADV_DONTNEED)
+        """Give the pages read so far back; views stay good, a page that is asked for again is mapped again."""
+        _give_back(self._pages)
 
 
 def unlisted_batches(path: Path, listed: int) -> int:
     """How many record batches stand in the file beyond the `listed` ones of its footer; bodies are not read."""
-    found = 0
-    with pa.memory_map(str(path)) as stream:
-        stream.seek(_FIRST_MESSAGE)
-        try:
-            reader = pa.ipc.MessageReader.open_stream(stream)
-            while True:
-                found += reader.read_next_message().type == "record batch"
-        except (StopIteration, pa.ArrowException, OSError, ValueError):  # the end, or damage
-            return max(0, found - listed)
+    pages, found = _mapped(path), 0
+    stream = pa.BufferReader(pa.py_buffer(pages))
+    stream.seek(_FIRST_MESSAGE)
+    try:
+        reader = pa.ipc.MessageReader.open_stream(stream)
+        for number in itertools.count():
+            found += reader.read_next_message().type == "record batch"
+            if number % _MESSAGES == 0:
+                _give_back(pages)
+    except (StopIteration, pa.ArrowException, OSError, ValueError):  # the end, or damage
+        pass
+    return max(0, found - listed)
+
+
+def _mapped(path: Path) -> mmap.mmap:
+    with path.open("rb") as stream:
+        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _give_back(pages: mmap.mmap) -> None:
+    """Let go of the pages touched so far: else the process would seem to hold all of the log that it has passed."""
+    if hasattr(mmap, "MADV_DONTNEED"):
+        pages.madvise(mmap.MADV_DONTNEED)
 
 
 def unlisted_reason(count: int) -> str:

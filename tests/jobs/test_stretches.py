@@ -26,7 +26,7 @@ def driven(tiles: int, beyond: int) -> DrivenTiles:
 @pytest.mark.parametrize(
     ("tiles", "size_m", "beyond", "count"),
     [
-        (40, 50.0, 0, 8),  # profilers: four tasks a worker
+        (40, 50.0, 0, 16),  # profilers: eight tasks a worker
         (16, 50.0, 30, 2),  # a lidar, which sees 30 row groups beyond its tile: one task a worker
         (40, 50.0, 30, 4),
         (600, 50.0, 30, 20),  # long enough: a kilometre and a half each

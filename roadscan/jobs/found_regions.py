@@ -190,7 +190,7 @@ def regions_of_piece(piece: RegionPiece) -> OutputRecord:
 
 
 def _found(piece: RegionPiece) -> list[Region]:
-    """Regions of a piece, from its coarse model."""
+    """Regions of a piece, from its coarse model: those that reach into its span, so that margins are told of once."""
     placer = Placer(piece.store, piece.ground, piece.slices)
     placement = placer.placement(piece.source)
     points = _profiles(piece, placement)
@@ -206,7 +206,10 @@ def _found(piece: RegionPiece) -> list[Region]:
     path = piece.ground.map.map_from_world(placement.trajectory.world, sensor)[:, :2]
     classes = np.where(points.kept, 0, 1).astype(np.uint8)
     stretch = Stretch.of_points(points.easting_m, points.northing_m, points.height_m, classes, path)
-    return find_regions(coarse_model(stretch, CoarseSettings()), piece.settings)
+    own = (points.epoch_gps_ns >= piece.start_gps_ns) & (points.epoch_gps_ns < piece.end_gps_ns)
+    within = stretch.along_m[own]
+    found = find_regions(coarse_model(stretch, CoarseSettings()), piece.settings)
+    return [r for r in found if ((within >= r.span_m[0]) & (within <= r.span_m[1])).any()]
 
 
 def _profiles(piece: RegionPiece, placement: Placement) -> ProfilePoints:
@@ -238,7 +241,7 @@ def _at(points: ProfilePoints, rows: npt.NDArray[Any]) -> ProfilePoints:
 def _polygons(one: Region) -> list[Any]:
     """An outline as sound polygons: it may cross itself where the vehicle turned on the spot."""
     parts = shapely.get_parts(shapely.make_valid(one.polygon))
-    return [p for p in parts if p.geom_type == "Polygon" and p.area > 0.0]
+    return [p for p in shapely.get_parts(parts) if p.geom_type == "Polygon" and p.area > 0.0]
 
 
 @dataclass(frozen=True)

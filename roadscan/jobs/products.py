@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.cell_files import read_cells, read_overview
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.drives import Drives
-from roadscan.jobs.fingerprint import key_of
+from roadscan.jobs.fingerprint import key_of, surface_version
 from roadscan.jobs.plan import SurveyPlan
 from roadscan.jobs.tile_files import WantedProduct, WantedSurface
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE
@@ -33,6 +33,7 @@ from roadscan.products.base import (
     source_digest,
 )
 from roadscan.products.lane_direction import LaneDirections
+from roadscan.surfaces.reconstruction import SurfaceGrid
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import Store, file_digest
 from roadscan.tiles.cells import TileCells
@@ -112,10 +113,13 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
 
 def wanted_surface_products(survey: Survey, context: ProductContext) -> list[WantedSurface]:
     """The same, of products of the reconstructed surface."""
+    config = survey.config.surface
+    grid = None if config is None else SurfaceGrid(context.grid, config)
     wanted: list[WantedSurface] = []
     for product, options in wanted_products(survey):
-        if isinstance(product, SurfaceProduct):
+        if isinstance(product, SurfaceProduct) and grid is not None:
             product.check_options(options, context)
+            product.check_cells(options, grid.cell_m, grid.shown)
             wanted.append(WantedSurface(product, options, _product_key(product, options, context)))
     return wanted
 
@@ -232,7 +236,9 @@ def _tasks(
     tasks: list[OutputTask] = []
     drives = Drives.of(plan) if product.needs_lanes else None
     driven = [] if drives is None else [drives.key()]
-    for output in product.outputs(list(summaries.values()), options, context) if summaries else []:
+    bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # they have a surface, and no reading
+    for planned in product.outputs(list(summaries.values()), options, context) if summaries else []:
+        output = replace(planned, tiles=tuple(sorted({*planned.tiles, *bridged}))) if bridged else planned
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
@@ -263,7 +269,8 @@ def _read(product: SurveyProduct, files: Sequence[OutputRecord], output: Output)
 
 def _product_key(product: Product, options: Strict, context: ProductContext) -> str:
     stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
+    joining = [surface_version()] if isinstance(product, SurveyProduct) and product.reads else []
     return key_of(
         product.name, product.version, options.model_dump(mode="json"), source_digest(product),
-        context.survey_id, context.title, context.map, context.grid, stated,
+        context.survey_id, context.title, context.map, context.grid, stated, *joining,
     )  # fmt: skip

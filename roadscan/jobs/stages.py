@@ -14,7 +14,7 @@ from roadscan.jobs.found_regions import find_due_regions, region_pieces
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.products import make_products, product_context, wanted_tile_products
+from roadscan.jobs.products import make_products, product_context, wanted_surface_products, wanted_tile_products
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
 from roadscan.jobs.surfaces import compute_surfaces
@@ -200,6 +200,7 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     if run.survey.config.surface is not None:
         checked_surface(run.survey, run.survey.config.surface)  # before the tiles are computed for it
         region_pieces(plan)
+        wanted_surface_products(run.survey, product_context(plan))
     footprints = load_ranges(plan, manifest)
     context = product_context(plan)
     wanted = tuple(wanted_tile_products(run.survey, context))

@@ -75,4 +75,5 @@ class PotholeJoining(Strict):
     min_area_m2: float = Field(default=0.005, gt=0.0)
     """Least area (m²)."""
     max_elongation: float = Field(default=4.0, ge=1.0)
-    """Longer than this many times its breadth it is a rut or a trench."""
+    """Longer than this many times the diameter of the largest circle in it, it is a rut, a trench or a strip beside a
+    kerb."""

@@ -179,6 +179,13 @@ class SurfaceProduct(TileFiles):
     section none is made by default.
     """
 
+    def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
+        """Raise :class:`ConfigError` where the settings do not fit the surface's cells; asked once, before any work.
+
+        `cell_m` are a cell's edges, east and north; `seen` is how many of the neighbours' a tile shows on each side.
+        """
+        return
+
     @abstractmethod
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
         """Write the tile's file to `path` (a temporary name on a local disk); some cell of the tile has a height."""

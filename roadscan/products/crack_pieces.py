@@ -32,21 +32,26 @@ COLUMNS: Final = pa.schema(
 )  # fmt: skip
 
 
-def height_window(surface: SurfaceTile, needed: int, product: str) -> HeightWindow:
-    """The surface of a tile for a detection that looks `needed` cells beyond it."""
-    east, north = surface.cell_m
-    if east != north or needed > surface.halo:
+def check_cells(cell_m: tuple[float, float], seen: int, needed: int, product: str) -> None:
+    """Raise :class:`ConfigError` where cells do not suit a detection that looks `needed` cells beyond its own."""
+    east, north = cell_m
+    if east != north or needed > seen:
         raise ConfigError(
-            f"'{product}' got cells of {east:g} × {north:g} m and {surface.halo} of the neighbours' on each side",
+            f"'{product}' got cells of {east:g} × {north:g} m and {seen} of the neighbours' on each side",
             expected=f"square cells, and {needed} of the neighbours'",
             change="give tiles.cell_m or surface.cell_m 5 mm or less, or look for narrower defects",
         )
+
+
+def height_window(surface: SurfaceTile, needed: int, product: str) -> HeightWindow:
+    """The surface of a tile for a detection that looks `needed` cells beyond it."""
+    check_cells(surface.cell_m, surface.halo, needed, product)
     window = surface.window
     seen = np.where(surface.origin == FILLED, np.nan, surface.height_m)  # a straight line is no evidence
     return HeightWindow(
         surface.raw_m,
         seen,
-        east,
+        surface.cell_m[0],
         surface.sigma_m,
         window.first_row,
         window.first_column,
@@ -68,6 +73,10 @@ class CrackPieces(SurfaceProduct):
     suffix: ClassVar[str] = ".parquet"
     options: ClassVar[type[Strict]] = CrackDetection
     default: ClassVar[bool] = False
+
+    def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
+        """Square cells, small enough that what cracks depend on lies within those that a tile sees."""
+        check_cells(cell_m, seen, halo_cells(cast(CrackDetection, options), cell_m[0]), self.name)
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
         """Detect and write."""

@@ -75,7 +75,7 @@ class Cracks(SurveyProduct):
             cell_m = max(cell_m, own_cell_m)
             pieces += own
             owner += [str(tile)] * len(own)
-        lane = load_cells.lanes().at([p.line_m[len(p.line_m) // 2] for p in pieces])
+        lane = load_cells.lanes().at([p.middle_m for p in pieces])
         found = join_cracks(pieces, lane, cell_m, cast(CrackJoining, options))
         rows = [_row(k, one, owner) for k, one in enumerate(found, start=1)]
         lines = np.array([one.line for one in found], dtype=object)

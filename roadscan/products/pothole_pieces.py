@@ -11,7 +11,7 @@ import pyarrow as pa
 from roadscan.model.distress import PotholeDetection
 from roadscan.model.strict import Strict
 from roadscan.products.base import ProductContext, SurfaceProduct
-from roadscan.products.crack_pieces import height_window
+from roadscan.products.crack_pieces import check_cells, height_window
 from roadscan.products.geo_table import check_geo_table, read_geo_table, write_geo_table
 from roadscan.surfaces.potholes import PotholePiece, halo_cells, pothole_pieces
 from roadscan.surfaces.tile import SurfaceTile
@@ -35,6 +35,10 @@ class PotholePieces(SurfaceProduct):
     suffix: ClassVar[str] = ".parquet"
     options: ClassVar[type[Strict]] = PotholeDetection
     default: ClassVar[bool] = False
+
+    def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
+        """Square cells, small enough that what potholes depend on lies within those that a tile sees."""
+        check_cells(cell_m, seen, halo_cells(cast(PotholeDetection, options), cell_m[0]), self.name)
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
         """Detect and write."""

@@ -27,7 +27,7 @@ _KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal"
 _CHORD_M = 0.1
 """Directions are those of chords about this long."""
 _BESIDE_NET_M = 0.25
-"""What hangs on a net and reaches no farther is its fringe."""
+"""What hangs on a net and has its middle no farther from the net's hull is its fringe."""
 _LEAST_SHARE = 0.6
 """What has the cross-section of a crack over less of its length is an edge or a row of pits."""
 _ONE_NODE_CELLS = 4.0
@@ -182,7 +182,7 @@ def _parts(
 
     def within(net: Int64, rows: Int64) -> npt.NDArray[np.bool_]:
         ground = shapely.buffer(shapely.convex_hull(shapely.multilinestrings(shapes[net])), _BESIDE_NET_M)
-        middle = np.array([lines[k][len(lines[k]) // 2] for k in rows.tolist()])
+        middle = np.array([pieces[k].middle_m for k in own[rows].tolist()])
         return np.asarray(shapely.intersects_xy(ground, *middle.T))
 
     found = parts_of(whole, is_net, within, config.min_length_m)

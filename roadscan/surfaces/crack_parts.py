@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -140,20 +141,36 @@ def _pairs(pieces: Int64, outwards: Float64, only_two: bool) -> list[tuple[int, 
 
 def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: float) -> None:
     """Give short parts to the longest that they meet, the shortest first."""
-    while True:
-        length = np.bincount(part, whole.length_m, len(kinds))
-        present = np.flatnonzero(np.bincount(part, minlength=len(kinds)))
-        few = present[length[present] < max(least_m, _FRINGE_M)].tolist()
-        for number in sorted((k for k in few if kinds[k] != NET), key=lambda k: (length[k], k)):
-            nodes = np.unique(whole.ends[part == number])
-            beside = np.unique(part[np.isin(whole.ends, nodes).any(axis=1)])
-            beside = beside[beside != number]
-            of_nets = all(kinds[k] == NET for k in beside.tolist())
-            if beside.size and (length[number] < least_m or of_nets):
-                part[part == number] = beside[np.argmax(length[beside])]
-                break
-        else:
-            return
+    length = np.bincount(part, whole.length_m, len(kinds)).tolist()
+    nodes: list[set[int]] = [set() for _ in kinds]
+    parts_at: dict[int, set[int]] = {}
+    for number, ends in zip(part.tolist(), whole.ends.tolist(), strict=True):
+        nodes[number].update(ends)
+        for node in ends:
+            parts_at.setdefault(node, set()).add(number)
+    into = np.arange(len(kinds))
+    limit = max(least_m, _FRINGE_M)
+    waiting = [(length[k], k) for k in np.unique(part).tolist() if kinds[k] != NET and length[k] < limit]
+    heapq.heapify(waiting)
+    while waiting:
+        size, number = heapq.heappop(waiting)
+        if into[number] != number or size != length[number]:
+            continue  # it was given away, or has grown
+        beside = sorted(set().union(*(parts_at[node] for node in nodes[number])) - {number})
+        if not beside or (size >= least_m and any(kinds[k] != NET for k in beside)):
+            continue
+        longest = max(beside, key=length.__getitem__)
+        into[number] = longest
+        length[longest] += size
+        nodes[longest] |= nodes[number]
+        for node in nodes[number]:
+            parts_at[node] = parts_at[node] - {number} | {longest}
+        for k in beside:  # they have grown, or meet something else now
+            if kinds[k] != NET and length[k] < limit:
+                heapq.heappush(waiting, (length[k], k))
+    while (into != into[into]).any():
+        into = into[into]
+    part[:] = into[part]
 
 
 def _merge_same(whole: Network, part: Int64, kinds: Sequence[int]) -> None:

@@ -60,6 +60,12 @@ class CrackPiece:
     """Integral of the depth along the piece (m²)."""
     depth_max_m: float
 
+    @property
+    def middle_m(self) -> Float64:
+        """(2,) halfway along its line (m): a straight line that was simplified has no vertex there."""
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.line_m, axis=0).T))])
+        return np.array([np.interp(0.5 * along[-1], along, axis) for axis in self.line_m.T])
+
 
 @dataclass(frozen=True)
 class Sections:

@@ -3,13 +3,15 @@
 1. *Blocks* (5 cm) of cells, counted from the map's origin, have mean heights.
 2. *Ground* of a block: the 60 % quantile of the means of opposite blocks within `window_m`, in each of four sectors.
    The mean of two opposite blocks is the plane's height here, whatever its slope, and a hole pulls few of them down.
-   A block that lies `min_depth_m` below the lowest sector is in a pothole: along a rut or a kerb there is a sector as
-   low. So within 0.3 m of the border of what was measured no pothole begins.
+   A block that lies `min_depth_m` below the lowest sector is in a pothole: along a rut there is a sector as low, and
+   along a kerb as well but for the 0.15 m beside it, which is a long strip (4). A hole that reaches into that strip is
+   lost with it. Within 0.3 m of the border of what was measured no pothole begins.
 3. *Outline*: cells that lie `edge_depth_m` or more below the ground, in the neighbourhood of such a block, and not in a
    thin line. Ground is here the lowest of the sectors whose means agree, because seen across its rim a
    hole has no ground; it is bilinear between blocks.
 4. Each tile has the pieces of its own cells; :func:`join_potholes` unites those that touch and judges the whole: area,
-   depth, elongation (a rut is deep as well, but long).
+   depth, elongation (length over the diameter of the largest circle in it: a rut and the strip beside a kerb are deep
+   as well, but long).
 """
 
 from __future__ import annotations
@@ -118,9 +120,15 @@ def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> lis
         own = np.sort(piece[whole == k])
         one = _pothole(outline, [pieces[p] for p in own.tolist()], own)
         deep = max((pieces[p].block_depth_max_m for p in own.tolist()), default=0.0) >= config.min_depth_m
-        if deep and one.area_m2 >= config.min_area_m2 and one.length_m <= config.max_elongation * one.breadth_m:
+        compact = one.length_m <= config.max_elongation * _widest_m(outline)
+        if deep and one.area_m2 >= config.min_area_m2 and compact:
             found.append(one)
     return sorted(found, key=lambda p: p.outline.bounds[1::-1])
+
+
+def _widest_m(outline: Any) -> float:
+    """Diameter of the largest circle in an outline, islands counted: a strip along a bent kerb is narrow."""
+    return 2.0 * float(shapely.maximum_inscribed_circle(shapely.Polygon(outline.exterior)).length)
 
 
 def _pothole(outline: Any, pieces: Sequence[PotholePiece], own: Int64) -> Pothole:

@@ -49,6 +49,8 @@ class Region:
     """``found`` or ``stated``."""
     roughness_m: float = float("nan")
     """Largest roughness of its patches; NaN for those that were stated."""
+    span_m: tuple[float, float] = (float("nan"), float("nan"))
+    """Begin and end along the stretch in which it was found (m)."""
 
     @property
     def polygon(self) -> shapely.Polygon:
@@ -70,8 +72,8 @@ def stated_regions(polygons: Iterable[npt.ArrayLike]) -> list[Region]:
 
 def find_regions(model: CoarseModel, settings: RegionSettings) -> list[Region]:
     """Regions where the coarse model varies in depth, in the order of the drive."""
-    if not model.height_m.size:
-        return []
+    if not model.height_m.size or model.along_m[0] == model.along_m[-1]:
+        return []  # a vehicle that stood still showed a line
     patches = _Patches.of(model, settings.patch_m)
     interesting = np.zeros(patches.shape, bool)
     most = np.zeros(patches.shape)
@@ -209,4 +211,4 @@ def _region(model: CoarseModel, box: tuple[float, ...]) -> Region:
         np.stack([np.interp(stations, along, a) for a in pair.T], axis=-1) for pair in (model.zero_m, model.right)
     )
     outline = np.concatenate([zero + left * unit, (zero + right * unit)[::-1]])
-    return Region(outline, FOUND, roughness)
+    return Region(outline, FOUND, roughness, (start, end))

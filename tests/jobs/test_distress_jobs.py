@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from roadscan.jobs import products
 from roadscan.jobs.drives import Drives
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import StoredTiles, wanted_products
@@ -14,7 +16,7 @@ from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext
+from roadscan.products.base import ProductContext, product_named
 from roadscan.simulate.truth import load
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tiles.grid import TileGrid
@@ -44,6 +46,29 @@ def test_files_of_tiles_are_read_from_the_store(simulated):
     assert tiles.file("crack_pieces", TileId(3, 4)) == b"pieces"
     assert tiles.file("crack_pieces", TileId(3, 5)) is None
     assert tiles.file("pothole_pieces", TileId(3, 4)) is None
+
+
+def test_other_code_that_joins_pieces_makes_tables_stale(monkeypatch):
+    context = ProductContext("s", "", MapFrame(None, "yard"), TileGrid(), (), DAY)
+
+    def keys():
+        named = (product_named(name) for name in ("cracks", "potholes", "tile_table"))
+        return [products._product_key(p, p.options(), context) for p in named]
+
+    before = keys()
+    monkeypatch.setattr(products, "surface_version", lambda: "another")
+    assert [a == b for a, b in zip(before, keys(), strict=True)] == [False, False, True]
+
+
+def test_pieces_of_tiles_without_a_reading_are_joined_as_well():
+    context = ProductContext("s", "", MapFrame(None, "yard"), TileGrid(), (), DAY)
+    own, bridged = TileId(3, 4), TileId(2, 4)
+    files = [OutputRecord("pothole_pieces", str(t), "key", f"{t}.parquet", 6, "digest") for t in (own, bridged)]
+    product = product_named("potholes")
+    plan, summaries = SimpleNamespace(store=None), {own: SimpleNamespace(tile=own)}
+    (task,) = products._tasks(product, product.options(), plan, context, {}, {}, summaries, files)
+    assert task.output.tiles == (bridged, own)
+    assert {r.unit for r in task.files} == {"2_4", "3_4"}
 
 
 def test_lanes_run_as_the_vehicle_drove(finished):

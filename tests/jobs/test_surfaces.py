@@ -320,6 +320,8 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     on_road = shapely.transform(shapes, lambda xy: np.stack(truth.station_offset_m(*xy.T), axis=-1))
     assert shapely.contains_xy(shapely.union_all(on_road), POTHOLE["station_m"], POTHOLE["offset_m"])
     assert all(row["roughness_m"] > 0.0015 and row["area_m2"] > 0.3 for row in rows)
+    told = shapely.contains_xy(on_road, POTHOLE["station_m"], POTHOLE["offset_m"])
+    assert told.sum() <= 2  # all pieces see it in their margins: those tell of it whose span it lies in
     planned = points.plan(survey)
     found = dict(_surfaces(planned.task(tuple(planned.keys))))
     assert_seamless(found, 100)
@@ -417,6 +419,13 @@ def test_settings_that_do_not_fit_the_tiles_stop_a_run_before_them(
 ) -> None:
     run = Run(cells.survey(settings), cells.store, Inline(), None, Lines())
     with pytest.raises(ConfigError, match=message):
+        run_stages(run, [s for s in STAGES if s.name == "tiles"])
+
+
+def test_cells_too_coarse_for_cracks_stop_a_run_before_them(cells: Reconstructed) -> None:
+    survey = cells.survey(CELLS, {"make": ["surface", "cracks"], "options": {}})
+    run = Run(survey, cells.store, Inline(), None, Lines())
+    with pytest.raises(ConfigError, match=r"'crack_pieces' got cells of 0\.05 × 0\.05 m"):
         run_stages(run, [s for s in STAGES if s.name == "tiles"])
 
 

@@ -149,6 +149,16 @@ def test_noise_that_is_largest_below_the_scanner_is_no_region(monkeypatch: pytes
     assert find_regions(model, RegionSettings(factor=2.0)) != []
 
 
+@pytest.mark.parametrize("profiles", [1, 200])
+def test_a_vehicle_that_stands_finds_no_region(profiles: int) -> None:
+    across = np.linspace(-4.0, 4.0, 361)
+    east = np.broadcast_to(across, (profiles, across.size))
+    path = np.zeros((profiles, 2))
+    kerb = 0.3 * np.clip(east - 2.0, 0.0, 1.0)
+    stretch = Stretch.of_points(east, np.zeros(east.shape), kerb, np.zeros(east.shape, np.uint8), path)
+    assert find_regions(coarse_model(stretch, CoarseSettings()), RegionSettings()) == []
+
+
 def test_regions_that_the_user_states() -> None:
     (one,) = stated_regions([[(0.0, 0.0), (4.0, 0.0), (4.0, 2.0)]])
     assert one.origin == STATED

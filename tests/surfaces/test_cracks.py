@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -240,6 +241,9 @@ def test_a_net_is_parted_from_the_crack_that_runs_into_it():
     assert ("alligator", 378, 1) in found
     assert kinds([*mesh, piece((0, 60), (0, 105))]) == [("alligator", 405, 1)]  # its fringe
     assert kinds([*mesh, piece((0, 60), (0, 115))]) == [("alligator", 360, 1), ("transverse", 55, 1)]
+    for ends in (((0, 60), (0, 115)), ((0, 115), (0, 60))):  # as tiles store it: a straight line has two vertices
+        stored = replace(piece(*ends), line_m=piece(*ends).line_m[[0, -1]])
+        assert kinds([*mesh, stored]) == [("alligator", 360, 1), ("transverse", 55, 1)]
     assert [f[0] for f in found if f[0] != "alligator"] == ["longitudinal"]  # one polygon is no net
     (net,) = [c for c in join_cracks([*mesh, *into], 0.0, 0.01, JOINING) if c.kind == "alligator"]
     assert net.polygons == len(shapely.polygonize([shapely.LineString(p.line_m) for p in mesh]).geoms) == 4

@@ -1,4 +1,4 @@
-"""Potholes: holes of known volume in slopes, ruts and beside kerbs, whole and cut by tiles."""
+"""Potholes: holes of known volume in slopes and ruts, whole and cut by tiles; kerbs and other forms that are none."""
 
 from __future__ import annotations
 
@@ -58,8 +58,10 @@ def test_in_a_rut():
         lambda x, y: -0.014 * ((x - 1.6) ** 2 + (y - 1.6) ** 2 < 0.31**2),
         lambda x, y: -0.03 * (np.abs(x - 1.6) < 0.02),
         lambda x, y: -0.03 * np.abs(x - 1.6),
+        lambda x, y: 0.12 * ((x > 2.3) | (y > 2.3)),
+        lambda x, y: 0.12 * ((x - 0.6) ** 2 + (y - 1.6) ** 2 > 1.0),
     ],
-    ids=["rut", "kerb", "sunk manhole", "trench", "crown"],
+    ids=["rut", "kerb", "sunk manhole", "trench", "crown", "corner of a parking bay", "bent kerb"],
 )
 def test_what_is_no_pothole(form):
     assert found(road(depth_m=0.0, extra=form)) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -63,7 +64,7 @@ class Crack:
     azimuth_deg: float
     """Mean direction, clockwise from map north, 0 to 180 (degrees)."""
     lane_angle_deg: float
-    """Between that and the lane, 0 to 90 (degrees)."""
+    """Between that and the lane, 0 to 90 (degrees), where it is known; NaN where it is nowhere."""
     longitudinal_m: float
     """Length within `lane_angle_deg` of the lane's direction (m)."""
     transverse_m: float
@@ -147,7 +148,7 @@ class _Turned:
     turning: npt.NDArray[np.complex128]
     """Sum of the lengths of its chords, each with twice its azimuth."""
     to_lane: npt.NDArray[np.complex128]
-    """The same with twice the angle to the lane."""
+    """The same with twice the angle to the lane; 0 where it is not known."""
     parts_m: Float64
     """(n, 3) lengths along, across and aslant the lane; 0 where it is not known."""
 
@@ -212,7 +213,7 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
         measured_share=measured / length if length > 0 else 0.0,
         polygons=polygons,
         azimuth_deg=math.degrees(np.angle(turned.turning[own].sum()) / 2) % 180.0,
-        lane_angle_deg=abs(math.degrees(np.angle(turned.to_lane[own].sum()) / 2)),
+        lane_angle_deg=abs(math.degrees(np.angle(turned.to_lane[own].sum()) / 2)) if parts.any() else math.nan,
         longitudinal_m=float(parts[0]),
         transverse_m=float(parts[1]),
         diagonal_m=float(parts[2]),
@@ -234,5 +235,5 @@ def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[com
     share = size * (one.length_m / max(size.sum(), 1e-12))
     known = 0.0 if math.isnan(lane) else 1.0
     parts = [known * float(share[own].sum()) for own in (along, across, ~along & ~across)]
-    turning, to_lane = (complex((size * np.exp(2j * a)).sum()) for a in (angle, angle - lane))
-    return turning, to_lane, parts
+    turning = complex((size * np.exp(2j * angle)).sum())
+    return turning, turning * cmath.exp(-2j * lane) if known else 0j, parts

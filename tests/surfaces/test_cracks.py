@@ -218,6 +218,9 @@ def test_cracks_that_meet_are_parts_of_a_network():
     apart = [piece((0, 900), (0, 960))]
     assert kinds(along + across + apart) == [("longitudinal", 200, 1), ("transverse", 60, 2), ("transverse", 169, 1)]
     assert kinds(along + across, float("nan")) == [("unknown", 369, 1)]
+    (part,) = join_cracks(along, [np.pi / 2, np.pi / 2, float("nan")], 0.01, JOINING)  # nobody drove by its end
+    assert part.kind == "transverse" and part.lane_angle_deg == pytest.approx(90.0, abs=2.0)
+    assert np.isnan(join_cracks(along, float("nan"), 0.01, JOINING)[0].lane_angle_deg)
 
 
 def test_a_crack_keeps_its_type_where_branches_leave_it():

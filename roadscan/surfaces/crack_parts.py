@@ -141,7 +141,7 @@ def _pairs(pieces: Int64, outwards: Float64, only_two: bool) -> list[tuple[int, 
 
 def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: float) -> None:
     """Give short parts to the longest that they meet, the shortest first."""
-    length = np.bincount(part, whole.length_m, len(kinds)).tolist()
+    length: list[float] = np.bincount(part, whole.length_m, len(kinds)).tolist()
     nodes: list[set[int]] = [set() for _ in kinds]
     parts_at: dict[int, set[int]] = {}
     for number, ends in zip(part.tolist(), whole.ends.tolist(), strict=True):
@@ -156,7 +156,7 @@ def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: flo
         size, number = heapq.heappop(waiting)
         if into[number] != number or size != length[number]:
             continue  # it was given away, or has grown
-        beside = sorted(set().union(*(parts_at[node] for node in nodes[number])) - {number})
+        beside = sorted(set[int]().union(*(parts_at[node] for node in nodes[number])) - {number})
         if not beside or (size >= least_m and any(kinds[k] != NET for k in beside)):
             continue
         longest = max(beside, key=length.__getitem__)

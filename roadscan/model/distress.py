@@ -54,8 +54,8 @@ class PotholeDetection(Strict):
     block_m: float = Field(default=0.05, gt=0.0, le=0.5)
     """Edge of the blocks whose mean heights show the ground around (m)."""
     window_m: float = Field(default=0.55, gt=0.0, le=5.0)
-    """Half the edge of the square in which the ground is looked for (m); holes up to 1.4 times as wide are found. A tile
-    sees 1 m of its neighbours: more than the default needs smaller blocks (0.75 with blocks of 2 cm)."""
+    """Half the edge of the square in which the ground is looked for (m); holes up to 1.4 times as wide are found. A
+    tile sees 1 m of its neighbours: more than the default needs smaller blocks (0.75 with blocks of 2 cm)."""
     edge_depth_m: float = Field(default=0.008, gt=0.0)
     """Depth below the ground at which a pothole's outline runs (m)."""
     min_depth_m: float = Field(default=0.02, gt=0.0)

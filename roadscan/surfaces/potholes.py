@@ -7,8 +7,8 @@
    along a kerb as well but for the 0.15 m beside it, which is a long strip (4). A hole that reaches into that strip is
    lost with it. Within 0.3 m of the border of what was measured no pothole begins.
 3. *Outline*: cells that lie `edge_depth_m` or more below the ground, in the neighbourhood of such a block, and not in a
-   thin line. Ground is here the lowest of the sectors whose means agree, because seen across its rim a
-   hole has no ground; it is bilinear between blocks.
+   thin line; cells without a height between others (up to 2 cm) have the mean depth of those. Ground is here the lowest
+   of the sectors whose means agree, because seen across its rim a hole has no ground; it is bilinear between blocks.
 4. Each tile has the pieces of its own cells; :func:`join_potholes` unites those that touch and judges the whole: area,
    depth, elongation (length over the diameter of the largest circle in it: a rut and the strip beside a kerb are deep
    as well, but long).
@@ -30,6 +30,7 @@ from rasterio.features import shapes
 from scipy.ndimage import label
 
 from roadscan.kernels.ground import ground
+from roadscan.kernels.valleys import fill_holes
 from roadscan.model.distress import PotholeDetection, PotholeJoining
 from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
 
@@ -95,7 +96,7 @@ def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[Potho
         return []
     square = np.ones((2 * _NEAR_BLOCKS + 1, 2 * _NEAR_BLOCKS + 1), np.uint8)
     near = cv2.dilate(seeds.astype(np.uint8), square).astype(np.bool_)
-    cells = blocks.depth_m(window)
+    cells = _bridged(blocks.depth_m(window), _thin_cells(window.cell_m) // 3)
     with np.errstate(invalid="ignore"):
         low = (cells >= config.edge_depth_m) & blocks.of_cells(near, window, absent=0)
     thin = _thin_cells(window.cell_m)
@@ -105,6 +106,15 @@ def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[Potho
     halo = window.halo
     inner[halo : low.shape[0] - halo, halo : low.shape[1] - halo] = True
     return _pieces(window, low & inner, cells, blocks.of_cells(depth, window, absent=np.nan))
+
+
+def _bridged(depth_m: Float64, reach: int) -> Float64:
+    """Depths with holes up to 2 · `reach` cells wide filled from their rims: a cell without a reading is no ground."""
+    known = (~np.isnan(depth_m)).astype(np.uint8)
+    holes = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > known
+    row, column = np.nonzero(holes[1:-1, 1:-1])
+    fill_holes(depth_m, row + 1, column + 1, reach)
+    return depth_m
 
 
 def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> list[Pothole]:

@@ -39,6 +39,15 @@ def test_a_paraboloid_has_its_area_depth_and_volume():
     assert 0.3 < one.breadth_m <= one.length_m < 0.45
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
+def test_cells_without_a_reading_cost_no_volume(share):
+    whole, window = found(road())[0], road()
+    window.raw_m[np.random.default_rng(3).random(window.raw_m.shape) < share] = np.nan
+    (one,) = found(window)
+    assert one.volume_m3 == pytest.approx(whole.volume_m3, rel=0.03)
+    assert one.area_m2 == pytest.approx(whole.area_m2, rel=0.05)
+
+
 @pytest.mark.parametrize("radius_m", [0.06, 0.1, 0.3])
 def test_small_and_large_holes(radius_m):
     (one,) = found(road(radius_m=radius_m))
@@ -70,6 +79,7 @@ def test_what_is_no_pothole(form):
 @pytest.mark.parametrize("halo", [80, halo_cells(CONFIG, CELL_M)], ids=["less than it may need", "full"])
 def test_tiles_give_the_potholes_of_the_whole(halo):
     whole = road(halo=halo, shape=(352, 362), extra=lambda x, y: 0.01 * np.sin(3.0 * x) * np.cos(2.0 * y))
+    whole.raw_m[np.random.default_rng(6).random(whole.raw_m.shape) < 0.1] = np.nan
     (expected,) = found(whole)
     cuts = [(slice(0, 164 + halo), slice(0, 161 + halo)), (slice(0, 164 + halo), slice(161 - halo, None))]
     cuts += [(slice(164 - halo, None), one[1]) for one in cuts]

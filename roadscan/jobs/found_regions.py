@@ -206,8 +206,8 @@ def _found(piece: RegionPiece) -> list[Region]:
     path = piece.ground.map.map_from_world(placement.trajectory.world, sensor)[:, :2]
     classes = np.where(points.kept, 0, 1).astype(np.uint8)
     stretch = Stretch.of_points(points.easting_m, points.northing_m, points.height_m, classes, path)
-    own = (points.epoch_gps_ns >= piece.start_gps_ns) & (points.epoch_gps_ns < piece.end_gps_ns)
-    within = stretch.along_m[own]
+    inside = (points.epoch_gps_ns >= piece.start_gps_ns) & (points.epoch_gps_ns < piece.end_gps_ns)
+    within = stretch.along_m[inside]
     found = find_regions(coarse_model(stretch, CoarseSettings()), piece.settings)
     return [r for r in found if ((within >= r.span_m[0]) & (within <= r.span_m[1])).any()]
 

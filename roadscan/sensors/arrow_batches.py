@@ -37,10 +37,11 @@ class MappedBatches:
 
 def unlisted_batches(path: Path, listed: int) -> int:
     """How many record batches stand in the file beyond the `listed` ones of its footer; bodies are not read."""
-    pages, found = _mapped(path), 0
-    stream = pa.BufferReader(pa.py_buffer(pages))
-    stream.seek(_FIRST_MESSAGE)
+    found = 0
     try:
+        pages = _mapped(path)
+        stream = pa.BufferReader(pa.py_buffer(pages))
+        stream.seek(_FIRST_MESSAGE)
         reader = pa.ipc.MessageReader.open_stream(stream)
         for number in itertools.count():
             found += reader.read_next_message().type == "record batch"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.kernels import delta_packing, wide_packing
@@ -34,6 +35,7 @@ _REQUIRED, _OPTIONAL, _REPEATED = 0, 1, 2
 _CONVERTED_LIST: Final = 3
 _LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10
 _UNCOMPRESSED: Final = 0
+_LZ4_RAW: Final = 7
 _SEAL: Final = b"roadscan.footer_crc32"
 _SEAL_DIGITS: Final = 8
 _ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
@@ -113,6 +115,7 @@ class Writer:
         self._at = self._group = stream.write(MAGIC)
         self._checksum = checksum()
         self._words = np.empty(0, np.uint64)
+        self._codec = pa.Codec("lz4_raw")
 
     def group(self, rows: pa.Table, number: int) -> Value:
         """Write a row group; returns its part of the footer."""
@@ -171,6 +174,15 @@ class Writer:
         at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
         path = (field.name, "list", "element")
         return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, at, size, {})
+
+    def compressed(
+        self, field: pa.Field, encoding: int, content: npt.NDArray[np.uint8], count: int, more: dict[int, Value]
+    ) -> Value:
+        """Write a column of numbers that are always there as a page under LZ4; returns its part of the footer."""
+        packed = np.frombuffer(self._codec.compress(content), np.uint8)
+        at, size = self.page(b"", packed, count, encoding, content.size)
+        raw = size - packed.size + content.size
+        return chunk(KINDS[field.type], (field.name,), encoding, count, at, size, more, codec=_LZ4_RAW, raw=raw)
 
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
         """Write a page, of `raw` bytes before it was compressed; returns where it starts, and its whole size."""

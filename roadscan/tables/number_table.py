@@ -17,10 +17,9 @@ from roadscan.kernels.byte_planes import split
 from roadscan.kernels.delta_packing import BLOCK, MINIBLOCKS
 from roadscan.kernels.long_packing import TOO_FAR, encode_long, room_words
 from roadscan.tables import pages
-from roadscan.tables.list_table import KINDS, Writer, chunk
+from roadscan.tables.list_table import KINDS, Writer
 from roadscan.tables.thrift import Value, binary, i64, struct, varint, zigzag
 
-_LZ4_RAW: Final = 7
 _WORD: Final = 4
 """Bytes of the shortest numbers that Parquet knows."""
 
@@ -53,16 +52,12 @@ class _Numbers(Writer):
         super().__init__(stream)
         self._planes = np.empty(0, np.uint8)
         self._room = np.empty(0, np.uint64)
-        self._codec = pa.Codec("lz4_raw")
 
     def column(self, field: pa.Field, values: Array) -> Value:
         """Write a column chunk; returns its part of the footer."""
         encoding, content = self._differences(values) if values.dtype == np.int64 else self._split(values)
-        packed = np.frombuffer(self._codec.compress(content), np.uint8)
-        at, size = self.page(b"", packed, values.size, encoding, content.size)
-        raw = size - packed.size + content.size
         more = {12: struct(_statistics(values, KINDS[field.type].stored))}
-        return chunk(KINDS[field.type], (field.name,), encoding, values.size, at, size, more, codec=_LZ4_RAW, raw=raw)
+        return self.compressed(field, encoding, content, values.size, more)
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
         if self._room.size < room_words(values.size):

@@ -73,14 +73,6 @@ def _about(values: int, encoding: int) -> bytes:
     return thrift.struct({1: own}).content
 
 
-@functools.lru_cache(maxsize=64)
-def _rest(values: int, encoding: int) -> bytes:
-    """What follows the sizes and the CRC-32 in a header."""
-    header = page_header(0, 0, values, encoding)
-    found = _SIZES_AND_CRC.match(header)
-    return header[found.end() :] if found else b""
-
-
 class PageHeader(NamedTuple):
     """What the header of a column chunk's one page says."""
 
@@ -98,7 +90,7 @@ def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -
     if found is None:
         return None
     raw, size, crc = (_number(varint) for varint in found.groups())
-    rest = _rest(values, encoding)
+    rest = _about(values, encoding)
     length = found.end() + len(rest)
     known = 0 <= raw < _LIMIT and 0 <= size < _LIMIT and -_LIMIT <= crc < _LIMIT
     if not known or length + size != chunk.size or head[found.end() : length] != rest:

@@ -17,10 +17,9 @@ import pyarrow as pa
 
 from roadscan.kernels.byte_planes import split, split_rounded
 from roadscan.tables import pages
-from roadscan.tables.list_table import KINDS, Writer, chunk
+from roadscan.tables.list_table import KINDS, Writer
 from roadscan.tables.thrift import Value, binary, struct
 
-_LZ4_RAW: Final = 7
 _SCRATCH: Final = 2048
 
 Columns = Mapping[str, npt.NDArray[Any]]
@@ -58,7 +57,6 @@ class _Planes(Writer):
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)
         self._planes = np.empty(0, np.uint8)
-        self._codec = pa.Codec("lz4_raw")
 
     def column(self, field: pa.Field, values: npt.NDArray[Any], step: float | None, stated: bool) -> Value:
         """Write a column chunk; returns its part of the footer."""
@@ -73,11 +71,8 @@ class _Planes(Writer):
             line = np.empty(_SCRATCH, values.dtype)
             number = values.dtype.type
             split_rounded(values, number(1 / step), number(step), line, line.view(f"u{width}"), planes)
-        packed = np.frombuffer(self._codec.compress(planes), np.uint8)
-        at, size = self.page(b"", packed, count, pages.BYTE_STREAM_SPLIT, planes.size)
         more: dict[int, Value] = {}
         if stated and count:
             low, high = (np.array(v, kind.stored).tobytes() for v in (values.min(), values.max()))
             more = {12: struct({5: binary(high), 6: binary(low)})}
-        raw = size - packed.size + planes.size
-        return chunk(kind, (field.name,), pages.BYTE_STREAM_SPLIT, count, at, size, more, codec=_LZ4_RAW, raw=raw)
+        return self.compressed(field, pages.BYTE_STREAM_SPLIT, planes, count, more)

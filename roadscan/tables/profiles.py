@@ -5,7 +5,6 @@ Files as `list_table` writes them are decoded here; those of other writers, and 
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -13,16 +12,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from roadscan.model.errors import StoreError
-from roadscan.tables.byte_source import opened
+from roadscan.tables.group_reader import GroupReader
 from roadscan.tables.list_table_reader import ListTableFile
-from roadscan.tables.page_file import DamageError, read_footer
+from roadscan.tables.page_file import DamageError
 from roadscan.tables.store import Store
 
 _COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
-_DAMAGE: Final = (OSError, ValueError, pa.ArrowException, DamageError)
 
 Int64 = np.ndarray[Any, np.dtype[np.int64]]
 UInt16 = np.ndarray[Any, np.dtype[np.uint16]]
@@ -41,49 +37,29 @@ class Profiles:
     """(n, m) raw intensities, contiguous; None where a profile has none."""
 
 
-class ProfileReader:
-    """Row groups of a file of scans, into buffers that are reused; one a thread.
+class ProfileReader(GroupReader[Profiles, ListTableFile]):
+    """Row groups of a file of scans; errors as of :class:`GroupReader`."""
 
-    Raises
-    ------
-    StoreError
-        naming file and row groups, where the file is missing, damaged or does not hold scans.
-    """
+    what = "profiles"
+    columns = _COLUMNS
 
     def __init__(self, store: Store, file: str) -> None:
-        self._file = file
         self._epochs: Int64 = np.empty(0, np.int64)
         self._ranges: UInt16 = np.empty(0, np.uint16)
         self._intensities: UInt8 = np.empty(0, np.uint8)
-        self._packed: ListTableFile | None = None
-        try:
-            self._source = opened(store, store.path(file))
-            self._metadata, ours = read_footer(self._source.stream)
-            self._list_size = _list_size(self._metadata.schema.to_arrow_schema())
-        except _DAMAGE as error:
-            raise self._error(error) from error
-        if ours and self._list_size is not None:
-            self._packed = ListTableFile(self._source, self._metadata)
+        self._size = 0
+        super().__init__(store, file)
 
-    def expect(self, groups: Sequence[int]) -> None:
-        """Let row groups be on their way that will be read soon; what is wrong with them is said when they are read."""
-        if self._packed is not None:
-            with contextlib.suppress(*_DAMAGE):
-                self._packed.expect([k for k in groups if 0 <= k < self._metadata.num_row_groups], _COLUMNS)
+    def _suits(self, schema: pa.Schema) -> bool:
+        size = _list_size(schema)
+        self._size = size or 0
+        return size is not None
 
-    def read(self, groups: Sequence[int]) -> Profiles:
-        """Profiles of row groups, in the order given; the arrays are valid until the next read of this reader."""
-        outside = [k for k in groups if not 0 <= k < self._metadata.num_row_groups]
-        try:
-            if outside:
-                raise DamageError(f"it has {self._metadata.num_row_groups} row groups")
-            if self._packed is None or self._list_size is None:
-                return self._arrow(list(groups))
-            return self._decoded(self._packed, groups, self._list_size)
-        except _DAMAGE as error:
-            raise self._error(error, groups) from error
+    def _pages(self) -> ListTableFile:
+        return ListTableFile(self._source, self._metadata)
 
-    def _decoded(self, packed: ListTableFile, groups: Sequence[int], size: int) -> Profiles:
+    def _decoded(self, packed: ListTableFile, groups: Sequence[int]) -> Profiles:
+        size = self._size
         rows = [self._metadata.row_group(k).num_rows for k in groups]
         total = sum(rows)
         if self._epochs.size < total:
@@ -103,9 +79,7 @@ class ProfileReader:
             first += n
         return Profiles(epochs, ranges, intensities if bright else None)
 
-    def _arrow(self, groups: list[int]) -> Profiles:
-        file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)
-        rows = file.read_row_groups(groups, columns=_COLUMNS, use_threads=False)
+    def _from_table(self, rows: pa.Table) -> Profiles:
         epochs, ranges, intensities = (rows.column(name) for name in _COLUMNS)
         if epochs.null_count or ranges.null_count:
             raise DamageError("a profile has no epoch or no ranges")
@@ -113,14 +87,6 @@ class ProfileReader:
             epochs.cast(pa.int64()).to_numpy(),
             _readings(ranges, pa.uint16()),
             None if intensities.null_count else _readings(intensities, pa.uint8()),
-        )
-
-    def _error(self, error: Exception, groups: Sequence[int] = ()) -> StoreError:
-        return StoreError(
-            f"ingested profiles cannot be read ({error})",
-            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
-            file=self._file,
-            record=f"row groups {', '.join(map(str, groups))}" if groups else None,
         )
 
 

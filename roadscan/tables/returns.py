@@ -5,7 +5,6 @@ Files as `number_table` writes them are decoded here; those of other writers, an
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,10 +16,9 @@ import pyarrow.parquet as pq
 
 from roadscan.kernels.byte_planes import join, join_low
 from roadscan.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
-from roadscan.model.errors import StoreError
 from roadscan.tables import pages
-from roadscan.tables.byte_source import opened
-from roadscan.tables.page_file import DamageError, PageFile, read_footer
+from roadscan.tables.group_reader import GroupReader
+from roadscan.tables.page_file import DamageError, PageFile
 from roadscan.tables.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
@@ -32,7 +30,6 @@ _KINDS: Final[dict[str, np.dtype[Any]]] = {
 _COLUMNS: Final = list(_KINDS)
 _PLANES: Final = 4
 _WORD: Final = 8
-_DAMAGE: Final = (OSError, ValueError, pa.ArrowException, DamageError)
 
 Array = npt.NDArray[Any]
 Bytes = npt.NDArray[np.uint8]
@@ -52,86 +49,6 @@ class Returns:
     y_sensor_m: Float32
     z_sensor_m: Float32
     intensity: npt.NDArray[np.uint16]
-
-
-class ReturnsReader:
-    """Row groups of a file of returns, into buffers that are reused; one a thread.
-
-    Raises
-    ------
-    StoreError
-        naming file and row groups, where the file is missing, damaged or does not hold returns.
-    """
-
-    def __init__(self, store: Store, file: str) -> None:
-        self._file = file
-        self._columns = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
-        self._packed: _NumberFile | None = None
-        try:
-            self._source = opened(store, store.path(file))
-            self._metadata, ours = read_footer(self._source.stream)
-            missing = set(_COLUMNS).difference(self._metadata.schema.names)
-            if missing:
-                raise DamageError(f"it has no column '{min(missing)}'")
-            if ours and _as_stored(self._metadata.schema.to_arrow_schema()):
-                self._packed = _NumberFile(self._source, self._metadata)
-        except _DAMAGE as error:
-            raise self._error(error) from error
-
-    def expect(self, groups: Sequence[int]) -> None:
-        """Let row groups be on their way that will be read soon; what is wrong with them is said when they are read."""
-        if self._packed is not None:
-            with contextlib.suppress(*_DAMAGE):
-                self._packed.expect([k for k in groups if 0 <= k < self._metadata.num_row_groups], _COLUMNS)
-
-    def read(self, groups: Sequence[int]) -> Returns:
-        """Returns of row groups, in the order given; the arrays are valid until the next read of this reader."""
-        try:
-            if any(not 0 <= k < self._metadata.num_row_groups for k in groups):
-                raise DamageError(f"it has {self._metadata.num_row_groups} row groups")
-            return self._arrow(groups) if self._packed is None else self._decoded(self._packed, groups)
-        except _DAMAGE as error:
-            raise self._error(error, groups) from error
-
-    def _decoded(self, packed: _NumberFile, groups: Sequence[int]) -> Returns:
-        rows = [self._metadata.row_group(k).num_rows for k in groups]
-        total = sum(rows)
-        if self._columns[_EPOCH].size < total:
-            self._columns = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
-        columns = {name: values[:total] for name, values in self._columns.items()}
-        first, one_epoch = 0, True
-        for group, n in zip(groups, rows, strict=True):
-            packed.load(group, _COLUMNS)
-            own = {name: values[first : first + n] for name, values in columns.items()}
-            same = packed.same(_EPOCH, _POSE_EPOCH)
-            for name, values in own.items():
-                if not (same and name == _POSE_EPOCH):
-                    packed.numbers(name, values)
-            if one_epoch and not same:
-                columns[_POSE_EPOCH][:first] = columns[_EPOCH][:first]
-            one_epoch &= same
-            if same and not one_epoch:
-                own[_POSE_EPOCH][:] = own[_EPOCH]
-            first += n
-        if one_epoch:
-            columns[_POSE_EPOCH] = columns[_EPOCH]
-        return Returns(*(columns[name] for name in _COLUMNS))
-
-    def _arrow(self, groups: Sequence[int]) -> Returns:
-        file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)
-        rows = file.read_row_groups(list(groups), columns=_COLUMNS, use_threads=False)
-        if any(rows.column(name).null_count for name in _COLUMNS):
-            raise DamageError("a return is not whole")
-        arrays = (np.array(rows.column(name).to_numpy(), kind) for name, kind in _KINDS.items())
-        return Returns(*arrays)
-
-    def _error(self, error: Exception, groups: Sequence[int] = ()) -> StoreError:
-        return StoreError(
-            f"ingested returns cannot be read ({error})",
-            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
-            file=self._file,
-            record=f"row groups {', '.join(map(str, groups))}" if groups else None,
-        )
 
 
 class _NumberFile(PageFile):
@@ -175,6 +92,55 @@ class _NumberFile(PageFile):
         fault = decode(room, self._unpacked, 0, page.size, values)
         if fault != WHOLE:
             raise DamageError(f"column '{name}': {FAULTS[fault]}")
+
+
+class ReturnsReader(GroupReader[Returns, _NumberFile]):
+    """Row groups of a file of returns; errors as of :class:`GroupReader`."""
+
+    what = "returns"
+    columns = _COLUMNS
+
+    def __init__(self, store: Store, file: str) -> None:
+        self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
+        super().__init__(store, file)
+
+    def _suits(self, schema: pa.Schema) -> bool:
+        missing = set(_COLUMNS).difference(schema.names)
+        if missing:
+            raise DamageError(f"it has no column '{min(missing)}'")
+        return _as_stored(schema)
+
+    def _pages(self) -> _NumberFile:
+        return _NumberFile(self._source, self._metadata)
+
+    def _decoded(self, packed: _NumberFile, groups: Sequence[int]) -> Returns:
+        rows = [self._metadata.row_group(k).num_rows for k in groups]
+        total = sum(rows)
+        if self._arrays[_EPOCH].size < total:
+            self._arrays = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
+        columns = {name: values[:total] for name, values in self._arrays.items()}
+        first, one_epoch = 0, True
+        for group, n in zip(groups, rows, strict=True):
+            packed.load(group, _COLUMNS)
+            own = {name: values[first : first + n] for name, values in columns.items()}
+            same = packed.same(_EPOCH, _POSE_EPOCH)
+            for name, values in own.items():
+                if not (same and name == _POSE_EPOCH):
+                    packed.numbers(name, values)
+            if one_epoch and not same:
+                columns[_POSE_EPOCH][:first] = columns[_EPOCH][:first]
+            one_epoch &= same
+            if same and not one_epoch:
+                own[_POSE_EPOCH][:] = own[_EPOCH]
+            first += n
+        if one_epoch:
+            columns[_POSE_EPOCH] = columns[_EPOCH]
+        return Returns(*(columns[name] for name in _COLUMNS))
+
+    def _from_table(self, rows: pa.Table) -> Returns:
+        if any(rows.column(name).null_count for name in _COLUMNS):
+            raise DamageError("a return is not whole")
+        return Returns(*(np.array(rows.column(name).to_numpy(), kind) for name, kind in _KINDS.items()))
 
 
 _ENCODINGS: Final = {

@@ -22,6 +22,7 @@ from roadscan.kernels.line_access import STORES_SOME, VECTOR, fetch_line, store_
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.run_lines import AT_ONCE, find_known_lines, lowest_bit
 from roadscan.kernels.runs import find_runs, sum_up
+from roadscan.kernels.selection import bounds_of
 
 LANES = 16
 """Cells of a group."""
@@ -292,7 +293,7 @@ def accumulate_cells(
         end, last = start, min(start + PIECE, column.size)
         while end < last and passes[end] == passes[start]:
             end += 1
-        low, high = reach_of(heights[start:end])
+        low, high = bounds_of(heights[start:end])
         fates[KEPT] += accumulate(
             column[start:end], row[start:end], heights[start : end + VECTOR], low, high, intensity[start:end],
             np.uint32(1), passes[start], starts, sums, cells, tile_rows, groups, edge, pool, touched,
@@ -329,7 +330,7 @@ def accumulate_points(
             end += 1
         n = end - start
         find_cells(x[start:end], y[start:end], height[start:end], 1.0 / cell_quanta, column, row, heights)
-        low, high = reach_of(heights[:n])
+        low, high = bounds_of(heights[:n])
         accumulate(
             column[:n], row[:n], heights, low, high, intensity[start:end], np.uint32(1), passes[start], starts, sums,
             cells, tile_rows, groups, edge, pool, touched,
@@ -345,12 +346,3 @@ def find_cells(x, y, height, per_cell, column, row, heights):
         column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
         row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))
         heights[j] = height[j]
-
-
-@bare
-def reach_of(heights):
-    """Lowest and highest height (int64)."""
-    low, high = heights[0], heights[0]
-    for j in range(heights.size):
-        low, high = min(low, heights[j]), max(high, heights[j])
-    return np.int64(low), np.int64(high)

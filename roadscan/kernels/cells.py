@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from roadscan.kernels.accumulate import (
     WORD_SHIFT,
     WORDS,
 )
-from roadscan.kernels.lanes import REACH, statistics_of_64
+from roadscan.kernels.full_cells import select_arrays, statistics_of_full
+from roadscan.kernels.lanes import statistics_of_64
 from roadscan.kernels.line_access import fetch_line
 from roadscan.kernels.line_statistics import line_statistics_of_8, line_statistics_of_28
 from roadscan.kernels.open_group import chained_lanes, open_group, put_apart
@@ -39,7 +39,8 @@ AT_ONCE = 64
 def work_arrays(most: int) -> tuple[Any, ...]:
     """Arrays that `finish_cells` works in; `most` : heights that a cell may have."""
     pairs, table = np.zeros((SLOTS // 2, LANES), np.int32), np.zeros((AT_ONCE, LANES), np.int32)
-    return pairs, table, *np.zeros((4, LANES), np.int32), np.zeros((STATISTICS, LANES)), np.empty(most, np.int64)
+    rows, out = np.zeros((4, LANES), np.int32), np.zeros((STATISTICS, LANES))
+    return pairs, table, *rows, out, np.empty(most, np.int32), select_arrays(most)
 
 
 @bare
@@ -101,66 +102,17 @@ def add_chains(first_line, longer, lines, heads, bases, chain, heights, counts, 
 
 
 @bare
-def kth_smallest(heights, n, k):
-    """The k-th smallest (from 0) of the first n heights, which change places (Hoare 1961, Algorithm 65: FIND)."""
-    left, right = 0, n - 1
-    while left < right:
-        pivot, i, j = heights[k], left, right
-        while i <= j:
-            while heights[i] < pivot:
-                i += 1
-            while pivot < heights[j]:
-                j -= 1
-            if i <= j:
-                heights[i], heights[j] = heights[j], heights[i]
-                i += 1
-                j -= 1
-        left, right = (i if j < k else left), (j if k < i else right)
-    return heights[k]
-
-
-@bare_inlined
-def gather_many(first_line, lines, heads, bases, chain, work):
-    """All heights of a cell, relative to the base of its first line → work. Returns their number and their light."""
+def gather_many(first_line, lines, heads, bases, chain, heights):
+    """All heights (quanta) of a cell → heights, int32. Returns their number and the sum of their intensities."""
     n, light, line = 0, np.int64(0), first_line
     while line >= 0:
-        shift = np.int64(bases[line]) - np.int64(bases[first_line])
         header = heads[line * HEADERS + HEADERS - 1]
         light += np.int64((header >> np.uint64(LIGHT_SHIFT)) & np.uint64(LIGHTS))
         for k in range(np.int64(header & np.uint64(COUNTS))):
-            work[n] = np.int64(lines[line * LINE + k]) + shift
+            heights[n] = bases[line] + np.int32(lines[line * LINE + k])
             n += 1
         line = np.int64(chain[line])
     return n, light
-
-
-@bare
-def statistics_of_many(first_line, lines, heads, bases, chain, floor, quantum_m, work, out, lane):
-    """Statistics of one cell of any size, as ``lanes.statistics_of``, into out[:, lane]."""
-    n, light = gather_many(first_line, lines, heads, bases, chain, work)
-    median = kth_smallest(work, n, (n - 1) // 2)
-    total, squares, low, high = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
-    for k in range(n):
-        d = work[k] - median
-        low, high = min(low, d), max(high, d)
-        total += d
-        squares += d * d
-        work[k] = abs(d)
-    reach = np.int64(math.floor(max(REACH * kth_smallest(work, n, (n - 1) // 2), floor)))
-    used, near = 0, np.int64(0)
-    gather_many(first_line, lines, heads, bases, chain, work)
-    for k in range(n):
-        d = work[k] - median
-        inside = (d <= reach) & (d >= -reach)
-        used += inside
-        near += d * inside
-    middle, average = median + np.int64(bases[first_line]), total / n
-    out[0, lane] = (middle + average) * quantum_m
-    out[1, lane] = (middle + near / used) * quantum_m
-    out[2, lane] = (middle + low) * quantum_m
-    out[3, lane] = (middle + high) * quantum_m
-    out[4, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
-    out[5, lane] = light / n
 
 
 @bare_inlined
@@ -224,7 +176,7 @@ def finish_cells(
     cells, ids : int, how many cells and pass ids were written.
     """
     lines, heads, bases, chain, free, spare, held = pool
-    pairs, heights, counts, light, marks, own_bases, out, many = work
+    pairs, heights, counts, light, marks, own_bases, out, many, select = work
     per_row = (edge + LANES - 1) // LANES
     cell, written = 0, 0
     for k in range(taken):
@@ -254,7 +206,8 @@ def finish_cells(
         else:
             for lane in range(LANES):
                 if counts[lane] > 0:
-                    statistics_of_many(first_line + lane, lines, heads, bases, chain, floor, quantum_m, many, out, lane)
+                    n, shine = gather_many(first_line + lane, lines, heads, bases, chain, many)
+                    statistics_of_full(many[:n], shine, floor, quantum_m, select, out, lane)
         if least > 0 and numbers.size == 1:
             store_group(
                 out, counts, np.uint16((group % per_row) * LANES), np.uint16(group // per_row), np.uint64(cell),

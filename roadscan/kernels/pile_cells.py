@@ -6,15 +6,14 @@ readings go through ``kernels.lanes`` together. Fuller ones are taken one by one
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.lanes import LANES, REACH, statistics_of, statistics_of_64
+from roadscan.kernels.full_cells import select_arrays, statistics_of_full
+from roadscan.kernels.lanes import LANES, statistics_of, statistics_of_64
 from roadscan.kernels.options import bare, bare_inlined
-from roadscan.kernels.row_piles import COLUMN, LIGHT, LIGHT_SHIFT, free_row, last_block, size_of
-from roadscan.kernels.selection import BINS, smallest
+from roadscan.kernels.row_piles import BLOCK, COLUMN, LIGHT, LIGHT_SHIFT, free_row, height_of, last_block, size_of
 
 statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
 
@@ -29,7 +28,6 @@ MOST = 1 << 23
 _LIGHTS = np.int64((1 << 40) - 1)
 _NUMBERS = 4
 _COUNT, _LIGHT, _BASE, _TARGET = range(_NUMBERS)
-_MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)
 
 
 def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
@@ -39,8 +37,7 @@ def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
         np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64), np.empty(edge, np.int32),
         np.empty(edge + 1, np.int32), np.empty(most, np.int32),
     )  # fmt: skip
-    select = np.empty(most, np.int32), np.empty(BINS, np.int32), np.empty(most + 1, np.int32)
-    return row, table, own, np.zeros(3, np.int64), np.zeros((6, LANES)), select
+    return row, table, own, np.zeros(3, np.int64), np.zeros((6, LANES)), select_arrays(most)
 
 
 @bare
@@ -51,7 +48,7 @@ def mark_row(end, piles, marks):
     while block >= 0:
         word, mark = np.int64(owners[block]) // WORD, np.uint64(1) << np.uint64(np.int64(owners[block]) % WORD)
         for k in range(size_of(block, end, sizes)):
-            marks[records[block * LONG + k] & COLUMN, word] |= mark
+            marks[records[block * BLOCK + k] & COLUMN, word] |= mark
         block = np.int64(before[block])
 
 
@@ -70,7 +67,7 @@ def sort_row(end, piles, sums, ends, used, heights):
     one = np.int64(1) << COUNT_SHIFT
     block = last_block(end)
     while block >= 0:
-        first = np.uint64(block) * np.uint64(LONG)
+        first = np.uint64(block) * np.uint64(BLOCK)
         for k in range(np.uint64(size_of(block, end, sizes))):
             record = records[first + np.uint64(k)]
             sums[record & COLUMN] += one + np.int64((record >> LIGHT_SHIFT) & LIGHT)
@@ -82,69 +79,15 @@ def sort_row(end, piles, sums, ends, used, heights):
         at += np.int32(sums[cell] >> COUNT_SHIFT)
     block = last_block(end)
     while block >= 0:
-        first = np.uint64(block) * np.uint64(LONG)
+        first = np.uint64(block) * np.uint64(BLOCK)
         for k in range(np.uint64(size_of(block, end, sizes))):
             record = records[first + np.uint64(k)]
             cell = record & COLUMN
             at = ends[cell]
-            heights[np.uint64(at)] = np.int32(np.int64(record) >> np.int64(32))
+            heights[np.uint64(at)] = height_of(record)
             ends[cell] = at + np.int32(1)
         block = np.int64(before[block])
     return cells
-
-
-@bare
-def differences(heights, base, out):
-    """Heights (n,) int32 above a base → out (≥ n,) int32."""
-    for k in range(heights.size):
-        out[k] = heights[k] - base
-
-
-@bare
-def distances(heights, middle, out):
-    """Distances of heights (n,) int32 from another → out (≥ n,) int32."""
-    for k in range(heights.size):
-        out[k] = abs(heights[k] - middle)
-
-
-@bare
-def sums_of(heights, middle, reach):
-    """Of (n,) int32 less another: sum, sum of squares, number within reach, and their sum."""
-    total, squares, used, near = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
-    for k in range(heights.size):
-        d = np.int64(heights[k]) - middle
-        inside = np.int64((d <= reach) & (d >= -reach))
-        total += d
-        squares += d * d
-        used += inside
-        near += d * inside
-    return total, squares, used, near
-
-
-@bare
-def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
-    """Statistics of one cell of n readings, as ``lanes.statistics_of``, into out[:, lane].
-
-    heights : (n,) int32; light : int64, sum of intensities; select : work, see :func:`row_arrays`.
-    """
-    work, bins, found = select
-    n, base = heights.size, heights[0]
-    differences(heights, base, work)
-    median = smallest(work[:n], (n - 1) // 2, bins, found)
-    middle = np.int64(base) + median
-    distances(heights, np.int32(middle), work)
-    low, high = np.int64(heights[0]), np.int64(heights[0])
-    for k in range(n):
-        low, high = min(low, np.int64(heights[k])), max(high, np.int64(heights[k]))
-    reach = np.int64(math.floor(max(REACH * smallest(work[:n], (n - 1) // 2, bins, found), floor)))
-    total, squares, used, near = sums_of(heights, middle, reach)
-    average = total / n
-    out[_MEAN, lane] = (middle + average) * quantum_m
-    out[_ROBUST, lane] = (middle + near / used) * quantum_m
-    out[_LOW, lane] = low * quantum_m
-    out[_HIGH, lane] = high * quantum_m
-    out[_DEVIATION, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
-    out[_BRIGHT, lane] = light / n
 
 
 @bare_inlined

@@ -10,6 +10,16 @@ from roadscan.kernels.row_piles import TAKEN, pile_up
 
 
 @kernel
+def work_arrays(size, tiles):
+    """Arrays for the places, classes and cells of so many readings, and what is known of so many active tiles."""
+    return (
+        np.empty(size), np.empty(size), np.empty(size), np.empty(size, np.uint8), np.empty(size, np.int32),
+        (np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)),
+        np.full(tiles, -1, np.int32),
+    )  # fmt: skip
+
+
+@kernel
 def pile_returns(
     epochs, pose_epochs, x, y, z, intensity, gain, passes, poses, limits, quanta_per_m, corner, cell_quanta, tile_rows,
     spans, sigmas, interval_sigmas, ends, piles, fates, first,
@@ -30,10 +40,7 @@ def pile_returns(
     int, the return before which the piles ran short of free blocks; n at the end.
     """
     mounting, knots, coefficients, valid, lattice, table, centres, charts = poses
-    east, north, height = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
-    classes, intervals = np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32)
-    cells = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
-    known = np.full(spans.shape[0], -1, np.int32)
+    east, north, height, classes, intervals, cells, known = work_arrays(CHUNK, spans.shape[0])
     for start in range(first, epochs.size, CHUNK):
         if piles[4].size - piles[5][TAKEN] < CHUNK:
             return start
@@ -69,10 +76,7 @@ def pile_mirror(
     m = ranges.shape[1]
     profiles = max(CHUNK // m, 1)
     size = profiles * m
-    east, north, height = np.empty(size), np.empty(size), np.empty(size)
-    classes, intervals = np.empty(size, np.uint8), np.empty(size, np.int32)
-    cells = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
-    known = np.full(spans.shape[0], -1, np.int32)
+    east, north, height, classes, intervals, cells, known = work_arrays(size, spans.shape[0])
     for start in range(first, profile_epochs.size, profiles):
         if piles[4].size - piles[5][TAKEN] < size:
             return start

@@ -166,6 +166,12 @@ def pile_up(
 
 
 @bare_inlined
+def height_of(record):
+    """Height of a reading (quanta)."""
+    return np.int32(np.int64(record) >> np.int64(HEIGHT_SHIFT))
+
+
+@bare_inlined
 def last_block(end):
     """Number of the last block of a pile that ends at `end`, −1 without readings."""
     return (np.int64(end) - 1) >> _BITS
@@ -220,7 +226,7 @@ def take_piles(ends, piles, west, south, column, row, heights, passes, intensity
             for k in range(size_of(block, ends[y], sizes)):
                 record = records[(block << _BITS) + k]
                 column[n], row[n] = west + np.int64(record & COLUMN), south + y
-                heights[n] = np.int32(np.int64(record) >> np.int64(32))
+                heights[n] = height_of(record)
                 passes[n], intensity[n] = owners[block], np.uint16((record >> LIGHT_SHIFT) & LIGHT)
                 n += 1
             block = np.int64(before[block])

@@ -73,8 +73,8 @@ class RegionPiece:
         return f"{self.source.run}/{self.source.sensor}/{self.start_gps_ns // NS_PER_S}"
 
 
-def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
-    """All pieces of the drives whose coarse model is looked at; none where the survey does not ask for it.
+def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
+    """Profiles whose coarse model is looked at, with their files; none where the survey does not ask for it.
 
     Raises
     ------
@@ -92,6 +92,14 @@ def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
             expected="scans of a sensor that looks down, its x along the driving direction",
             change='take regions = "everywhere" or "polygons"',
         )
+    return sources
+
+
+def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
+    """All pieces of the drives that are searched; errors as of :func:`searched_sources`."""
+    config, sources = plan.survey.config.surface, searched_sources(plan)
+    if config is None or not sources:
+        return []
     context = product_context(plan)
     return [p for s, files in sources for p in _pieces(plan, context, config.search, s, files)]
 
@@ -163,18 +171,17 @@ def find_due_regions(
 
 def regions_of_piece(piece: RegionPiece) -> OutputRecord:
     """Find the regions of a piece of drive and write them, where there are any (runs on a worker)."""
-    found = _found(piece)
-    shapes = np.array([part for one in found for part in _polygons(one)], object)
+    found = [(part, one.roughness_m) for one in _found(piece) for part in _polygons(one)]
+    shapes = np.array([part for part, _ in found], object)
     if not shapes.size:
         return OutputRecord(REGIONS, piece.unit, piece.key, "", 0, "")
-    rough = [one.roughness_m for one in found for _ in _polygons(one)]
     middle = shapely.get_coordinates(shapely.centroid(shapes))
     columns = {
         "run": [piece.source.run] * len(shapes),
         "sensor": [piece.source.sensor] * len(shapes),
         "start_gps_ns": [piece.start_gps_ns] * len(shapes),
         "end_gps_ns": [piece.end_gps_ns] * len(shapes),
-        "roughness_m": rough,
+        "roughness_m": [rough for _, rough in found],
         "area_m2": shapely.area(shapes).tolist(),
         "easting_m": middle[:, 0].tolist(),
         "northing_m": middle[:, 1].tolist(),

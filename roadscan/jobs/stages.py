@@ -10,7 +10,7 @@ from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
-from roadscan.jobs.found_regions import find_due_regions, region_pieces
+from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
@@ -197,12 +197,12 @@ class TileWork:
 def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     """Compare what there is with what there should be."""
     plan = plan_survey(run.survey, run.store)
+    context = product_context(plan)
     if run.survey.config.surface is not None:
         checked_surface(run.survey, run.survey.config.surface)  # before the tiles are computed for it
-        region_pieces(plan)
-        wanted_surface_products(run.survey, product_context(plan))
+        searched_sources(plan)
+        wanted_surface_products(run.survey, context)
     footprints = load_ranges(plan, manifest)
-    context = product_context(plan)
     wanted = tuple(wanted_tile_products(run.survey, context))
     tiles = plan_tiles(footprints, plan)
     if run.selection is not None:

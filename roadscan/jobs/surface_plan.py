@@ -272,7 +272,7 @@ def bridged_tiles(cells: Collection[TileId]) -> set[TileId]:
     Its corners lie in tiles on two adjoining sides: were they in one, or in one and the tile at its corner, a straight
     line would part the triangle from this tile.
     """
-    beside = {TileId(t.column + c, t.row + r) for t in cells for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))}
+    beside = {side for t in cells for side in _sides(t)}
     return {
         t
         for t in beside - set(cells)
@@ -281,8 +281,11 @@ def bridged_tiles(cells: Collection[TileId]) -> set[TileId]:
     }
 
 
+def _sides(tile: TileId) -> list[TileId]:
+    return [TileId(tile.column + c, tile.row + r) for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+
+
 def _date(tile: TileId, cells: Mapping[TileId, OutputRecord]) -> dt.date:
     """UTC date of a tile's first reading; of one that holds none, of the first in the tiles on its sides."""
-    sides = [TileId(tile.column + c, tile.row + r) for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    own = [tile] if tile in cells else [t for t in sides if t in cells]
+    own = [tile] if tile in cells else [t for t in _sides(tile) if t in cells]
     return utc_from_gps_ns(min(cells[t].figures()["first_epoch_gps_ns"] for t in own)).date()

@@ -393,10 +393,8 @@ class CloudFrame:
 
 def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[np.uint16]:
     """Pass of each epoch, (n,), 0 where none: `passes` are those of one run."""
-    out = np.zeros(epochs_gps_ns.size, dtype=np.uint16)
-    for one in passes:
-        out[(epochs_gps_ns >= one.start_gps_ns) & (epochs_gps_ns < one.end_gps_ns)] = one.pass_id
-    return out
+    ids = np.array(sorted(one.pass_id for one in passes), dtype=np.uint16)
+    return np.append(ids, np.uint16(0))[pass_numbers(epochs_gps_ns, passes, ids)]
 
 
 def pass_numbers(

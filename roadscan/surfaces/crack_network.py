@@ -11,12 +11,10 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from roadscan.model.distress import CrackJoining
 from roadscan.surfaces.crack_gaps import bridges_of, outwards
-from roadscan.surfaces.crack_parts import Network, components, grouped, parts_of
+from roadscan.surfaces.crack_parts import Network, components, grouped, parts_of, united
 from roadscan.surfaces.cracks import CrackPiece
 
 Float64 = npt.NDArray[np.float64]
@@ -129,7 +127,7 @@ class _Nodes:
     def of(cls, ends: Int64, length_m: Float64, nodes: int, cell_m: float) -> _Nodes:
         degree = np.bincount(ends.ravel(), minlength=nodes)
         inner = (length_m < _ONE_NODE_CELLS * cell_m) & (degree[ends] >= 3).all(axis=1)
-        _, merged = _networks(ends[inner], nodes) if inner.any() else (0, np.arange(nodes))
+        merged = united(ends[inner], nodes)
         return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes))
 
     def figures(self, own: Int64) -> tuple[int, int, int]:
@@ -157,13 +155,6 @@ class _Turned:
         rows = [_directions(p, lane, config) for p, lane in zip(pieces, azimuth.tolist(), strict=True)]
         turning, to_lane, parts = (np.array(column) for column in zip(*rows, strict=True))
         return cls(turning, to_lane, parts)
-
-
-def _networks(ends: Int64, nodes: int) -> tuple[int, Int64]:
-    """Connected components of nodes."""
-    joined = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(nodes, nodes))
-    count, of_node = connected_components(joined, directed=False)
-    return int(count), np.asarray(of_node, dtype=np.int64)
 
 
 def _parts(

@@ -113,7 +113,7 @@ def _mark_strokes(whole: Network, rest: Int64, part: Int64, kinds: list[int]) ->
         node = int(ends.ravel()[meeting[0]])
         pairs += _pairs(meeting // 2, outwards[meeting // 2, meeting % 2], degree[node] == 2)
     joined = np.array(pairs, np.int64).reshape(-1, 2)
-    stroke = _united(joined, rest.size)
+    stroke = united(joined, rest.size)
     for own in grouped(rest, stroke):
         part[own] = len(kinds)
         lengths = whole.directions_m[own].sum(axis=0)
@@ -184,20 +184,21 @@ def _merge_same(whole: Network, part: Int64, kinds: Sequence[int]) -> None:
             for row in rows.tolist()
             for node in whole.ends[row].tolist()
         ]
-        united = _united(np.array(pairs, np.int64).reshape(-1, 2), len(kinds))
+        together = united(np.array(pairs, np.int64).reshape(-1, 2), len(kinds))
         lowest = np.full(len(kinds), len(kinds))
-        np.minimum.at(lowest, united, np.arange(len(kinds)))
-        part[rows] = lowest[united[part[rows]]]
+        np.minimum.at(lowest, together, np.arange(len(kinds)))
+        part[rows] = lowest[together[part[rows]]]
 
 
 def components(ends: Int64) -> Int64:
     """(n,) number of the connected set that each edge (n, 2) between nodes lies in."""
     _, local = np.unique(ends, return_inverse=True)
     local = local.reshape(ends.shape)
-    return _united(local, int(local.max()) + 1)[local[:, 0]] if len(ends) else np.zeros(0, np.int64)
+    return united(local, int(local.max()) + 1)[local[:, 0]] if len(ends) else np.zeros(0, np.int64)
 
 
-def _united(pairs: Int64, count: int) -> Int64:
+def united(pairs: Int64, count: int) -> Int64:
+    """(count,) number of the connected set that each of so many lies in; pairs (n, 2) connect two of them."""
     joined = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 

@@ -15,11 +15,11 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from roadscan.jobs.clocks import load_clocks
 from roadscan.jobs.navigate import records_with_trajectories
 from roadscan.jobs.plan import trajectory_source
 from roadscan.jobs.pose_sigma import pose_sigma
 from roadscan.jobs.readings import load_trajectory, read_groups
+from roadscan.jobs.taken_pictures import taken_pictures
 from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.camera import Interior
 from roadscan.model.crs import add_grid_folder
@@ -237,18 +237,11 @@ class _Taken:
 
 def _pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> dict[str, _Taken]:
     """Pictures of a camera by the name that measurements use; epochs as its clock was found."""
-    clocks = load_clocks(store)
-    taken: list[_Taken] = []
-    for record in records:
-        if record.sensor != sensor:
-            continue
-        clock = clocks.get((record.run, sensor)) or clocks.get(("*", sensor))
-        for file in record.tables.get("images", ()):
-            rows = read_groups(store, file.path, range(len(file.group_rows)), ["epoch_gps_ns", "file"])
-            epochs = rows.column("epoch_gps_ns").to_numpy()
-            epochs = epochs if clock is None else clock.applied(epochs)
-            names = rows.column("file").to_pylist()
-            taken += [_Taken(record.run, n, int(e)) for n, e in zip(names, epochs, strict=True)]
+    taken = [
+        _Taken(log.record.run, name, int(epoch))
+        for log in taken_pictures(store, records, sensor)
+        for name, epoch in zip(log.files, log.epochs_gps_ns, strict=True)
+    ]
     if not taken:
         raise RunError(
             f"the camera '{sensor}' has no pictures in the store",

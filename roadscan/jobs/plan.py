@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from roadscan.jobs.centre_line import CentreLines
@@ -122,8 +122,7 @@ def _sources(
             trajectory = None if table == "cloud" else trajectory_source(record.run, records)
             sensor = survey.rig.sensors.get(record.sensor)
             nominal = sensor.mounting() if sensor else _UNMOUNTED
-            dated = calibrated.get((record.run, record.sensor)) or calibrated.get(("*", record.sensor)) or []
-            mountings = _mountings(nominal, dated)
+            mountings = mountings_of(record.run, record.sensor, nominal, calibrated)
             clock = clocks.get((record.run, record.sensor)) or clocks.get(("*", record.sensor))
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
@@ -152,9 +151,11 @@ def _sources(
     return found
 
 
-def _mountings(nominal: Mounting, calibrated: Sequence[tuple[int, Mounting]]) -> Mountings:
-    """The rig file's mounting, until the first calibrated one, and so on."""
-    dated = [(since, mounting) for since, mounting in calibrated]
+def mountings_of(
+    run: str, sensor: str, nominal: Mounting, calibrated: Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
+) -> Mountings:
+    """The rig file's mounting of a sensor, until the first calibrated one of its run (or of all), and so on."""
+    dated = list(calibrated.get((run, sensor)) or calibrated.get(("*", sensor)) or [])
     if not dated or dated[0][0] > 0:
         dated = [(0, nominal), *dated]
     return Mountings(tuple(since for since, _ in dated), tuple(mounting for _, mounting in dated))

@@ -14,8 +14,9 @@ from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.products import make_products, product_context, wanted_surface_products, wanted_tile_products
+from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
+from roadscan.jobs.surface_colours import check_colours, colour_notes
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
 from roadscan.jobs.surfaces import compute_surfaces
 from roadscan.jobs.tile_files import tile_file_names
@@ -86,6 +87,8 @@ def run_tiles(run: Run) -> None:
     """Readings → cells and tile products, by way of points where these are asked for."""
     manifest = Manifest(run.store)
     work = plan_tile_work(run, manifest)
+    if work.chosen:
+        check_colours(work.planned.plan, folders=True)  # before the tiles are computed for them
     manifest.remove(work.gone)
     tasks = work.planned.tasks(work.chosen, run.compute.workers)
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
@@ -109,11 +112,14 @@ def run_surfaces(run: Run) -> None:
         run.reporter.line(f"note: {work.note}")
     if work.planned is None or not work.chosen:
         return
+    check_colours(work.planned.tiles.plan, folders=True)
     tasks = work.planned.tasks(work.chosen, run.compute.workers)
     report = _bar(run, "surfaces")
     failures = run_tasks(compute_surfaces, tasks, work.planned.singly, manifest, run.compute, report)
     manifest.forget(SURFACE, [unit for unit, _ in failures])
     manifest.remove(files_without_surface(manifest))
+    for note in colour_notes(work.planned.pictures, manifest, work.chosen):
+        run.reporter.line(f"note: {note}")
     run.failed("surfaces", failures)
 
 
@@ -201,7 +207,7 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
     if run.survey.config.surface is not None:
         checked_surface(run.survey, run.survey.config.surface)  # before the tiles are computed for it
         searched_sources(plan)
-        wanted_surface_products(run.survey, context)
+        check_colours(plan)
     footprints = load_ranges(plan, manifest)
     wanted = tuple(wanted_tile_products(run.survey, context))
     tiles = plan_tiles(footprints, plan)

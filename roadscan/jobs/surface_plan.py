@@ -11,9 +11,11 @@ import shapely
 from roadscan.jobs.fingerprint import key_of, surface_version
 from roadscan.jobs.footprints import load_ranges
 from roadscan.jobs.found_regions import REGIONS, FoundRegions, load_found_regions
+from roadscan.jobs.pictures import Pictures
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import product_context, wanted_surface_products
 from roadscan.jobs.selection import Selection
+from roadscan.jobs.surface_colours import plan_colours, shown_box
 from roadscan.jobs.surface_regions import Regions, stated_regions
 from roadscan.jobs.tile_files import WantedSurface, surface_file_names
 from roadscan.jobs.tile_plan import TILE, TilePlan, TileTask, plan_tiles
@@ -54,6 +56,8 @@ class SurfaceTask:
     """What places the points in reach, where it is made of points."""
     regions: Regions | None
     """Polygons or found regions in reach; None where the surface is made everywhere."""
+    pictures: Mapping[str, Pictures]
+    """Pictures that may show some of the tiles, by the product that wants their colours."""
     dates: tuple[dt.date, ...]
     """UTC date of each tile's first reading."""
     products: tuple[WantedSurface, ...]
@@ -72,6 +76,8 @@ class SurfacePlan:
     products: tuple[WantedSurface, ...]
     keys: Mapping[TileId, str]
     """Key of each tile's surface that is due."""
+    pictures: Mapping[str, Pictures]
+    """Pictures of the survey, by the product that wants their colours."""
     waiting: frozenset[TileId] = frozenset()
     """Tiles whose surface depends on cells that are missing or out of date: what there is of it stays."""
 
@@ -114,6 +120,7 @@ class SurfacePlan:
             cells=() if of_points else tuple(self.cells[t] for t in reach if t in self.cells),
             readings=self.tiles.task(Block(tuple(t for t in reach if t in self.tiles.tiles))) if of_points else None,
             regions=None if self.regions is None else self.regions.near(*boxes),
+            pictures={n: p.near(*(shown_box(self.grid, t) for t in tiles)) for n, p in self.pictures.items()},
             dates=tuple(_date(t, self.cells) for t in tiles),
             products=self.products,
             context=self.tiles.context,
@@ -163,7 +170,8 @@ def plan_surface_work(survey: Survey, store: Store, selection: Selection | None,
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
     tiles = TilePlan(plan, footprints, plan_tiles(footprints, plan), (), context)
     found = load_found_regions(plan, manifest)
-    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found)
+    pictures = plan_colours(plan, wanted)
+    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found, pictures)
     units = {str(tile) for tile in (*planned.keys, *planned.waiting)}
     names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
     gone = [
@@ -196,6 +204,7 @@ def plan_surfaces(
     products: tuple[WantedSurface, ...],
     manifest: Manifest,
     found: FoundRegions,
+    pictures: Mapping[str, Pictures],
 ) -> SurfacePlan:
     """Surfaces that are due: of all tiles that hold cells, of points those between them too, or of those of them that a
     polygon or a found region touches.
@@ -221,10 +230,11 @@ def plan_surfaces(
         if within is not None and not within.near(grid.tiles.bounds(tile)).shapes.size:
             continue
         around = [(str(t), inputs[t]) for t in grid.tiles.tiles_in(box) if t in inputs]
-        keys[tile] = key_of(common, str(_date(tile, cells)), around, None if within is None else within.key())
+        seen = [(name, all_.near(shown_box(grid, tile)).key()) for name, all_ in pictures.items()]
+        keys[tile] = key_of(common, str(_date(tile, cells)), around, None if within is None else within.key(), *seen)
     if config.regions == "polygons" and regions is not None and cells and not keys:
         raise _beside(regions, config, list(cells), grid)
-    return SurfacePlan(tiles, grid, cells, regions, products, keys, frozenset(waiting))
+    return SurfacePlan(tiles, grid, cells, regions, products, keys, pictures, frozenset(waiting))
 
 
 def checked_surface(survey: Survey, config: SurfaceConfig) -> tuple[SurfaceGrid, Regions | None]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.cell_files import read_cells
 from roadscan.jobs.compute import reason_of
+from roadscan.jobs.surface_colours import Painter
 from roadscan.jobs.surface_plan import SURFACE, SurfaceTask
 from roadscan.jobs.tile_files import publish_product
 from roadscan.jobs.tile_plan import TileTask
@@ -33,13 +34,15 @@ _CELLS_KEPT = 24_000_000
 def compute_surfaces(task: SurfaceTask) -> TaskResult:
     """Make the surfaces of a task's tiles and write their files (runs on a worker)."""
     source = source_of(task)
+    painter = Painter(task.pictures)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     for tile, key, date in zip(task.block.tiles, task.keys, task.dates, strict=True):
         context = dataclasses.replace(task.context, date=date)
         try:
             wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
-            records += _write(task, key, surface_of(tile, source.patch(tile, wanted), task.grid, wanted), context)
+            surface = surface_of(tile, source.patch(tile, wanted), task.grid, wanted)
+            records += _write(task, key, surface, context, painter)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), reason_of(error)))
     return TaskResult(tuple(records), tuple(failures))
@@ -95,13 +98,17 @@ class _Points:
         return patch_of_points(self._grid.window(tile), own, self._grid, wanted)
 
 
-def _write(task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext) -> list[OutputRecord]:
+def _write(
+    task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext, painter: Painter
+) -> list[OutputRecord]:
     """Files of a surface; its own record comes last, so that a tile is current only with all its files."""
     unit, figures = str(surface.tile), _figures(surface)
     records: list[OutputRecord] = []
     with task.store.scratch() as folder:
         for wanted in task.products if figures["cells"] else ():
-            write = partial(wanted.product.write, surface, wanted.options, context)
+            painted, told = painter.paint(wanted, surface)
+            figures |= told
+            write = partial(wanted.product.write, painted, wanted.options, context)
             records += publish_product(wanted, unit, write, key, task.store, folder)
     return [*records, OutputRecord(SURFACE, unit, key, "", 0, "", json.dumps(figures))]
 

@@ -103,6 +103,9 @@ class Sensor(Strict):
     """Errors of an IMU: a grade ("navigation", "tactical", "industrial", "mems"), or a table from its data sheet."""
     interior: Interior | None = None
     """Interior orientation of a camera, as `roadscan camera` finds it."""
+    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Polygons in a camera's pictures that show its own vehicle, each a list of corners (u, v), in pixels from the
+    centre of the upper left one: no colour is taken from there."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -110,6 +113,8 @@ class Sensor(Strict):
             raise ValueError(f"axes '{self.axes}', expected one of {', '.join(BODY_FROM_AXES)}")
         if self.range_max_m <= self.range_min_m:
             raise ValueError(f"range_max_m {self.range_max_m:g} is not above range_min_m {self.range_min_m:g}")
+        if any(len(polygon) < 3 for polygon in self.own_vehicle_px):
+            raise ValueError("own_vehicle_px holds a polygon of fewer than three corners")
         if self.body_from_sensor is not None:
             matrix = np.array(self.body_from_sensor, dtype=np.float64)
             if matrix.shape != (3, 3) or np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4:

@@ -25,6 +25,7 @@ from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
+from roadscan.points.views import PictureRule
 from roadscan.products.lane_direction import LaneDirections
 from roadscan.surfaces.tile import SurfaceTile
 from roadscan.tiles.cells import TileCells
@@ -185,6 +186,14 @@ class SurfaceProduct(TileFiles):
         `cell_m` are a cell's edges, east and north; `seen` is how many of the neighbours' a tile shows on each side.
         """
         return
+
+    def picture_rule(self, options: Strict) -> PictureRule | None:
+        """Which of the survey's pictures give colours, for a product that wants such; asked before any work."""
+        return None
+
+    def coloured_nodes(self, surface: SurfaceTile, options: Strict) -> tuple[range, range]:
+        """Rows and columns of the surface's arrays whose colours such a product gets, as `surface.colours`."""
+        return range(0), range(0)
 
     @abstractmethod
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:

@@ -21,21 +21,22 @@ _GLTF: Final = 0x46546C67
 _JSON: Final = 0x4E4F534A
 _BIN: Final = 0x004E4942
 _DIGEST: Final = "blake3"
+_UNLIT: Final = "KHR_materials_unlit"
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices with their grey, and the triangles between them."""
+    """Vertices with their colours, and the triangles between them."""
 
     vertices_m: npt.NDArray[np.float32]
     """(n, 3) east, north, up from the mesh's origin (m)."""
-    grey: npt.NDArray[np.uint8]
-    """(n,)."""
+    colour: npt.NDArray[np.uint8]
+    """(n,) grey of an intensity, or (n, 3) red, green, blue as a picture has them (sRGB)."""
     triangles: npt.NDArray[np.uint32]
     """(m, 3) vertices, counter-clockwise as seen from above."""
 
 
-def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, grey: npt.NDArray[np.uint8]) -> Mesh:
+def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, colour: npt.NDArray[np.uint8]) -> Mesh:
     """Two triangles between four nodes that hold a height, one between three.
 
     Of a square's diagonals the one whose ends differ less in height is taken: edges and cracks keep their lines.
@@ -43,7 +44,8 @@ def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, grey: np
     Parameters
     ----------
     easting_m, northing_m : (columns,), (rows,) from the mesh's origin.
-    height_m, grey : (rows, columns), row 0 the southernmost; NaN where there is no node.
+    height_m : (rows, columns), row 0 the southernmost; NaN where there is no node.
+    colour : (rows, columns) or (rows, columns, 3).
     """
     known = ~np.isnan(height_m)
     sw, se, nw, ne = (known[r, c] for r, c in _CORNERS)
@@ -63,7 +65,7 @@ def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, grey: np
     used, triangles = np.unique(corners, return_inverse=True)
     row, column = np.divmod(used, known.shape[1])
     places = np.stack([easting_m[column], northing_m[row], height_m.ravel()[used]], axis=-1)
-    return Mesh(places.astype(np.float32), grey.ravel()[used], triangles.reshape(-1, 3).astype(np.uint32))
+    return Mesh(places.astype(np.float32), colour[row, column], triangles.reshape(-1, 3).astype(np.uint32))
 
 
 _LOW, _HIGH = slice(None, -1), slice(1, None)
@@ -77,14 +79,16 @@ def _picked(where: npt.NDArray[np.bool_], *corners: npt.NDArray[np.int64]) -> np
 def write_glb(path: Path, mesh: Mesh, about: Mapping[str, Any], generator: str) -> None:
     """Write binary glTF 2.0 (Khronos, *glTF 2.0 Specification*, chapter 4): y up, so x is east and z is south.
 
+    Colours of vertices are linear there (section 3.9.2): an intensity is taken as linear, a picture's colours are made
+    so, in 16 bits, which keep its 256 steps apart. Their light is that of the picture: they are shown without another
+    (KHR_materials_unlit).
+
     Parameters
     ----------
     about : what `asset.extras` says of the mesh, beside the digest of the arrays.
     """
     upright = mesh.vertices_m[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
-    colours = np.repeat(mesh.grey[:, None], 4, axis=1)
-    colours[:, 3] = 255
-    arrays = [upright.astype("<f4").tobytes(), colours.tobytes(), mesh.triangles.astype("<u4").tobytes()]
+    arrays = [upright.astype("<f4").tobytes(), _linear(mesh.colour).tobytes(), mesh.triangles.astype("<u4").tobytes()]
     content = b"".join(arrays)
     described: dict[str, Any] = {
         "asset": {
@@ -105,6 +109,22 @@ def write_glb(path: Path, mesh: Mesh, about: Mapping[str, Any], generator: str) 
     path.write_bytes(struct.pack("<III", _GLTF, 2, 12 + len(chunks)) + chunks)
 
 
+def _linear(colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.unsignedinteger[Any]]:
+    """Linear red, green, blue and opacity (n, 4): uint8 of greys (n,), uint16 of colours (n, 3).
+
+    sRGB to linear: IEC 61966-2-1, section 5.2.
+    """
+    if colour.ndim == 1:
+        grey = np.repeat(colour[:, None], 4, axis=1)
+        grey[:, 3] = 255
+        return grey
+    encoded = np.arange(256) / 255.0
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    out = np.full((len(colour), 4), 65_535, "<u2")
+    out[:, :3] = np.rint(65_535.0 * linear).astype("<u2")[colour]
+    return out
+
+
 def _described(mesh: Mesh, upright: npt.NDArray[np.float32], sizes: list[int]) -> dict[str, Any]:
     """Scene, mesh and arrays of the file."""
     vertices, colours, triangles = sizes
@@ -114,15 +134,19 @@ def _described(mesh: Mesh, upright: npt.NDArray[np.float32], sizes: list[int]) -
         {"buffer": 0, "byteOffset": vertices + colours, "byteLength": triangles, "target": 34963},
     ]
     low, high = (bound.astype(float).tolist() for bound in (upright.min(axis=0), upright.max(axis=0)))
-    count = len(upright)
+    count, of_pictures = len(upright), mesh.colour.ndim == 2
+    kind = 5123 if of_pictures else 5121
+    unlit: dict[str, Any] = {"extensions": {_UNLIT: {}}} if of_pictures else {}
+    matt = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
     return {
+        **({"extensionsUsed": [_UNLIT]} if of_pictures else {}),
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}],
+        "materials": [matt | unlit],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": count, "type": "VEC3", "min": low, "max": high},
-            {"bufferView": 1, "componentType": 5121, "normalized": True, "count": count, "type": "VEC4"},
+            {"bufferView": 1, "componentType": kind, "normalized": True, "count": count, "type": "VEC4"},
             {"bufferView": 2, "componentType": 5125, "count": 3 * len(mesh.triangles), "type": "SCALAR"},
         ],
         "bufferViews": views,
@@ -145,14 +169,14 @@ def check_glb(path: Path) -> None:
 
 
 def write_ply(path: Path, mesh: Mesh, about: Mapping[str, Any]) -> None:
-    """Write binary little-endian PLY 1.0 (Turk 1994): x east, y north, z up, grey as red, green and blue.
+    """Write binary little-endian PLY 1.0 (Turk 1994): x east, y north, z up, red, green, blue as screens show them.
 
     Parameters
     ----------
     about : comments of the header, beside the digest of what follows it.
     """
     vertices = np.empty(len(mesh.vertices_m), [("place", "<f4", 3), ("colour", "u1", 3)])
-    vertices["place"], vertices["colour"] = mesh.vertices_m, mesh.grey[:, None]
+    vertices["place"], vertices["colour"] = mesh.vertices_m, mesh.colour.reshape(len(vertices), -1)
     faces = np.empty(len(mesh.triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.triangles
     content = vertices.tobytes() + faces.tobytes()

@@ -15,7 +15,17 @@ from roadscan.surfaces.window import GridWindow
 EMPTY: Final = NOTHING
 """Origin of a cell without a height; the others are 1 measured, 2 interpolated, 3 filled."""
 
-__all__ = ["EMPTY", "FILLED", "INTERPOLATED", "MEASURED", "SurfaceTile"]
+__all__ = ["EMPTY", "FILLED", "INTERPOLATED", "MEASURED", "NodeColours", "SurfaceTile"]
+
+
+@dataclass(frozen=True)
+class NodeColours:
+    """Colours of some of a surface's cells, as the survey's pictures show them at their centres."""
+
+    colour: npt.NDArray[np.uint8]
+    """(rows, columns, 3) red, green, blue (sRGB) of the rows and columns that were asked for."""
+    seen: npt.NDArray[np.bool_]
+    """(rows, columns) False where no picture shows a cell, or it has no height: no colour."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,8 @@ class SurfaceTile:
     """Mean intensity of the readings of a cell, of filled cells that of their rims; NaN where there is none."""
     sigma_m: float
     """1 σ of the noise of one cell's height before smoothing (m)."""
+    colours: NodeColours | None = None
+    """Colours of the cells that a product asked for; None for one that did not."""
 
     @property
     def cell_m(self) -> tuple[float, float]:

@@ -118,7 +118,8 @@ class Pictures:
 
 def check_pictures(plan: SurveyPlan, rule: PictureRule) -> None:
     """Raise where the survey has no pictures that the rule could take colours from; reads no pose and no picture."""
-    _camera_logs(plan, rule)
+    for camera, taken in _camera_logs(plan, rule):
+        _fits(camera, taken)
 
 
 def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:

@@ -151,13 +151,21 @@ def clean() -> Iterator[Figure]:
 
 
 def potholes() -> Iterator[Figure]:
-    for radius_m, depth_m in ((0.08, 0.03), (0.2, 0.05), (0.3, 0.04)):
-        hole = {"station_m": 11.2, "offset_m": 1.7, "radius_m": radius_m, "depth_m": depth_m}
-        one = seen({"potholes": [hole]}, 0.005, (2.4, 2.4), 1, 0.0025)
+    """Volumes of holes in the open and where a kerb of 12 cm meets their rim; then a clean road."""
+    kerb = {"lane_width_m": 2.9, "kerbs": [{"side": "right", "height_m": 0.12}]}
+    for radius_m, depth_m in ((0.08, 0.03), (0.2, 0.05), (0.3, 0.04), (0.5, 0.05), (0.75, 0.05), (0.75, 0.08)):
+        for road, offset_m in (({}, 1.7), (kerb, 2.9 - radius_m)):
+            hole = {"station_m": 12.0, "offset_m": offset_m, "radius_m": radius_m, "depth_m": depth_m}
+            one = seen({"potholes": [hole], **road}, 0.005, (4.0, 4.0), 1, 0.0025)
+            found = join_potholes(pothole_pieces(one.window, PotholeDetection()), PotholeJoining())
+            volume = sum(p.volume_m3 for p in found)
+            what = f"pothole of {radius_m * 2e3:g} × {depth_m * 1e3:g} mm{' at a kerb' if road else ''}"
+            true = np.pi * radius_m**2 * depth_m * 8 / 15 * 1e3
+            yield Figure(f"{what}: volume ({len(found)} found)", volume * 1e3, "l", true, "truth, to its rim")
+    for iso_class in "CD":
+        one = seen({"roughness": {"iso_class": iso_class}}, 0.01, (100.0, 3.0), 4, 0.01)
         found = join_potholes(pothole_pieces(one.window, PotholeDetection()), PotholeJoining())
-        volume = sum(p.volume_m3 for p in found)
-        what = f"pothole of {radius_m * 2e3:g} × {depth_m * 1e3:g} mm: volume ({len(found)} found)"
-        yield Figure(what, volume * 1e3, "l", np.pi * radius_m**2 * depth_m * 8 / 15 * 1e3, "truth, to its rim")
+        yield Figure(f"100 m without a pothole, class {iso_class}", len(found), "potholes", 0, "truth")
 
 
 def speed() -> Iterator[Figure]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import shapely
 
@@ -210,6 +210,8 @@ def plan_surfaces(
     polygon or a found region touches.
     """
     grid, regions = checked_surface(tiles.plan.survey, config)
+    beyond_m = [one.product.around_m(one.options, grid.cell_m) for one in products]
+    grid = replace(grid, around_m=max(beyond_m, default=0.0))
     regions = found.regions if config.regions == "found" else regions
     expected = dict(zip(tiles.tiles.ids, tiles.tiles.keys, strict=True))
     records = {TileId.parse(unit): r for unit, r in manifest.of(TILE).items()}

@@ -53,13 +53,16 @@ class PotholeDetection(Strict):
 
     block_m: float = Field(default=0.05, gt=0.0, le=0.5)
     """Edge of the blocks whose mean heights show the ground around (m)."""
-    window_m: float = Field(default=0.55, gt=0.0, le=5.0)
-    """Half the edge of the square in which the ground is looked for (m); holes up to 1.4 times as wide are found. A
-    tile sees 1 m of its neighbours: more than the default needs smaller blocks (0.75 with blocks of 2 cm)."""
+    max_size_m: float = Field(default=1.5, gt=0.0, le=4.0)
+    """Longest way across the largest pothole that is measured whole (m); of larger ones parts are missing. A tile looks
+    1.3 times as far around itself, and 0.7 m."""
     edge_depth_m: float = Field(default=0.008, gt=0.0)
     """Depth below the ground at which a pothole's outline runs (m)."""
     min_depth_m: float = Field(default=0.02, gt=0.0)
     """Least depth of the deepest block (m): settled patches and sunk manholes are mostly less."""
+    min_wall_slope: float = Field(default=0.08, ge=0.0)
+    """Least slope (m/m, over three blocks) that most of a pothole's walls have somewhere: what sinks more gently is a
+    hollow of an uneven road."""
 
     @model_validator(mode="after")
     def _in_order(self) -> PotholeDetection:
@@ -76,5 +79,4 @@ class PotholeJoining(Strict):
     min_area_m2: float = Field(default=0.005, gt=0.0)
     """Least area (m²)."""
     max_elongation: float = Field(default=4.0, ge=1.0)
-    """Longer than this many times the diameter of the largest circle in it, it is a rut, a trench or a strip beside a
-    kerb."""
+    """Longer than this many times the diameter of the largest circle in it, it is a rut or a trench."""

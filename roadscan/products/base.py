@@ -180,6 +180,13 @@ class SurfaceProduct(TileFiles):
     section none is made by default.
     """
 
+    def around_m(self, options: Strict, cell_m: tuple[float, float]) -> float:
+        """How far beyond a tile the product looks at heights before smoothing (m); 0 where those after it are enough.
+
+        `cell_m` are a cell's edges, east and north.
+        """
+        return 0.0
+
     def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
         """Raise :class:`ConfigError` where the settings do not fit the surface's cells; asked once, before any work.
 

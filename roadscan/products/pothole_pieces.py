@@ -9,11 +9,13 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.model.distress import PotholeDetection
+from roadscan.model.errors import ConfigError
 from roadscan.model.strict import Strict
 from roadscan.products.base import ProductContext, SurfaceProduct
 from roadscan.products.crack_pieces import check_cells, height_window
 from roadscan.products.geo_table import check_geo_table, read_geo_table, write_geo_table
-from roadscan.surfaces.potholes import PotholePiece, halo_cells, pothole_pieces
+from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.potholes import PotholePiece, around_cells, halo_cells, pothole_pieces
 from roadscan.surfaces.tile import SurfaceTile
 
 COLUMNS: Final = pa.schema(
@@ -38,17 +40,38 @@ class PotholePieces(SurfaceProduct):
 
     def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
         """Square cells, small enough that what potholes depend on lies within those that a tile sees."""
-        check_cells(cell_m, seen, halo_cells(cast(PotholeDetection, options), cell_m[0]), self.name)
+        config = cast(PotholeDetection, options)
+        check_cells(cell_m, seen, halo_cells(config, cell_m[0]), self.name)
+        if cell_m[0] > config.block_m:
+            raise ConfigError(
+                f"'{self.name}' got cells of {cell_m[0]:g} m",
+                expected=f"at most block_m, {config.block_m:g} m",
+                change="make tiles.cell_m or surface.cell_m smaller",
+            )
+
+    def around_m(self, options: Strict, cell_m: tuple[float, float]) -> float:
+        """As far as the ground around the largest pothole."""
+        return around_cells(cast(PotholeDetection, options), cell_m[0]) * cell_m[0]
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
         """Detect and write."""
         config = cast(PotholeDetection, options)
-        pieces = pothole_pieces(height_window(surface, halo_cells(config, surface.cell_m[0]), self.name), config)
+        pieces = pothole_pieces(self._window(surface, config), config)
         table = pa.table(
             [pa.array([getattr(p, name) for p in pieces], pa.float64()) for name in COLUMNS.names], COLUMNS
         )
         outlines = np.array([p.outline for p in pieces], dtype=object)
         write_geo_table(path, table, "outline", outlines, ["Polygon"], context)
+
+    def _window(self, surface: SurfaceTile, config: PotholeDetection) -> HeightWindow:
+        """What was measured around the tile, and the tile's smooth heights in the midst of it."""
+        near = height_window(surface, halo_cells(config, surface.cell_m[0]), self.name)
+        wide_m, halo = surface.around
+        more = halo - near.halo
+        height_m = np.full(wide_m.shape, np.nan)
+        height_m[more : wide_m.shape[0] - more, more : wide_m.shape[1] - more] = near.height_m
+        first = near.first_row - more, near.first_column - more
+        return HeightWindow(wide_m, height_m, near.cell_m, near.sigma_m, *first, halo)
 
     def check(self, path: Path) -> None:
         """Decode it."""

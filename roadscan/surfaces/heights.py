@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,8 @@ class HeightWindow:
     first_column: int = 0
     halo: int = 0
     """Cells along each border that belong to the neighbours: they are looked at, and nothing is reported of them."""
+    cut_off: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0))
+    """Cells that were cut off at the south and north, and at the west and east, the halo's first."""
 
     def __post_init__(self) -> None:
         if self.raw_m.ndim != 2 or self.raw_m.shape != self.height_m.shape:
@@ -43,18 +45,43 @@ class HeightWindow:
                 f"heights of shapes {self.raw_m.shape} and {self.height_m.shape}",
                 expected="two grids of the same rows and columns",
             )
-        if 2 * self.halo >= min(self.raw_m.shape, default=0):
+        whole = [n + sum(gone) for n, gone in zip(self.raw_m.shape, self.cut_off, strict=True)]
+        if 2 * self.halo >= min(whole):
             raise RoadscanError(
-                f"a window of {self.raw_m.shape[0]} × {self.raw_m.shape[1]} cells with a halo of {self.halo}",
+                f"a window of {whole[0]} × {whole[1]} cells with a halo of {self.halo}",
                 expected="cells that are not halo",
             )
 
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the cells that are not halo."""
+        rows, columns = (
+            slice(min(max(self.halo - low, 0), n), max(n - max(self.halo - high, 0), 0))
+            for n, (low, high) in zip(self.raw_m.shape, self.cut_off, strict=True)
+        )
+        return rows, columns
+
+    def part(self, rows: tuple[int, int], columns: tuple[int, int]) -> HeightWindow:
+        """Its cells from one row and column up to others, as far as it has them."""
+        spans, cut_off = [], []
+        for n, span, gone in zip(self.raw_m.shape, (rows, columns), self.cut_off, strict=True):
+            low = min(max(span[0], 0), n)
+            high = max(min(span[1], n), low)
+            spans.append(slice(low, high))
+            cut_off.append((gone[0] + low, gone[1] + n - high))
+        own = (spans[0], spans[1])
+        return replace(
+            self,
+            raw_m=self.raw_m[own],
+            height_m=self.height_m[own],
+            first_row=self.first_row + spans[0].start,
+            first_column=self.first_column + spans[1].start,
+            cut_off=(cut_off[0], cut_off[1]),
+        )
+
     def is_inner(self, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Bool:
         """Which cells (n,), counted within the window, are not halo."""
-        rows, columns = self.raw_m.shape
-        return np.asarray(
-            (row >= self.halo) & (row < rows - self.halo) & (column >= self.halo) & (column < columns - self.halo)
-        )
+        rows, columns = self.inner()
+        return np.asarray((row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop))
 
     def cleaned_m(self) -> Float64:
         """Raw heights without those that the smoothing left out as impulses."""

@@ -1,8 +1,9 @@
 """The surface of a tile, from the tiles' cells or from points: what is needed around it, raw heights, smoothing.
 
 A tile is computed on a window that reaches beyond it: by the cells that products see of the neighbours
-(:data:`SHOWN_M`), by those that smoothing depends on, and, for points, by those that triangles depend on. The outer
-ones are cut off again, so all that is left has the same bits in every tile that sees it.
+(:data:`SHOWN_M`; before smoothing, where they ask for more, farther), by those that smoothing depends on, and, for
+points, by those that triangles depend on. The outer ones are cut off again, so all that is left has the same bits in
+every tile that sees it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +50,8 @@ class SurfaceGrid:
 
     tiles: TileGrid
     config: SurfaceConfig
+    around_m: float = 0.0
+    """What products see of the neighbours before smoothing, at least (m)."""
 
     @property
     def cell_m(self) -> tuple[float, float]:
@@ -59,6 +62,11 @@ class SurfaceGrid:
     def shown(self) -> int:
         """Cells of the neighbours that products see, on each side."""
         return math.ceil(SHOWN_M / min(self.cell_m) - 1e-9)
+
+    @property
+    def around(self) -> int:
+        """Cells of the neighbours that products see before smoothing, on each side."""
+        return max(self.shown, math.ceil(self.around_m / min(self.cell_m) - 1e-9))
 
     @property
     def smoothed(self) -> int:
@@ -79,7 +87,7 @@ class SurfaceGrid:
 
     def window(self, tile: TileId) -> GridWindow:
         """Cells that are computed for a tile."""
-        beyond = self.shown + self.filled + self.smoothed
+        beyond = max(self.shown + self.filled + self.smoothed, self.around)
         return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(beyond)
 
     def reach(self, tile: TileId) -> Bounds:
@@ -197,8 +205,10 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
     wanted : (rows, columns) of the window, cells outside which there shall be no surface; None for all.
     """
     settings = grid.config.smoothing_settings()
+    around_m = _around(patch.raw_m if wanted is None else np.where(wanted, patch.raw_m, np.nan), grid)
+    patch, wanted = _for_smoothing(patch, grid), None if wanted is None else _cut(wanted, _beyond_smoothing(grid))
     height = patch.raw_m if settings is None else smoothed_where_known(patch.raw_m, settings)
-    rim, window = grid.filled + grid.smoothed, grid.window(tile)
+    rim, window = grid.filled + grid.smoothed, grid.window(tile).grown(-_beyond_smoothing(grid))
     inner = (slice(rim, window.rows - rim), slice(rim, window.columns - rim))
     raw, origin = patch.raw_m[inner].copy(), patch.origin[inner].copy()
     if grid.filled:
@@ -213,7 +223,29 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
         left_out = ~wanted[inner]
         raw[left_out] = height[left_out] = np.nan
         intensity[left_out], origin[left_out] = np.nan, EMPTY
-    return SurfaceTile(tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, grid.config.sigma_m)
+    sigma_m = grid.config.sigma_m
+    return SurfaceTile(tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, sigma_m, around_m=around_m)
+
+
+def _around(raw_m: Float64, grid: SurfaceGrid) -> Float64:
+    """Heights before smoothing of what products see, of those of a tile's window."""
+    return _cut(raw_m, max(grid.shown + grid.filled + grid.smoothed - grid.around, 0))
+
+
+def _for_smoothing(patch: Patch, grid: SurfaceGrid) -> Patch:
+    """The part of a window's patch that smoothing and filling look at."""
+    margin = _beyond_smoothing(grid)
+    return Patch(_cut(patch.raw_m, margin), _cut(patch.origin, margin), _cut(patch.intensity, margin))
+
+
+def _beyond_smoothing(grid: SurfaceGrid) -> int:
+    """Cells along each border of a tile's window that are seen as they were measured alone."""
+    return max(grid.around - grid.shown - grid.filled - grid.smoothed, 0)
+
+
+def _cut(cells: npt.NDArray[Any], margin: int) -> npt.NDArray[Any]:
+    """An array (rows, columns) without so many cells along each border."""
+    return cells[margin : cells.shape[0] - margin, margin : cells.shape[1] - margin]
 
 
 def _filled(height_m: Float64, intensity: Float32, grid: SurfaceGrid) -> tuple[Float64, Float32, Bool]:

@@ -55,6 +55,14 @@ class SurfaceTile:
     """1 σ of the noise of one cell's height before smoothing (m)."""
     colours: NodeColours | None = None
     """Colours of the cells that a product asked for; None for one that did not."""
+    around_m: npt.NDArray[np.float64] | None = None
+    """Heights before smoothing of more cells around the tile, as many as products ask for; None: those of `raw_m`."""
+
+    @property
+    def around(self) -> tuple[npt.NDArray[np.float64], int]:
+        """Heights before smoothing (m), and how many of the neighbours' cells they hold on each side."""
+        wide = self.raw_m if self.around_m is None else self.around_m
+        return wide, self.halo + (wide.shape[0] - self.raw_m.shape[0]) // 2
 
     @property
     def cell_m(self) -> tuple[float, float]:

@@ -26,6 +26,8 @@ from roadscan.tables.schema import table_schema
 
 CELL_M = 0.005
 HALO = 200
+AROUND = 540
+"""Cells that are seen before smoothing."""
 WEST, SOUTH = TileId(553_211, 6_020_119), TileId(553_212, 6_020_119)
 """Tiles of 1 m, side by side."""
 DRIVEN = LaneDirections.of_path([(WEST.column + x, WEST.row) for x in range(3)])
@@ -42,13 +44,20 @@ def ground(easting_m, northing_m):
 
 
 def surface(tile):
-    window = GridWindow(tile.column * 200, tile.row * 200, 200, 200, CELL_M, CELL_M).grown(HALO)
+    wide = GridWindow(tile.column * 200, tile.row * 200, 200, 200, CELL_M, CELL_M).grown(AROUND)
+    around = heights(wide)
+    seen = slice(AROUND - HALO, HALO - AROUND)
+    height = np.ascontiguousarray(around[seen, seen])
+    full = np.full(height.shape, MEASURED, np.uint8)
+    window = wide.grown(HALO - AROUND)
+    return SurfaceTile(tile, window, HALO, height, height, full, full.astype(np.float32), 0.0003, around_m=around)
+
+
+def heights(window):
     east, north = window.nodes_m()
     row, column = np.indices((window.rows, window.columns))
     noise = ((row + window.first_row) * 7919 + (column + window.first_column) * 104_729) % 1009 / 1009 - 0.5
-    height = ground(east[None, :], north[:, None]) + 0.0006 * noise
-    full = np.full(height.shape, MEASURED, np.uint8)
-    return SurfaceTile(tile, window, HALO, height, height, full, full.astype(np.float32), 0.0003)
+    return ground(east[None, :], north[:, None]) + 0.0006 * noise
 
 
 class Files:
@@ -161,6 +170,8 @@ def test_coarse_cells_are_refused(context, tmp_path):
     whole = surface(WEST)
     with pytest.raises(ConfigError, match=r"'crack_pieces' got cells of 0\.005 × 0\.005 m and 20 of"):
         CrackPieces().write(dataclasses.replace(whole, halo=20), DETECT, context, tmp_path / "x")
+    with pytest.raises(ConfigError, match=r"'pothole_pieces' got cells of 0\.06 m; expected at most block_m, 0\.05 m"):
+        PotholePieces().check_cells(PotholeDetection(), (0.06, 0.06), 20)
 
 
 def test_the_lane_runs_as_the_vehicle_drove():

@@ -98,7 +98,8 @@ def join_cracks(
     turned = _Turned.of(pieces, azimuth, config)
     networks = grouped(np.arange(len(pieces)), components(ends))
     whole = [own for own in networks if _is_crack([pieces[k] for k in own.tolist()], config)]
-    found = [_parts(own, pieces, nodes, turned, config) for own in whole]
+    parted = [_parts(own, pieces, nodes, turned, config) for own in whole]
+    found = [deep for parts in parted if (deep := [c for c in parts if not c.depth_mean_m < config.min_depth_m])]
     found.sort(key=lambda parts: min(c.line.bounds[1::-1] for c in parts))
     numbered = [
         replace(c, network=k, pieces=c.pieces[c.pieces < seen]) for k, parts in enumerate(found, start=1) for c in parts
@@ -108,8 +109,7 @@ def join_cracks(
 
 def _is_crack(network: Sequence[CrackPiece], config: CrackJoining) -> bool:
     length, measured = sum(p.length_m for p in network), sum(p.measured_m for p in network)
-    deep = sum(p.depth_sum_m2 for p in network) >= config.min_depth_m * measured
-    return length >= config.min_length_m and measured > 0.0 and deep and measured >= _LEAST_SHARE * length
+    return length >= config.min_length_m and measured > 0.0 and measured >= _LEAST_SHARE * length
 
 
 @dataclass(frozen=True)

@@ -266,6 +266,19 @@ def test_gaps_between_ends_that_face_one_another_are_closed():
     assert len(join_cracks([third, one, other], 0.0, 0.01, JOINING)) == 2
 
 
+def test_depth_is_judged_crack_by_crack():
+    deep = [piece((0, 50), (50, 50)), piece((50, 50), (90, 50))]
+    shallow = [piece((50, 50), (50, 250)), piece((50, 250), (50, 300))]
+    shallow = [replace(one, depth_sum_m2=0.0006 * one.length_m, depth_max_m=0.0009) for one in shallow]
+    assert sum(p.depth_sum_m2 for p in deep + shallow) > 0.001 * sum(p.length_m for p in deep + shallow)
+    (one,) = join_cracks(deep + shallow, 0.0, 0.01, JOINING)
+    assert (one.kind, one.depth_mean_m) == ("longitudinal", pytest.approx(0.01)) and one.pieces.tolist() == [0, 1]
+    deep = [replace(one, depth_sum_m2=0.0015 * one.length_m) for one in deep]  # the mean of all is below 1 mm
+    assert [c.kind for c in join_cracks(deep + shallow, 0.0, 0.01, JOINING)] == ["longitudinal"]
+    assert len(join_cracks(deep + shallow, 0.0, 0.01, CrackJoining(min_depth_m=0.0005))) == 2
+    assert join_cracks(shallow, 0.0, 0.01, JOINING) == []
+
+
 def test_bridges_are_those_without_which_a_network_falls_apart():
     rng = np.random.default_rng(8)
     for _ in range(20):

@@ -36,8 +36,8 @@ class CrackJoining(Strict):
     min_length_m: float = Field(default=0.15, ge=0.0)
     """Least length of a crack with all its branches, over all tiles (m)."""
     min_depth_m: float = Field(default=0.001, ge=0.0)
-    """Least mean depth of a crack (m): of each row by itself, so a shallow branch of another type is left out, and a deep
-    one stays in a network of shallow ones."""
+    """Least mean depth of a crack (m): of each row by itself, so a shallow branch of another type is left out, and a
+    deep one stays in a network of shallow ones."""
     bridge_m: float = Field(default=0.1, ge=0.0, le=1.0)
     """Two ends that point at one another are one crack if they are no farther apart (m); 0: gaps stay."""
     lane_angle_deg: float = Field(default=30.0, gt=0.0, le=45.0)

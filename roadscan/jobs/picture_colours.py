@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.pictures import Pictures
 from roadscan.model.crs import add_grid_folder
-from roadscan.points.views import HEIGHT, NO_VIEW, WIDTH, best_views, sampled
+from roadscan.points.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
 from roadscan.sensors.image_headers import ImageError, image_size
 
 UInt8 = npt.NDArray[np.uint8]
@@ -20,6 +21,7 @@ Float64 = npt.NDArray[np.float64]
 
 _KEPT_BYTES: Final = 160 << 20
 """Decoded pictures that stay in memory for the tiles that follow; one does whatever its size."""
+_POINTS_AT_ONCE: Final = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,11 @@ class ColourSource:
 
     def colours(self, pictures: Pictures, enh_m: Float64) -> PointColours:
         """Colours of points (m, 3: easting, northing, height), from those pictures that may show one of them."""
-        worlds = [np.ascontiguousarray(pictures.map.world_from_map(world, enh_m)) for world in pictures.worlds]
         colour, seen = np.zeros((len(enh_m), 3), np.uint8), np.zeros(len(enh_m), np.bool_)
         unreadable: dict[int, str] = {}
         used, left = set[int](), np.arange(len(enh_m))
         while left.size:
-            shown = best_views([points[left] for points in worlds], pictures.views, pictures.rule, unreadable)
+            shown = _shown(pictures, enh_m[left], unreadable)
             again = []
             for number in np.unique(shown.view[shown.view != NO_VIEW]).tolist():
                 own = np.flatnonzero(shown.view == number)
@@ -83,6 +84,23 @@ class ColourSource:
         while len(self._kept) > 1 and sum(p.nbytes for p in self._kept.values()) > _KEPT_BYTES:
             self._kept.popitem(last=False)
         return picture
+
+
+def _shown(pictures: Pictures, enh_m: Float64, without: Collection[int]) -> Shown:
+    """Which picture shows points of the map best, and where."""
+    parts = []
+    for start in range(0, len(enh_m), _POINTS_AT_ONCE):
+        part = enh_m[start : start + _POINTS_AT_ONCE]
+        worlds = [_world_m(pictures, world, part) for world in pictures.worlds]
+        parts.append(best_views(worlds, pictures.views, pictures.rule, without))
+    return Shown(np.concatenate([p.view for p in parts]), np.concatenate([p.pixel for p in parts]))
+
+
+def _world_m(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
+    """Points (m, 3) of the map in a world frame."""
+    if len(enh_m) == 1:  # NumPy multiplies one row in another order than several
+        return _world_m(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
+    return np.ascontiguousarray(pictures.map.world_from_map(world, enh_m))
 
 
 def _read(pictures: Pictures, number: int) -> UInt8:

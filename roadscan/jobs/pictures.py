@@ -19,7 +19,7 @@ from roadscan.jobs.taken_pictures import TakenPictures, taken_pictures
 from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError, RunError, nearest
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.rig import Mountings, Sensor
+from roadscan.model.rig import Mountings, Rig, Sensor
 from roadscan.navigation.calibration.resection import SENSOR_FROM_OPENCV
 from roadscan.navigation.trajectory import Poses, world_from_ned
 from roadscan.points.views import Lens, PictureRule, Views
@@ -203,7 +203,7 @@ class _Placed:
 
 def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, TakenPictures]]:
     """Logs of pictures with their cameras."""
-    cameras = _cameras(plan, rule)
+    cameras = rule_cameras(plan.survey.rig, rule)
     found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
     usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
     if not usable:
@@ -222,9 +222,9 @@ def _is_video(taken: TakenPictures) -> bool:
     return taken.record.attributes.get("kind") == "video"
 
 
-def _cameras(plan: SurveyPlan, rule: PictureRule) -> list[tuple[str, Sensor]]:
-    """Cameras of the rig that the rule takes, with their interior orientation."""
-    known = {name: sensor for name, sensor in plan.survey.rig.sensors.items() if sensor.kind == "camera"}
+def rule_cameras(rig: Rig, rule: PictureRule) -> list[tuple[str, Sensor]]:
+    """Cameras of a rig that a rule takes; each has an interior orientation. ConfigError where there are none."""
+    known = {name: sensor for name, sensor in rig.sensors.items() if sensor.kind == "camera"}
     for name in rule.cameras:
         if name not in known:
             raise ConfigError(

@@ -16,7 +16,7 @@ from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import make_products, product_context, wanted_tile_products
 from roadscan.jobs.selection import Selection
-from roadscan.jobs.surface_colours import check_colours, colour_notes
+from roadscan.jobs.surface_colours import check_cameras, check_colours, colour_notes
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
 from roadscan.jobs.surfaces import compute_surfaces
 from roadscan.jobs.tile_files import tile_file_names
@@ -63,6 +63,7 @@ class Run:
 
 def run_ingest(run: Run) -> None:
     """Raw logs → tables."""
+    check_cameras(run.survey)
     ingest(run.survey, run.store, run.reporter.line, run.compute)
 
 
@@ -118,7 +119,8 @@ def run_surfaces(run: Run) -> None:
     failures = run_tasks(compute_surfaces, tasks, work.planned.singly, manifest, run.compute, report)
     manifest.forget(SURFACE, [unit for unit, _ in failures])
     manifest.remove(files_without_surface(manifest))
-    for note in colour_notes(work.planned.pictures, manifest, work.chosen):
+    made = manifest.of(SURFACE)
+    for note in colour_notes(work.planned.pictures, [made[str(t)] for t in work.chosen if str(t) in made]):
         run.reporter.line(f"note: {note}")
     run.failed("surfaces", failures)
 

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from roadscan.jobs.picture_colours import ColourSource
-from roadscan.jobs.pictures import Pictures, check_folders, check_pictures, plan_pictures
+from roadscan.jobs.pictures import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.products import product_context, wanted_surface_products
+from roadscan.jobs.products import product_context, wanted_products, wanted_surface_products
 from roadscan.jobs.tile_files import WantedSurface
 from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.products.base import SurfaceProduct
 from roadscan.surfaces.reconstruction import SurfaceGrid
 from roadscan.surfaces.tile import NodeColours, SurfaceTile
-from roadscan.tables.manifest import Manifest
+from roadscan.tables.manifest import OutputRecord
 from roadscan.tiles.grid import Bounds
 
 COLOURS: Final = "colours"
 """Where a tile's record keeps the figures of its colours."""
 _NAMED: Final = 5
+
+
+def check_cameras(survey: Survey) -> None:
+    """Raise where products of the surface want colours, and the rig has no camera for them; reads no log."""
+    for product, options in wanted_products(survey) if survey.config.surface is not None else ():
+        rule = product.picture_rule(options) if isinstance(product, SurfaceProduct) else None
+        if rule is not None:
+            rule_cameras(survey.rig, rule)
 
 
 def check_colours(plan: SurveyPlan, *, folders: bool = False) -> None:
@@ -80,10 +90,9 @@ class Painter:
         return replace(surface, colours=NodeColours(colour, seen)), {f"{COLOURS}:{name}": figures}
 
 
-def colour_notes(pictures: Mapping[str, Pictures], manifest: Manifest, made: Sequence[TileId]) -> list[str]:
-    """What became of the colours of the tiles made, each damaged picture told of once."""
-    records = manifest.of("surfaces")
-    figures = [records[str(t)].figures() for t in made if str(t) in records]
+def colour_notes(pictures: Mapping[str, Pictures], made: Iterable[OutputRecord]) -> list[str]:
+    """What became of the colours of surfaces, by their records; each damaged picture is told of once."""
+    figures = [record.figures() for record in made]
     notes: list[str] = []
     for name, placed in pictures.items():
         own = [f[f"{COLOURS}:{name}"] for f in figures if f"{COLOURS}:{name}" in f]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
@@ -21,7 +22,6 @@ UInt8 = npt.NDArray[np.uint8]
 __all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Views", "best_views", "sampled"]
 
 NO_VIEW: Final = -1
-_NOTHING_HIDDEN: Final[Bool] = np.zeros((0, 0), np.bool_)
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,26 @@ class Lens:
 
     parameters: Float64
     """(12,) as the kernel takes them."""
-    hidden: Bool
-    """(height, width) pixels that show the own vehicle; (0, 0) where none does."""
+    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Polygons of pixels (u, v) that show the own vehicle."""
 
     @classmethod
-    def of(cls, interior: Interior, own_vehicle_px: Sequence[Sequence[tuple[float, float]]] = ()) -> Self:
-        """From the rig's values; polygons of pixels (u, v)."""
+    def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
+        """From the rig's values."""
         k1, k2, p1, p2, k3 = interior.distortion
         size = float(interior.width_px), float(interior.height_px)
         lens = [*interior.focal_px, *interior.principal_px, k1, k2, p1, p2, k3, _fold(k1, k2, k3), *size]
-        hidden = _NOTHING_HIDDEN
-        if own_vehicle_px:
-            drawn = np.zeros((interior.height_px, interior.width_px), np.uint8)
-            for polygon in own_vehicle_px:
-                cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
-            hidden = drawn.astype(np.bool_)
-        return cls(np.array(lens), hidden)
+        return cls(np.array(lens), own_vehicle_px)
+
+    @functools.cached_property
+    def hidden(self) -> Bool:
+        """(height, width) pixels that show the own vehicle; (0, 0) where none does. Drawn where it is needed."""
+        if not self.own_vehicle_px:
+            return np.zeros((0, 0), np.bool_)
+        drawn = np.zeros((round(self.parameters[HEIGHT]), round(self.parameters[WIDTH])), np.uint8)
+        for polygon in self.own_vehicle_px:
+            cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
+        return drawn.astype(np.bool_)
 
 
 def _fold(k1: float, k2: float, k3: float) -> float:

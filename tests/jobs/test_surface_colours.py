@@ -18,6 +18,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from roadscan.jobs.compute import Compute, Inline
+from roadscan.jobs.pictures import Pictures
 from roadscan.jobs.stages import STAGES, Run, Stage, run_stages
 from roadscan.jobs.surface_plan import SURFACE, plan_surface_work
 from roadscan.model.errors import ConfigError
@@ -186,7 +187,10 @@ def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: 
     assert np.array_equal(first[which], colour)
     monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
     monkeypatch.setattr("roadscan.jobs.picture_colours._KEPT_BYTES", 0)
+    monkeypatch.setattr("roadscan.jobs.picture_colours._POINTS_AT_ONCE", 777)
     assert drive.run(drive.survey(), TwoThreads()) == files
+    monkeypatch.setattr(Pictures, "near", lambda self, *_: self)  # all pictures: none that counts was left out
+    assert drive.run(drive.survey()) == files
 
 
 def test_glb_has_the_same_colours_linear(drive: Drive) -> None:
@@ -258,8 +262,9 @@ def test_what_cannot_be_coloured(
     drive: Drive, options: dict[str, object], changes: dict[str, object], message: str
 ) -> None:
     survey = drive.survey(COLOURED | options, **changes)
+    stage = "tiles" if "pixels" in message else "ingest"
     with pytest.raises(ConfigError, match=message):
-        run_stages(Run(survey, drive.store, Inline(), None, Lines()), [s for s in STAGES if s.name == "tiles"])
+        run_stages(Run(survey, drive.store, Inline(), None, Lines()), [s for s in STAGES if s.name == stage])
 
 
 def test_pictures_that_are_gone(drive: Drive) -> None:

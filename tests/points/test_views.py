@@ -28,7 +28,7 @@ def views(rng: np.random.Generator, count: int) -> Views:
     turn = np.stack([-sensor[:, :, 1], -sensor[:, :, 2], sensor[:, :, 0]], axis=1)
     world = rng.integers(0, 2, count)
     up = np.tile([0.0, 0.0, 1.0], (count, 1))
-    lenses = (Lens.of(LENSES[0], [HIDDEN]), Lens.of(LENSES[1]))
+    lenses = (Lens.of(LENSES[0], (HIDDEN,)), Lens.of(LENSES[1]))
     return Views(eye + 1e6 * world[:, None], turn, up, world, rng.integers(0, 2, count), lenses)
 
 
@@ -108,4 +108,4 @@ def test_samples_are_bilinear() -> None:
 
 def test_a_pinhole_has_no_fold() -> None:
     assert np.isinf(Lens.of(LENSES[1]).parameters[9])
-    assert Lens.of(LENSES[0], [HIDDEN]).hidden.sum() == 441 * 100
+    assert Lens.of(LENSES[0], (HIDDEN,)).hidden.sum() == 441 * 100

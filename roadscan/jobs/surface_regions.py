@@ -8,14 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import pyogrio
 import shapely
 
 from roadscan.model.crs import LOCAL_WORLD, MapFrame
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
 from roadscan.sensors.road_lines import place_in_map
-from roadscan.sensors.vector_layer import chosen_layer, feature_batches, gdal_faults, gdal_name, layer_names, shapes_of
+from roadscan.sensors.vector_layer import chosen_layer, feature_batches, gdal_faults, layer_info, layer_names, shapes_of
 from roadscan.surfaces.window import GridWindow
 from roadscan.tiles.grid import Bounds
 
@@ -69,7 +68,7 @@ def stated_regions(survey: Survey) -> Regions | None:
 def _shapes(path: Path) -> npt.NDArray[Any]:
     with gdal_faults(path, _EXPECTED):
         layer = chosen_layer(layer_names(path), None, path)
-        geometry = pyogrio.read_info(gdal_name(path), layer=layer).get("geometry_name") or ""
+        geometry = layer_info(path, layer).get("geometry_name") or ""
     parts = [shapes_of(batch, geometry) for batch in feature_batches(path, layer, _EXPECTED)]
     shapes = np.concatenate(parts) if parts else np.empty(0, object)
     holds_ground = ~(shapely.is_missing(shapes) | shapely.is_empty(shapes))
@@ -89,7 +88,7 @@ def _shapes(path: Path) -> npt.NDArray[Any]:
 
 def _crs(path: Path, stated: str | None) -> str:
     with gdal_faults(path, _EXPECTED):
-        own = pyogrio.read_info(gdal_name(path))["crs"]
+        own = layer_info(path)["crs"]
     crs = stated or own
     if crs is None:
         raise ConfigError(

@@ -24,7 +24,7 @@ from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicHermiteSpline, make_lsq_spline
+import scipy
 from scipy.ndimage import binary_closing, median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -305,7 +305,9 @@ def _likely_slope(leap: _Leap, length: float) -> Float64:
 
 def _cubic(seconds: Float64, length: float, value: Float64, slope: Float64) -> Float64:
     """(n, 3) at seconds since the begin: 0 with slope 0 there, a value and a slope (per second) at the end."""
-    ends = CubicHermiteSpline([0.0, length], np.stack([np.zeros(3), value]), np.stack([np.zeros(3), slope]))
+    ends = scipy.interpolate.CubicHermiteSpline(
+        [0.0, length], np.stack([np.zeros(3), value]), np.stack([np.zeros(3), slope])
+    )
     values: Float64 = ends(seconds)
     return values
 
@@ -376,7 +378,7 @@ def _spline(seconds: Float64, values: Float64, weights: Float64, knot_s: float) 
     # Knots where the poses are: each piece has as many of them.
     inner = np.quantile(seconds, np.arange(1, pieces) / pieces)
     knots = np.concatenate([np.repeat(seconds[0], 4), inner, np.repeat(seconds[-1], 4)])
-    spline: Float64 = make_lsq_spline(seconds, values, knots, k=3, w=weights)(seconds)
+    spline: Float64 = scipy.interpolate.make_lsq_spline(seconds, values, knots, k=3, w=weights)(seconds)
     return spline
 
 
@@ -427,7 +429,7 @@ def _bridge(trajectory: Trajectory, at: int, new: Int64) -> Trajectory:
     after = _side(trajectory, at, last, reference[1], 1)
     position = _hermite(before, after, trajectory.position_world_m[at : at + 2], length, seconds)
     turn = (reference[0].inv() * reference[1]).as_rotvec()
-    ends = CubicHermiteSpline(
+    ends = scipy.interpolate.CubicHermiteSpline(
         [0.0, length],
         np.stack([np.zeros(3), turn]),
         np.stack([before.rate_rad_per_s, _tangent_rate(turn, after.rate_rad_per_s)]),
@@ -440,7 +442,7 @@ def _bridge(trajectory: Trajectory, at: int, new: Int64) -> Trajectory:
 def _hermite(before: _Side, after: _Side, ends_m: Float64, length: float, seconds: Float64) -> Float64:
     """Positions (n, 3) between two poses (2, 3) with the velocities beside them."""
     origin = ends_m[0]
-    curve = CubicHermiteSpline(
+    curve = scipy.interpolate.CubicHermiteSpline(
         [0.0, length], ends_m - origin, np.stack([before.velocity_m_per_s, after.velocity_m_per_s])
     )
     positions: Float64 = curve(seconds) + origin

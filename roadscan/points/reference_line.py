@@ -13,8 +13,7 @@ from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_filter
+import scipy
 
 from roadscan.kernels.curved_grid import thin_path
 from roadscan.model.errors import NavigationError
@@ -73,10 +72,10 @@ class ReferenceLine:
         knots = np.column_stack([np.interp(at, along, path[:, a]) for a in range(2)])
         window = min(2 * round(smoothing_m / KNOT_M / 2) + 1, count - 1 + count % 2)
         if window > 3:
-            knots = savgol_filter(knots, window, 2, axis=0, mode="interp")
+            knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
         way = _way(knots)
         stations = step_m * np.arange(int(way[-1] / step_m) + 1)
-        steps = np.diff(CubicSpline(way, knots)(stations), axis=0)
+        steps = np.diff(scipy.interpolate.CubicSpline(way, knots)(stations), axis=0)
         phi = np.arctan2(steps[:, 1], steps[:, 0]).astype(np.float32).astype(np.float64)
         own = along[np.cumsum(kept) - 1]
         return cls(float(knots[0, 0]), float(knots[0, 1]), phi, step_m), (np.interp(own, at, way) / step_m).astype(

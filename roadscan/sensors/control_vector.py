@@ -6,12 +6,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyogrio
 import shapely
 
 from roadscan.model.crs import LOCAL_WORLD, crs_from_text
@@ -30,6 +28,7 @@ from roadscan.sensors.vector_layer import (
     gdal_faults,
     geopackage_kinds,
     is_geopackage,
+    layer_info,
     layer_names,
     number_of,
     shapes_of,
@@ -129,7 +128,7 @@ def _plan(source: LogSource) -> _Plan:
     with gdal_faults(source.path):
         layers = layer_names(source.path)
         layer = chosen_layer(layers, options.layer, source.path)
-        info: dict[str, Any] = pyogrio.read_info(source.path, layer=layer)
+        info = layer_info(source.path, layer)
     if info["geometry_type"] is None:
         raise FormatError(f"layer '{layer}' has no geometry", expected="points", file=source.path)
     _check_crs(info["crs"], frame, source.path)

@@ -24,7 +24,6 @@ from typing import Annotated, Any, ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyogrio
 import pyproj
 import shapely
 from pydantic import Field
@@ -46,9 +45,9 @@ from roadscan.sensors.vector_layer import (
     feature_batches,
     flat_crs,
     gdal_faults,
-    gdal_name,
     geopackage_kinds,
     is_geopackage,
+    layer_info,
     layer_names,
     number_of,
     shapes_of,
@@ -266,7 +265,7 @@ class LineLayer:
         check_archive(path)
         with gdal_faults(path, _EXPECTED):
             name = chosen_layer(layer_names(path), options.layer, path)
-            info: dict[str, Any] = pyogrio.read_info(gdal_name(path), layer=name)
+            info = layer_info(path, name)
         names = tuple(str(field) for field in info["fields"])
         columns = {
             "id": _attribute(options.id_column, _KNOWN_IDS, names, path),

@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyogrio
 import pyproj
 import shapely
 
@@ -68,7 +67,16 @@ def gdal_faults(path: Path, expected: str = "GeoJSON or GeoPackage points") -> I
 
 def layer_names(path: Path) -> list[str]:
     """Names of a file's layers; to be asked inside :func:`gdal_faults`."""
+    import pyogrio  # slow to import
+
     return [str(layer[0]) for layer in pyogrio.list_layers(gdal_name(path))]
+
+
+def layer_info(path: Path, layer: str | None = None) -> dict[str, Any]:
+    """What GDAL says of a layer (by default the first); to be asked inside :func:`gdal_faults`."""
+    import pyogrio  # slow to import
+
+    return dict(pyogrio.read_info(gdal_name(path), layer=layer))
 
 
 def chosen_layer(layers: list[str], stated: str | None, file: Path) -> str:
@@ -98,6 +106,8 @@ def feature_batches(
     path: Path, layer: str, expected: str = "GeoJSON or GeoPackage points", **asked: Any
 ) -> Iterator[pa.RecordBatch]:
     """Features of a layer with their geometry as WKB; `asked` goes to GDAL."""
+    import pyogrio  # slow to import
+
     with ExitStack() as stack:
         with gdal_faults(path, expected):
             opened = pyogrio.open_arrow(

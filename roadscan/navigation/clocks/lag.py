@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import irfft, next_fast_len, rfft
+import scipy
 
 from roadscan.navigation.clocks.signals import Felt, Motion
 
@@ -135,11 +135,12 @@ def _explained(
 
     same_sign : values are the rates themselves; otherwise they are the rates in other axes, or a mixture.
     """
-    size = next_fast_len(rates.shape[0] + values.shape[0])
+    fft = scipy.fft
+    size = fft.next_fast_len(rates.shape[0] + values.shape[0])
 
     def together(a: Float64, b: Float64) -> Float64:
         """Σ a[k] · b[k + shift] for each shift."""
-        product: Float64 = irfft(np.conj(rfft(a, size)) * rfft(b, size), size)[:shifts]
+        product: Float64 = fft.irfft(np.conj(fft.rfft(a, size)) * fft.rfft(b, size), size)[:shifts]
         return product
 
     of_y, of_x = has_values.astype(np.float64), has_rates.astype(np.float64)

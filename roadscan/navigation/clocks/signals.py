@@ -9,8 +9,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
@@ -138,15 +137,15 @@ class Motion:
         return max(_SMOOTH_KNOTS, _SMOOTH_S / self.interval_s)
 
     @cached_property
-    def _spline(self) -> CubicSpline:
-        return CubicSpline(self._knots_s, self.totals)
+    def _spline(self) -> scipy.interpolate.CubicSpline:
+        return scipy.interpolate.CubicSpline(self._knots_s, self.totals)
 
     @cached_property
-    def _smooth(self) -> CubicSpline:
+    def _smooth(self) -> scipy.interpolate.CubicSpline:
         # Knots are smoothed with their times: they need not be even, and steady motion stays as it is.
         both = np.column_stack([self._knots_s, self.totals])
-        smooth = gaussian_filter1d(both, self._width_knots, axis=0, mode="nearest")
-        return CubicSpline(smooth[:, 0], smooth[:, 1:])
+        smooth = scipy.ndimage.gaussian_filter1d(both, self._width_knots, axis=0, mode="nearest")
+        return scipy.interpolate.CubicSpline(smooth[:, 0], smooth[:, 1:])
 
 
 def felt_by_imu(imu: ImuReadings, finest_s: float) -> Felt:

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+import scipy
 
 from roadscan.navigation.clocks.lines import Line
 from roadscan.navigation.clocks.signals import Felt, Motion
@@ -159,7 +159,7 @@ class _Samples:
             for part in parts:
                 own = values[part]
                 changes = np.diff(own, axis=0, prepend=own[:level_of].mean(axis=0, keepdims=True))
-                out[part] = lfilter([1.0], [1.0, -keep], changes, axis=0)
+                out[part] = scipy.signal.lfilter([1.0], [1.0, -keep], changes, axis=0)
             return out
 
         signals = (white(v) for v in (self.y, self.f, self.df, self.z, self.dz, self.ddz))

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+import scipy
 
 from roadscan.kernels.kalman import filter_forwards
 from roadscan.kernels.kalman_smoother import Poses, smooth_backwards, spread
@@ -183,7 +183,7 @@ def _model(vehicle: VehicleSensors, config: SmootherConfig) -> Model:
         zero_rate_sigma=float(np.radians(config.standing_deg_per_s)),
         loose_rate=0.2,
         loose_force=2.0,
-        outlier=np.array([np.inf, *(chi2.ppf(1.0 - config.outlier_probability, c) / c for c in (1, 2, 3))]),
+        outlier=np.array([np.inf, *(scipy.stats.chi2.ppf(1.0 - config.outlier_probability, c) / c for c in (1, 2, 3))]),
         patience_s=config.outlier_patience_s,
         delay_wander=config.imu_clock_wander_ms_per_sqrt_s * 1e-3,
         interval_s=1.0 / config.constraints_per_s,

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from roadscan.navigation.calibration.estimator import Calibrated, Calibration, Figures
 from roadscan.navigation.calibration.rotations import logarithm
+from roadscan.products.pictures.canvas import empty_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _LEVER: Final = ("forward", "right", "down")
 _ANGLES: Final = ("roll", "pitch", "heading")
@@ -27,8 +28,7 @@ def draw_calibration(path: Path, calibration: Calibration, title: str) -> None:
     Above, the change of each lever arm and boresight with 1 σ, and the prior 1 σ as a grey band: hollow where the
     evidence does not determine it. Below, RMS of the residuals before and after.
     """
-    figure = Figure(figsize=(13.0, 9.0), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(13.0, 9.0, 110)
     grid = figure.add_gridspec(2, 2, height_ratios=[1.2, 1.0])
     held = calibration.observability.undetermined
     words = "all mountings determined" if not held else "not determined: " + "; ".join(held[:4])

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.clocks import ClockCorrection, Residuals
+from roadscan.products.pictures.canvas import empty_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Float64 = npt.NDArray[np.float64]
 
@@ -35,8 +36,7 @@ class ClockPicture:
 
 def draw_clock(path: Path, picture: ClockPicture) -> None:
     """Write the residuals over time, and their distribution against the one that their σ promise, as PNG."""
-    figure = Figure(figsize=(10.0, 4.4), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(10.0, 4.4, 120)
     over_time, spread = figure.subplots(1, 2, width_ratios=[3.2, 1.0])
     figure.suptitle(f"{picture.title}\n{_summary(picture)}", fontsize=9, x=0.01, ha="left")
     _draw_over_time(over_time, picture)

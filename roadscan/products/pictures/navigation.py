@@ -6,20 +6,19 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
+from roadscan.products.pictures.canvas import empty_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -82,8 +81,7 @@ def draw_navigation(path: Path, picture: NavigationPicture) -> None:
     """
     axis = _axis(picture)
     residuals = _residuals(picture, axis)
-    figure = Figure(figsize=(15.0, 13.5), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(15.0, 13.5, 110)
     grid = figure.add_gridspec(5, 2, width_ratios=[1.0, 1.35])
     figure.suptitle(f"{picture.title}\n{_summary(picture, residuals, axis)}", fontsize=10, x=0.01, ha="left")
     _draw_path(figure.add_subplot(grid[0:2, 0]), picture, axis)
@@ -196,6 +194,8 @@ def _draw_path(axes: Axes, picture: NavigationPicture, axis: _Axis) -> None:
         dark |= (seconds >= a) & (seconds <= b)
     pieces = [ned[k : k + 2, 1::-1] for k in np.flatnonzero(dark[:-1] & dark[1:])]
     if pieces:
+        from matplotlib.collections import LineCollection  # slow to import
+
         axes.add_collection(LineCollection(pieces, colors=_REFUSED, linewidths=2.4, zorder=3, label="GNSS out"))
     placed = np.isfinite(g.position_world_m[:, 0])
     for name in _qualities(g.quality[placed]):
@@ -348,7 +348,7 @@ def _over_time(axes: Axes, axis: _Axis, unit: str, title: str, *, columns: int =
     _finish(axes, title, columns)
     if utc:
         above = axes.secondary_xaxis("top")
-        above.xaxis.set_major_formatter(FuncFormatter(lambda s, _: _clock(axis.begin_gps_ns, s)))
+        above.xaxis.set_major_formatter(lambda s, _: _clock(axis.begin_gps_ns, s))
         above.tick_params(labelsize=7)
         above.set_xlabel("UTC", fontsize=7)
 

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
+import scipy
 
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.evidence import Known, Seen, Ties, Traverse
@@ -95,7 +95,9 @@ def find_object(readings: Sequence[Readings], estimate: Estimate, steps: Steps, 
     turns = heading + np.radians([-8.0, -4.0, 0.0, 4.0, 8.0])
     starts = [np.array([x, y, turn]) for turn in turns for x in grid for y in grid]
     best = min(starts, key=misfit)
-    found = minimize(misfit, best, method="Nelder-Mead", options={"initial_simplex": _simplex(best), "xatol": 1e-4})
+    found = scipy.optimize.minimize(
+        misfit, best, method="Nelder-Mead", options={"initial_simplex": _simplex(best), "xatol": 1e-4}
+    )
     x, y, turn = found.x
     c, s = np.cos(turn), np.sin(turn)
     ground = float(np.median(np.concatenate(heights)))

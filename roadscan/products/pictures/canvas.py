@@ -1,0 +1,18 @@
+"""What pictures are drawn on. Matplotlib takes most of a second to import: only what draws loads it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def empty_figure(width_in: float, height_in: float, dots_per_inch: int) -> Figure:
+    """A figure that needs no window."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), dpi=dots_per_inch, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure

@@ -19,10 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding
 import numba
 
 from roadscan.kernels.compiled_once import compile_once
+from roadscan.registers import use_whole_registers
 
 Kernel = Callable[..., Any]
 
@@ -65,15 +65,6 @@ def _compiled(function: Kernel, *, forceinline: bool, counted: bool = True) -> K
     return compiled
 
 
-def _use_whole_registers() -> None:
-    """Let the compiler use all 512 bits of a register where there are that many; it prefers 256 for old machines."""
-    host = llvmlite.binding.get_host_cpu_features()
-    if host.get("avx512f") and "NUMBA_CPU_FEATURES" not in os.environ:
-        os.environ.setdefault("NUMBA_CPU_NAME", llvmlite.binding.get_host_cpu_name())
-        os.environ["NUMBA_CPU_FEATURES"] = host.flatten() + ",-prefer-256-bit"
-        numba.config.reload_config()
-
-
 @functools.cache
 def _cache_folder(source: str) -> str:
     """Folder for the compiled kernels of a source file."""
@@ -95,4 +86,4 @@ def _cache_folder(source: str) -> str:
 
 
 _IMPORTED_KERNELS = re.compile(r"^from roadscan\.kernels\.(\w+) import", re.MULTILINE)
-_use_whole_registers()
+use_whole_registers()

@@ -14,6 +14,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from roadscan.registers import use_whole_registers
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -50,3 +52,4 @@ def _cache_folder() -> str:
 
 
 _CACHE_FOLDER = _cache_folder()
+use_whole_registers()

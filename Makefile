@@ -10,6 +10,8 @@ export DO_NOT_TRACK := 1
 export MPLBACKEND := Agg
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
+# Python keeps what it has compiled, even where the shell forbids it: the tests start dozens of processes.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -75,7 +77,7 @@ $(VENV)/.created:
 	echo "On Debian or Ubuntu: apt-get install python3 python3-venv" >&2; exit 1
 
 # uv is faster where it is present and finds the packages; pip is always there.
-install_into_venv = { command -v uv >/dev/null && uv pip install --quiet --python $(BIN)/python --constraint constraints.txt --editable '$(1)'; } \
+install_into_venv = { command -v uv >/dev/null && uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint constraints.txt --editable '$(1)'; } \
 	|| $(BIN)/python -m pip install --quiet --prefer-binary --constraint constraints.txt --editable '$(1)'
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt

@@ -50,7 +50,13 @@ class Simulated:
         return run
 
     def copy_to(self, folder: Path) -> Simulated:
+        """A copy of the raw logs and of all that the survey file names; without a store."""
         shutil.copytree(self.survey_file.parent, folder, ignore=shutil.ignore_patterns("store*"))
+        return Simulated(folder / self.survey_file.name)
+
+    def copy_with_store_to(self, folder: Path) -> Simulated:
+        """The same with the store ``store``: as if it had been run there."""
+        shutil.copytree(self.survey_file.parent, folder, ignore=shutil.ignore_patterns("store-*"))
         return Simulated(folder / self.survey_file.name)
 
 

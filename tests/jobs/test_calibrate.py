@@ -49,7 +49,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = scene.changed(
         lidar={"on": False}, sick={"on": False}, camera={"on": False}, gnss={"on": False}, encoder={"on": False},
         imu={"on": False}, passes=[one.model_dump() for one in scene.passes[1:]],
-        profilers={"readings": 400},
+        profilers={"readings": 200},
     )  # fmt: skip
     made = simulate(scene, tmp_path_factory.mktemp("yard") / "survey")
     survey = Survey.load(made.survey_file)
@@ -133,7 +133,7 @@ def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
         profilers={"on": False}, sick={"on": False}, camera={"on": False}, gnss={"on": False}, encoder={"on": False},
         imu={"on": False}, lidar={"range_max_m": 30.0}, noise={"position_m": 0.0, "attitude_deg": 0.0},
         passes=[{"route": {"station_m": 30.0, "offset_m": -20.0, "pieces": QUARTER}}],
-        vehicle={"standstill_s": 0.0},
+        vehicle={"standstill_s": 0.0, "speed_m_per_s": 25.0},
     )  # fmt: skip
     made = simulate(scene, tmp_path / "survey", write_hits=True)
     hits = pq.read_table(tmp_path / "survey" / "truth" / "hits" / "run-1" / "lidar.parquet").to_pandas()

@@ -68,7 +68,6 @@ def test_shuffled_row_groups_change_no_byte(finished: Simulated, tmp_path: Path)
 def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, tmp_path: Path) -> None:
     """Ties included: a whole sweep of returns is put at one epoch before."""
     copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
     survey = Survey.load(copy.survey_file)
     results = []
     for name, shuffled in (("a", False), ("b", True)):
@@ -156,8 +155,7 @@ def test_selections(finished: Simulated) -> None:
 
 
 def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
     record = next(r for r in read_log_records(store) if r.sensor == "profiler_left")
     path = Path(store.path(record.tables["scans"][0].path))
@@ -178,8 +176,7 @@ def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path:
 
 
 def test_a_changed_setting_makes_stale_what_depends_on_it(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
     before = outputs(store)
     run = copy.run(products__options={"las": {"compress": False}})
@@ -305,8 +302,8 @@ def test_one_missing_log_does_not_keep_the_others_out(finished: Simulated, tmp_p
 
 
 def test_raw_logs_may_be_archived_once_they_are_ingested(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+    copy.run()  # logs are known by their place
     (copy.survey_file.parent / "raw").rename(tmp_path / "archive")
     assert copy.run(products__make=["las", "tile_table"]).failures == []
     assert survey_status(Survey.load(copy.survey_file), copy.store()).failures == []
@@ -315,8 +312,7 @@ def test_raw_logs_may_be_archived_once_they_are_ingested(finished: Simulated, tm
 def test_a_tile_that_could_not_be_made_again_counts_as_stale(
     finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
     unit = next(u for u, r in Manifest(store).of("tile").items() if r.path)
 
@@ -365,8 +361,7 @@ def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_
 
 
 def test_a_tile_that_a_filter_empties_loses_its_files(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     record = max((r for r in Manifest(copy.store()).of("tile").values() if r.path), key=lambda r: r.figures()["points"])
     column, row = (int(v) for v in record.unit.split("_"))
     line = (
@@ -385,8 +380,7 @@ def test_a_tile_that_a_filter_empties_loses_its_files(finished: Simulated, tmp_p
 
 
 def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     store, survey = copy.store(), Survey.load(copy.survey_file)
     path = Path(store.path(store.files("tiles/las")[0]))
     whole = path.read_bytes()
@@ -401,8 +395,7 @@ def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_pat
 
 
 def test_sql_shows_the_logs_of_the_survey_only(finished: Simulated, tmp_path: Path) -> None:
-    copy = finished.copy_to(tmp_path / "survey")
-    copy.run()
+    copy = finished.copy_with_store_to(tmp_path / "survey")
     sbet = copy.survey_file.parent / "raw/run-1/trajectory.sbet"
     sbet.write_bytes(sbet.read_bytes()[:-136])
     copy.run()

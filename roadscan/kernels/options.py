@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy.typing as npt
 
 from roadscan.kernels.compiled_once import compile_once
 from roadscan.registers import use_whole_registers
@@ -49,6 +50,17 @@ def inlined(function: Kernel) -> Kernel:
 def bare_inlined(function: Kernel) -> Kernel:
     """Compile a piece of a `bare` kernel into it; it makes no array either."""
     return _compiled(function, forceinline=True, counted=False)
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, not to be written to.
+
+    What Arrow decoded is so already, what NumPy computed is not; a kernel that can get either, array by array, would
+    be compiled for each mixture.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _compiled(function: Kernel, *, forceinline: bool, counted: bool = True) -> Kernel:

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from roadscan.kernels.flat_profiles import georeference_flat_profiles
 from roadscan.kernels.georeference import FATES
+from roadscan.kernels.options import read_only
 from roadscan.kernels.placed_points import georeference_mirror, georeference_returns
 from roadscan.model.crs import Geoid, MapFrame, world_frame_of
 from roadscan.model.errors import CrsError
@@ -267,7 +268,7 @@ class Placement:
                 )  # fmt: skip
             else:
                 readings = slice(rows.start * geometry.readings, rows.stop * geometry.readings)
-                ranges = _lists(piece, "range", geometry.readings) if road is None else road.ranges[rows]
+                ranges = _lists(piece, "range", geometry.readings) if road is None else read_only(road.ranges[rows])
                 out = (
                     own.rows, own.readings, own.tiles, own.quanta, work.fates,
                     _NO_MARKS if classes is None else classes[readings],

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.block_ranges import block_ranges
+from roadscan.kernels.options import read_only
 from roadscan.kernels.reach import reach_of_profiles, reach_of_returns
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import Trajectory
@@ -104,13 +105,14 @@ class Reach:
             group = np.repeat(np.arange(starts.size - 1), np.diff(starts))
             order = np.lexsort((epochs, group))
             epochs, low, high = epochs[order], low[order], high[order]
+        low, high = read_only(low), read_only(high)
         scale = (float(geometry.range_offset_m), float(geometry.range_step_m))
         limits = (float(self.range_min_m), float(self.range_max_m))
         pieces = self._pieces(spans, geometry)
 
         parts = [
             reach_of_profiles(
-                epochs, low, high, np.clip(starts, rows.start, rows.stop), pieces, scale, limits,
+                read_only(epochs), low, high, np.clip(starts, rows.start, rows.stop), pieces, scale, limits,
                 float(geometry.reading_period_ns), *self._common(mounting),
             )
             for rows, mounting in self.mountings.pieces(epochs)

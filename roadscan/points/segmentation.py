@@ -51,6 +51,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.kernels.options import read_only
 from roadscan.kernels.segmentation import segment_profiles
 from roadscan.model.segmentation import SegmentationConfig
 from roadscan.points.readings import ScanGeometry
@@ -83,7 +84,7 @@ def segmented(
     directions_y, directions_z = (np.ascontiguousarray(rays[1][:, a]) for a in (1, 2))
     classes = np.empty(ranges.shape, np.uint8)
     segment_profiles(
-        np.ascontiguousarray(ranges), origins_y, origins_z, directions_y, directions_z,
+        read_only(np.ascontiguousarray(ranges)), origins_y, origins_z, directions_y, directions_z,
         (geometry.range_offset_m, geometry.range_step_m), geometry.raw_limits(range_min_m, range_max_m),
         _numbers(settings), classes,
     )  # fmt: skip

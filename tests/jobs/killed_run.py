@@ -16,6 +16,8 @@ import psutil
 
 from roadscan.cli import main
 from roadscan.jobs import stages
+from roadscan.products.base import products
+from roadscan.sensors.base import log_formats
 
 
 def run_for(seconds: float) -> str:
@@ -51,7 +53,7 @@ def _status_of(child: int, options: int) -> str | None:
 
 
 if __name__ == "__main__":
-    assert stages.STAGES
+    assert stages.STAGES and log_formats() and products()
     for line in sys.stdin:
         sys.stdout.write(f"{run_for(float(line))}\n")
         sys.stdout.flush()

@@ -34,8 +34,8 @@ from tests.conftest import REPOSITORY
 
 from .conftest import Simulated, outputs
 
-LONGEST_S = 5.0
-"""Processor time within which a run is killed: one that has nothing to do takes 2 s, a whole one 9 s."""
+LONGEST_S = 4.0
+"""Processor time within which a run is killed: one that has nothing to do takes 1 s, a whole one 7 s."""
 
 
 def assert_same_files(a: Store, b: Store) -> None:

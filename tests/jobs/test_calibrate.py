@@ -49,7 +49,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = scene.changed(
         lidar={"on": False}, sick={"on": False}, camera={"on": False}, gnss={"on": False}, encoder={"on": False},
         imu={"on": False}, passes=[one.model_dump() for one in scene.passes[1:]],
-        profilers={"readings": 200},
+        profilers={"readings": 400},
     )  # fmt: skip
     made = simulate(scene, tmp_path_factory.mktemp("yard") / "survey")
     survey = Survey.load(made.survey_file)

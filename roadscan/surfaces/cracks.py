@@ -91,6 +91,9 @@ def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiec
     Neighbouring windows give pieces that meet at common cells and do not overlap. None is left out for its length:
     that is known when all are joined.
     """
+    window = needed_part(window, config)
+    if not window.raw_m.size:
+        return []
     found = find_valleys(window, config)
     graph = pruned(found.skeleton, _spur_cells(config, window.cell_m))
     if not graph.edges.size:
@@ -99,6 +102,17 @@ def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiec
     first = graph.edges[:, 0]
     own = window.is_inner(graph.row[first], graph.column[first])
     return [_piece(path, graph, sections, window) for path in graph.paths(own)]
+
+
+def needed_part(window: HeightWindow, config: CrackDetection) -> HeightWindow:
+    """The part of a window on which its pieces depend: near its inner cells, and near what was measured there."""
+    halo = halo_cells(config, window.cell_m)
+    own = window.inner()
+    part = window.part(*((max(s.start - halo, 0), s.stop + halo) for s in own))
+    known = ~np.isnan(part.raw_m)
+    border = valleys.border_cells(config, window.cell_m)
+    spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    return part.part(*((int(at[0]) - border, int(at[-1]) + 1 + border) if at.size else (0, 0) for at in spans))
 
 
 def sharpened(width_cells: Float64, depth_m: Float64) -> tuple[Float64, Float64]:

@@ -88,6 +88,11 @@ def halo_cells(config: CrackDetection, cell_m: float) -> int:
     return lines + 2 * _texture_half(cell_m) + LINE_HALF + _GROWTHS + 2 + 4 * _thinnings(config, cell_m)
 
 
+def border_cells(config: CrackDetection, cell_m: float) -> int:
+    """Cells beyond the last that was measured, on which the skeleton may depend where all beyond is empty."""
+    return LINE_HALF + _FAR * flank_cells(config, cell_m)[-1] + _MEASURED_HALF + 1
+
+
 def find_valleys(window: HeightWindow, config: CrackDetection) -> Valleys:
     """Valleys and the skeleton of a window. Along the border, as wide as a line and its flanks, nothing is found."""
     cell_m = window.cell_m

@@ -19,10 +19,10 @@ from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.crack_network import join_cracks
 from roadscan.surfaces.crack_parts import bridges
-from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells, sharpened
+from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.skeleton_graph import SkeletonGraph, pruned
-from roadscan.surfaces.valleys import _thinned
+from roadscan.surfaces.valleys import _thinned, find_valleys
 
 CONFIG, JOINING = CrackDetection(), CrackJoining()
 CELL_M = 0.0025
@@ -192,6 +192,23 @@ def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
     assert [
         (c.kind, c.junctions, c.ends, c.polygons, c.depth_max_m, c.width_max_m, c.length_m) for c in again
     ] == figures
+
+
+def test_what_is_empty_is_not_looked_at_and_changes_nothing():
+    config = CrackDetection(max_width_m=0.02)
+    y, x = np.indices((500, 520))
+    height = 560 - 0.008 * (np.abs((0.96 * x + 0.28 * y) % 50 - 25) < 1.5)
+    height[(y < 210 + 0.1 * x) | (y > 300 + 0.1 * x) | (x < 180) | (x > 400)] = np.nan  # a road that ends
+    whole = drawn(height, first=(7_000, 9_000), halo=halo_cells(config, 0.005))
+    part = needed_part(whole, config)
+    assert part.raw_m.shape < (260, 320)
+    low = part.first_row - whole.first_row, part.first_column - whole.first_column
+    own = tuple(slice(a, a + n) for a, n in zip(low, part.raw_m.shape, strict=True))
+    expected, found = find_valleys(whole, config), find_valleys(part, config)
+    assert found.skeleton.sum() > 300 and expected.skeleton.sum() == found.skeleton.sum()
+    assert (expected.skeleton[own] == found.skeleton).all()
+    for name in ("depth_m", "direction", "flank"):
+        assert (getattr(expected, name)[own] == getattr(found, name))[found.skeleton].all()
 
 
 def piece(start, end):

@@ -87,7 +87,7 @@ def geodetic(x, y, z):
     return s_lat, c_lat, s_lon, c_lon, height
 
 
-@inlined
+@kernel
 def gravity_at(x, y, z):
     """Normal gravity (m/s², downwards positive) and the upward unit vector, ECEF.
 

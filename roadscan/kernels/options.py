@@ -1,36 +1,23 @@
-"""The one place that sets compiler options.
-
-Kernels are serial and release the GIL: parallelism comes from Dask over blocks. `fastmath` stays off,
-so that the order of operations, and with it every bit of the result, is the same everywhere.
-
-Compiled code is cached on disk, in a folder named after the hash of a module's source and of the kernels that it
-imports: Numba itself looks only at the file a function stands in, and would keep a kernel whose inlined parts have
-changed elsewhere.
-"""
+"""The kinds of kernels there are; parallelism comes from Dask over blocks, never from inside a kernel."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import hashlib
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy.typing as npt
 
-from roadscan.kernels.compiled_once import compile_once
-from roadscan.registers import use_whole_registers
+from roadscan.compiler import cache_folder, compiled
 
 Kernel = Callable[..., Any]
 
 
 def kernel(function: Kernel) -> Kernel:
-    """Compile a loop over arrays once per machine, without the GIL."""
-    return _compiled(function, forceinline=False)
+    """Compile a loop over arrays."""
+    return compiled(function, _folder_of(function), inlined=False, counted=True)
 
 
 def bare(function: Kernel) -> Kernel:
@@ -39,17 +26,17 @@ def bare(function: Kernel) -> Kernel:
     To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     take as long for that as for the readings.
     """
-    return _compiled(function, forceinline=False, counted=False)
+    return compiled(function, _folder_of(function), inlined=False, counted=False)
 
 
 def inlined(function: Kernel) -> Kernel:
     """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
-    return _compiled(function, forceinline=True)
+    return compiled(function, _folder_of(function), inlined=True, counted=True)
 
 
 def bare_inlined(function: Kernel) -> Kernel:
     """Compile a piece of a `bare` kernel into it; it makes no array either."""
-    return _compiled(function, forceinline=True, counted=False)
+    return compiled(function, _folder_of(function), inlined=True, counted=False)
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -63,23 +50,13 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return view
 
 
-def _compiled(function: Kernel, *, forceinline: bool, counted: bool = True) -> Kernel:
-    before = numba.config.CACHE_DIR
-    folder = _cache_folder(function.__code__.co_filename)
-    numba.config.CACHE_DIR = folder  # read when the function is decorated
-    try:
-        decorate = numba.njit(nogil=True, cache=True, error_model="numpy", forceinline=forceinline, _nrt=counted)
-        compiled: Kernel = decorate(function)
-    finally:
-        numba.config.CACHE_DIR = before
-    if not numba.config.DISABLE_JIT:
-        compile_once(compiled, folder)
-    return compiled
+def _folder_of(function: Kernel) -> str:
+    return _folder_of_source(function.__code__.co_filename)
 
 
 @functools.cache
-def _cache_folder(source: str) -> str:
-    """Folder for the compiled kernels of a source file."""
+def _folder_of_source(source: str) -> str:
+    """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
     here = Path(__file__).parent
     unseen, seen = [Path(source), Path(__file__)], set[Path]()
     while unseen:
@@ -87,15 +64,7 @@ def _cache_folder(source: str) -> str:
         if file not in seen:
             seen.add(file)
             unseen += [here / f"{name}.py" for name in _IMPORTED_KERNELS.findall(file.read_text(encoding="utf-8"))]
-    digest = hashlib.blake2b(digest_size=6)
-    for file in sorted(seen, key=lambda file: file.name):
-        digest.update(file.read_bytes())
-    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "roadscan" / f"kernels-{digest.hexdigest()}"
-    with contextlib.suppress(OSError):  # not writable: Numba says so, or looks for another place
-        folder.mkdir(parents=True, exist_ok=True)
-    return str(folder)
+    return cache_folder("kernels", seen)
 
 
 _IMPORTED_KERNELS = re.compile(r"^from roadscan\.kernels\.(\w+) import", re.MULTILINE)
-use_whole_registers()

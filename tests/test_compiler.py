@@ -1,6 +1,6 @@
-"""Two processes on one empty cache: Numba's own count of what each had to compile.
+"""How loops are compiled: Numba's own counts of what had to be, on empty caches.
 
-One of them meets the simulator first: both have to compile for the same processor.
+Of two processes one meets the simulator first: both have to compile for the same processor.
 """
 
 from __future__ import annotations
@@ -39,3 +39,33 @@ def test_one_process_compiles_and_the_others_load(tmp_path: Path) -> None:
         process.stdin.flush()
     said = sorted(process.communicate()[0].strip() for process in processes)
     assert said == ["0 2.0", "1 2.0"]  # the square's slope at 1, computed by both
+
+
+PARTS = """
+from roadscan.kernels.options import inlined, kernel
+
+@inlined
+def one_more(count):
+    return count + 1
+
+@kernel
+def up_to(n):
+    count = 0
+    while count < n:
+        count = one_more(count)
+    return one_more(0) + count
+
+print(up_to(3), len(one_more.overloads))
+try:
+    one_more(3)
+except TypeError as error:
+    print(error)
+"""
+
+
+def test_a_written_number_makes_no_second_variant_and_a_part_is_not_called_from_python(tmp_path: Path) -> None:
+    (tmp_path / "parts.py").write_text(PARTS, encoding="utf-8")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, str(tmp_path / "parts.py")]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    assert said.startswith("4 1\none_more is compiled into its callers only")

@@ -1,0 +1,130 @@
+"""How a loop is compiled: with which options, for which types, where it is kept, and by which process.
+
+Compiled code is cached on disk, in a folder named after the hash of the sources that it was made from: Numba itself
+looks only at the file a function stands in, and would keep one whose inlined parts have changed elsewhere.
+
+Among processes that share a cache, one compiles a function; the others wait for it and load it. Workers that begin on
+an empty cache want the same functions at the same moment. Without a lock each of them compiles all of them, and of two
+that store variants of one function at once, Numba's index keeps only one. A process waits for a function's lock with
+at most the locks of that function's callers in hand, and functions do not call one another in circles: nobody waits
+for ever. The system gives back the locks of a process that dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import llvmlite.binding
+import numba
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+
+try:
+    import fcntl
+except ImportError:  # no such locks on this system: each process compiles for itself
+    fcntl = None  # type: ignore[assignment]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -> Function:
+    """Compile a loop over arrays once per machine, serially, without the GIL.
+
+    `fastmath` stays off, so that the order of operations, and with it every bit of the result, is the same everywhere.
+
+    Parameters
+    ----------
+    folder : from :func:`cache_folder`.
+    inlined : only ever into the compiled functions that call it; it gets no entry for Python, which would take longer
+        to make than the function itself.
+    counted : references to arrays are counted; a function that makes no array needs none.
+    """
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = folder  # read when the function is decorated
+    try:
+        made = numba.njit(
+            nogil=True, cache=True, error_model="numpy", forceinline=inlined, _nrt=counted,
+            no_cpython_wrapper=inlined, no_cfunc_wrapper=True,
+        )(function)  # fmt: skip
+    finally:
+        numba.config.CACHE_DIR = before
+    if not numba.config.DISABLE_JIT:
+        _compile_once(made, folder)
+        if inlined:
+            made.__class__ = _Part
+    return cast("Function", made)
+
+
+def cache_folder(kind: str, sources: Iterable[Path]) -> str:
+    """Folder for what is compiled from these files; made where it is not there."""
+    digest = hashlib.blake2b(digest_size=6)
+    for file in sorted({*sources, Path(__file__)}, key=lambda file: file.name):
+        digest.update(file.read_bytes())
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "roadscan" / f"{kind}-{digest.hexdigest()}"
+    with contextlib.suppress(OSError):  # not writable: Numba says so, or looks for another place
+        folder.mkdir(parents=True, exist_ok=True)
+    return str(folder)
+
+
+class _Part(CPUDispatcher):  # type: ignore[misc]
+    """A piece of compiled functions. Called from Python, where it has no entry, it would end the process."""
+
+    def __call__(self, *_: object, **__: object) -> None:
+        raise TypeError(f"{self.py_func.__name__} is compiled into its callers only; Python calls a kernel")
+
+
+def _compile_once(dispatcher: Any, folder: str) -> None:
+    """Let a function compile, or load what is compiled, with a lock of its own in the folder.
+
+    A literal number counts as its type: Numba would compile a function, and all that it calls, once for a `0` that is
+    written out and once more for the variable that it grows into.
+    """
+    function = dispatcher.py_func
+    path = f"{folder}/{function.__module__}.{function.__qualname__}.lock"
+    compile_now: Callable[[Any], Any] = dispatcher.compile
+    inside = False
+
+    def compile_alone(signature: Any) -> Any:
+        nonlocal inside
+        signature = tuple(numba.types.unliteral(kind) for kind in signature)
+        with global_compiler_lock:  # first the threads of this process, or two of them wait for each other
+            if inside:
+                return compile_now(signature)
+            with _locked(path):
+                inside = True
+                try:
+                    return compile_now(signature)
+                finally:
+                    inside = False
+
+    dispatcher.compile = compile_alone
+
+
+@contextlib.contextmanager
+def _locked(path: str) -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):  # a folder that cannot be written, or has no locks
+                fcntl.flock(stack.enter_context(open(path, "a")), fcntl.LOCK_EX)  # noqa: PTH123
+        yield
+
+
+def _use_whole_registers() -> None:
+    """Let the compiler use all 512 bits of a register where there are that many; it prefers 256 for old machines.
+
+    The processor is part of every compiled function's key, and settled when a process decorates its first one.
+    """
+    host = llvmlite.binding.get_host_cpu_features()
+    if host.get("avx512f") and "NUMBA_CPU_FEATURES" not in os.environ:
+        os.environ.setdefault("NUMBA_CPU_NAME", llvmlite.binding.get_host_cpu_name())
+        os.environ["NUMBA_CPU_FEATURES"] = host.flatten() + ",-prefer-256-bit"
+        numba.config.reload_config()
+
+
+_use_whole_registers()

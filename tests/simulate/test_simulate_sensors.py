@@ -305,7 +305,10 @@ def test_a_sensors_clock_shifts_its_stamps_alone(tmp_path: Path):
 
 def test_rig_file_states_nominal_mountings(tmp_path: Path):
     off = {"on": False}
-    scene = Scene.load("calibration_yard").changed(lidar=off, sick=off, camera=off)
+    scene = Scene.load("calibration_yard").changed(
+        lidar=off, sick=off, camera=off, profilers={"spacing_m": 0.5, "readings": 20}, vehicle={"standstill_s": 1.0},
+        passes=[{"route": {"station_m": 5.0, "offset_m": 0.0, "pieces": [{"length_m": 10.0}]}}],
+    )  # fmt: skip
     rig = Survey.load(simulate(scene, tmp_path / "s").survey_file).rig
     in_truth = Rig.load(truth.load(tmp_path / "s").rig_file)
     assert in_truth.sensors["profiler_left"].boresight.roll_deg == 0.7

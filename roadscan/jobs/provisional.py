@@ -9,10 +9,11 @@ line that the survey file has to state. Nothing of this reaches ingest.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -191,6 +192,11 @@ def open_log(log_format: LogFormat, path: Path, stated: Stated, trials: int = MO
     return found
 
 
+@functools.cache
+def _clock(system: TimeSystem, unit: str, week: int | None) -> Clock:
+    return Clock(system, unit=unit, week=week)
+
+
 class _Search:
     """Depth first: each refusal is answered with what may mend it."""
 
@@ -199,7 +205,7 @@ class _Search:
         self._path = path
         self._stated = stated
         self._trials = trials
-        self._seen: set[str] = set()
+        self._seen: set[Hashable] = set()
         self.first_error: RoadscanError | None = None
 
     def run(self, trial: Stated, asked: dict[Dimension, RoadscanError]) -> OpenedLog | None:
@@ -209,9 +215,10 @@ class _Search:
         ----------
         asked : the refusal that first led to a change, by what was changed.
         """
-        if len(self._seen) >= self._trials or repr(trial) in self._seen:
+        known = (trial.clock, trial.crs, trial.height, trial.geoid, repr(trial.options), repr(trial.sensor))
+        if known in self._seen:
             return None
-        self._seen.add(repr(trial))
+        self._seen.add(known)
         error = self._refusal(trial)
         if error is None:
             return self._opened(trial, asked)
@@ -222,6 +229,8 @@ class _Search:
             return self._opened(fitting, asked)
         own: Iterator[tuple[Dimension, Stated]] = (("proposal", one) for one in proposals)
         for dimension, changed in itertools.chain(own, self._changes(trial, error)):
+            if len(self._seen) >= self._trials:
+                return None
             found = self.run(changed, {dimension: error} | asked)
             if found is not None:
                 return found
@@ -297,7 +306,7 @@ class _Search:
         for system in dict.fromkeys(systems):
             if system is not TimeSystem.UTC_HOUR:
                 week = 0 if system is TimeSystem.GPS_WEEK else None
-                yield from (dataclasses.replace(trial, clock=Clock(system, unit=u, week=week)) for u in units)
+                yield from (dataclasses.replace(trial, clock=_clock(system, u, week)) for u in units)
 
     def _frames(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
         if self._stated.crs is None:

@@ -28,7 +28,7 @@ _CHORD_M = 0.1
 _BESIDE_NET_M = 0.25
 """What hangs on a net and has its middle no farther from the net's hull is its fringe."""
 _LEAST_SHARE = 0.6
-"""What has the cross-section of a crack over less of its length is an edge or a row of pits."""
+"""What has the cross-section of a crack over less of its length, gaps left out, is an edge or a row of pits."""
 _ONE_NODE_CELLS = 4.0
 """Junctions closer than this are one: thinning makes two of a crossing."""
 
@@ -96,8 +96,11 @@ def join_cracks(
     ends = np.array([[number[one.start], number[one.end]] for one in pieces])
     nodes = _Nodes.of(ends, np.array([p.length_m for p in pieces]), len(names), cell_m)
     turned = _Turned.of(pieces, azimuth, config)
+    bridged_m = np.array([0.0] * seen + [one.length_m for one in bridges])
     networks = grouped(np.arange(len(pieces)), components(ends))
-    whole = [own for own in networks if _is_crack([pieces[k] for k in own.tolist()], config)]
+    whole = [
+        own for own in networks if _is_crack([pieces[k] for k in own[own < seen].tolist()], bridged_m[own], config)
+    ]
     parted = [_parts(own, pieces, nodes, turned, config) for own in whole]
     found = [deep for parts in parted if (deep := [c for c in parts if not c.depth_mean_m < config.min_depth_m])]
     found.sort(key=lambda parts: min(c.line.bounds[1::-1] for c in parts))
@@ -107,9 +110,11 @@ def join_cracks(
     return sorted(numbered, key=lambda c: c.line.bounds[1::-1])
 
 
-def _is_crack(network: Sequence[CrackPiece], config: CrackJoining) -> bool:
+def _is_crack(network: Sequence[CrackPiece], bridged_m: Float64, config: CrackJoining) -> bool:
+    """Whether pieces are a crack, with gaps between them of so many metres in all."""
     length, measured = sum(p.length_m for p in network), sum(p.measured_m for p in network)
-    return length >= config.min_length_m and measured > 0.0 and measured >= _LEAST_SHARE * length
+    long = length + float(bridged_m.sum()) >= config.min_length_m
+    return long and measured > 0.0 and measured >= _LEAST_SHARE * length
 
 
 @dataclass(frozen=True)

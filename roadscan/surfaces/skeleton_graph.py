@@ -57,9 +57,9 @@ class SkeletonGraph:
         return [beside[a:b] for a, b in itertools.pairwise(cuts)]
 
     def spurs(self, cells: int) -> list[int]:
-        """Cells of branches that end within `cells` of a junction."""
+        """Cells of branches that end within `cells` of a junction; the longest goes on where no other branch does."""
         beside = self.neighbours()
-        found: list[int] = []
+        at: dict[int, list[list[int]]] = {}
         for end in np.flatnonzero(self.degree == 1).tolist():
             path, before, here = [end], -1, end
             while len(path) <= cells and len(beside[here]) <= 2:
@@ -69,7 +69,12 @@ class SkeletonGraph:
                 before, here = here, onward[0]
                 path.append(here)
             if len(beside[here]) > 2:
-                found += path[:-1]
+                at.setdefault(here, []).append(path[:-1])
+        found: list[int] = []
+        for junction, paths in at.items():
+            paths.sort(key=lambda path: (-len(path), path[0]))
+            goes_on = len(beside[junction]) - len(paths) >= 2
+            found += [k for path in paths[0 if goes_on else 1 :] for k in path]
         return found
 
     def smoothed(self, place: Float64) -> Float64:

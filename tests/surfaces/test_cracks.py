@@ -332,6 +332,23 @@ def test_thinning_keeps_the_topology_that_scipy_counts():
         assert not (thin & (blobs == 0)).any()
 
 
+def test_the_end_of_a_crack_that_frays_goes_on_as_the_longer_branch():
+    cells = np.zeros((40, 40), bool)
+    cells[20, 3:31] = True
+    cells[21:24, 25] = True  # five cells on, three to the side
+    graph = pruned(cells, 8)
+    assert (graph.degree == 1).sum() == 2
+    assert sorted(zip(graph.row.tolist(), graph.column.tolist(), strict=True)) == [(20, c) for c in range(3, 31)]
+
+
+def test_gaps_do_not_count_as_what_has_no_cross_section():
+    parts = [piece((10 * k, 100), (10 * k + 5, 100)) for k in range(9)]
+    parts = [replace(p, measured_m=0.7 * p.length_m) for p in parts]
+    (one,) = join_cracks(parts, 0.0, 0.01, JOINING)
+    assert one.length_m == pytest.approx(0.85) and one.measured_share == pytest.approx(0.7 * 0.45 / 0.85)
+    assert join_cracks([replace(p, measured_m=0.5 * p.length_m) for p in parts], 0.0, 0.01, JOINING) == []
+
+
 def test_spurs_go_and_branches_stay():
     cells = np.zeros((40, 40), bool)
     cells[20, 3:37] = True

@@ -23,6 +23,11 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000)
 
 
+def pytest_unconfigure() -> None:
+    """Let it look again, or DuckDB tells of all that is left at the end."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session")
 def recordings() -> Path:
     """Folder of the real recordings; the test is skipped where it is absent."""

@@ -346,7 +346,7 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     assert not points.store.files("tables/regions")
 
 
-def test_workers_change_no_byte_of_cracks_and_potholes(points: Reconstructed, tmp_path: Path) -> None:
+def test_workers_change_no_byte_of_a_pothole_on_the_border_of_tiles(points: Reconstructed, tmp_path: Path) -> None:
     scene = load(points.simulated.survey_file.parent).scene
     place, azimuth = scene.map, np.radians(scene.map.azimuth_deg)
     station, offset = POTHOLE["station_m"], POTHOLE["offset_m"]  # on the border of two tiles

@@ -17,6 +17,7 @@ from roadscan.jobs.readings import MOUNTINGS
 from roadscan.model.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.model.errors import ConfigError, RunError, nearest
 from roadscan.model.gpstime import gps_ns_from_utc
+from roadscan.model.ids import ALL_RUNS
 from roadscan.model.survey import Survey
 from roadscan.navigation.calibration.estimator import Calibration, Prior, calibrate
 from roadscan.navigation.calibration.evidence import Directions, Evidence, Orientation, Ties, Traverse
@@ -28,7 +29,6 @@ from roadscan.tables.store import Store
 
 Report = Callable[[str], None]
 
-ALL_RUNS: Final = "*"
 _HELD: Final = 0.9
 """A σ above this share of the prior's is the prior's."""
 PICTURE: Final = "products/calibration/calibration.png"

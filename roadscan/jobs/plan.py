@@ -24,7 +24,7 @@ from roadscan.jobs.readings import (
 from roadscan.jobs.road import check_road, road_of
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.gpstime import utc_from_gps_ns
-from roadscan.model.ids import LanePass, RunId
+from roadscan.model.ids import LanePass, RunId, of_run
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.survey import Survey
 from roadscan.points.place import HeightLimits
@@ -123,7 +123,7 @@ def _sources(
             sensor = survey.rig.sensors.get(record.sensor)
             nominal = sensor.mounting() if sensor else _UNMOUNTED
             mountings = mountings_of(record.run, record.sensor, nominal, calibrated)
-            clock = clocks.get((record.run, record.sensor)) or clocks.get(("*", record.sensor))
+            clock = of_run(clocks, record.run, record.sensor)
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
                 code_version(),
@@ -155,7 +155,7 @@ def mountings_of(
     run: str, sensor: str, nominal: Mounting, calibrated: Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
 ) -> Mountings:
     """The rig file's mounting of a sensor, until the first calibrated one of its run (or of all), and so on."""
-    dated = list(calibrated.get((run, sensor)) or calibrated.get(("*", sensor)) or [])
+    dated = list(of_run(calibrated, run, sensor) or [])
     if not dated or dated[0][0] > 0:
         dated = [(0, nominal), *dated]
     return Mountings(tuple(since for since, _ in dated), tuple(mounting for _, mounting in dated))

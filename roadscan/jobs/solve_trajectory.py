@@ -20,6 +20,7 @@ from roadscan.jobs.navigation_logs import (
     odometer_readings,
     vehicle_sensors,
 )
+from roadscan.model.ids import of_run
 from roadscan.model.survey import Survey
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.inertial.checks import prepared
@@ -118,7 +119,7 @@ def plan_solutions(survey: Survey, store: Store, records: Sequence[LogRecord]) -
         if not logs.imu or not logs.gnss:
             continue
         sensors = sorted({r.sensor for r in logs.records})
-        own = tuple((s, c) for s in sensors if (c := clocks.get((run, s)) or clocks.get(("*", s))) is not None)
+        own = tuple((s, c) for s in sensors if (c := of_run(clocks, run, s)) is not None)
         rig = {s: survey.rig.sensors[s].model_dump(mode="json") for s in sensors if s in survey.rig.sensors}
         key = key_of(
             SMOOTHER, solver_version(), run, [r.key for r in logs.records], rig, own,

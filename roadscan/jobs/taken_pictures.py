@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.clock_tables import load_clocks
 from roadscan.jobs.readings import read_groups
+from roadscan.model.ids import of_run
 from roadscan.tables.logs import LogRecord
 from roadscan.tables.store import Store
 
@@ -36,7 +37,7 @@ def taken_pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> l
     for record in records:
         if record.sensor != sensor:
             continue
-        clock = clocks.get((record.run, sensor)) or clocks.get(("*", sensor))
+        clock = of_run(clocks, record.run, sensor)
         for file in record.tables.get("images", ()):
             rows = read_groups(store, file.path, range(len(file.group_rows)), _COLUMNS)
             epochs = rows.column("epoch_gps_ns").to_numpy()

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NewType, Self
+from typing import Final, NewType, Self, TypeVar
 
 from roadscan.model.errors import ConfigError
 
 RunId = NewType("RunId", str)
 """One recorded drive, from switching on to switching off."""
+
+ALL_RUNS: Final = "*"
+"""Stands for every run in what holds for a sensor: its mounting, its clock."""
+
+_Held = TypeVar("_Held")
+
+
+def of_run(held: Mapping[tuple[str, str], _Held], run: str, sensor: str) -> _Held | None:
+    """What holds for a sensor in a run, of values by run and sensor: the run's own, else that of all runs."""
+    return held.get((run, sensor)) or held.get((ALL_RUNS, sensor))
+
 
 PassId = NewType("PassId", int)
 """Number of one traverse of a lane, 1–65,535; the `point_source_id` of LAS."""

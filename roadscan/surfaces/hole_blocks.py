@@ -87,19 +87,17 @@ class Blocks:
 
     def of_cells(self, values: npt.NDArray[Any], window: HeightWindow) -> npt.NDArray[Any]:
         """Each cell of a window the value of its block, NaN beyond the blocks."""
-        padded = np.pad(values, 1, constant_values=np.nan)
-        places = zip(window.raw_m.shape, (window.first_row, window.first_column), self.first, padded.shape, strict=True)
-        block = [np.clip((np.arange(n) + cell) // self.size - first + 1, 0, m - 1) for n, cell, first, m in places]
+        padded, places = self._placed(values, window)
+        block = [np.clip(cells // self.size + 1, 0, m - 1) for cells, m in places]
         return np.asarray(padded[np.ix_(*block)])
 
     def below_ground_m(self, window: HeightWindow) -> Float64:
         """Depth of each cell below the ground, bilinear between the middles of blocks; NaN where no hole is near."""
         ground = self._ground_m()
-        padded = np.pad(ground, 1, constant_values=np.nan)
-        places = zip(window.raw_m.shape, (window.first_row, window.first_column), self.first, padded.shape, strict=True)
+        padded, places = self._placed(ground, window)
         low, share = [], []
-        for n, cell, first, limit in places:
-            place = (np.arange(n) + (cell - first * self.size) + 0.5) / self.size + 0.5
+        for cells, limit in places:
+            place = (cells + 0.5) / self.size + 0.5
             whole = np.clip(np.floor(place), 0, limit - 2)
             low.append(whole.astype(np.int64))
             share.append(np.clip(place - whole, 0.0, 1.0))
@@ -108,6 +106,12 @@ class Blocks:
         level = level + (u * (1 - v) * padded[np.ix_(i + 1, j)] + u * v * padded[np.ix_(i + 1, j + 1)])
         nearest = self.of_cells(ground, window)
         return np.asarray(np.where(np.isnan(level), nearest, level) - window.height_m)
+
+    def _placed(self, values: npt.NDArray[Any], window: HeightWindow) -> tuple[Float64, list[tuple[Int64, int]]]:
+        """Values with a border of NaN; by axis the window's cells from the first block on, and how many values."""
+        padded = np.pad(values, 1, constant_values=np.nan)
+        starts = zip(window.raw_m.shape, (window.first_row, window.first_column), self.first, padded.shape, strict=True)
+        return padded, [(np.arange(n) + (cell - first * self.size), m) for n, cell, first, m in starts]
 
     def _ground_m(self) -> Float64:
         """Ground of the blocks near deep ones."""

@@ -54,7 +54,7 @@ _STEEPEST = 0.25
 _UNKNOWN = -90_000_000
 """Height of what is not known, below all others: it lowers no flank (no rise) and makes none."""
 _GROWTHS, _LEAP = 20, 7
-"""Steps of growth of a cell each; every so manieth leaps over a cell."""
+"""Steps of growth of a cell each; every seventh leaps over a cell."""
 _MEASURED_HALF = 3
 _MEAN_TO_SIGMA = 1.2533
 """σ of normal values over the mean of their absolutes."""

@@ -81,7 +81,7 @@ class Pool:
         needed = int(self.held[0]) + elements
         if needed <= self.size:
             return True
-        size = max(needed, self.size * 3 // 2)
+        size = max(needed, self.size * 4)  # memory that is never written takes none, and what is copied costs
         each = self.bytes // self.size
         if size * each > most_bytes:
             size = most_bytes // each

@@ -148,8 +148,10 @@ def take(group, slots, tiles, weights, count, made, out_tiles, out_readings):
     if made + max(count, 0) > out_readings.size:
         size = 2 * (made + count)
         more_tiles, more_readings = np.empty((size, 3), np.int64), np.empty(size, np.int64)
-        more_tiles[:made] = out_tiles[:made]
-        more_readings[:made] = out_readings[:made]
+        for i in range(made):  # a slice's assignment takes four seconds to compile, for the text of its error
+            more_readings[i] = out_readings[i]
+            for k in range(3):
+                more_tiles[i, k] = out_tiles[i, k]
         out_tiles, out_readings = more_tiles, more_readings
     for i in range(count):
         out_tiles[made, 0] = group

@@ -1,12 +1,12 @@
-"""Readings with an epoch each, placed chunk by chunk and put on the piles of their tiles' rows."""
+"""Readings with an epoch each, placed chunk by chunk, or points of a tile, put on the piles of their tiles' rows."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import bare, kernel
 from roadscan.kernels.placing import CHUNK, place_mirror, place_returns
-from roadscan.kernels.row_piles import TAKEN, pile_up
+from roadscan.kernels.row_piles import TAKEN, pile_up, put_on_own_piles
 
 
 @kernel
@@ -94,3 +94,42 @@ def pile_mirror(
             ends, piles, fates,
         )  # fmt: skip
     return profile_epochs.size
+
+
+@bare
+def cells_in_tile(x, y, per_cell, column, row):
+    """Cells (n,) int32, out, of points; x, y : (n,) int32, quanta from the tile's south-west corner."""
+    for j in range(x.size):
+        column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
+        row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))
+
+
+@kernel
+def pile_points(x, y, height, passes, intensity, cell_quanta, ends, piles, first):
+    """Put the points of one tile on its piles.
+
+    Parameters
+    ----------
+    x, y, height : (n,) int32, quanta, x and y from the tile's south-west corner.
+    passes : (n,) int32, number of each point's pass among the accumulator's; best few after one another.
+    intensity : (n,) uint16.
+    ends : (edge,) int32, in/out, of the tile; piles : as in ``row_piles.put_on_piles``.
+    first : int, point to begin with.
+
+    Returns
+    -------
+    int, the point before which the piles ran short of free blocks; n at the end.
+    """
+    column, row = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
+    start = first
+    while start < x.size:
+        if piles[4].size - piles[5][TAKEN] < CHUNK:
+            return start
+        end, last = start, min(start + CHUNK, x.size)
+        while end < last and passes[end] == passes[start]:
+            end += 1
+        n = end - start
+        cells_in_tile(x[start:end], y[start:end], 1.0 / cell_quanta, column, row)
+        put_on_own_piles(column[:n], row[:n], height[start:end], intensity[start:end], passes[start], ends, piles)
+        start = end
+    return start

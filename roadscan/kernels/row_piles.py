@@ -128,6 +128,28 @@ def put_on_piles(
 
 
 @bare
+def put_on_own_piles(column, row, height, intensity, number, ends, piles):
+    """Put readings of one pass on the piles of the tile that all of them lie in.
+
+    column, row, height : (n,) int32; intensity : (n,) uint16; number : int, of the pass; ends : (edge,) int32, in/out,
+    of the tile; piles : as in :func:`put_on_piles`.
+    """
+    records, before, sizes, owners, free, held = piles
+    if held[PASS] != number:
+        close_piles(ends, sizes)
+        held[PASS] = number
+    for i in range(np.uint64(column.size)):
+        pile = np.uint64(row[i])
+        end = np.int64(ends[pile])
+        if end & (BLOCK - 1) == 0:
+            end = new_block(end, number, before, sizes, owners, free, held)
+        light, level = np.uint64(intensity[i]), np.uint64(np.uint32(height[i]))
+        records[np.uint64(end)] = np.uint64(column[i]) | (light << LIGHT_SHIFT) | (level << HEIGHT_SHIFT)
+        fetch_line(records, np.uint64(end + _LINE))
+        ends[pile] = np.int32(end + 1)
+
+
+@bare
 def pile_up(
     east, north, height, classes, epochs, intervals, passes, intensity, gain, corner, cell_quanta, cells, tile_rows,
     spans, sigmas, interval_sigmas, known, ends, piles, fates,

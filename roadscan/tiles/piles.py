@@ -40,7 +40,7 @@ class Piles:
             return True
         if needed * BLOCK_BYTES > most_bytes and self.held[0]:
             return False
-        size = max(needed, min(self.size * 3 // 2, most_bytes // BLOCK_BYTES), _FIRST_BLOCKS)
+        size = max(needed, min(self.size * 4, most_bytes // BLOCK_BYTES), _FIRST_BLOCKS)
         kept = self.arrays[:-1]
         self._make(size)
         for new, old in zip(self.arrays, kept, strict=False):

@@ -95,6 +95,20 @@ def test_order_of_points_changes_no_bit(seed: int, n: int, spread: int) -> None:
             assert value.tobytes() == getattr(b, name).tobytes(), name
 
 
+@pytest.mark.parametrize("changes", [0, 3, 300])
+@pytest.mark.parametrize("spread", [50, 6_000_000])
+def test_points_cell_by_cell_and_in_any_order_give_the_same_bits(changes: int, spread: int) -> None:
+    p = points(2, 40_000, spread)
+    passes = np.sort(p.pass_id) if changes < 4 else p.pass_id
+    p = dataclasses.replace(p, pass_id=np.ones_like(passes) if changes == 0 else passes)
+    order = np.lexsort((p.x_quanta // 50_000, p.y_quanta // 50_000))
+    by_cell = dataclasses.replace(p, **{k: v[order] for k, v in vars(p).items() if isinstance(v, np.ndarray)})
+    a, b = cells_of(by_cell, GRID), cells_of(p, GRID)
+    for name, value in vars(a).items():
+        if isinstance(value, np.ndarray):
+            assert value.tobytes() == getattr(b, name).tobytes(), name
+
+
 def test_raster_is_north_up() -> None:
     ones = np.ones(1, np.uint16)
     p = TilePoints(

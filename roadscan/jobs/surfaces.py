@@ -117,10 +117,12 @@ def _figures(surface: SurfaceTile) -> dict[str, Any]:
     origin = surface.origin[surface.inner]
     change = (surface.height_m - surface.raw_m)[surface.inner]
     known = change[~np.isnan(change)]
+    lowest = 0 if surface.lowest is None else np.count_nonzero(~np.isnan(surface.lowest.drop_m[surface.inner]))
     return {
         "cells": int(np.count_nonzero(origin)),
         "measured": int(np.count_nonzero(origin == MEASURED)),
         "interpolated": int(np.count_nonzero(origin == INTERPOLATED)),
         "filled": int(np.count_nonzero(origin == FILLED)),
+        "lowest_known": int(lowest),
         "change_rms_m": float(np.sqrt(np.mean(known * known))) if known.size else None,
     }

@@ -19,7 +19,8 @@ def fill_bins(heights, i, j, north, east, reach, total, count):
     """Sum and count of the cells around (i, j) by their distance to the right of a line through its middle.
 
     heights : (rows, columns) float64, NaN where none; north, east : unit vector of the line in rows and columns;
-    reach : cells to either side; total, count : (2 BINS reach + 1,) float64, out.
+    reach : cells to either side; total, count : (2 BINS reach + 1,) float64, out. Returns what all heights were
+    lowered by.
     """
     total[:] = 0.0
     count[:] = 0.0
@@ -35,6 +36,7 @@ def fill_bins(heights, i, j, north, east, reach, total, count):
             if abs(along) <= HALF_ALONG and 0 <= k < total.size and not math.isnan(z):
                 total[k] += z - base
                 count[k] += 1.0
+    return base
 
 
 @kernel
@@ -52,15 +54,15 @@ def mean_between(total, count, first, end):
 def depths(total, count, flank, depth):
     """Depth of each bin below the straight line between both flanks; empty bins between others are interpolated.
 
-    flank : bins from the middle to where the flanks begin; depth : (bins,) float64, out. Returns by how much that line
-    lies above the lower flank in the middle; NaN where a flank or the valley holds nothing.
+    flank : bins from the middle to where the flanks begin; depth : (bins,) float64, out. Returns the height of that
+    line in the middle and that of the lower flank; NaN where a flank or the valley holds nothing.
     """
     middle = total.size // 2
     wide = max(flank // 2, 2 * BINS)
     left, left_at = mean_between(total, count, middle - flank - wide, middle - flank + 1)
     right, right_at = mean_between(total, count, middle + flank, middle + flank + wide + 1)
     if math.isnan(left) or math.isnan(right):
-        return np.nan
+        return np.nan, np.nan
     slope = (right - left) / (right_at - left_at)
     last, any_bin = -1, False
     for k in range(total.size):
@@ -72,7 +74,7 @@ def depths(total, count, flank, depth):
             last, any_bin = k, any_bin or abs(k - middle) < flank
     for empty in range(last + 1, total.size):
         depth[empty] = depth[last]
-    return left + slope * (middle - left_at) - min(left, right) if any_bin else np.nan
+    return (left + slope * (middle - left_at), min(left, right)) if any_bin else (np.nan, np.nan)
 
 
 @kernel
@@ -95,17 +97,18 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
     heights : (rows, columns) float64 (m), NaN where there is none.
     row, column : (n,) int64 cells; north, east : (n,) float64, unit vector along the valley, in rows and columns.
     flank : (n,) int64, where its flanks begin (cells); reach : most cells to either side.
-    out : (n, 4) float64: depth below the line between both flanks (m), width at half that depth and how far the middle
-        lies to the right (cells), depth below the lower flank (m). NaN where it cannot be told.
+    out : (n, 5) float64: depth below the line between both flanks (m), width at half that depth and how far the middle
+        lies to the right (cells), depth below the lower flank (m), height of that line at the cell (m). NaN where it
+        cannot be told.
     """
     size = 2 * BINS * reach + 1
     total, count, depth = np.empty(size), np.empty(size), np.empty(size)
     for n in range(row.size):
         out[n] = np.nan
-        fill_bins(heights, row[n], column[n], north[n], east[n], reach, total, count)
+        base = fill_bins(heights, row[n], column[n], north[n], east[n], reach, total, count)
         begin = BINS * flank[n]
-        above = depths(total, count, begin, depth)
-        if math.isnan(above):
+        ground, lower = depths(total, count, begin, depth)
+        if math.isnan(ground):
             continue
         middle = BINS * reach
         peak, deepest = middle, -np.inf
@@ -120,4 +123,5 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
         out[n, 0] = deepest
         out[n, 1] = (left + right) / BINS
         out[n, 2] = (peak - middle + 0.5 * (right - left)) / BINS
-        out[n, 3] = deepest - above
+        out[n, 3] = deepest - (ground - lower)
+        out[n, 4] = base + ground

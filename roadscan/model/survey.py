@@ -261,7 +261,8 @@ class TileConfig(Strict):
     cell_table: CellColumns = "full"
     """What is stored of a cell: `full`, all columns of the table `cells`; `surface`, its place, count, robust height
     (rounded to 2⁻²⁰ m) and mean intensity (rounded to 1/64), which takes a third of the time and a sixth
-    of the room. Products of other columns (height_std of the mosaic) need `full`."""
+    of the room. Products of other columns (height_std of the mosaic) need `full`, and so do depths of cracks narrower
+    than two cells (`height_min_m`)."""
     block_tiles: int = Field(default=8, ge=1, le=64)
     """Edge of the largest block of work, in tiles; changes no result."""
     max_block_readings: int = Field(default=10_000_000, ge=1)

@@ -56,6 +56,7 @@ def height_window(surface: SurfaceTile, needed: int, product: str) -> HeightWind
         window.first_row,
         window.first_column,
         surface.halo,
+        lowest=surface.lowest,
     )
 
 

@@ -5,8 +5,9 @@ smoothing (impulses left out): all cells up to 4.5 cells along the crack are sor
 bins of half a cell. Because a line rarely runs along the grid, the section is finer than a cell; nothing is
 interpolated between cells and nothing is smoothed across the crack. Ground is the straight line between the flanks.
 
-- *depth*: deepest mean over one cell's width. It is the depth of a cell: a crack narrower than two cells looks
-  shallower than it is, because no cell lies in it alone.
+- *depth*: of the bottom below the ground: from robust heights, where cells lie in the crack alone, and from the lowest
+  readings of cells, where it is narrower (``surfaces/crack_depths.py``). Where these are not known, robust heights show
+  a crack narrower than two cells shallower than it is.
 - *width*: between the places of half that depth.
 - *line*: through the middles of the sections, which is good to a fraction of a cell, so that its length is that of the
   crack and not that of steps from cell to cell.
@@ -22,8 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.cross_sections import cross_sections
+from roadscan.kernels.quantiles_along import HALF_ALONG
 from roadscan.model.distress import CrackDetection
 from roadscan.surfaces import valleys
+from roadscan.surfaces.crack_depths import ValleyCells, blended, bottom_depths
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.skeleton_graph import PRUNINGS, SkeletonGraph, pruned
 from roadscan.surfaces.valleys import DIRECTIONS, Valleys, find_valleys, flank_cells
@@ -82,7 +85,7 @@ def halo_cells(config: CrackDetection, cell_m: float) -> int:
     """Cells that a window needs beyond those of which cracks are wanted."""
     reach = math.ceil(math.hypot(4.5, section_cells(config, cell_m))) + 1
     walked = PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
-    return valleys.halo_cells(config, cell_m) + max(reach, walked)
+    return valleys.halo_cells(config, cell_m) + max(HALF_ALONG + reach, walked)
 
 
 def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiece]:
@@ -137,24 +140,33 @@ def _spur_cells(config: CrackDetection, cell_m: float) -> int:
 
 
 def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config: CrackDetection) -> Sections:
-    row, column = graph.row, graph.column
-    angle = found.direction[row, column] * (np.pi / DIRECTIONS)
-    north, east = np.sin(angle), np.cos(angle)
-    flank = np.maximum(found.flank[row, column], 2).astype(np.int64)
-    out = np.empty((row.size, 4))
+    cells = _valley_cells(found)
+    row, column = cells.row, cells.column
     reach = section_cells(config, window.cell_m)
-    cross_sections(window.cleaned_m(), row, column, north, east, flank, reach, out)
+    out = np.empty((row.size, 5))
+    cross_sections(window.cleaned_m(), row, column, cells.north, cells.east, cells.flank, reach, out)
     right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)
-    place = np.stack(
-        [column + window.first_column + 0.5 + right * north, row + window.first_row + 0.5 - right * east], axis=-1
-    )
-    for _ in range(_SMOOTHINGS):
-        place = graph.smoothed(place)
     with np.errstate(invalid="ignore"):
         is_valley = (out[:, 1] * window.cell_m <= config.max_width_m) & (out[:, 3] >= _LOWER_FLANK * out[:, 0])
     out[~is_valley] = np.nan
     width, depth = sharpened(out[:, 1], out[:, 0])
-    return Sections(place, width * window.cell_m, depth)
+    depth = blended(bottom_depths(window, cells, right, out[:, 4]), depth, out[:, 1])
+    columns = found.skeleton.shape[1]
+    own = np.searchsorted(row * columns + column, graph.row * columns + graph.column)
+    east = column + window.first_column + 0.5 + right * cells.north
+    north = row + window.first_row + 0.5 - right * cells.east
+    place = np.stack([east, north], axis=-1)[own]
+    for _ in range(_SMOOTHINGS):
+        place = graph.smoothed(place)
+    return Sections(place, width[own] * window.cell_m, depth[own])
+
+
+def _valley_cells(found: Valleys) -> ValleyCells:
+    """All cells of the skeleton, those that are pruned later included: what is pruned depends on cells far away."""
+    row, column = np.nonzero(found.skeleton)
+    angle = found.direction[row, column] * (np.pi / DIRECTIONS)
+    flank = np.maximum(found.flank[row, column], 2).astype(np.int64)
+    return ValleyCells(row, column, np.sin(angle), np.cos(angle), flank)
 
 
 def _piece(path: Sequence[int], graph: SkeletonGraph, sections: Sections, window: HeightWindow) -> CrackPiece:

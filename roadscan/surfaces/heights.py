@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.errors import RoadscanError
+from roadscan.surfaces.lowest import LowestReadings
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
@@ -38,6 +39,8 @@ class HeightWindow:
     """Cells along each border that belong to the neighbours: they are looked at, and nothing is reported of them."""
     cut_off: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0))
     """Cells that were cut off at the south and north, and at the west and east, the halo's first."""
+    lowest: LowestReadings | None = None
+    """Of the same cells; None where they are not known."""
 
     def __post_init__(self) -> None:
         if self.raw_m.ndim != 2 or self.raw_m.shape != self.height_m.shape:
@@ -73,6 +76,7 @@ class HeightWindow:
             self,
             raw_m=self.raw_m[own],
             height_m=self.height_m[own],
+            lowest=None if self.lowest is None else self.lowest.part(*own),
             first_row=self.first_row + spans[0].start,
             first_column=self.first_column + spans[1].start,
             cut_off=(cut_off[0], cut_off[1]),

@@ -23,6 +23,7 @@ from roadscan.points.cloud import QUANTUM_M, TilePoints
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings
 from roadscan.surfaces.holes import RIM, Holes, cells_across
+from roadscan.surfaces.lowest import LowestReadings
 from roadscan.surfaces.normals import slopes_at
 from roadscan.surfaces.sites import sites
 from roadscan.surfaces.smoothing import halo_cells, smooth_surface
@@ -40,6 +41,7 @@ SHOWN_M: Final = 1.0
 """What products see of the neighbouring tiles, at least (m)."""
 
 _BRIGHTEST: Final = 65_535.0
+_MOST_COUNTED: Final = 65_535
 _CELLS_SMOOTHED: Final = 2_000_000
 """Cells that are smoothed at once, about: smoothing needs 100 bytes of memory a cell."""
 
@@ -122,10 +124,12 @@ class Patch:
     raw_m: Float64
     origin: npt.NDArray[np.uint8]
     intensity: Float32
+    lowest: LowestReadings | None = None
+    """Of the same cells; None where they are not known."""
 
 
 def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
-    """What tiles' cells say of a window: robust heights and mean intensities.
+    """What tiles' cells say of a window: robust heights, mean intensities, and lowest readings where they are stored.
 
     Parameters
     ----------
@@ -134,13 +138,18 @@ def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
     """
     shape = window.rows, window.columns
     raw, intensity = np.full(shape, np.nan), np.full(shape, np.nan, np.float32)
+    lowest = LowestReadings(np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint16))
     for cells in tiles:
         row = cells.row.astype(np.int64) + (cells.tile.row * cells.cells_per_edge - window.first_row)
         column = cells.column.astype(np.int64) + (cells.tile.column * cells.cells_per_edge - window.first_column)
         own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
         raw[row[own], column[own]] = cells.height_robust_m[own]
         intensity[row[own], column[own]] = cells.intensity_mean[own]
-    return Patch(raw, np.where(np.isnan(raw), EMPTY, MEASURED).astype(np.uint8), intensity)
+        lowest.drop_m[row[own], column[own]] = (cells.height_robust_m - cells.height_min_m)[own]
+        lowest.count[row[own], column[own]] = np.minimum(cells.count[own], _MOST_COUNTED)
+    stored = not np.isnan(lowest.drop_m).all()
+    origin = np.where(np.isnan(raw), EMPTY, MEASURED).astype(np.uint8)
+    return Patch(raw, origin, intensity, lowest if stored else None)
 
 
 def patch_of_points(
@@ -211,6 +220,7 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
     rim, window = grid.filled + grid.smoothed, grid.window(tile).grown(-_beyond_smoothing(grid))
     inner = (slice(rim, window.rows - rim), slice(rim, window.columns - rim))
     raw, origin = patch.raw_m[inner].copy(), patch.origin[inner].copy()
+    lowest = None if patch.lowest is None else patch.lowest.part(*inner)
     if grid.filled:
         seen = (slice(grid.smoothed, window.rows - grid.smoothed), slice(grid.smoothed, window.columns - grid.smoothed))
         cut = (slice(grid.filled, -grid.filled),) * 2
@@ -223,8 +233,10 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
         left_out = ~wanted[inner]
         raw[left_out] = height[left_out] = np.nan
         intensity[left_out], origin[left_out] = np.nan, EMPTY
-    sigma_m = grid.config.sigma_m
-    return SurfaceTile(tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, sigma_m, around_m=around_m)
+    return SurfaceTile(
+        tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, grid.config.sigma_m,
+        around_m=around_m, lowest=lowest,
+    )  # fmt: skip
 
 
 def _around(raw_m: Float64, grid: SurfaceGrid) -> Float64:
@@ -235,7 +247,9 @@ def _around(raw_m: Float64, grid: SurfaceGrid) -> Float64:
 def _for_smoothing(patch: Patch, grid: SurfaceGrid) -> Patch:
     """The part of a window's patch that smoothing and filling look at."""
     margin = _beyond_smoothing(grid)
-    return Patch(_cut(patch.raw_m, margin), _cut(patch.origin, margin), _cut(patch.intensity, margin))
+    rows, columns = (slice(margin, n - margin) for n in patch.raw_m.shape)
+    lowest = None if patch.lowest is None else patch.lowest.part(rows, columns)
+    return Patch(_cut(patch.raw_m, margin), _cut(patch.origin, margin), _cut(patch.intensity, margin), lowest)
 
 
 def _beyond_smoothing(grid: SurfaceGrid) -> int:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.model.ids import TileId
 from roadscan.surfaces.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING
+from roadscan.surfaces.lowest import LowestReadings
 from roadscan.surfaces.window import GridWindow
 
 EMPTY: Final = NOTHING
@@ -57,6 +58,9 @@ class SurfaceTile:
     """Colours of the cells that a product asked for; None for one that did not."""
     around_m: npt.NDArray[np.float64] | None = None
     """Heights before smoothing of more cells around the tile, as many as products ask for; None: those of `raw_m`."""
+    lowest: LowestReadings | None = None
+    """Of the same cells, filled ones and others without a height included; None where they are not known, as where the
+    surface is made of points or the files of cells lack them."""
 
     @property
     def around(self) -> tuple[npt.NDArray[np.float64], int]:

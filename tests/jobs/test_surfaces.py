@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pickle
 import shutil
@@ -14,6 +15,7 @@ from typing import Any
 
 import geopandas
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import rasterio
 import shapely
@@ -23,13 +25,13 @@ from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.jobs.status import verify_store
 from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles, plan_surface_work
-from roadscan.jobs.surfaces import source_of
+from roadscan.jobs.surfaces import _Cells, source_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load
-from roadscan.surfaces.reconstruction import surface_of
+from roadscan.surfaces.reconstruction import patch_of_cells, surface_of
 from roadscan.surfaces.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.sql import query
@@ -113,6 +115,11 @@ def assert_seamless(found: dict[TileId, SurfaceTile], least: int = 1000) -> None
         for name in ("raw_m", "height_m", "origin", "intensity"):
             one, other = getattr(a, name)[cuts[0]], getattr(b, name)[cuts[1]]
             assert one.tobytes() == other.tobytes(), (a.tile, b.tile, name)
+        if a.lowest is not None and b.lowest is not None:
+            for own, others in zip(
+                *((part.drop_m, part.count) for part in (a.lowest.part(*cuts[0]), b.lowest.part(*cuts[1]))), strict=True
+            ):
+                assert own.tobytes() == others.tobytes()
         shared += int(np.count_nonzero(a.origin[cuts[0]]))
     assert shared > least
 
@@ -166,6 +173,30 @@ def test_cells_are_seamless_and_keep_to_their_tile(cells: Reconstructed) -> None
     assert not np.isnan(one.intensity[one.origin == FILLED]).any()
 
 
+def test_lowest_readings_are_those_of_the_cells(cells: Reconstructed) -> None:
+    one = max(cells.surfaces(**CELLS).values(), key=lambda s: np.count_nonzero(s.origin[s.inner]))
+    rows = pq.read_table(cells.store.path(f"tiles/cells/{one.tile}.parquet")).to_pandas()
+    assert one.lowest is not None and len(rows) > 1000 and rows["count"].max() > 1
+    own = one.lowest.part(*one.inner)
+    at = rows["row"], rows["column"]
+    np.testing.assert_allclose(own.drop_m[at], rows["height_robust_m"] - rows["height_min_m"], rtol=1e-6, atol=1e-9)
+    assert (own.count[at] == rows["count"]).all()
+    assert np.count_nonzero(~np.isnan(own.drop_m)) == np.count_nonzero(own.count) == len(rows)
+
+
+def test_files_of_cells_without_lowest_readings_say_so(cells: Reconstructed) -> None:
+    survey = cells.survey(CELLS)
+    planned = cells.plan(survey)
+    tile = next(iter(planned.cells))
+    source = source_of(planned.task((tile,)))
+    assert isinstance(source, _Cells)
+    kept = source._read(tile)
+    without = dataclasses.replace(kept, height_min_m=np.full(len(kept), np.nan))
+    patch = patch_of_cells(planned.grid.window(tile), [without])
+    assert patch.lowest is None and patch_of_cells(planned.grid.window(tile), [kept]).lowest is not None
+    assert surface_of(tile, patch, planned.grid).lowest is None
+
+
 def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
     survey = cells.survey(CELLS)
     made, files = cells.run(survey)
@@ -174,6 +205,7 @@ def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: py
     record = next(iter(Manifest(cells.store).of(SURFACE).values()))
     figures = json.loads(record.detail)
     assert record.path == "" and figures["cells"] == sum(figures[k] for k in ("measured", "interpolated", "filled")) > 0
+    assert figures["lowest_known"] == figures["measured"]
     cells.forget()
     monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
     monkeypatch.setattr("roadscan.jobs.surfaces._CELLS_KEPT", 0)
@@ -355,7 +387,7 @@ def test_workers_change_no_byte_of_a_pothole_on_the_border_of_tiles(points: Reco
     layer = tmp_path / "hole.gpkg"
     geopandas.GeoDataFrame(geometry=[shapely.Point(east, north).buffer(0.9)], crs=place.crs).to_file(layer)
     finely = {**UNSMOOTHED, "cell_m": [0.007, 0.007], "regions": "polygons", "polygons": str(layer)}
-    options = {"crack_pieces": {"max_width_m": 0.02, "spur_m": 0.0}}
+    options = {"crack_pieces": {"max_width_m": 0.018, "spur_m": 0.0}}
     survey = points.survey(finely, {"make": ["cracks", "potholes"], "options": options})
     stages = [s for s in STAGES if s.name in ("surfaces", "products")]
     made = []

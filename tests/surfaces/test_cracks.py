@@ -21,6 +21,7 @@ from roadscan.surfaces.crack_network import join_cracks
 from roadscan.surfaces.crack_parts import bridges
 from roadscan.surfaces.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
 from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.lowest import LowestReadings
 from roadscan.surfaces.skeleton_graph import SkeletonGraph, pruned
 from roadscan.surfaces.valleys import _thinned, find_valleys
 
@@ -145,11 +146,11 @@ def test_types_follow_the_lane():
     assert across.transverse_m == pytest.approx(across.length_m) and across.longitudinal_m == 0.0
 
 
-def net(halo=0, first=(7_000, 9_000)):
+def net(halo=0, first=(7_000, 9_000), half=1.8):
     """A net of cracks, 0.25 m apart, aslant, with holes in the data."""
     y, x = np.indices((500, 520))
     distance = np.minimum(np.abs((0.96 * x + 0.28 * y) % 50 - 25), np.abs((0.96 * y - 0.28 * x) % 50 - 25))
-    height = 560 - 0.008 * np.clip(1 - (distance / 1.8) ** 2, 0, 1)
+    height = 560 - 0.008 * np.clip(1 - (distance / half) ** 2, 0, 1)
     height[np.hypot(x - 260, y - 250) > 170] = 560.0
     height[200:205, 300:330] = np.nan
     return drawn(height, halo=halo, first=first)
@@ -166,6 +167,13 @@ def test_a_net_is_an_alligator_and_closes_the_polygons_that_shapely_closes():
     assert one.depth_mean_m == pytest.approx(0.008, rel=0.1)
 
 
+def with_lowest(window):
+    """The same with lowest readings of two to nine a cell, below the heights by up to 2 mm."""
+    rng = np.random.default_rng(6)
+    drop = rng.uniform(0.0, 0.002, window.raw_m.shape).astype(np.float32)
+    return replace(window, lowest=LowestReadings(drop, rng.integers(2, 10, drop.shape, np.uint16)))
+
+
 def edges_of(pieces):
     return {frozenset(e) for p in pieces for e in itertools.pairwise(map(tuple, p.line_m.tolist()))}
 
@@ -173,14 +181,17 @@ def edges_of(pieces):
 def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
     config = CrackDetection(max_width_m=0.02)
     halo = halo_cells(config, 0.005)
-    whole = net(halo)
+    plain = net(halo, half=1.2)
+    whole = with_lowest(plain)
     expected = crack_pieces(whole, config)
+    depths, others = ([p.depth_sum_m2 for p in pieces] for pieces in (expected, crack_pieces(plain, config)))
+    assert (np.array(depths) != others).all()
     found = []
     for rows in (slice(0, 2 * halo + 61), slice(61, None)):
         for columns in (slice(0, 2 * halo + 50), slice(50, None)):
-            cut = whole.raw_m[rows, columns]
+            cut, low = whole.raw_m[rows, columns], whole.lowest.part(rows, columns)
             first = whole.first_row + (rows.start or 0), whole.first_column + (columns.start or 0)
-            found += crack_pieces(HeightWindow(cut, cut, 0.005, 0.0002, *first, halo), config)
+            found += crack_pieces(HeightWindow(cut, cut, 0.005, 0.0002, *first, halo, lowest=low), config)
     assert len(found) > len(expected) > 10
     assert sum(len(p.line_m) - 1 for p in found) == len(edges_of(found))  # none twice
     assert edges_of(found) == edges_of(expected)
@@ -373,7 +384,7 @@ def test_widths_and_depths_seen_through_cells_are_sharpened(width_cells):
     form = 560.0 + 0.01 * right - 0.01 * np.exp(-4 * np.log(2) * (right / width_cells) ** 2)
     cells = form.reshape(40, fine, 60, fine).mean(axis=(1, 3))
     row, column, flank = np.array([20, 21]), np.array([30, 33]), np.full(2, 8)
-    out = np.empty((2, 4))
+    out = np.empty((2, 5))
     cross_sections(cells, row, column, np.full(2, north), np.full(2, east), flank, 13, out)
     width, depth = sharpened(out[:, 1], out[:, 0])
     np.testing.assert_allclose(width, width_cells, rtol=0.12)

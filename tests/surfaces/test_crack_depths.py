@@ -1,0 +1,116 @@
+"""Depths from lowest readings: the simulator's cracks, narrower than a cell, in cells of many readings; NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roadscan.kernels.quantiles_along import quantiles_along
+from roadscan.model.distress import CrackDetection, CrackJoining
+from roadscan.simulate.scene import Scene
+from roadscan.simulate.surface import Surface
+from roadscan.surfaces.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
+from roadscan.surfaces.crack_network import join_cracks
+from roadscan.surfaces.cracks import crack_pieces
+from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.lowest import LowestReadings
+
+CELL_M, FINE = 0.005, 5
+CELLS = (112, 130)
+WRONG = 0.02
+LINE = [(10.0, 0.95), (10.3, 1.03), (10.6, 0.98)]
+
+
+def cells_of(width_m: float, depth_m: float, kept: float = 0.95, wrong: float = 0.0) -> HeightWindow:
+    """Cells of 5 mm of a textured road with a crack along it, of readings 1 mm apart of which a share is kept.
+
+    Of these a share is wrong by up to 3 cm. What wrong readings do to the robust height is another matter: smoothed
+    heights are those of a road without any.
+    """
+    crack = {"points_m": LINE, "width_m": width_m, "depth_m": depth_m}
+    road = {"texture": {"mpd_mm": 0.8}, "cross_slope": 0.03, "cracks": [crack]}
+    scene = Scene(seed=3).changed(map={"azimuth_deg": 0.0}, road=road)
+    north, east = round((scene.map.northing_m + 10.0) / CELL_M), round((scene.map.easting_m + 0.7) / CELL_M)
+    y, x = ((k + (np.arange(n * FINE) + 0.5) / FINE) * CELL_M for k, n in zip((north, east), CELLS, strict=True))
+    draw = np.random.default_rng(11)
+    height = Surface(scene).height_m(*np.broadcast_arrays(x[None], y[:, None]))
+    height += draw.normal(0.0, 0.0003, height.shape)
+    height += np.where(draw.random(height.shape) < wrong, draw.uniform(-0.03, 0.03, height.shape), 0.0)
+    height[draw.random(height.shape) > kept] = np.nan
+    readings = height.reshape(CELLS[0], FINE, CELLS[1], FINE).swapaxes(1, 2).reshape(*CELLS, FINE * FINE)
+    count = (~np.isnan(readings)).sum(axis=2)
+    readings[count == 0, 0] = height[~np.isnan(height)].mean()
+    robust = np.nanmedian(readings, axis=2)
+    drop = robust - np.nanmin(readings, axis=2)
+    robust[count == 0] = drop[count == 0] = np.nan
+    lowest = LowestReadings(drop.astype(np.float32), count.astype(np.uint16))
+    return HeightWindow(robust, robust, CELL_M, 0.0003, north, east, lowest=lowest)
+
+
+def depths(window: HeightWindow) -> tuple[float, float]:
+    """Mean and greatest depth of the only crack (m)."""
+    (crack,) = join_cracks(crack_pieces(window, CrackDetection(max_width_m=0.02)), 0.0, CELL_M, CrackJoining())
+    return crack.depth_mean_m, crack.depth_max_m
+
+
+@pytest.mark.parametrize(
+    ("width_m", "depth_m", "kept", "wrong"),
+    [(0.005, 0.003, 0.95, 0.0), (0.005, 0.008, 0.95, WRONG), (0.004, 0.010, 0.95, 0.0), (0.005, 0.008, 0.3, 0.0)],
+    ids=["5 x 3 mm", "5 x 8 mm, wrong readings", "4 x 10 mm", "few readings"],
+)
+def test_a_crack_narrower_than_a_cell_is_as_deep_as_the_simulators(
+    width_m: float, depth_m: float, kept: float, wrong: float
+) -> None:
+    window = cells_of(width_m, depth_m, kept, wrong)
+    mean, greatest = depths(window)
+    assert mean == pytest.approx(depth_m, rel=0.1)
+    assert mean <= greatest < 1.25 * depth_m
+    unknown, _ = depths(replace(window, lowest=None))
+    assert unknown < 0.75 * depth_m  # half of it is not in the cells
+
+
+def test_a_crack_wider_than_two_cells_has_its_depth_from_robust_heights() -> None:
+    window = cells_of(0.020, 0.015, wrong=WRONG)
+    mean, greatest = depths(window)
+    plain, plain_greatest = depths(replace(window, lowest=None))
+    assert mean == pytest.approx(0.015, rel=0.03) and mean == pytest.approx(plain, rel=0.01)
+    assert greatest == pytest.approx(plain_greatest, rel=0.05)
+
+
+def test_where_no_lowest_reading_is_known_robust_heights_are_taken() -> None:
+    window = cells_of(0.010, 0.010)
+    nothing = LowestReadings(np.full(CELLS, np.nan, np.float32), np.zeros(CELLS, np.uint16))
+    assert depths(replace(window, lowest=nothing)) == depths(replace(window, lowest=None))
+
+
+def test_the_depth_changes_gradually_with_the_width() -> None:
+    width = np.array([0.9, NARROW_CELLS, 2.0, WIDE_CELLS, 4.0, 1.0])
+    bottom = np.array([0.01, 0.01, 0.01, 0.01, 0.01, np.nan])
+    found = blended(bottom, np.full(6, 0.006), width)
+    np.testing.assert_allclose(found, [0.01, 0.01, 0.008, 0.006, 0.006, 0.006])
+
+
+def test_quantiles_along_a_line_are_numpys() -> None:
+    draw = np.random.default_rng(5)
+    grid = np.full((60, 70), np.nan)
+    row, column = np.arange(5, 55), 10 + np.arange(50) // 2  # half a column a row
+    values = draw.normal(0.0, 1.0, row.size)
+    values[[7, 8, 20]] = np.nan
+    grid[row, column] = values
+    beside_row, beside_column = np.array([30]), np.array([27])  # 5 cells off the line: it is another's
+    number = np.full(grid.shape, -1, np.int32)
+    number[row, column] = np.arange(50)
+    number[beside_row, beside_column] = 50
+    angle = np.arctan2(2.0, 1.0)
+    north, east = np.full(51, np.sin(angle)), np.full(51, np.cos(angle))
+    level, found = draw.uniform(0.0, 1.0, 51), np.empty(51)
+    every = [np.concatenate(pair) for pair in ((row, beside_row), (column, beside_column), (values, [99.0]))]
+    quantiles_along(number, every[0], every[1], north, east, every[2], level, found)
+    for k in range(50):
+        stretch = grid[max(row[k] - 10, 0) : row[k] + 11, max(column[k] - 10, 0) : column[k] + 11]
+        assert found[k] == pytest.approx(np.nanquantile(stretch, level[k]), abs=1e-12)
+    values[:] = np.nan
+    quantiles_along(number, row, column, north[:50], east[:50], values, level[:50], found[:50])
+    assert np.isnan(found[:50]).all()

@@ -54,7 +54,8 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
         done: int = pile_points(x, y, height, passes, intensity, grid.cell_quanta, own, piles, first)
         return done
 
-    if np.count_nonzero(np.diff(passes)) > _MOST_CHANGES or _cell_by_cell(x, y, grid.cell_quanta):
+    mixed = not one and np.count_nonzero(np.diff(passes)) > _MOST_CHANGES
+    if mixed or _cell_by_cell(x, y, grid.cell_quanta):
         accumulator.run(count, n, 2 * PIECE)
     else:
         accumulator.pile(pile, n, CHUNK)

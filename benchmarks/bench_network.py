@@ -29,15 +29,14 @@ from roadscan.jobs.products import OutputTask, make_products, product_context, w
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.jobs.tiles import TaskResult, compute_tiles, run_tasks
 from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.records import Packed
 from roadscan.tables.store import Store
 
 _BAR_S = 120.0
-_DIGEST = "blake3:" + 32 * "0"
 _TILE_FIGURES = (
-    '{"points": 40000000, "cells": 1600000, "height_min_m": 86.123456, "height_mean_m": 87.1, "height_max_m": 88.2,'
-    ' "height_std_median_m": 0.0004, "intensity_mean": 90.2, "passes": [1], "first_epoch_gps_ns": '
-    '1454644800000000000, "last_epoch_gps_ns": 1454644800360000000, "sigma_horizontal_m": null, "sigma_down_m": '
-    "null}"
+    '{{"points": {0}, "cells": {1}, "height_min_m": 86.{0}, "height_mean_m": 87.{0}, "height_max_m": 88.{0},'
+    ' "height_std_median_m": 0.000{0}, "intensity_mean": 90.{1}, "passes": [1], "first_epoch_gps_ns": '
+    '145464480{0}00, "last_epoch_gps_ns": 145464481{0}00, "sigma_horizontal_m": null, "sigma_down_m": null}}'
 )
 
 
@@ -175,24 +174,27 @@ class _NoKernels(OnDask):
 def stand_in(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
     """What a worker returns, without the work: records with the figures of a tile, a data file or a sheet."""
     if isinstance(task, TileTask):
-        return TaskResult(tuple(_tile_records(task)), ())
+        return TaskResult.of(list(_tile_records(task)))
     return [Ended(_piece_record(piece)) for piece in task.pieces]
 
 
 def _tile_records(task: TileTask) -> Iterator[OutputRecord]:
+    files = [item for wanted in task.products for item in wanted.files.items()]
     for tile, key in zip(map(str, task.block.tiles), task.keys, strict=True):
-        for wanted in task.products:
-            for name, suffix in wanted.files.items():
-                yield OutputRecord(name, tile, key, f"tiles/{name}/{tile}{suffix}", 12_345_678, _DIGEST)
-        yield OutputRecord(OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", 1_234_567, _DIGEST)
-        yield OutputRecord(TILE, tile, key, f"tiles/cells/{tile}.parquet", 12_345_678, _DIGEST, _TILE_FIGURES)
+        digest, number, own_key = f"blake3:{key}{key[::-1]}", int(key[:8], 16), key[8:] + key[:8]
+        for name, suffix in files:
+            yield OutputRecord(name, tile, own_key, f"tiles/{name}/{tile}{suffix}", number, digest)
+        yield OutputRecord(OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", number, digest)
+        figures = _TILE_FIGURES.format(number, number // 40)
+        yield OutputRecord(TILE, tile, key, f"tiles/cells/{tile}.parquet", number, digest, figures)
 
 
 def _piece_record(piece: FootprintTask | OutputTask) -> OutputRecord:
+    digest = f"blake3:{piece.key}{piece.key[::-1]}"
     if isinstance(piece, FootprintTask):
         detail = '{"window": [56321, 593487, 56350, 593512]}'
-        return OutputRecord(PRODUCT, piece.slice.file, piece.key, piece.target, 12_345, _DIGEST, detail)
-    return OutputRecord(piece.product.name, piece.output.name, piece.key, piece.target, 12_345_678, _DIGEST)
+        return OutputRecord(PRODUCT, piece.slice.file, piece.key, piece.target, 12_345, digest, detail)
+    return OutputRecord(piece.product.name, piece.output.name, piece.key, piece.target, 12_345_678, digest)
 
 
 class _Timed(Manifest):
@@ -206,6 +208,18 @@ class _Timed(Manifest):
         """As the manifest underneath."""
         started = time.perf_counter()
         super().add(records)
+        self._seen.manifest_s += time.perf_counter() - started
+
+    def add_packed(self, records: Packed) -> None:
+        """As the manifest underneath."""
+        started = time.perf_counter()
+        super().add_packed(records)
+        self._seen.manifest_s += time.perf_counter() - started
+
+    def settle(self) -> None:
+        """As the manifest underneath."""
+        started = time.perf_counter()
+        super().settle()
         self._seen.manifest_s += time.perf_counter() - started
 
     def compact(self) -> None:

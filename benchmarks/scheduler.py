@@ -17,7 +17,7 @@ import psutil
 from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.compute import FEW_MESSAGES_KEPT
+from roadscan.jobs.compute import QUIET_CLUSTER
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]
@@ -56,6 +56,11 @@ class Watched:
         times = psutil.Process(self._pid).cpu_times()
         return float(times.user + times.system)
 
+    def workers_cpu_s(self) -> float:
+        """Processor time so far of the workers, which are its children."""
+        times = [child.cpu_times() for child in psutil.Process(self._pid).children(recursive=True)]
+        return float(sum(t.user + t.system for t in times))
+
     def most_tasks(self) -> int:
         """Most tasks held at a time."""
         return int(self._client.run_on_scheduler(_most))
@@ -82,7 +87,7 @@ def running_scheduler(workers: int) -> Iterator[tuple[Any, Watched]]:
 def main() -> None:
     """Run until the standard input ends."""
     with (
-        dask.config.set(FEW_MESSAGES_KEPT),
+        dask.config.set(QUIET_CLUSTER),
         LocalCluster(
             n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
         ) as cluster,

@@ -7,6 +7,7 @@ import gc
 import itertools
 import logging
 import os
+import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,25 @@ _OBJECTS = 100_000
 
 FEW_MESSAGES_KEPT = {"distributed.admin.low-level-log-length": 50}
 """Setting of Dask: its log of messages holds whole tasks, by default the last 1,000 of each worker."""
+
+QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.comm.timeouts.connect": "60s",
+}
+"""Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
+and pausing stay out of the way, and nobody looks at its figures, of which it would take hundreds a second."""
+
+_HELD_A_THREAD = 8
+"""Tasks of each worker thread that the scheduler holds: with more of them on their way, fewer messages."""
+
+_TOGETHER_S = 0.01
+"""How long results wait for others, so that one message asks for them all."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +121,7 @@ class OnDask:
 
         waiting = iter(tasks)
         running: dict[str, T] = {}
-        queue = as_completed(with_results=True, raise_errors=False)
+        queue = as_completed(raise_errors=False)
 
         def hand_out(count: int) -> None:
             chosen = list(itertools.islice(waiting, count))
@@ -111,13 +131,16 @@ class OnDask:
             running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
             queue.update(futures)
 
-        hand_out(2 * max(sum(self._client.nthreads().values()), 1))
+        hand_out(_HELD_A_THREAD * self.workers)
         for batch in queue.batches():
-            hand_out(len(batch))
-            for future, result in batch:
+            time.sleep(_TOGETHER_S)
+            ended = batch + queue.next_batch(block=False)
+            hand_out(len(ended))
+            results = self._client.gather({future.key: future for future in ended}, errors="skip")
+            for future in ended:
                 error = future.exception() if future.status != "finished" else None
                 future.release()
-                yield Done(running.pop(future.key), None if error is not None else result, error)
+                yield Done(running.pop(future.key), None if error is not None else results.pop(future.key), error)
 
     def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
         """Hand some tasks to the scheduler; returns their futures."""
@@ -200,22 +223,7 @@ def _embedded(stack: contextlib.ExitStack, workers: int | None) -> Any:
     import dask
     from distributed import Client, LocalCluster
 
-    # A worker's memory is bounded by the size of its blocks, so Dask's spilling and pausing stay out of the way, and
-    # nobody looks at its figures, of which it would take hundreds a second.
-    stack.enter_context(
-        dask.config.set(
-            {
-                "distributed.worker.memory.target": False,
-                "distributed.worker.memory.spill": False,
-                "distributed.worker.memory.pause": False,
-                "distributed.worker.memory.monitor-interval": "1s",
-                "distributed.worker.profile.enabled": False,
-                "distributed.admin.tick.interval": "1s",
-                "distributed.admin.system-monitor.interval": "5s",
-                "distributed.comm.timeouts.connect": "60s",
-            }
-        )
-    )
+    stack.enter_context(dask.config.set(QUIET_CLUSTER))
     cluster = LocalCluster(
         n_workers=workers or dask.system.CPU_COUNT, threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
     )

@@ -149,7 +149,7 @@ def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask]
     ]
     due = {(t.product.name, t.output.name) for t in tasks}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
-    gone = [r for r in manifest.all() if r.product in kinds and (r.product, r.unit) not in due]
+    gone = [r for r in manifest.beside(kinds, ()) if (r.product, r.unit) not in due]
     return [t for t in tasks if not manifest.is_current(t.product.name, t.output.name, t.key)], gone
 
 

@@ -95,8 +95,9 @@ def run_tiles(run: Run) -> None:
     run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
     failures = run_tasks(compute_tiles, tasks, work.planned.singly, manifest, run.compute, _bar(run, "tiles"))
     manifest.forget(TILE, [unit for unit, _ in failures])
-    empty = {unit for unit, r in manifest.of(TILE).items() if not r.path}
-    manifest.remove([r for r in manifest.all() if r.unit in empty and r.product in {OVERVIEWS, *tile_file_names()}])
+    empty = manifest.without_file(TILE)
+    names = {OVERVIEWS, *tile_file_names()} if empty else ()
+    manifest.remove([r for name in names for unit, r in manifest.of(name).items() if unit in empty])
     run.failed("tiles", failures)
 
 
@@ -219,9 +220,8 @@ def plan_tile_work(run: Run, manifest: Manifest) -> TileWork:
         chosen = stale_tiles(tiles, wanted, manifest)
     per_tile = tile_file_names()
     dropped = per_tile - tile_file_names({w.product.name for w in wanted})
-    units = {str(t) for t in tiles}
-    kinds = {TILE, OVERVIEWS, *per_tile}
-    gone = [r for r in manifest.all() if r.product in kinds and (r.unit not in units or r.product in dropped)]
+    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, {str(t) for t in tiles})
+    gone += manifest.beside(dropped, ())
     return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,7 +94,7 @@ def survey_status(survey: Survey, store: Store) -> Status:
     keys = {*(log.key for log in planned), *known_keys(survey, store)}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in read_log_records(store) if r.key not in keys]
     manifest = Manifest(store)
-    status.outputs = dict(Counter(r.product for r in manifest.all() if r.path and r.product != PRODUCT))
+    status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
     if unplanned or any(log["state"] == "waiting" for log in status.logs):
         waiting = [log for log in status.logs if log["state"] == "waiting"]
         status.next_run = {

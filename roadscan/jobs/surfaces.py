@@ -45,7 +45,7 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
             records += _write(task, key, surface, context, painter)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), reason_of(error)))
-    return TaskResult(tuple(records), tuple(failures))
+    return TaskResult.of(records, failures)
 
 
 class Source(Protocol):

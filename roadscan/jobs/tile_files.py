@@ -22,7 +22,7 @@ class WantedFiles:
     options: Strict
     key: str
 
-    @property
+    @functools.cached_property
     def files(self) -> dict[str, str]:
         """Suffix of each file by its name in the manifest; the product's own file is the last."""
         beside = self.product.companions(self.options)

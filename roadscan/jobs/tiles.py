@@ -21,7 +21,8 @@ from roadscan.kernels.cell_figures import median, totals
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.products.base import Tile, TileSummary
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.records import OutputRecord, Packed, table_of
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.cells import TileCells
@@ -32,17 +33,14 @@ from roadscan.tiles.statistics import cells_of
 class TaskResult:
     """What a worker did."""
 
-    records: tuple[OutputRecord, ...]
+    records: Packed
     failures: tuple[tuple[str, str], ...]
     """Tiles that failed, with the reason."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """By columns: hundreds of records take longer to send one by one."""
-        return _unpacked, (tuple(zip(*self.records, strict=True)), self.failures)
-
-
-def _unpacked(columns: tuple[tuple[Any, ...], ...], failures: tuple[tuple[str, str], ...]) -> TaskResult:
-    return TaskResult(tuple(map(OutputRecord, *columns)) if columns else (), failures)
+    @classmethod
+    def of(cls, records: Sequence[OutputRecord], failures: Sequence[tuple[str, str]] = ()) -> TaskResult:
+        """Finished outputs as the manifest will keep them, so that the run has only to write them."""
+        return cls(Packed.of(table_of(records)), tuple(failures))
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ def run_tasks(
         for done in compute.map(function, round_tasks):
             tiles = done.task.block.tiles
             if done.result is not None:
-                manifest.add(done.result.records)
+                manifest.add_packed(done.result.records)
                 failures.extend(done.result.failures)
             elif len(tiles) > 1:
                 again.extend(tiles)
@@ -104,6 +102,7 @@ def run_tasks(
                 failures.append((str(tiles[0]), reason_of(done.error)))
             finished += len(tiles)
             report(finished, total)
+    manifest.settle()
     return failures
 
 
@@ -130,7 +129,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
             failures.append((str(computed.tile), reason_of(error)))
     for tile, key in [*empty, *waiting.items()]:
         records.append(OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0})))
-    return TaskResult(tuple(_with_fates(r, fates) for r in records), tuple(failures))
+    return TaskResult.of([_with_fates(r, fates) for r in records], failures)
 
 
 def computed_tiles(task: TileTask, fates: Fates) -> Iterator[ComputedTile]:

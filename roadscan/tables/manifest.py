@@ -2,56 +2,22 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
+import pyarrow.compute as pc
 
+from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, table_of, unpacked
 from roadscan.tables.store import Store
 
+__all__ = ["Manifest", "OutputRecord", "read_failures", "write_failures"]
+
 _FOLDER: Final = "manifest/outputs"
-_MOST_PARTS: Final = 64
+_MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
-_SCHEMA: Final = pa.schema(
-    [
-        ("product", pa.string()),
-        ("unit", pa.string()),
-        ("key", pa.string()),
-        ("path", pa.string()),
-        ("bytes", pa.int64()),
-        ("digest", pa.string()),
-        ("detail", pa.string()),
-    ]
-)
-
-
-class OutputRecord(NamedTuple):
-    """One finished file (or a finished unit without a file, where `path` is empty). A network has millions."""
-
-    product: str
-    """Product, or 'footprints', or 'tile' for the tile as a whole."""
-    unit: str
-    """Tile id, output name, or log key."""
-    key: str
-    """Hash of its inputs, of the configuration that matters to it, and of the code."""
-    path: str
-    """Relative to the survey's root."""
-    bytes: int
-    digest: str
-    """BLAKE2b-128 of the file."""
-    detail: str = ""
-    """JSON with figures that later stages need."""
-
-    def figures(self) -> dict[str, Any]:
-        """The detail as values."""
-        return dict(json.loads(self.detail)) if self.detail else {}
-
-
-_Row: TypeAlias = tuple[str, str, str, str, int, str, str]
 
 
 @dataclass(frozen=True)
@@ -60,8 +26,8 @@ class _Part:
 
     path: str
     rows: int
-    table: pa.Table | None = None
-    """Its rows, where they were written a moment ago and are soon merged."""
+    records: Packed | None = None
+    """What it holds, where that was written a moment ago and is soon merged."""
 
     @property
     def number(self) -> int:
@@ -74,34 +40,52 @@ class Manifest:
 
     What changes is written as a part of its own. Parts are merged with those before them that are no more than twice
     as large, so a record is written again as often as the survey doubles, not each time that some tasks end.
+
+    Records stay in tables; only those of products that are asked for one by one become Python's.
     """
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._parts: list[_Part] = []
-        # Bare tuples by product and unit: Python's collector walks over every named one again and again.
-        self._rows: dict[str, dict[str, _Row]] = {}
+        tables = [RECORDS.empty_table()]
         for path in store.files(_FOLDER, ".parquet"):
-            table = self._read(path)
-            self._parts.append(_Part(path, table.num_rows))
-            for row in zip(*(table.column(field.name).to_pylist() for field in _SCHEMA), strict=True):
-                if row[2]:
-                    self._keep(row)
-                else:
-                    self._drop(row[0], row[1])
+            tables.append(unpacked(store.read_bytes(path)))
+            self._parts.append(_Part(path, tables[-1].num_rows))
+        self._table, self._moved = latest(pa.concat_tables(tables))
+        self._behind: list[_Part] = []  # parts that the table does not know yet
+        self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, of products that were asked for
 
     def get(self, product: str, unit: str) -> OutputRecord | None:
         """Record of an output, None where it was never finished."""
-        row = self._rows.get(product, {}).get(unit)
+        row = self._of(product).get(unit)
         return None if row is None else OutputRecord._make(row)
 
     def of(self, product: str) -> dict[str, OutputRecord]:
         """Records of one product by unit."""
-        return {unit: OutputRecord._make(row) for unit, row in self._rows.get(product, {}).items()}
+        return {unit: OutputRecord._make(row) for unit, row in self._of(product).items()}
 
     def all(self) -> list[OutputRecord]:
         """All records, by product and unit."""
-        return list(map(OutputRecord._make, self._sorted()))
+        return list(map(OutputRecord._make, rows_of(self._current())))
+
+    def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
+        """Records of some products, of all units but these."""
+        table = self._current()
+        own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
+        due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
+        return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
+
+    def without_file(self, product: str) -> set[str]:
+        """Units of a product that are finished and have no file."""
+        table = self._current()
+        found = pc.and_(pc.equal(table.column("product"), product), pc.equal(table.column("path"), ""))
+        return set(table.column("unit").filter(found).to_pylist())
+
+    def files(self) -> dict[str, int]:
+        """How many files there are, by product."""
+        table = self._current()
+        found = table.column("product").filter(pc.not_equal(table.column("path"), ""))
+        return {one["values"]: one["counts"] for one in found.value_counts().to_pylist()}
 
     def is_current(self, product: str, unit: str, key: str) -> bool:
         """True if the output has this key and its file is there in its recorded size."""
@@ -115,51 +99,77 @@ class Manifest:
         added = list(records)
         if not added:
             return
-        known = [self._rows.get(r.product, {}).get(r.unit) for r in added]
+        known = [self._of(r.product).get(r.unit) for r in added]
         for r in added:
-            self._keep((*r,))
-        self._append(added)
+            self._rows[r.product][r.unit] = (*r,)
+        self._append(Packed.of(table_of(added)))
         for old, new in zip(known, added, strict=True):
             if old is not None and old[3] not in ("", new.path):
                 self._store.remove(old[3])
+
+    def add_packed(self, records: Packed) -> None:
+        """The same, of many as a worker packed them; files under older names are removed by :meth:`settle`."""
+        if records.rows:
+            self._rows.clear()
+            self._append(records)
+
+    def settle(self) -> None:
+        """Remove files under older names: those of packed records, and what a run that was killed left."""
+        table = self._current()
+        if self._moved:
+            moved = pa.array(self._moved, pa.string())
+            for path in moved.filter(pc.invert(pc.is_in(moved, table.column("path")))).to_pylist():
+                self._store.remove(path)
+            self._moved.clear()
 
     def remove(self, records: Iterable[OutputRecord]) -> None:
         """Forget outputs and remove their files."""
         gone = list(records)
         if not gone:
             return
-        for r in gone:
-            self._drop(r.product, r.unit)
-        self._append([OutputRecord(r.product, r.unit, "", "", 0, "") for r in gone])
+        self._forget([(r.product, r.unit) for r in gone])
         for r in gone:
             if r.path:
                 self._store.remove(r.path)
 
     def forget(self, product: str, units: Iterable[str]) -> None:
         """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
-        known = [u for u in units if self._drop(product, u) is not None]
+        known = [(product, u) for u in units if u in self._of(product)]
         if known:
-            self._append([OutputRecord(product, u, "", "", 0, "") for u in known])
-
-    def _keep(self, row: _Row) -> None:
-        self._rows.setdefault(row[0], {})[row[1]] = row
-
-    def _drop(self, product: str, unit: str) -> _Row | None:
-        return self._rows.get(product, {}).pop(unit, None)
-
-    def _sorted(self) -> list[_Row]:
-        return [own[unit] for _, own in sorted(self._rows.items()) for unit in sorted(own)]
+            self._forget(known)
 
     def compact(self) -> None:
         """Bring all parts into one, without what is no more."""
+        self.settle()
         old, self._parts = self._parts, []
-        self._write(_table(self._sorted()), old[-1].number + 1 if old else 0)
+        self._write(Packed.of(self._table), old[-1].number + 1 if old else 0)
         for part in old:
             self._store.remove(part.path)
 
-    def _append(self, records: list[OutputRecord]) -> None:
-        table = _table(records)
-        self._write(table, self._parts[-1].number + 1 if self._parts else 0, keep=True)
+    def _of(self, product: str) -> dict[str, Row]:
+        """Rows of a product by unit."""
+        rows = self._rows.get(product)
+        if rows is None:
+            table = self._current()
+            own = rows_of(table.filter(pc.equal(table.column("product"), product)))
+            rows = self._rows[product] = {row[1]: row for row in own}
+        return rows
+
+    def _current(self) -> pa.Table:
+        """Every record, by product and unit."""
+        if self._behind:
+            news, self._behind = list(map(self._read, self._behind)), []
+            self._table, moved = latest(pa.concat_tables([self._table, *news]))
+            self._moved += moved
+        return self._table
+
+    def _forget(self, outputs: list[tuple[str, str]]) -> None:
+        for product, unit in outputs:
+            self._rows.get(product, {}).pop(unit, None)
+        self._append(Packed.of(table_of([(product, unit, "", "", 0, "", "") for product, unit in outputs])))
+
+    def _append(self, records: Packed) -> None:
+        self._behind.append(self._write(records, self._parts[-1].number + 1 if self._parts else 0, keep=True))
         if len(self._parts) > _MOST_PARTS:
             self._merge()
 
@@ -171,26 +181,24 @@ class Manifest:
             first -= 1
             rows += self._parts[first].rows
         old = self._parts[first:]
-        self._parts = self._parts[:first]
-        tables = [self._read(part.path) if part.table is None else part.table for part in old]
-        self._write(pa.concat_tables(tables), old[-1].number + 1)
+        table, moved = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
+        for path in moved:  # no record tells of them once these parts are one
+            self._store.remove(path)
+        del self._parts[first:]
+        merged = self._write(Packed.of(table), old[-1].number + 1)
+        known = [part for part in self._behind if part not in old]
+        self._behind = known if known == self._behind else [*known, merged]
         for part in old:  # where these stay, the new part says once more what they say
             self._store.remove(part.path)
 
-    def _read(self, path: str) -> pa.Table:
-        return self._store.read_table(path)
+    def _read(self, part: _Part) -> pa.Table:
+        return unpacked(self._store.read_bytes(part.path)) if part.records is None else part.records.table()
 
-    def _write(self, table: pa.Table, number: int, keep: bool = False) -> None:
+    def _write(self, records: Packed, number: int, keep: bool = False) -> _Part:
         path = f"{_FOLDER}/part-{number:08d}.parquet"
-        buffer = io.BytesIO()
-        pq.write_table(table, buffer, use_dictionary=["product"], write_statistics=False)
-        self._store.write_bytes(path, buffer.getvalue())
-        self._parts.append(_Part(path, table.num_rows, table if keep else None))
-
-
-def _table(rows: Sequence[_Row]) -> pa.Table:
-    columns = list(zip(*rows, strict=True)) or [()] * len(_SCHEMA)
-    return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, _SCHEMA, strict=True)], schema=_SCHEMA)
+        self._store.write_bytes(path, records.content)
+        self._parts.append(_Part(path, records.rows, records if keep else None))
+        return self._parts[-1]
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:

@@ -18,9 +18,9 @@ import shutil
 import socket
 import tempfile
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import fsspec
 import pyarrow as pa
@@ -32,6 +32,8 @@ from roadscan.model.errors import StoreError
 _STAGING: Final = ".staging"
 _CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
 _ALGORITHM: Final = "blake3:"
+
+_T = TypeVar("_T")
 
 
 def file_digest(path: Path) -> str:
@@ -121,12 +123,13 @@ class Store:
                 self.publish(temporary, relative)
             return
         temporary = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
-        temporary.parent.mkdir(parents=True, exist_ok=True)
         try:
-            temporary.write_bytes(content)
+            with _made(temporary.parent, lambda: temporary.open("wb")) as stream:
+                stream.write(content)
             self.publish(temporary, relative)
-        finally:
+        except BaseException:
             temporary.unlink(missing_ok=True)
+            raise
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -147,8 +150,7 @@ class Store:
         """Move a finished local file into the store under its final name."""
         target = self.path(relative)
         if self.is_folder:
-            Path(target).parent.mkdir(parents=True, exist_ok=True)
-            local.replace(target)
+            _made(Path(target).parent, lambda: local.replace(target))
         else:
             self.fs.put_file(str(local), target)
             local.unlink()
@@ -168,18 +170,17 @@ class Store:
 
     def remove(self, relative: str) -> None:
         """Remove a file or folder if it is there; a folder vanishes at once."""
-        if not self.exists(relative):
+        if not self.is_folder:
+            if self.exists(relative):
+                self.fs.rm(self.path(relative), recursive=True)
             return
-        if self.is_folder:
-            doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
-            doomed.parent.mkdir(parents=True, exist_ok=True)
-            Path(self.path(relative)).rename(doomed)
-            if doomed.is_dir():
-                shutil.rmtree(doomed, ignore_errors=True)
-            else:
-                doomed.unlink()
-        else:
-            self.fs.rm(self.path(relative), recursive=True)
+        path = Path(self.path(relative))
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
+            return
+        doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        _made(doomed.parent, lambda: path.rename(doomed))
+        shutil.rmtree(doomed, ignore_errors=True)
 
     def local_copy(self, relative: str, folder: Path) -> Path:
         """Path of a local file with the content of a stored one (itself, where the store is a folder)."""
@@ -228,6 +229,15 @@ class Store:
             if not _alive(int(folder.name.split("-")[0])):
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.unlink(missing_ok=True) if folder.is_file() else None
+
+
+def _made(folder: Path, write: Callable[[], _T]) -> _T:
+    """What comes of `write`, which needs the folder: it is made where it is missing."""
+    try:
+        return write()
+    except FileNotFoundError:
+        folder.mkdir(parents=True, exist_ok=True)
+        return write()
 
 
 def _alive(pid: int) -> bool:

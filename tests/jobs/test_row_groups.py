@@ -89,5 +89,7 @@ def test_a_task_arrives_as_it_was_sent_and_carries_no_epochs_of_row_groups(finis
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_results_arrive_as_they_were_sent(count: int) -> None:
     records = [OutputRecord("tile", f"{k}_7", f"key{k}", f"tiles/cells/{k}_7.parquet", k, "d") for k in range(count)]
-    result = TaskResult(tuple(records), (("9_9", "damaged"),))
-    assert pickle.loads(pickle.dumps(result)) == result
+    arrived = pickle.loads(pickle.dumps(TaskResult.of(records, [("9_9", "damaged")])))
+    assert [tuple(row.values()) for row in arrived.records.table().to_pylist()] == records
+    assert arrived.records.rows == count
+    assert arrived.failures == (("9_9", "damaged"),)

@@ -16,6 +16,7 @@ import pytest
 
 from roadscan.model.errors import StoreError
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.tables import manifest as manifest_module
 from roadscan.tables.logs import DataFile, LogRecord, read_log_records, write_log_record
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.merge import merged
@@ -208,6 +209,7 @@ def test_manifest_of_a_long_run_is_merged_and_says_the_same(
     tmp_path: Path, dies_at: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against a dictionary; where the process dies while merged parts are removed, too."""
+    monkeypatch.setattr(manifest_module, "_MOST_PARTS", 64)
     store, known, written = Store(str(tmp_path), "long"), {}, []
     manifest, write, remove = Manifest(store), store.write_bytes, store.remove
     monkeypatch.setattr(store, "write_bytes", lambda path, content: (written.append(path), write(path, content)))

@@ -1,0 +1,137 @@
+"""Records of outputs as rows of tables: each finished file with its key; what a later record says counts."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+RECORDS: Final = pa.schema(
+    [
+        ("product", pa.string()),
+        ("unit", pa.string()),
+        ("key", pa.string()),
+        ("path", pa.string()),
+        ("bytes", pa.int64()),
+        ("digest", pa.string()),
+        ("detail", pa.string()),
+    ]
+)
+
+Row: TypeAlias = tuple[str, str, str, str, int, str, str]
+
+
+class OutputRecord(NamedTuple):
+    """One finished file (or a finished unit without a file, where `path` is empty). A network has millions."""
+
+    product: str
+    """Product, or 'footprints', or 'tile' for the tile as a whole."""
+    unit: str
+    """Tile id, output name, or log key."""
+    key: str
+    """Hash of its inputs, of the configuration that matters to it, and of the code; empty where it is forgotten."""
+    path: str
+    """Relative to the survey's root."""
+    bytes: int
+    digest: str
+    """BLAKE3-128 of the file."""
+    detail: str = ""
+    """JSON with figures that later stages need."""
+
+    def figures(self) -> dict[str, Any]:
+        """The detail as values."""
+        return dict(json.loads(self.detail)) if self.detail else {}
+
+
+def table_of(records: Sequence[Row]) -> pa.Table:
+    """Records as a table."""
+    columns = list(zip(*records, strict=True)) or [()] * len(RECORDS)
+    return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, RECORDS, strict=True)], schema=RECORDS)
+
+
+def rows_of(table: pa.Table) -> list[Row]:
+    """The rows of a table, as bare tuples: Python's collector walks over every named one again and again."""
+    return list(zip(*(table.column(f.name).to_pylist() for f in RECORDS), strict=True))
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Records as the Parquet file that the manifest keeps: made by a worker, written by the run that it works for."""
+
+    content: bytes
+    rows: int
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Packed:
+        """A table of records, packed."""
+        buffer = io.BytesIO()
+        pq.write_table(table, buffer, compression="lz4", use_dictionary=["product"], write_statistics=False)
+        return cls(buffer.getvalue(), table.num_rows)
+
+    def table(self) -> pa.Table:
+        """The records."""
+        return unpacked(self.content)
+
+
+def unpacked(content: bytes) -> pa.Table:
+    """Records of such a file; read by this thread alone, as :meth:`Store.read_table` does."""
+    return pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+
+
+def latest(table: pa.Table, *, forgotten: bool = False) -> tuple[pa.Table, list[str]]:
+    """Last row of each product and unit, by both; and the files of which a later record says that they moved.
+
+    Parameters
+    ----------
+    table : records in the order in which they were made.
+    forgotten : keep the rows that forget a record.
+    """
+    table = table.combine_chunks()
+    place = _places(table)
+    order = np.argsort(place, kind="stable")
+    again = place[order[1:]] == place[order[:-1]]
+    known = pc.not_equal(table.column("key"), "").to_numpy()
+    moved = _moved(table, order, again, known) if again.any() else []
+    last = order[np.append(~again, np.ones(min(order.size, 1), bool))]
+    return table.take(pa.array(last if forgotten else last[known[last]])), moved
+
+
+def _places(table: pa.Table) -> npt.NDArray[np.int64]:
+    """(rows,) numbers that order the rows by product and unit."""
+    (product, _), (unit, units) = (_ranks(table.column(name)) for name in ("product", "unit"))
+    return product * units + unit
+
+
+def _ranks(column: pa.ChunkedArray) -> tuple[npt.NDArray[np.int64], int]:
+    """Place (rows,) of each text among those that there are, and their number."""
+    coded = _codes(column)
+    rank = np.empty(len(coded.dictionary), np.int64)
+    rank[pc.array_sort_indices(coded.dictionary).to_numpy()] = np.arange(rank.size)
+    return rank[coded.indices.to_numpy()], rank.size
+
+
+def _codes(column: pa.ChunkedArray) -> pa.DictionaryArray:
+    """A column as numbers of the texts that there are."""
+    return column.combine_chunks().dictionary_encode()
+
+
+def _moved(
+    table: pa.Table, order: npt.NDArray[np.int64], again: npt.NDArray[np.bool_], known: npt.NDArray[np.bool_]
+) -> list[str]:
+    """Files whose output's next record names another, and no record after that names them again."""
+    path = _codes(table.column("path"))
+    code = path.indices.to_numpy()[order]
+    nowhere = pc.index(path.dictionary, "").as_py()
+    last = np.zeros(len(path.dictionary), np.int64)
+    np.maximum.at(last, code, np.arange(code.size))
+    at = np.flatnonzero(again & (code[1:] != code[:-1]) & (code[:-1] != nowhere) & known[order[1:]])
+    at = at[last[code[at]] == at]
+    return list(path.dictionary.take(pa.array(code[at])).to_pylist())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
-import itertools
 import logging
 import os
 import time
@@ -33,15 +33,19 @@ QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.comm.timeouts.connect": "60s",
+    "distributed.scheduler.worker-saturation": "inf",
 }
 """Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
 and pausing stay out of the way, and nobody looks at its figures, of which it would take hundreds a second."""
 
-_HELD_A_THREAD = 8
-"""Tasks of each worker thread that the scheduler holds: with more of them on their way, fewer messages."""
+_HELD_A_THREAD = 2
+"""Tasks of each worker thread that the scheduler holds at least, while there are any …"""
 
-_TOGETHER_S = 0.01
-"""How long results wait for others, so that one message asks for them all."""
+_MORE_HELD = 28
+"""… and more in all while many wait, so that messages carry several of tasks that end quickly."""
+
+_TOGETHER_S = 0.05
+"""How long results wait for half of the others at most, so that one message asks for them all."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,23 @@ def reason_of(error: Exception | None) -> str:
     if error is None:
         return "the worker gave no result"
     return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
+
+
+class Made(Sequence[T]):
+    """Tasks that are made when they are handed out: while workers are at the first, and not all in memory."""
+
+    def __init__(self, pieces: Sequence[Any], make: Callable[[Any], T]) -> None:
+        self._pieces, self._make = pieces, make
+
+    def __len__(self) -> int:
+        return len(self._pieces)
+
+    def __getitem__(self, place: Any) -> Any:
+        """One task, or some."""
+        return [*map(self._make, self._pieces[place])] if isinstance(place, slice) else self._make(self._pieces[place])
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._make, self._pieces)
 
 
 class Compute(Protocol):
@@ -119,28 +140,29 @@ class OnDask:
         """
         from distributed import as_completed  # slow to import
 
-        waiting = iter(tasks)
+        threads = self.workers
         running: dict[str, T] = {}
         queue = as_completed(raise_errors=False)
 
-        def hand_out(count: int) -> None:
-            chosen = list(itertools.islice(waiting, count))
-            if not chosen:
-                return
-            futures = self.send(function, chosen)
-            running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
-            queue.update(futures)
+        def hand_out(first: int) -> int:
+            held = _HELD_A_THREAD * threads + min(_MORE_HELD, (len(tasks) - first) // 4)
+            chosen = tasks[first : first + max(held - len(running), 0)]
+            if chosen:
+                futures = self.send(function, chosen)
+                running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
+                queue.update(futures)
+            return first + len(chosen)
 
-        hand_out(_HELD_A_THREAD * self.workers)
+        handed_out = hand_out(0)
         for batch in queue.batches():
-            time.sleep(_TOGETHER_S)
-            ended = batch + queue.next_batch(block=False)
-            hand_out(len(ended))
+            ended = batch + _others(queue, len(running) // 2 - len(batch))
+            own = [running.pop(future.key) for future in ended]
+            handed_out = hand_out(handed_out)
             results = self._client.gather({future.key: future for future in ended}, errors="skip")
-            for future in ended:
+            for future, task in zip(ended, own, strict=True):
                 error = future.exception() if future.status != "finished" else None
                 future.release()
-                yield Done(running.pop(future.key), None if error is not None else results.pop(future.key), error)
+                yield Done(task, None if error is not None else results.pop(future.key), error)
 
     def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
         """Hand some tasks to the scheduler; returns their futures."""
@@ -151,12 +173,34 @@ class OnDask:
         return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
 
 
+def _others(queue: Any, wanted: int) -> list[Any]:
+    """Futures that end soon: as many as are wanted, or those of the next moment."""
+    ended: list[Any] = queue.next_batch(block=False)
+    until = time.perf_counter() + _TOGETHER_S
+    while len(ended) < wanted and time.perf_counter() < until:
+        time.sleep(_TOGETHER_S / 10)
+        ended += queue.next_batch(block=False)
+    return ended
+
+
 def _called(sent: bytes) -> Any:
     """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker)."""
     from distributed.protocol import pickle  # slow to import
 
     function, task = pickle.loads(sent)
-    return function(task)
+    result = function(task)
+    _freeze()
+    return result
+
+
+@functools.cache
+def _freeze() -> None:
+    """Tell Python's collector, once a process, that what was loaded for a first task stays.
+
+    Else it looks through all of that again and again while records are made.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 class WhenNeeded:

@@ -79,12 +79,11 @@ class GroupsByTile:
             last_epoch_gps_ns=_reduced(np.maximum, self._last_epoch[rows], starts),
         )
 
-    def groups(self, runs: Runs, number: int) -> Sequence[int]:
-        """Row groups of a slice of the runs, counted within their file."""
-        own = np.flatnonzero(runs.slice == number)
-        begin = (runs.begin - self._base[runs.source])[own]
-        end = begin + (runs.end - runs.begin)[own]
-        if own.size == 1:
+    def groups(self, runs: Runs, first: int, last: int) -> Sequence[int]:
+        """Row groups of one data file, from run `first` to `last` − 1, counted within their file."""
+        base = self._base[runs.source[first]]
+        begin, end = runs.begin[first:last] - base, runs.end[first:last] - base
+        if begin.size == 1:
             return range(int(begin[0]), int(end[0]))
         return tuple(expanded(begin, end).tolist())
 

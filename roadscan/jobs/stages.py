@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clocks import estimate_clocks
-from roadscan.jobs.compute import Compute, rare_collections
+from roadscan.jobs.compute import Compute, Made, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
 from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
@@ -20,7 +20,7 @@ from roadscan.jobs.surface_colours import check_cameras, check_colours, colour_n
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
 from roadscan.jobs.surfaces import compute_surfaces
 from roadscan.jobs.tile_files import tile_file_names
-from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, plan_tiles, stale_tiles
+from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.jobs.tiles import compute_tiles, run_tasks
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
@@ -53,6 +53,11 @@ class Run:
     """Stage, unit and reason of everything that failed."""
     raw_bytes_read: int = 0
     """Compressed bytes of readings that the tiles stage asked for."""
+
+    def handed_out(self, task: TileTask) -> TileTask:
+        """Count what a task reads."""
+        self.raw_bytes_read += task.raw_bytes
+        return task
 
     def failed(self, stage: str, found: Sequence[tuple[str, object]]) -> None:
         """Keep failures of a stage."""
@@ -91,9 +96,9 @@ def run_tiles(run: Run) -> None:
     if work.chosen:
         check_colours(work.planned.plan, folders=True)  # before the tiles are computed for them
     manifest.remove(work.gone)
-    tasks = work.planned.tasks(work.chosen, run.compute.workers)
-    run.raw_bytes_read = sum(t.raw_bytes for t in tasks)
-    failures = run_tasks(compute_tiles, tasks, work.planned.singly, manifest, run.compute, _bar(run, "tiles"))
+    tasks = Made(work.planned.tasks(work.chosen, run.compute.workers), run.handed_out)
+    report = _bar(run, "tiles")
+    failures = run_tasks(compute_tiles, tasks, len(work.chosen), work.planned.singly, manifest, run.compute, report)
     manifest.forget(TILE, [unit for unit, _ in failures])
     empty = manifest.without_file(TILE)
     names = {OVERVIEWS, *tile_file_names()} if empty else ()
@@ -117,7 +122,7 @@ def run_surfaces(run: Run) -> None:
     check_colours(work.planned.tiles.plan, folders=True)
     tasks = work.planned.tasks(work.chosen, run.compute.workers)
     report = _bar(run, "surfaces")
-    failures = run_tasks(compute_surfaces, tasks, work.planned.singly, manifest, run.compute, report)
+    failures = run_tasks(compute_surfaces, tasks, len(work.chosen), work.planned.singly, manifest, run.compute, report)
     manifest.forget(SURFACE, [unit for unit, _ in failures])
     manifest.remove(files_without_surface(manifest))
     made = manifest.of(SURFACE)

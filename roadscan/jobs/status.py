@@ -119,7 +119,7 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
         status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}
         return
     work = plan_tile_work(Run(survey, store, Inline()), manifest)
-    tasks = work.planned.tasks(work.chosen)
+    tasks = list(work.planned.tasks(work.chosen))
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
     status.tiles_stale = len(stale)
     status.tiles_current = sum(1 for r in manifest.of(TILE).values() if r.path and r.unit not in stale)

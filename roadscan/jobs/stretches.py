@@ -1,4 +1,4 @@
-"""Tiles in stretches of road, each of which is a task: a kilometre, or less where there are few for the workers."""
+"""Tiles in stretches of road, each of which is a task: two kilometres, or less where there are few for the workers."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from roadscan.jobs.row_groups import GroupsByTile
 _SQUARE_M = 100.0
 """Edge of the squares whose tiles stay together."""
 
-_SQUARES = 15
-"""Squares that one task computes at most: a kilometre of road oblique to the grid, one and a half along it."""
+_SQUARES = 29
+"""Squares that one task computes at most: two kilometres of road oblique to the grid, three along it."""
 
 _SQUARES_A_TASK = 4
 """Squares of a task at least, of less than 100 m where there are few: tasks have about as many readings each."""
@@ -71,7 +71,7 @@ def _squares(tiles: DrivenTiles, numbers: Int64, edge: int) -> npt.NDArray[np.in
 
 
 def _stretch_by_turn(readings: Int64, parts: int) -> Int64:
-    """Stretch of each square, in the order of the drive: of 15 squares, or `parts` of about as many readings each."""
+    """Stretch of each square, in the order of the drive: of 29 squares, or `parts` of about as many readings each."""
     if readings.size >= _SQUARES * parts:
         return np.arange(readings.size, dtype=np.int64) // _SQUARES
     upto = np.cumsum(readings)

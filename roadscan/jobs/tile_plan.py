@@ -6,11 +6,13 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.jobs.centre_line import CentreLines
+from roadscan.jobs.compute import Made
 from roadscan.jobs.fingerprint import key_of, keys_of
 from roadscan.jobs.footprints import FootprintRanges
 from roadscan.jobs.plan import SurveyPlan
@@ -59,8 +61,18 @@ class PlannedTiles(DrivenTiles):
         return {tile: number for number, tile in enumerate(self.ids)}
 
     def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
-        """Places of some tiles."""
-        return np.array([self.number[tile] for tile in tiles], dtype=np.int64)
+        """Places of some tiles, each of which is one of these."""
+        wanted = np.array([(tile.row, tile.column) for tile in tiles], dtype=np.int64).reshape(-1, 2)
+        return np.searchsorted(self._place, _places(*wanted.T))
+
+    @cached_property
+    def _place(self) -> npt.NDArray[np.int64]:
+        return _places(self.row, self.column)
+
+
+def _places(row: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Numbers that order tiles by row and column."""
+    return (row.astype(np.int64) << 32) + column.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -172,8 +184,8 @@ class TilePlan:
     products: tuple[WantedProduct, ...]
     context: ProductContext
 
-    def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> list[TileTask]:
-        """Tasks over the chosen tiles: a kilometre each, or less where there are few for that many workers.
+    def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> Sequence[TileTask]:
+        """Tasks over the chosen tiles: two kilometres each, or less where there are few for that many workers.
 
         Where products need points, a task is a block that fits into memory.
         """
@@ -184,11 +196,11 @@ class TilePlan:
         if self._points_of(self.task(Block(()))):
             readings = dict(zip(chosen, self.tiles.readings[numbers].tolist(), strict=True))
             return [self.task(b) for b in cut_blocks(readings, config.block_tiles, config.max_block_readings)]
-        ids = self.tiles.ids
-        return [
-            self._task(Block(tuple(ids[n] for n in own.tolist())), own, own)
-            for own in cut_stretches(self.tiles, numbers, config.size_m, workers)
-        ]
+        return Made(cut_stretches(self.tiles, numbers, config.size_m, workers), self._stretch)
+
+    def _stretch(self, own: npt.NDArray[np.int64]) -> TileTask:
+        """A task over tiles by their numbers, without halo."""
+        return self._task(Block(tuple(map(self.tiles.ids.__getitem__, own.tolist()))), own, own)
 
     def singly(self, chosen: Sequence[TileId]) -> list[TileTask]:
         """A task for each tile."""
@@ -209,16 +221,16 @@ class TilePlan:
         cuts = np.flatnonzero(np.diff(runs.slice, prepend=-1))
         spans = list(zip(runs.first_epoch_gps_ns.tolist(), runs.last_epoch_gps_ns.tolist(), strict=True))
         slices: list[RawSlice] = []
-        for number, (start, end) in enumerate(itertools.pairwise([*cuts.tolist(), len(spans)])):
+        for start, end in itertools.pairwise([*cuts.tolist(), len(spans)]):
             whole = self.footprints.slices[int(runs.source[start])]
-            groups = tiles.groups.groups(runs, number)
+            groups = tiles.groups.groups(runs, start, end)
             share = whole.bytes * len(groups) // max(len(whole.groups), 1)
             slices.append(RawSlice(whole.source, whole.file, groups, tuple(spans[start:end]), share))
         return TileTask(
             store=self.plan.store,
             ground=self.plan.ground,
             block=block,
-            keys=tuple(tiles.keys[n] for n in core.tolist()),
+            keys=tuple(map(tiles.keys.__getitem__, core.tolist())),
             slices=tuple(slices),
             touched=tiles.groups.touched(runs, core),
             owned_runs=tiles.groups.owned(runs, core),

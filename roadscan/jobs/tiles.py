@@ -68,17 +68,17 @@ T = TypeVar("T", bound=OfTiles)
 def run_tasks(
     function: Callable[[T], TaskResult],
     tasks: Sequence[T],
+    total: int,
     singly: Callable[[Sequence[TileId]], list[T]],
     manifest: Manifest,
     compute: Compute,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
-    """Compute tasks by `function`; returns the failures.
+    """Compute tasks over `total` tiles by `function`; returns the failures.
 
     A task that fails as a whole (a worker out of memory, a damaged raw block where points are made) is tried again
     tile by tile, with the tasks that `singly` makes of its tiles, so that only the tiles at fault are lost.
     """
-    total = sum(len(t.block.tiles) for t in tasks)
     finished = 0
     failures: list[tuple[str, str]] = []
     again: list[TileId] = []

@@ -142,7 +142,7 @@ class Manifest:
         """Bring all parts into one, without what is no more."""
         self.settle()
         old, self._parts = self._parts, []
-        self._write(Packed.of(self._table), old[-1].number + 1 if old else 0)
+        self._write(Packed.of(self._table, "lz4"), old[-1].number + 1 if old else 0)
         for part in old:
             self._store.remove(part.path)
 
@@ -185,7 +185,7 @@ class Manifest:
         for path in moved:  # no record tells of them once these parts are one
             self._store.remove(path)
         del self._parts[first:]
-        merged = self._write(Packed.of(table), old[-1].number + 1)
+        merged = self._write(Packed.of(table, "lz4"), old[-1].number + 1)
         known = [part for part in self._behind if part not in old]
         self._behind = known if known == self._behind else [*known, merged]
         for part in old:  # where these stay, the new part says once more what they say

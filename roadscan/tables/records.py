@@ -70,10 +70,10 @@ class Packed:
     rows: int
 
     @classmethod
-    def of(cls, table: pa.Table) -> Packed:
-        """A table of records, packed."""
+    def of(cls, table: pa.Table, compression: str = "none") -> Packed:
+        """A table of records, packed; to be compressed where it is long kept, which takes twice the time."""
         buffer = io.BytesIO()
-        pq.write_table(table, buffer, compression="lz4", use_dictionary=["product"], write_statistics=False)
+        pq.write_table(table, buffer, compression=compression, use_dictionary=["product"], write_statistics=False)
         return cls(buffer.getvalue(), table.num_rows)
 
     def table(self) -> pa.Table:

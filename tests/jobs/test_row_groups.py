@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pickle
 from types import SimpleNamespace
 
@@ -49,8 +50,9 @@ def test_what_a_task_needs_and_tells(seed: int) -> None:
     by_tile = GroupsByTile(footprints, order, starts)
     tiles = np.random.default_rng(seed).permutation(TILES)[:5]
     runs = by_tile.runs(tiles)
-    sources = [int(s) for s in runs.source[np.flatnonzero(np.diff(runs.slice, prepend=-1))]]
-    groups = [by_tile.groups(runs, number) for number in range(len(sources))]
+    cuts = np.flatnonzero(np.diff(runs.slice, prepend=-1)).tolist()
+    sources = [int(s) for s in runs.source[cuts]]
+    groups = [by_tile.groups(runs, a, b) for a, b in itertools.pairwise([*cuts, runs.slice.size])]
     held = [(s, g) for s, own in zip(sources, groups, strict=True) for g in own]
     assert held == sorted(set().union(*(needed[int(t)] for t in tiles)))
     assert sources == sorted(set(sources))

@@ -29,7 +29,7 @@ def driven(tiles: int, beyond: int) -> DrivenTiles:
         (40, 50.0, 0, 16),  # profilers: eight tasks a worker
         (16, 50.0, 30, 2),  # a lidar, which sees 30 row groups beyond its tile: one task a worker
         (40, 50.0, 30, 4),
-        (600, 50.0, 30, 20),  # long enough: a kilometre and a half each
+        (1000, 50.0, 30, 18),  # long enough: three kilometres each
         (3, 10.0, 0, 3),
         (1, 50.0, 30, 1),
     ],
@@ -42,4 +42,4 @@ def test_every_tile_is_in_one_stretch_in_the_order_of_the_drive(
     assert np.concatenate(stretches).tolist() == list(range(tiles))[::-1]
     assert len(stretches) == count
     sizes = [part.size for part in stretches]
-    assert max(sizes) <= 2 * min(sizes) + 2 or tiles == 600
+    assert max(sizes) <= 2 * min(sizes) + 2 or tiles == 1000

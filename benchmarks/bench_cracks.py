@@ -91,7 +91,7 @@ class Seen:
 def figures(_: Path) -> Iterator[Figure]:
     """Cracks by class and cell, a net, clean roads, potholes, speed."""
     for cell_m in CELLS_M:
-        for width_m, depth_m in CLASSES_M[cell_m > CELLS_M[1] :]:
+        for width_m, depth_m in CLASSES_M:
             yield from quality(cell_m, width_m, depth_m, CLEAN)
     for faults in (MANY, FEW):
         for width_m, depth_m in CLASSES_M[1:]:

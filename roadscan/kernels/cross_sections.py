@@ -110,6 +110,7 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
         ground, lower = depths(total, count, begin, depth)
         if math.isnan(ground):
             continue
+        out[n, 4] = base + ground
         middle = BINS * reach
         peak, deepest = middle, -np.inf
         for k in range(middle - begin // 2 - 1, middle + begin // 2 + 1):
@@ -124,4 +125,3 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
         out[n, 1] = (left + right) / BINS
         out[n, 2] = (peak - middle + 0.5 * (right - left)) / BINS
         out[n, 3] = deepest - (ground - lower)
-        out[n, 4] = base + ground

@@ -57,6 +57,10 @@ class ValleyCells:
     flank: Int64
     """How far away its flanks begin (cells)."""
 
+    def part(self, rows: npt.NDArray[np.bool_]) -> ValleyCells:
+        """Some of them."""
+        return ValleyCells(self.row[rows], self.column[rows], self.north[rows], self.east[rows], self.flank[rows])
+
     def beside(self, right: Float64 | Int64) -> tuple[Int64, Int64]:
         """Rows and columns of the cells so many cells to the right."""
         south, east = (np.rint(right * part).astype(np.int64) for part in (self.east, self.north))

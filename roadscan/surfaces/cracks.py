@@ -4,6 +4,7 @@ The skeleton comes from ``surfaces/valleys.py``. At each of its cells a cross-se
 smoothing (impulses left out): all cells up to 4.5 cells along the crack are sorted by their distance from its line into
 bins of half a cell. Because a line rarely runs along the grid, the section is finer than a cell; nothing is
 interpolated between cells and nothing is smoothed across the crack. Ground is the straight line between the flanks.
+Where that shows no crack, heights that are lowered to the lowest readings are asked, as ``surfaces/valleys.py`` does.
 
 - *depth*: of the bottom below the ground: from robust heights, where cells lie in the crack alone, and from the lowest
   readings of cells, where it is narrower (``surfaces/crack_depths.py``). Where these are not known, robust heights show
@@ -142,15 +143,15 @@ def _spur_cells(config: CrackDetection, cell_m: float) -> int:
 def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config: CrackDetection) -> Sections:
     cells = _valley_cells(found)
     row, column = cells.row, cells.column
-    reach = section_cells(config, window.cell_m)
-    out = np.empty((row.size, 5))
-    cross_sections(window.cleaned_m(), row, column, cells.north, cells.east, cells.flank, reach, out)
+    out = _valley_sections(window.cleaned_m(), cells, window, config)
+    hidden = np.isnan(out[:, 0])
+    if window.lowest is not None:  # what robust heights do not show, lowest readings may
+        lowered = window.lowered_m(config.lowered_m)
+        out[hidden, :4] = _valley_sections(lowered, cells.part(hidden), window, config)[:, :4]
     right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)
-    with np.errstate(invalid="ignore"):
-        is_valley = (out[:, 1] * window.cell_m <= config.max_width_m) & (out[:, 3] >= _LOWER_FLANK * out[:, 0])
-    out[~is_valley] = np.nan
     width, depth = sharpened(out[:, 1], out[:, 0])
-    depth = blended(bottom_depths(window, cells, right, out[:, 4]), depth, out[:, 1])
+    bottom = bottom_depths(window, cells, right, np.where(np.isnan(depth), np.nan, out[:, 4]))
+    depth = blended(bottom, depth, np.where(hidden, 0.0, out[:, 1]))
     columns = found.skeleton.shape[1]
     own = np.searchsorted(row * columns + column, graph.row * columns + graph.column)
     east = column + window.first_column + 0.5 + right * cells.north
@@ -159,6 +160,17 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
     for _ in range(_SMOOTHINGS):
         place = graph.smoothed(place)
     return Sections(place, width[own] * window.cell_m, depth[own])
+
+
+def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow, config: CrackDetection) -> Float64:
+    """(n, 5) of :func:`cross_sections`; where one is not that of a crack NaN but for the height of the ground."""
+    out = np.empty((cells.row.size, 5))
+    reach = section_cells(config, window.cell_m)
+    cross_sections(heights, cells.row, cells.column, cells.north, cells.east, cells.flank, reach, out)
+    with np.errstate(invalid="ignore"):
+        is_valley = (out[:, 1] * window.cell_m <= config.max_width_m) & (out[:, 3] >= _LOWER_FLANK * out[:, 0])
+    out[~is_valley, :4] = np.nan
+    return out
 
 
 def _valley_cells(found: Valleys) -> ValleyCells:

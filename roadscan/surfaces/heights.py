@@ -16,6 +16,8 @@ Bool = npt.NDArray[np.bool_]
 HEIGHT_STEP_M = 1e-5
 """Heights are whole multiples of this, so that sums do not depend on their order."""
 _OUTLIER_SIGMAS = 6.0
+_SURE_READINGS = 5
+"""Of so many readings half are hardly wrong."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,29 @@ class HeightWindow:
         return np.asarray((row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop))
 
     def cleaned_m(self) -> Float64:
-        """Raw heights without those that the smoothing left out as impulses."""
-        off = np.abs(self.raw_m - self.height_m)
+        """Raw heights without those that the smoothing left out as impulses.
+
+        The robust height of several readings that lies below is none: it is a crack's, of which little is in the cells
+        around. One above may be that of what lies on the road.
+        """
+        off = self.raw_m - self.height_m
         with np.errstate(invalid="ignore"):
-            return np.where(off <= _OUTLIER_SIGMAS * self.sigma_m, self.raw_m, np.nan)
+            kept = np.abs(off) <= _OUTLIER_SIGMAS * self.sigma_m
+            if self.lowest is not None:
+                kept |= (off < 0.0) & (self.lowest.count >= _SURE_READINGS)
+        return np.where(kept, self.raw_m, np.nan)
+
+    def lowered_m(self, most_m: float) -> Float64:
+        """The same, lowered to the lowest reading of a cell where it is known, but by `most_m` at most.
+
+        A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
+        reading decides that: it must not outweigh the cells around.
+        """
+        heights = self.cleaned_m()
+        if self.lowest is None or most_m <= 0.0:
+            return heights
+        drop = np.minimum(self.lowest.drop_m, np.float32(most_m))
+        return np.asarray(heights - np.where(np.isnan(drop), np.float32(0.0), drop))
 
     def map_m(self, row: npt.ArrayLike, column: npt.ArrayLike) -> Float64:
         """Easting and northing (n, 2) of places in cells within the window; .5 is a cell's middle."""

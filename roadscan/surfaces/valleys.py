@@ -1,5 +1,7 @@
 """Narrow valleys of a gridded surface: where lines of cells lie below both flanks.
 
+0. *Heights* are lowered to the lowest reading of each cell where it is known, but by `lowered_m` at most: a crack that
+   takes in less than half of a cell is in that alone. One wrong reading among 25 lowers its cell by no more than that.
 1. *Lines*: the mean height at 21 places a cell apart, in 24 directions, 7.5° apart. Noise and stones average out; a
    crack does not.
 2. *Valley*: how far a line lies below the lower of two lines beside it, 2, 4, 8 … cells away; the deepest of all
@@ -101,7 +103,7 @@ def find_valleys(window: HeightWindow, config: CrackDetection) -> Valleys:
     """Valleys and the skeleton of a window. Along the border, as wide as a line and its flanks, nothing is found."""
     cell_m = window.cell_m
     flanks = flank_cells(config, cell_m)
-    heights = window.cleaned_m()
+    heights = window.lowered_m(config.lowered_m)
     measured = ~np.isnan(heights)
     whole = _whole_numbers(_filled(heights, _fill_cells(config, cell_m)))
     depth, which, bend = _deepest(whole, flanks, cell_m)

@@ -16,10 +16,12 @@ from roadscan.surfaces.crack_network import join_cracks
 from roadscan.surfaces.cracks import crack_pieces
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.lowest import LowestReadings
+from roadscan.surfaces.valleys import LINE_HALF, flank_cells
 
 CELL_M, FINE = 0.005, 5
 CELLS = (112, 130)
 WRONG = 0.02
+CONFIG = CrackDetection(max_width_m=0.02)
 LINE = [(10.0, 0.95), (10.3, 1.03), (10.6, 0.98)]
 
 
@@ -51,7 +53,7 @@ def cells_of(width_m: float, depth_m: float, kept: float = 0.95, wrong: float = 
 
 def depths(window: HeightWindow) -> tuple[float, float]:
     """Mean and greatest depth of the only crack (m)."""
-    (crack,) = join_cracks(crack_pieces(window, CrackDetection(max_width_m=0.02)), 0.0, CELL_M, CrackJoining())
+    (crack,) = join_cracks(crack_pieces(window, CONFIG), 0.0, CELL_M, CrackJoining())
     return crack.depth_mean_m, crack.depth_max_m
 
 
@@ -75,8 +77,32 @@ def test_a_crack_wider_than_two_cells_has_its_depth_from_robust_heights() -> Non
     window = cells_of(0.020, 0.015, wrong=WRONG)
     mean, greatest = depths(window)
     plain, plain_greatest = depths(replace(window, lowest=None))
-    assert mean == pytest.approx(0.015, rel=0.03) and mean == pytest.approx(plain, rel=0.01)
+    assert mean == pytest.approx(0.015, rel=0.05) and mean == pytest.approx(plain, rel=0.02)
     assert greatest == pytest.approx(plain_greatest, rel=0.05)
+
+
+def test_a_crack_that_heights_hardly_show_is_found_by_lowest_readings() -> None:
+    window = cells_of(0.003, 0.005)
+    found, alone = (
+        sum(p.length_m for p in crack_pieces(one, CrackDetection(max_width_m=0.02, lowered_m=lowered)))
+        for one, lowered in ((window, 0.002), (window, 0.0))
+    )
+    border = LINE_HALF + 3 * flank_cells(CONFIG, CELL_M)[-1]  # where nothing is found
+    assert found == pytest.approx((CELLS[0] - 2 * border) * CELL_M, rel=0.1) and alone < 0.7 * found
+    assert crack_pieces(cells_of(0.003, 1e-6, wrong=WRONG), CONFIG) == []
+
+
+def test_heights_of_several_readings_below_are_no_impulses() -> None:
+    raw = np.array([[299.99, 299.99, 300.01, 300.0005, np.nan]])
+    lowest = LowestReadings(
+        np.array([[0.001, 0.0, 0.001, 0.009, np.nan]], np.float32), np.array([[5, 2, 9, 9, 0]], np.uint16)
+    )
+    window = HeightWindow(raw, np.full(raw.shape, 300.0), CELL_M, 0.0003, lowest=lowest)
+    np.testing.assert_array_equal(window.cleaned_m(), [[299.99, np.nan, np.nan, 300.0005, np.nan]])
+    np.testing.assert_allclose(window.lowered_m(0.002), [[299.989, np.nan, np.nan, 299.9985, np.nan]], atol=1e-9)
+    np.testing.assert_array_equal(window.lowered_m(0.0), window.cleaned_m())
+    alone = replace(window, lowest=None)
+    np.testing.assert_array_equal(alone.lowered_m(0.002), [[np.nan, np.nan, np.nan, 300.0005, np.nan]])
 
 
 def test_where_no_lowest_reading_is_known_robust_heights_are_taken() -> None:

@@ -34,9 +34,9 @@ from roadscan.tables.store import Store
 
 _BAR_S = 120.0
 _TILE_FIGURES = (
-    '{{"points": {0}, "cells": {1}, "height_min_m": 86.{0}, "height_mean_m": 87.{0}, "height_max_m": 88.{0},'
-    ' "height_std_median_m": 0.000{0}, "intensity_mean": 90.{1}, "passes": [1], "first_epoch_gps_ns": '
-    '145464480{0}00, "last_epoch_gps_ns": 145464481{0}00, "sigma_horizontal_m": null, "sigma_down_m": null}}'
+    '"height_mean_m": 87.1, "height_max_m": 88.2, "height_std_median_m": 0.0004, "intensity_mean": 90.2, "passes": [1],'
+    ' "first_epoch_gps_ns": 1454644800000000000, "last_epoch_gps_ns": 1454644800360000000, "sigma_horizontal_m": null,'
+    ' "sigma_down_m": null}'
 )
 
 
@@ -192,16 +192,16 @@ def stand_in(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
 def _tile_records(task: TileTask) -> Iterator[OutputRecord]:
     files = [item for wanted in task.products for item in wanted.files.items()]
     for tile, key in zip(map(str, task.block.tiles), task.keys, strict=True):
-        digest, number, own_key = f"blake3:{key}{key[::-1]}", int(key[:8], 16), key[8:] + key[:8]
+        number, own_key, digest = hash(key) & 0xFFFFFF, key[8:] + key[:8], "blake3:" + key + key
         for name, suffix in files:
             yield OutputRecord(name, tile, own_key, f"tiles/{name}/{tile}{suffix}", number, digest)
         yield OutputRecord(OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", number, digest)
-        figures = _TILE_FIGURES.format(number, number // 40)
+        figures = f'{{"points": {number}, "cells": {number}, "height_min_m": 86.{number}, ' + _TILE_FIGURES
         yield OutputRecord(TILE, tile, key, f"tiles/cells/{tile}.parquet", number, digest, figures)
 
 
 def _piece_record(piece: FootprintTask | OutputTask) -> OutputRecord:
-    digest = f"blake3:{piece.key}{piece.key[::-1]}"
+    digest = "blake3:" + piece.key + piece.key
     if isinstance(piece, FootprintTask):
         detail = '{"window": [56321, 593487, 56350, 593512]}'
         return OutputRecord(PRODUCT, piece.slice.file, piece.key, piece.target, 12_345, digest, detail)

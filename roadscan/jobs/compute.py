@@ -44,7 +44,7 @@ _HELD_A_THREAD = 2
 _MORE_HELD = 28
 """… and more in all while many wait, so that messages carry several of tasks that end quickly."""
 
-_TOGETHER_S = 0.05
+_TOGETHER_S = 0.02
 """How long results wait for half of the others at most, so that one message asks for them all."""
 
 

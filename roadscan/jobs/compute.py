@@ -32,11 +32,13 @@ QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
+    "distributed.admin.large-graph-warning-threshold": "1GB",
     "distributed.comm.timeouts.connect": "60s",
     "distributed.scheduler.worker-saturation": "inf",
 }
 """Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
-and pausing stay out of the way, and nobody looks at its figures, of which it would take hundreds a second."""
+and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second, nor can change
+how large a task is."""
 
 _HELD_A_THREAD = 2
 """Tasks of each worker thread that the scheduler holds at least, while there are any …"""

@@ -34,7 +34,6 @@ QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.admin.large-graph-warning-threshold": "1GB",
     "distributed.comm.timeouts.connect": "60s",
-    "distributed.scheduler.worker-saturation": "inf",
 }
 """Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
 and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second, nor can change

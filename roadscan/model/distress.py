@@ -12,10 +12,11 @@ class CrackDetection(Strict):
 
     max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
     """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""
-    lowered_m: float = Field(default=0.002, ge=0.0, le=0.05)
+    lowered_m: float = Field(default=0.0, ge=0.0, le=0.05)
     """Each cell is lowered to its lowest reading before cracks are looked for, but by this at most (m): a crack that
-    takes in less than half of a cell is not in its height. 0: heights alone. Take 0 where single profiles lie lower
-    than their neighbours: each would be a crack."""
+    takes in less than half of a cell is not in its height. 0: heights alone; 0.002 finds nets of cracks narrower than
+    a cell. But a single profile that lies lower than its neighbours is a crack then, and so is a row of cells with many
+    times the readings of those beside it, where a vehicle stood and its profiler went on."""
     strong_sigmas: float = Field(default=6.0, gt=0.0)
     """A crack begins where a line of cells lies deeper than its flanks by this many σ of such lines nearby …"""
     weak_sigmas: float = Field(default=3.0, gt=0.0)

@@ -329,7 +329,9 @@ def accumulate_points(
         while end < last and passes[end] == passes[start]:
             end += 1
         n = end - start
-        find_cells(x[start:end], y[start:end], height[start:end], 1.0 / cell_quanta, column, row, heights)
+        find_cells(x[start:end], y[start:end], 1.0 / cell_quanta, column, row)
+        for j in range(n):
+            heights[j] = height[start + j]
         low, high = bounds_of(heights[:n])
         accumulate(
             column[:n], row[:n], heights, low, high, intensity[start:end], np.uint32(1), passes[start], starts, sums,
@@ -340,9 +342,8 @@ def accumulate_points(
 
 
 @bare
-def find_cells(x, y, height, per_cell, column, row, heights):
-    """Cells of points, and their heights; x, y, height : (n,) int32, see :func:`accumulate_points`."""
+def find_cells(x, y, per_cell, column, row):
+    """Cells (≥ n,) int32, out, of points; x, y : (n,) int32, quanta from the tile's south-west corner."""
     for j in range(x.size):
         column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
         row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))
-        heights[j] = height[j]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import bare, kernel
+from roadscan.kernels.accumulate import find_cells
+from roadscan.kernels.options import kernel
 from roadscan.kernels.placing import CHUNK, place_mirror, place_returns
 from roadscan.kernels.row_piles import TAKEN, pile_up, put_on_own_piles
 
@@ -96,14 +97,6 @@ def pile_mirror(
     return profile_epochs.size
 
 
-@bare
-def cells_in_tile(x, y, per_cell, column, row):
-    """Cells (n,) int32, out, of points; x, y : (n,) int32, quanta from the tile's south-west corner."""
-    for j in range(x.size):
-        column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
-        row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))
-
-
 @kernel
 def pile_points(x, y, height, passes, intensity, cell_quanta, ends, piles, first):
     """Put the points of one tile on its piles.
@@ -129,7 +122,7 @@ def pile_points(x, y, height, passes, intensity, cell_quanta, ends, piles, first
         while end < last and passes[end] == passes[start]:
             end += 1
         n = end - start
-        cells_in_tile(x[start:end], y[start:end], 1.0 / cell_quanta, column, row)
+        find_cells(x[start:end], y[start:end], 1.0 / cell_quanta, column, row)
         put_on_own_piles(column[:n], row[:n], height[start:end], intensity[start:end], passes[start], ends, piles)
         start = end
     return start

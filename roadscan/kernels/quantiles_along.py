@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from roadscan.kernels.options import kernel
+from roadscan.kernels.selection import sort_few
 
 HALF_ALONG = 10
 """Cells to either side, in rows and in columns, that a stretch takes in."""
@@ -16,13 +17,8 @@ _HALF_ASIDE = 2.5
 
 @kernel
 def quantile_of(values, count, level):
-    """Quantile of the first `count` values, which are sorted; between two it is interpolated. NaN of none."""
-    for k in range(1, count):
-        one, at = values[k], k
-        while at > 0 and values[at - 1] > one:
-            values[at] = values[at - 1]
-            at -= 1
-        values[at] = one
+    """Quantile of the first `count` values, which change places; between two it is interpolated. NaN of none."""
+    sort_few(values[:count])
     if count == 0:
         return np.nan
     place = level * (count - 1)

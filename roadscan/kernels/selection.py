@@ -38,15 +38,14 @@ def _of_bin(values, low, shift, wanted, found):
 
 
 @bare
-def _in_order(values, k):
-    """The k-th of few numbers, which change places."""
+def sort_few(values):
+    """Put few numbers (n,) in order, one by one."""
     for i in range(1, values.size):
         own, j = values[i], i
         while j > 0 and values[j - 1] > own:
             values[j] = values[j - 1]
             j -= 1
         values[j] = own
-    return np.int64(values[k])
 
 
 @bare
@@ -78,4 +77,5 @@ def smallest(values, k, bins, found):
         for i in range(n):
             values[i] = found[i]
         values, k = values[:n], k - before
-    return _in_order(values, k)
+    sort_few(values)
+    return np.int64(values[k])

@@ -145,7 +145,7 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
     row, column = cells.row, cells.column
     out = _valley_sections(window.cleaned_m(), cells, window, config)
     hidden = np.isnan(out[:, 0])
-    if window.lowest is not None:  # what robust heights do not show, lowest readings may
+    if window.lowest is not None and config.lowered_m > 0.0:  # what robust heights do not show, lowest readings may
         lowered = window.lowered_m(config.lowered_m)
         out[hidden, :4] = _valley_sections(lowered, cells.part(hidden), window, config)[:, :4]
     right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import pickle
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from roadscan.tables import manifest as manifest_module
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.records import Packed, latest, table_of
 from roadscan.tables.store import Store
+from tests.tables.killed import dies_at_removal
 
 _COLUMNS = {"product": "string", "unit": "string", "key": "string", "path": "string", "bytes": "int64"} | dict.fromkeys(
     ("digest", "detail"), "string"
@@ -177,15 +177,8 @@ def test_last_rows_and_moved_files_as_told_one_by_one() -> None:
 @pytest.mark.parametrize("dies_at", [0, 3, 11])
 def test_killed_while_parts_are_merged(store: Store, dies_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(manifest_module, "_MOST_PARTS", 8)
-    manifest, known, remove = Manifest(store), {}, store.remove
-    removals = itertools.count()
-
-    def dying(path: str) -> None:
-        if path.startswith("manifest/") and next(removals) == dies_at:
-            raise KeyboardInterrupt
-        remove(path)
-
-    monkeypatch.setattr(store, "remove", dying)
+    manifest, known = Manifest(store), {}
+    dies_at_removal(store, dies_at, monkeypatch)
     for step in range(60):
         made = [record("tile", n, f"k{step}", "") for n in (step % 7, 10 + step % 11)]
         known |= {r.unit: r for r in made}

@@ -24,6 +24,7 @@ from roadscan.tables.schema import table_schema
 from roadscan.tables.sql import connect, query
 from roadscan.tables.store import Store
 from roadscan.tables.writer import LogWriter
+from tests.tables.killed import dies_at_removal
 
 START = 1_400_000_000
 
@@ -211,16 +212,9 @@ def test_manifest_of_a_long_run_is_merged_and_says_the_same(
     """Against a dictionary; where the process dies while merged parts are removed, too."""
     monkeypatch.setattr(manifest_module, "_MOST_PARTS", 64)
     store, known, written = Store(str(tmp_path), "long"), {}, []
-    manifest, write, remove = Manifest(store), store.write_bytes, store.remove
+    manifest, write = Manifest(store), store.write_bytes
     monkeypatch.setattr(store, "write_bytes", lambda path, content: (written.append(path), write(path, content)))
-    removals = itertools.count()
-
-    def dying(path: str) -> None:
-        if path.startswith("manifest/") and next(removals) == dies_at:
-            raise KeyboardInterrupt
-        remove(path)
-
-    monkeypatch.setattr(store, "remove", dying)
+    dies_at_removal(store, dies_at, monkeypatch)
     for k in range(150):
         record = OutputRecord("las", f"{k % 90}_0", f"key{k}", "", k, "d")
         try:

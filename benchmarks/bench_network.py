@@ -23,8 +23,9 @@ from benchmarks.scheduler import running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.jobs.bundles import Bundle, Ended
-from roadscan.jobs.compute import Made, OnDask, rare_collections
+from roadscan.jobs.compute import Made, rare_collections
 from roadscan.jobs.footprints import PRODUCT, FootprintTask, index_footprints
+from roadscan.jobs.on_dask import OnDask
 from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.jobs.tiles import TaskResult, compute_tiles, run_tasks

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import psutil
 
-from roadscan.jobs.compute import Compute, compute_on
+from roadscan.jobs.compute import Compute
+from roadscan.jobs.compute_on import compute_on
 from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
 from roadscan.jobs.tile_plan import TILE
 from roadscan.model.strict import load_toml

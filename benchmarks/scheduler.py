@@ -17,7 +17,7 @@ import psutil
 from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.compute import QUIET_CLUSTER
+from roadscan.jobs.on_dask import QUIET_CLUSTER
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]

@@ -13,7 +13,7 @@ from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed, Failed
 
-from roadscan.jobs.compute import compute_on
+from roadscan.jobs.compute_on import compute_on
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
 from roadscan.model.errors import RoadscanError, RunError

@@ -492,7 +492,7 @@ def _run(
     scheduler: str | None,
     selection: Selection | None = None,
 ) -> Run:
-    from roadscan.jobs.compute import compute_on
+    from roadscan.jobs.compute_on import compute_on
     from roadscan.jobs.stages import Run, run_stages
     from roadscan.model.survey import Survey
     from roadscan.tables.store import Store

@@ -61,9 +61,14 @@ class PlannedTiles(DrivenTiles):
         return {tile: number for number, tile in enumerate(self.ids)}
 
     def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
-        """Places of some tiles, each of which is one of these."""
+        """Places of some tiles; a `KeyError` where one is none of these."""
         wanted = np.array([(tile.row, tile.column) for tile in tiles], dtype=np.int64).reshape(-1, 2)
-        return np.searchsorted(self._place, _places(*wanted.T))
+        place = _places(*wanted.T)
+        found = np.searchsorted(self._place, place)
+        missing = self._place.take(found, mode="clip") != place if len(self) else np.ones(found.shape, bool)
+        if missing.any():
+            raise KeyError(TileId(*wanted[missing][0, ::-1].tolist()))
+        return found
 
     @cached_property
     def _place(self) -> npt.NDArray[np.int64]:

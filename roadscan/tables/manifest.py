@@ -95,7 +95,7 @@ class Manifest:
         return not record.path or self._store.size(record.path) == record.bytes
 
     def add(self, records: Iterable[OutputRecord]) -> None:
-        """Record finished outputs; durable when this returns. A file under an older name is removed."""
+        """Record finished outputs; durable when this returns. Files under older names are removed by :meth:`settle`."""
         added = list(records)
         if not added:
             return
@@ -103,21 +103,20 @@ class Manifest:
         for r in added:
             self._rows[r.product][r.unit] = (*r,)
         self._append(Packed.of(table_of(added)))
-        for old, new in zip(known, added, strict=True):
-            if old is not None and old[3] not in ("", new.path):
-                self._store.remove(old[3])
+        pairs = zip(known, added, strict=True)
+        self._moved += [old[3] for old, new in pairs if old is not None and old[3] not in ("", new.path)]
 
     def add_packed(self, records: Packed) -> None:
-        """The same, of many as a worker packed them; files under older names are removed by :meth:`settle`."""
+        """The same, of many as a worker packed them."""
         if records.rows:
             self._rows.clear()
             self._append(records)
 
     def settle(self) -> None:
-        """Remove files under older names: those of packed records, and what a run that was killed left."""
+        """Remove files under older names that no output has any more, also those that a run that was killed left."""
         table = self._current()
         if self._moved:
-            moved = pa.array(self._moved, pa.string())
+            moved = pa.array(sorted(set(self._moved)), pa.string())
             for path in moved.filter(pc.invert(pc.is_in(moved, table.column("path")))).to_pylist():
                 self._store.remove(path)
             self._moved.clear()
@@ -182,8 +181,9 @@ class Manifest:
             rows += self._parts[first].rows
         old = self._parts[first:]
         table, moved = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
-        for path in moved:  # no record tells of them once these parts are one
-            self._store.remove(path)
+        if moved:  # no record tells of them once these parts are one
+            self._moved += moved
+            self.settle()
         del self._parts[first:]
         merged = self._write(Packed.of(table, "lz4"), old[-1].number + 1)
         known = [part for part in self._behind if part not in old]

@@ -138,10 +138,11 @@ def ended(client: SyncPrefectClient, run_id: UUID, survey_file: Path) -> FlowRun
 
 
 def log_of(client: SyncPrefectClient, run_id: UUID) -> list[str] | None:
-    """Lines of a flow run's log, when all have reached the server."""
+    """Lines of a flow run's log, when all have reached the server: the flow's own last line, not that of a task."""
     own = LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run_id]))
-    lines = [line.message for line in client.read_logs(own, limit=200)]
-    return lines if any(line.startswith("Finished in state") for line in lines) else None
+    lines = client.read_logs(own, limit=200)
+    ended = any(line.task_run_id is None and line.message.startswith("Finished in state") for line in lines)
+    return [line.message for line in lines] if ended else None
 
 
 def eventually(look: Callable[[], T | None], complaint: str, log: Path | None = None) -> T:

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import roadscan.jobs.tile_cells as tile_cells
-from roadscan.jobs.compute import compute_on
+from roadscan.jobs.compute_on import compute_on
 from roadscan.jobs.status import survey_status
 from roadscan.model.errors import RunError
 from roadscan.model.survey import Survey

@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.tables import manifest as manifest_module
 from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.records import Packed, latest, table_of
+from roadscan.tables.records import Packed, latest, rows_of, table_of
 from roadscan.tables.store import Store
 from tests.tables.killed import dies_at_removal
 
@@ -39,7 +39,8 @@ def packed(*records: OutputRecord) -> Packed:
 def filed(store: Store, *records: OutputRecord) -> Packed:
     """As a worker does it: the files first."""
     for r in records:
-        store.write_bytes(r.path, b"x" * r.bytes)
+        if r.path:
+            store.write_bytes(r.path, b"x" * r.bytes)
     return packed(*records)
 
 
@@ -134,6 +135,24 @@ def test_a_file_under_an_older_name_goes(store: Store, ends: str, monkeypatch: p
         case _:
             getattr(manifest, ends)()
     assert paths(store) == ["pic/1_0.bmp", "pic/2_0.png"]
+
+
+@pytest.mark.parametrize("way", ["add", "packed", "merge"])
+def test_a_file_that_another_unit_names_stays(store: Store, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = Manifest(store)
+    first, second = record("pic", 1, "k1", ".png"), record("pic", 2, "k1", ".png")
+    shared = second._replace(path=first.path)
+    manifest.add_packed(filed(store, first, *(record("pic", n, "k1", "") for n in range(10, 60))))
+    manifest.add_packed(packed(shared))
+    later = filed(store, record("pic", 2, "k2", ".bmp"))
+    if way == "add":
+        manifest.add(list(map(OutputRecord._make, rows_of(later.table()))))
+    else:
+        monkeypatch.setattr(manifest_module, "_MOST_PARTS", 2 if way == "merge" else 99)
+        manifest.add_packed(later)
+    manifest.settle()
+    assert paths(store) == ["pic/1_0.png", "pic/2_0.bmp"]
+    assert manifest.is_current("pic", "1_0", "k1")
 
 
 def test_a_file_that_came_back_stays(store: Store) -> None:

@@ -1,0 +1,66 @@
+"""Tasks on a Dask cluster whose workers die."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from roadscan.jobs import on_dask
+from roadscan.jobs.on_dask import OnDask, embedded
+from roadscan.model.errors import RoadscanError
+
+DEADLY = 7
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[OnDask]:
+    with embedded(2) as opened:
+        yield opened
+
+
+def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:
+    ended = {done.task: done for done in cluster.map(squared, range(20))}
+    assert sorted(ended) == list(range(20))
+    error = ended.pop(DEADLY).error
+    assert isinstance(error, RoadscanError)
+    assert "died" in str(error)
+    assert {task: done.result for task, done in ended.items()} == {task: task**2 for task in ended}
+
+
+def test_an_error_is_the_tasks_own(cluster: OnDask) -> None:
+    (done,) = cluster.map(inverse, [0])
+    assert isinstance(done.error, ZeroDivisionError)
+
+
+def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_dask, "_LOST_S", 0.5)
+    with embedded(1) as alone:
+        dask_cluster = alone._client.cluster
+        (nanny,) = dask_cluster.workers.values()
+        dask_cluster.sync(nanny.close)
+        assert [done.result for done in alone.map(squared, [3])] == [9]
+
+
+def test_workers_keep_their_memory(cluster: OnDask) -> None:
+    (done,) = cluster.map(environment, ["MALLOC_TRIM_THRESHOLD_"])
+    assert int(done.result or 0) >= 1 << 30
+    (done,) = cluster.map(environment, ["OMP_NUM_THREADS"])
+    assert done.result == "1"
+
+
+def squared(number: int) -> int:
+    if number == DEADLY:
+        os._exit(9)
+    time.sleep(0.01)
+    return number**2
+
+
+def inverse(number: int) -> float:
+    return 1 / number
+
+
+def environment(name: str) -> str | None:
+    return os.environ.get(name)

@@ -28,6 +28,7 @@ from pyproj.exceptions import CRSError
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, CrsError, StoreError
 from roadscan.points.cloud import QUANTA_PER_M
+from roadscan.products.laz_points import write_compressed
 from roadscan.products.raster import SOFTWARE
 
 VLR_USER_ID: Final = "roadscan"
@@ -154,9 +155,7 @@ def write_points(
         stream.write(_filled(layout, head, len(laszip), axes, records, stated, date))
         stream.write(_VLR.pack(0, VLR_USER_ID.encode(), VLR_RECORD_ID, len(stated), _ABOUT_FACTS) + stated + laszip)
         if compress:
-            compressor = lazrs.LasZipCompressor(stream, _laz(layout))
-            compressor.compress_many(records.view(np.uint8))
-            compressor.done()
+            write_compressed(stream, _laz(layout), records, layout.point_format)
         else:
             stream.write(records.view(np.uint8).data)
 

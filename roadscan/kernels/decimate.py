@@ -90,15 +90,16 @@ def slopes_of(heights, corner, edge, side, steps):
 
 
 @bare_inlined
-def _micrometres_at(height, base, out, at):
+def micrometres(height, base):
+    """A height (m) as whole micrometres above `base` (int32), cut off at `FARTHEST_UM`."""
     above = np.floor((height - base) * 1e6 + 0.5)
-    out[at] = np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
+    return np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
 
 
 @bare
 def _micrometres(height, base, out):
     for k in range(out.size):
-        _micrometres_at(height[k], base, out, k)
+        out[k] = micrometres(height[k], base)
 
 
 @bare
@@ -137,7 +138,7 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, ro
         west, at = np.int64(column[i]), (np.int64(row[i]) - first_row) * edge + np.int64(column[i])
         to = at + end - i
         if end == i + 1:
-            _micrometres_at(height[i], base, heights, at)
+            heights[at] = micrometres(height[i], base)
             lights[at] = np.int32(intensity[i] * LIGHT_STEPS + 0.5)
             counts[at] = count[i]
         else:

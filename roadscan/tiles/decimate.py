@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.decimate import decimate_cells
+from roadscan.kernels.decimate_fours import AT_ONCE, SCRATCH_ROWS, SUMS, decimate_fours
 from roadscan.kernels.lanes import LANES
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
@@ -83,21 +85,32 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     edge = cells.cells_per_edge
     patch = patch_cells(side, edge, cell_m)
     room = min(len(cells), (edge // side) ** 2)
-    column, row = np.empty(room, np.uint16), np.empty(room, np.uint16)
-    height, intensity = np.empty(room, np.float64), np.empty(room, np.float32)
-    used, points, sloped = np.empty(room, np.uint32), np.empty(room, np.uint32), np.empty(room, np.bool_)
-    heights, lights, counts = np.empty((3, patch * edge), np.int32)
-    scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
+    out: list[npt.NDArray[Any]] = [
+        *(np.empty(room, np.uint16) for _ in range(2)), np.empty(room, np.float64), np.empty(room, np.float32),
+        *(np.empty(room, np.uint32) for _ in range(2)), np.empty(room, np.bool_),
+    ]  # fmt: skip
     some = cells.height_robust_m[:: max(len(cells) // _SAMPLE, 1)]
     base = math.floor(float(np.median(some))) if len(cells) else 0.0
-    written = decimate_cells(
-        cells.column, cells.row, cells.height_robust_m, cells.intensity_mean, cells.count, base, edge, patch, side,
-        FLOOR_UM, heights, lights, counts, scratch, column, row, height, intensity, used, points, sloped,
-    )  # fmt: skip
-    return Squares(
-        column[:written], row[:written], height[:written], intensity[:written],
-        used[:written], points[:written], sloped[:written],
-    )  # fmt: skip
+    written = _fours(cells, base, out) if patch == side == 2 else _squares(cells, base, patch, side, out)
+    return Squares(*(values[:written] for values in out))
+
+
+def _fours(cells: TileCells, base: float, out: Sequence[npt.NDArray[Any]]) -> int:
+    """Squares of two by two cells, each a patch; returns how many."""
+    starts = np.searchsorted(cells.row, np.arange(cells.cells_per_edge + 1))
+    found, sums = np.empty((SCRATCH_ROWS, AT_ONCE), np.int32), np.empty((SUMS, AT_ONCE), np.int64)
+    values = cells.height_robust_m, cells.intensity_mean, cells.count
+    return int(decimate_fours(cells.column, starts, *values, base, FLOOR_UM, found, sums, *out))
+
+
+def _squares(cells: TileCells, base: float, patch: int, side: int, out: Sequence[npt.NDArray[Any]]) -> int:
+    """Squares of any size; returns how many."""
+    edge = cells.cells_per_edge
+    heights, lights, counts = np.empty((3, patch * edge), np.int32)
+    scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
+    values = cells.height_robust_m, cells.intensity_mean, cells.count
+    strips = heights, lights, counts, scratch
+    return int(decimate_cells(cells.column, cells.row, *values, base, edge, patch, side, FLOOR_UM, *strips, *out))
 
 
 def patch_cells(side: int, edge: int, cell_m: float) -> int:

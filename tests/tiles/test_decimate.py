@@ -8,7 +8,7 @@ import pytest
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.decimate import cells_per_square, decimate, patch_cells
+from roadscan.tiles.decimate import _fours, _squares, cells_per_square, decimate, patch_cells
 from roadscan.tiles.grid import TileGrid
 
 EDGE = 40  # cells of 5 mm: a tile of 20 cm
@@ -90,9 +90,11 @@ def by_numpy(cells, side, patch):
     return [np.array(c) for c in zip(*out, strict=True)]
 
 
-@pytest.mark.parametrize("side", [4, 20, 8, 40])
+@pytest.mark.parametrize(
+    ("side", "cell_m"), [(4, CELL_M), (20, CELL_M), (8, CELL_M), (40, CELL_M), (2, 0.05), (1, 0.05)]
+)
 @pytest.mark.parametrize("cover", [1.0, 0.3])
-def test_rule_is_the_one_stated(side, cover):
+def test_rule_is_the_one_stated(side, cell_m, cover):
     rng = np.random.default_rng(side)
     height = plane(0.03, -0.05, rng, noise_m=0.002)
     height += rng.choice([0.0, 0.008, -0.015], (EDGE, EDGE), p=[0.85, 0.1, 0.05])
@@ -100,8 +102,8 @@ def test_rule_is_the_one_stated(side, cover):
     keep[:, 27:] = False  # the strip ends inside a square
     keep[:3] = False
     cells = cells_of(height, keep, side)
-    patch = patch_cells(side, EDGE, CELL_M)
-    found, told = decimate(cells, side, CELL_M), by_numpy(cells, side, patch)
+    patch = patch_cells(side, EDGE, cell_m)
+    found, told = decimate(cells, side, cell_m), by_numpy(cells, side, patch)
     assert np.array_equal(found.column, told[0]) and np.array_equal(found.row, told[1])
     # whole micrometres can put a cell on the other side of the limit: a few squares may have one cell more or less
     same = found.cells == told[4]
@@ -136,3 +138,17 @@ def test_a_spacing_that_does_not_fit_is_refused():
     for spacing in (0.004, 0.007, 0.03):
         with pytest.raises(ConfigError, match=f"model.spacing_m = {spacing:g}"):
             cells_per_square(spacing, TileGrid(10.0, 0.005), "model.spacing_m")
+
+
+def test_squares_of_four_cells_are_to_the_bit_those_of_any_size():
+    rng = np.random.default_rng(3)
+    height = plane(0.03, -0.05, rng, noise_m=0.002) + rng.choice([0.0, 0.02, -400.0], (EDGE, EDGE), p=[0.8, 0.1, 0.1])
+    for cover in (1.0, 0.5, 0.1):
+        cells = cells_of(height, rng.random((EDGE, EDGE)) < cover, 5)
+        room = len(cells)
+        kinds = np.uint16, np.uint16, np.float64, np.float32, np.uint32, np.uint32, np.bool_
+        fours, squares = ([np.empty(room, kind) for kind in kinds] for _ in range(2))
+        written = _fours(cells, 412.0, fours)
+        assert written == _squares(cells, 412.0, 2, 2, squares) > 0
+        for one, other in zip(fours, squares, strict=True):
+            assert np.array_equal(one[:written], other[:written])

@@ -28,10 +28,9 @@ from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.lowest import LowestReadings
 from roadscan.surfaces.potholes import join_potholes, pothole_pieces
 from roadscan.surfaces.smoothing import smooth_surface
-from roadscan.surfaces.valleys import LINE_HALF, flank_cells
+from roadscan.surfaces.valley_lines import LINE_HALF, flank_cells
 
 SEEDS = (1, 2, 3)
-LOWERED = CrackDetection(lowered_m=0.002)
 READING_M, SIGMA_M = 0.001, 0.0003
 CLASSES_M = (
     (0.003, 0.005),
@@ -140,7 +139,7 @@ def seen(
 
 
 def cracks_of(one: Seen) -> list[Crack]:
-    return join_cracks(crack_pieces(one.window, LOWERED), 0.0, one.window.cell_m, CrackJoining())
+    return join_cracks(crack_pieces(one.window, CrackDetection()), 0.0, one.window.cell_m, CrackJoining())
 
 
 def scores(found: Sequence[Crack], truth: Any, cell_m: float) -> tuple[float, float]:
@@ -221,7 +220,7 @@ def speed() -> Iterator[Figure]:
     raw[:, 400::400] -= 0.006
     window = HeightWindow(raw, raw, 0.005, SIGMA_M, 0, 0, 200)
     for what, work in (
-        ("pieces of cracks", lambda: crack_pieces(window, LOWERED)),
+        ("pieces of cracks", lambda: crack_pieces(window, CrackDetection())),
         ("pieces of potholes", lambda: pothole_pieces(window, PotholeDetection())),
     ):
         yield Figure(f"{what}, halo counted", raw.size / thread_seconds(work, 2) / 1e6, "M cells/s of a core")

@@ -12,10 +12,13 @@ class CrackDetection(Strict):
 
     max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
     """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""
-    lowered_m: float = Field(default=0.0, ge=0.0, le=0.05)
-    """Each cell is lowered to its lowest reading before cracks are looked for, but by this at most (m): a crack that
-    takes in less than half of a cell is not in its height. 0: heights alone; 0.002 finds nets of cracks narrower than
-    a cell. But a single profile that lies lower than its neighbours is a crack then, and so is a row of cells with many
+    lowered_m: float = Field(default=0.002, ge=0.0, le=0.05)
+    """A crack goes on where it is in the lowest readings of cells alone, because it takes in less than half of each, if
+    it leads to another that heights show. Each cell is lowered to its lowest reading for that, but by this at most (m).
+    0: heights alone."""
+    lowest_alone: bool = False
+    """Cracks begin and end where lowest readings alone show them as well: of cracks of 3 mm more is found in cells of
+    5 mm. But a single profile that lies lower than its neighbours is a crack then, and so is a row of cells with many
     times the readings of those beside it, where a vehicle stood and its profiler went on."""
     strong_sigmas: float = Field(default=6.0, gt=0.0)
     """A crack begins where a line of cells lies deeper than its flanks by this many σ of such lines nearby …"""

@@ -14,7 +14,6 @@ from roadscan.points.views import PictureRule
 from roadscan.products.base import ProductContext, SurfaceProduct
 from roadscan.products.mesh import Mesh, check_glb, check_ply, mesh_of, write_glb, write_ply
 from roadscan.products.raster import SOFTWARE
-from roadscan.surfaces.reconstruction import SHOWN_M
 from roadscan.surfaces.tile import SurfaceTile
 
 _UNKNOWN_GREY = 128
@@ -25,7 +24,7 @@ class SurfaceMeshOptions(Strict):
 
     format: Literal["glb", "ply"] = "glb"
     """Binary glTF 2.0, for viewers and the web, or binary PLY, for point-cloud programs."""
-    spacing_m: float = Field(default=0.02, gt=0.0, le=SHOWN_M)
+    spacing_m: float = Field(default=0.02, gt=0.0, le=1.0)
     """Spacing of the vertices (m), rounded down to whole cells of the surface, at least one: 5 mm give 30 MB and more
     a tile."""
     black: float = 0.0

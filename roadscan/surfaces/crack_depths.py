@@ -14,11 +14,16 @@ measured: where some readings of a cell lie on it, the cell's lowest reading is 
 3. *Drop*: for noise and texture alone lowest readings lie below the ground, by as much as they do beside the crack. The
    bottom is met by some readings of a cell only, so that a share of the drop, `_DROP_SHARE`, is taken off (the lowest
    of 5 normal values lies 1.2 σ below their mean, that of 25 2.0 σ, and the quantile above is below the median).
-4. *Width*: a valley wider than :data:`NARROW_CELLS`, as cells show it, has more and more of its depth from their robust
+4. *Floor*: of the readings at a level floor the lowest lies as far below the others as it does beside the crack. Where
+   lowest readings (their median over the same cells) lie no more than `_FLOOR_BEGIN` times as far below their cell's
+   robust height as beside the crack, the cells lie on the floor, and the depth is the median of their robust heights;
+   from `_FLOOR_END` times on they do not.
+5. *Width*: a valley wider than :data:`NARROW_CELLS`, as cells show it, has more and more of its depth from their robust
    heights, and all from :data:`WIDE_CELLS` on, where cells lie in it alone: what is wide needs no single reading.
 
 `_HALF_READINGS` and `_DROP_SHARE` were chosen on cracks of 3 to 10 mm in cells of 2 to 5 mm with 1 to 100 readings,
 with and without wrong ones (``benchmarks/bench_cracks.py``); a quarter more or less of either changes depths by 3 %.
+The bounds of a floor were chosen on slots with level floors, 5 to 15 mm wide and 3 to 10 mm deep, beside these.
 """
 
 from __future__ import annotations
@@ -36,13 +41,15 @@ from roadscan.surfaces.lowest import LowestReadings
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-NARROW_CELLS: Final = 1.75
-WIDE_CELLS: Final = 2.25
+NARROW_CELLS: Final = 2.5
+WIDE_CELLS: Final = 3.5
 _FLANK_CELLS: Final = 3
 """Cells of each flank whose drop is looked at."""
 _HALF_READINGS: Final = 2.5
 _BOTTOM_M: Final = 0.001
 _DROP_SHARE: Final = 0.35
+_FLOOR_BEGIN: Final = 1.25
+_FLOOR_END: Final = 1.75
 
 
 @dataclass(frozen=True)
@@ -78,16 +85,29 @@ def bottom_depths(window: HeightWindow, cells: ValleyCells, right: Float64, grou
     if window.lowest is None:
         return np.full(cells.row.size, np.nan)
     at = cells.beside(right)
-    low = ground_m - (window.raw_m[at] - window.lowest.drop_m[at])
-    drop, readings = _flanks(window.lowest, cells)
-    drop[np.isnan(low)] = np.nan
+    own = window.lowest.drop_m[at].astype(np.float64)
+    floor = ground_m - window.raw_m[at]
+    lower, usual, readings = _flanks(window.lowest, cells)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = np.where(usual > 0.0, own / usual, np.inf)
     number = np.full(window.raw_m.shape, -1, np.int32)
     number[cells.row, cells.column] = np.arange(cells.row.size)
-    found = np.empty((2, cells.row.size))
+    half = np.full(cells.row.size, 0.5)
     level = _HALF_READINGS / (_HALF_READINGS + readings * (_BOTTOM_M / window.cell_m))
-    for values, levels, out in zip((low, drop), (level, np.full_like(level, 0.5)), found, strict=True):
-        quantiles_along(number, cells.row, cells.column, cells.north, cells.east, values, levels, out)
-    return np.asarray(found[0] - _DROP_SHARE * found[1])
+    low, drop, floor, spread = (
+        _along(number, cells, np.where(np.isnan(floor + own), np.nan, values), levels)
+        for values, levels in ((floor + own, level), (lower, half), (floor, half), (spread, half))
+    )
+    narrow = low - _DROP_SHARE * drop
+    on_floor = np.clip((_FLOOR_END - spread) / (_FLOOR_END - _FLOOR_BEGIN), 0.0, 1.0)
+    return np.asarray(narrow + on_floor * (floor - narrow))
+
+
+def _along(number: npt.NDArray[np.int32], cells: ValleyCells, values: Float64, level: Float64) -> Float64:
+    """Quantiles (n,) of what the cells around each along its valley hold."""
+    out = np.empty(cells.row.size)
+    quantiles_along(number, cells.row, cells.column, cells.north, cells.east, values, level, out)
+    return out
 
 
 def blended(bottom_m: Float64, depth_m: Float64, width_cells: Float64) -> Float64:
@@ -96,12 +116,15 @@ def blended(bottom_m: Float64, depth_m: Float64, width_cells: Float64) -> Float6
     return np.where(np.isnan(bottom_m), depth_m, share * depth_m + (1.0 - share) * bottom_m)
 
 
-def _flanks(lowest: LowestReadings, cells: ValleyCells) -> tuple[Float64, Float64]:
-    """(n,) drop (m) of the cells in both flanks, NaN where there is none, and how many readings a cell holds."""
+def _flanks(lowest: LowestReadings, cells: ValleyCells) -> tuple[Float64, Float64, Float64]:
+    """(n,) drop (m) of the cells in both flanks, lower quartile and median, and how many readings a cell holds.
+
+    NaN where there is none. Wrong readings only add to a drop.
+    """
     away = [side * (cells.flank + k) for side in (-1, 1) for k in range(_FLANK_CELLS)]
     places = [cells.beside(right) for right in away]
     drop = np.sort(np.stack([lowest.drop_m[at] for at in places]).astype(np.float64), axis=0)  # NaN last
     known = (~np.isnan(drop)).sum(axis=0)
-    lower = np.take_along_axis(drop, (np.maximum(known - 1, 0) // 4)[None], 0)[0]  # wrong readings only add to it
+    lower, usual = (np.take_along_axis(drop, (np.maximum(known - 1, 0) // part)[None], 0)[0] for part in (4, 2))
     count = np.stack([lowest.count[at] for at in places]).sum(axis=0)
-    return lower, count / np.maximum(known, 1)
+    return lower, usual, count / np.maximum(known, 1)

@@ -4,7 +4,8 @@ The skeleton comes from ``surfaces/valleys.py``. At each of its cells a cross-se
 smoothing (impulses left out): all cells up to 4.5 cells along the crack are sorted by their distance from its line into
 bins of half a cell. Because a line rarely runs along the grid, the section is finer than a cell; nothing is
 interpolated between cells and nothing is smoothed across the crack. Ground is the straight line between the flanks.
-Where that shows no crack, heights that are lowered to the lowest readings are asked, as ``surfaces/valleys.py`` does.
+Where that shows no crack, or one less than half as deep, the section is that of heights lowered to the lowest readings,
+as ``surfaces/valleys.py`` asks them.
 
 - *depth*: of the bottom below the ground: from robust heights, where cells lie in the crack alone, and from the lowest
   readings of cells, where it is narrower (``surfaces/crack_depths.py``). Where these are not known, robust heights show
@@ -29,8 +30,9 @@ from roadscan.model.distress import CrackDetection
 from roadscan.surfaces import valleys
 from roadscan.surfaces.crack_depths import ValleyCells, blended, bottom_depths
 from roadscan.surfaces.heights import HeightWindow
-from roadscan.surfaces.skeleton_graph import PRUNINGS, SkeletonGraph, pruned
-from roadscan.surfaces.valleys import DIRECTIONS, Valleys, find_valleys, flank_cells
+from roadscan.surfaces.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, trimmed
+from roadscan.surfaces.valley_lines import DIRECTIONS, flank_cells
+from roadscan.surfaces.valleys import Valleys, bridge_cells, find_valleys
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -43,6 +45,11 @@ _FARTHEST_CELLS = 1.5
 _BLUR_CELLS = 0.98
 """Width at half its height of a cell folded with a bin and with the spread of directions (7.5°)."""
 _MOST_RAISED = 1.6
+_LOWERED_M = 0.002
+"""Heights of sections are lowered to the lowest readings by so much at most."""
+_SHOWN_SHARE = 0.5
+"""A section of robust heights less than this share as deep as that of lowered ones is noise: heights do not show the
+crack there."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +92,7 @@ class Sections:
 def halo_cells(config: CrackDetection, cell_m: float) -> int:
     """Cells that a window needs beyond those of which cracks are wanted."""
     reach = math.ceil(math.hypot(4.5, section_cells(config, cell_m))) + 1
-    walked = PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
+    walked = bridge_cells() + 2 + PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
     return valleys.halo_cells(config, cell_m) + max(HALF_ALONG + reach, walked)
 
 
@@ -99,7 +106,7 @@ def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiec
     if not window.raw_m.size:
         return []
     found = find_valleys(window, config)
-    graph = pruned(found.skeleton, _spur_cells(config, window.cell_m))
+    graph = pruned(trimmed(found.skeleton, found.bridge, bridge_cells()), _spur_cells(config, window.cell_m))
     if not graph.edges.size:
         return []
     sections = _sections(window, found, graph, config)
@@ -144,10 +151,11 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
     cells = _valley_cells(found)
     row, column = cells.row, cells.column
     out = _valley_sections(window.cleaned_m(), cells, window, config)
-    hidden = np.isnan(out[:, 0])
-    if window.lowest is not None and config.lowered_m > 0.0:  # what robust heights do not show, lowest readings may
-        lowered = window.lowered_m(config.lowered_m)
-        out[hidden, :4] = _valley_sections(lowered, cells.part(hidden), window, config)[:, :4]
+    hidden = np.zeros(row.size, bool)
+    if window.lowest is not None:  # what robust heights do not show, lowest readings may
+        lowered = _valley_sections(window.lowered_m(_LOWERED_M), cells, window, config)
+        hidden = np.isnan(out[:, 0]) | (out[:, 0] < _SHOWN_SHARE * lowered[:, 0])
+        out[hidden, :4] = lowered[hidden, :4]
     right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)
     width, depth = sharpened(out[:, 1], out[:, 0])
     bottom = bottom_depths(window, cells, right, np.where(np.isnan(depth), np.nan, out[:, 4]))

@@ -37,7 +37,7 @@ Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 
-SHOWN_M: Final = 1.0
+SHOWN_M: Final = 1.15
 """What products see of the neighbouring tiles, at least (m)."""
 
 _BRIGHTEST: Final = 65_535.0

@@ -77,6 +77,25 @@ class SkeletonGraph:
             found += [k for path in paths[0 if goes_on else 1 :] for k in path]
         return found
 
+    def loose_ends(self, doubtful: Bool, cells: int) -> list[int]:
+        """Cells at ends of the skeleton that are `doubtful` (n,), as far as the first that is none or a junction.
+
+        At most so many cells of each end.
+        """
+        beside = self.neighbours()
+        found: list[int] = []
+        for end in np.flatnonzero((self.degree <= 1) & doubtful).tolist():
+            before, here = -1, end
+            for _ in range(cells):
+                if not doubtful[here] or len(beside[here]) > 2:
+                    break
+                found.append(here)
+                onward = [k for k in beside[here] if k != before]
+                if not onward:
+                    break
+                before, here = here, onward[0]
+        return found
+
     def smoothed(self, place: Float64) -> Float64:
         """Places (n, 2) moved halfway to the middle of both neighbours, where a cell has two."""
         total = np.zeros_like(place)
@@ -102,6 +121,16 @@ class SkeletonGraph:
                 walked.update(itertools.pairwise(path))
                 walked.update(itertools.pairwise(path[::-1]))
                 yield path
+
+
+def trimmed(skeleton: Bool, doubtful: Bool, end_cells: int) -> Bool:
+    """A skeleton without those of its ends that are doubtful, so many cells of each at most; grids of cells."""
+    cells = skeleton.copy()
+    if doubtful.any():
+        graph = SkeletonGraph.of(cells)
+        loose = graph.loose_ends(doubtful[graph.row, graph.column], end_cells)
+        cells[graph.row[loose], graph.column[loose]] = False
+    return cells
 
 
 def pruned(skeleton: Bool, spur_cells: int) -> SkeletonGraph:

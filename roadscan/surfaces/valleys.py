@@ -1,21 +1,17 @@
 """Narrow valleys of a gridded surface: where lines of cells lie below both flanks.
 
-0. *Heights* are lowered to the lowest reading of each cell where it is known, but by `lowered_m` at most: a crack that
-   takes in less than half of a cell is in that alone. One wrong reading among 25 lowers its cell by no more than that.
-1. *Lines*: the mean height at 21 places a cell apart, in 24 directions, 7.5° apart. Noise and stones average out; a
-   crack does not.
-2. *Valley*: how far a line lies below the lower of two lines beside it, 2, 4, 8 … cells away; the deepest of all
-   directions and distances. On slopes, edges of patches and rims of potholes one flank is always as low, so that
-   nothing is found. Ground that rises from the line on, as beside a kerb or in a rut, is no wall: the flank counts as
-   high as the line from three times as far through it meets the middle. Comparing with both sides is the idea of
-   Steger (1998), "An unbiased detector of curvilinear structures" (IEEE PAMI 20, 113-125), whose derivatives of a
-   Gaussian would need a scale for each width.
-3. *Texture*: σ of such differences is measured nearby (0.15 m), from lines along both axes, large ones left out. So a
-   rough pavement needs deeper valleys than a smooth one.
-4. *Cells*: valleys beyond `strong_sigmas`, grown on those beyond `weak_sigmas`, now and then over a cell that is none:
+1. *Lines* (``surfaces/valley_lines.py``) of 21 cells in 24 directions say how far a cell lies below both its flanks.
+2. *Cells*: valleys beyond `strong_sigmas`, grown on those beyond `weak_sigmas`, now and then over a cell that is none:
    a crack narrower than a cell fades where it passes from one row of cells to the next. A line that reaches beyond a
    crack's end or lies across it is shallower than one along it nearby (`nearby_share`).
-5. *Skeleton*: thinned to lines (Guo & Hall 1989, "Parallel thinning with two-subiteration algorithms", CACM 32,
+3. *Bridges*: a crack that takes in less than half of a cell is in the cell's lowest reading alone. So the same lines
+   are laid through heights that are lowered to the lowest readings, but by `lowered_m` at most: one wrong reading among
+   25 lowers its cell by no more. Cracks go on where these are valleys beyond `weak_sigmas`, and begin where they are
+   beyond `strong_sigmas` and heights alone beyond 5/6 of that. What lowest readings alone show must lead from one
+   stretch that heights show to another (:attr:`Valleys.bridge`), because a single profile that lies lower than its
+   neighbours is such a valley too, and so is a row of cells with many times the readings of those beside it. With
+   `lowest_alone` cracks begin and end there as well.
+4. *Skeleton*: thinned to lines (Guo & Hall 1989, "Parallel thinning with two-subiteration algorithms", CACM 32,
    algorithm A1). What is not thin after as many passes as the widest crack needs is a pit and left out.
 
 Every step looks a stated number of cells far (:func:`halo_cells`) and adds whole numbers, so a cell has the same bits
@@ -33,36 +29,25 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.thinning import thin
-from roadscan.kernels.valleys import add_bend, deepen, fill_holes, line_sums
 from roadscan.model.distress import CrackDetection
-from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
+from roadscan.surfaces.heights import HeightWindow
+from roadscan.surfaces.valley_lines import (
+    DIRECTIONS,
+    FAR,
+    LINE_HALF,
+    MEASURED_HALF,
+    Lines,
+    flank_cells,
+    line_cells,
+    lines_through,
+)
 
 Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-DIRECTIONS = 24
-LINE_HALF = 10
-LINE_CELLS = 2 * LINE_HALF + 1
-_TEXTURE_M = 0.15
-"""Half the edge of the square in which texture is measured."""
-_TEXTURE_FLANK = 4
-_FAR = 3
-"""Flanks are compared with lines this many times as far."""
-_STEEPEST = 0.25
-"""Ground rises no more than this (m/m): beyond, it is another thing, such as a kerb."""
-_UNKNOWN = -90_000_000
-"""Height of what is not known, below all others: it lowers no flank (no rise) and makes none."""
 _GROWTHS, _LEAP = 20, 7
 """Steps of growth of a cell each; every seventh leaps over a cell."""
-_MEASURED_HALF = 3
-_MEAN_TO_SIGMA = 1.2533
-"""σ of normal values over the mean of their absolutes."""
-_CUT = 2.5
-"""Differences beyond this many means are no texture; of normal values that leaves a mean of 0.88."""
-_CUT_MEAN = 0.88
 
 
 @dataclass(frozen=True)
@@ -76,62 +61,75 @@ class Valleys:
     flank: UInt8
     """Of that line: how far its flanks are away (cells)."""
     skeleton: Bool
-
-
-def flank_cells(config: CrackDetection, cell_m: float) -> list[int]:
-    """Distances of flanks (cells): doubled until the widest crack lies between them."""
-    found = [2]
-    while 2 * found[-1] * cell_m < 1.5 * config.max_width_m and found[-1] < 64:
-        found.append(2 * found[-1])
-    return found
+    bridge: Bool
+    """Cells of the skeleton that lowest readings alone show."""
 
 
 def halo_cells(config: CrackDetection, cell_m: float) -> int:
     """Cells beyond those that are wanted, on which the skeleton depends."""
-    lines = LINE_HALF + _FAR * flank_cells(config, cell_m)[-1] + _fill_cells(config, cell_m)
-    grown = _GROWTHS + _GROWTHS // _LEAP + 2
     thinned = 3 * _thinnings(config, cell_m) + 1  # two cells a pass, and as far as a pit
-    return lines + 2 * _texture_half(cell_m) + LINE_HALF + grown + thinned
+    return line_cells(config, cell_m) + bridge_cells() + thinned
 
 
 def border_cells(config: CrackDetection, cell_m: float) -> int:
     """Cells beyond the last that was measured, on which the skeleton may depend where all beyond is empty."""
-    return LINE_HALF + _FAR * flank_cells(config, cell_m)[-1] + _MEASURED_HALF + 1
+    return LINE_HALF + FAR * flank_cells(config, cell_m)[-1] + MEASURED_HALF + 1
 
 
 def find_valleys(window: HeightWindow, config: CrackDetection) -> Valleys:
     """Valleys and the skeleton of a window. Along the border, as wide as a line and its flanks, nothing is found."""
-    cell_m = window.cell_m
-    flanks = flank_cells(config, cell_m)
-    heights = window.lowered_m(config.lowered_m)
-    measured = ~np.isnan(heights)
-    whole = _whole_numbers(_filled(heights, _fill_cells(config, cell_m)))
-    depth, which, bend = _deepest(whole, flanks, cell_m)
-    unit = HEIGHT_STEP_M / LINE_CELLS
-    depth_m = np.asarray(depth * unit, dtype=np.float64)
-    sigma_m = _texture_sigma(bend, measured, _texture_half(cell_m)) * unit
-    cells = _crack_cells(depth_m, sigma_m, measured, config)
-    skeleton = _thinned(cells, _thinnings(config, cell_m))
-    flank = np.take(np.array(flanks, np.uint8), which // DIRECTIONS)
-    return Valleys(depth_m, (which % DIRECTIONS).astype(np.uint8), flank, skeleton)
+    lines = lines_through(window.cleaned_m(), window.cell_m, config)
+    shown = cells = _grown(lines.strong, lines.weak)
+    lowered = _lowered_lines(window, lines.nearly, config)
+    if lowered is not None:
+        begin = lines.strong | (lowered.strong if config.lowest_alone else lines.nearly & lowered.strong)
+        cells = _grown(begin, lines.weak | lowered.weak)
+        shown = cells if config.lowest_alone else _grown(begin, lines.weak)
+        both = zip(vars(lines).values(), vars(lowered).values(), strict=True)
+        lines = Lines(*(np.where(lines.weak, a, b) for a, b in both))
+    skeleton = _thinned(cells, _thinnings(config, window.cell_m))
+    flank = np.take(np.array(flank_cells(config, window.cell_m), np.uint8), lines.which // DIRECTIONS)
+    bridge = skeleton & (cv2.dilate(shown, np.ones((3, 3), np.uint8)) == 0)
+    return Valleys(lines.depth_m, (lines.which % DIRECTIONS).astype(np.uint8), flank, skeleton, bridge)
 
 
-@functools.cache
-def _lines() -> tuple[Int64, Int64]:
-    """(24, 21, 2) rows and columns of each direction's cells; (24, 2) the unit vectors to the right of them."""
-    angle = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
-    step = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-    cells = np.rint(step[:, None, :] * np.arange(-LINE_HALF, LINE_HALF + 1)[None, :, None])
-    right = np.stack([-step[:, 1], step[:, 0]], axis=-1)
-    return np.ascontiguousarray(cells, dtype=np.int64), right
+def bridge_cells() -> int:
+    """Cells from one that heights show as far as lowest readings lead."""
+    return _GROWTHS + _GROWTHS // _LEAP + 2
 
 
-def _fill_cells(config: CrackDetection, cell_m: float) -> int:
-    return LINE_HALF + flank_cells(config, cell_m)[-1] + 1
+def _lowered_lines(window: HeightWindow, begin: Bool, config: CrackDetection) -> Lines | None:
+    """Lines through lowered heights wherever cracks may lead that begin at these cells; None where nowhere."""
+    if window.lowest is None or config.lowered_m <= 0.0:
+        return None
+    if config.lowest_alone:
+        return lines_through(window.lowered_m(config.lowered_m), window.cell_m, config)
+    if not begin.any():
+        return None
+    whole = Lines(*(np.zeros(begin.shape, kind) for kind in (np.float64, np.int32, np.bool_, np.bool_, np.bool_)))
+    beyond = line_cells(config, window.cell_m)
+    for rows, columns in _boxes(begin, bridge_cells(), beyond):
+        first = max(rows.start - beyond, 0), max(columns.start - beyond, 0)
+        part = window.part((first[0], rows.stop + beyond), (first[1], columns.stop + beyond))
+        lines = lines_through(part.lowered_m(config.lowered_m), window.cell_m, config)
+        own = tuple(slice(s.start - a, s.stop - a) for s, a in zip((rows, columns), first, strict=True))
+        for cells, found in zip(vars(whole).values(), vars(lines).values(), strict=True):
+            cells[rows, columns] = found[own]
+    return whole
 
 
-def _texture_half(cell_m: float) -> int:
-    return max(20, min(100, round(_TEXTURE_M / cell_m)))
+def _boxes(cells: Bool, reach: int, beyond: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of rectangles that hold all within `reach` of the cells.
+
+    Many where that is less to look at, each with `beyond` around it, else one.
+    """
+    near = cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    stats = cv2.connectedComponentsWithStats(near, connectivity=8)[2][1:].astype(np.int64)
+    low, size = stats[:, [1, 0]], stats[:, [3, 2]]
+    around = low.min(axis=0), (low + size).max(axis=0)
+    if (size + 2 * beyond).prod(axis=1).sum() >= (around[1] - around[0] + 2 * beyond).prod():
+        low, size = around[0][None], (around[1] - around[0])[None]
+    return [(slice(a, a + n), slice(b, b + m)) for (a, b), (n, m) in zip(low.tolist(), size.tolist(), strict=True)]
 
 
 def _thinnings(config: CrackDetection, cell_m: float) -> int:
@@ -139,80 +137,8 @@ def _thinnings(config: CrackDetection, cell_m: float) -> int:
     return math.ceil(config.max_width_m / cell_m / 2) + 4
 
 
-def _filled(heights: Float64, reach: int) -> Float64:
-    """Heights with holes filled up to `reach` cells from what was measured, so that lines may cross them."""
-    known = ~np.isnan(heights)
-    near = _count(known, reach) > 0
-    inside = np.zeros_like(known)
-    inside[1:-1, 1:-1] = True
-    row, column = np.nonzero(near & ~known & inside)
-    fill_holes(heights, row.astype(np.int64), column.astype(np.int64), reach)
-    return heights
-
-
-def _whole_numbers(heights: Float64) -> Int32:
-    """Heights in HEIGHT_STEP_M, less a whole number of them."""
-    known = ~np.isnan(heights)
-    if not known.any():
-        return np.full(heights.shape, _UNKNOWN, np.int32)
-    steps = np.rint(np.where(known, heights, 0.0) / HEIGHT_STEP_M)
-    return np.where(known, (steps - steps[known].min()).clip(0, -_UNKNOWN / LINE_CELLS), _UNKNOWN).astype(np.int32)
-
-
-def _deepest(whole: Int32, flanks: list[int], cell_m: float) -> tuple[Int32, Int32, Int32]:
-    """Depth (of sums), 24 · number of the flank + direction, and bends along both axes."""
-    margin = LINE_HALF + _FAR * flanks[-1]
-    rows, columns = whole.shape
-    shape = (max(rows - 2 * margin, 0), max(columns - 2 * margin, 0))
-    depth, which, bend = (np.zeros(shape, np.int32) for _ in range(3))
-    if not depth.size:
-        return tuple(np.zeros(whole.shape, np.int32) for _ in range(3))  # type: ignore[return-value]
-    sums = np.empty((rows - 2 * LINE_HALF, columns - 2 * LINE_HALF), np.int32)
-    cells, right = _lines()
-    for direction in range(DIRECTIONS):
-        line_sums(whole, cells[direction], sums)
-        for number, flank in enumerate(flanks):
-            away = np.rint(right[direction] * flank * np.array([[1], [_FAR]])).astype(np.int64)
-            most = np.int32(_STEEPEST * flank * cell_m / HEIGHT_STEP_M * LINE_CELLS)
-            deepen(sums, away, most, np.int32(DIRECTIONS * number + direction), depth, which)
-        if direction % (DIRECTIONS // 2) == 0:  # along both axes
-            add_bend(sums, np.rint(right[direction] * _TEXTURE_FLANK).astype(np.int64), bend)
-    return tuple(np.pad(a, margin) for a in (depth, which, bend))  # type: ignore[return-value]
-
-
-def _texture_sigma(bend: Int32, measured: Bool, half: int) -> Float64:
-    """σ of a line's depth below the mean of its flanks, from the cells around; infinite where nothing was measured."""
-    level = _mean(bend, measured & (bend > 0), half)
-    level = _mean(bend, measured & (bend > 0) & (bend < _CUT * level), half)
-    # The bends of two directions were added, each twice the depth: |a| + |b| has twice the mean of |a|.
-    return np.where(level > 0, level, np.inf) * (_MEAN_TO_SIGMA / _CUT_MEAN / 4.0)
-
-
-def _mean(values: Int32, where: Bool, half: int) -> Float64:
-    total, count = _sum(np.where(where, values, 0), half), _count(where, half)
-    return total / np.maximum(count, 1)
-
-
-def _count(cells: Bool, half: int) -> Int32:
-    """Cells in the square around each cell."""
-    side = 2 * half + 1
-    return np.asarray(cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, (side, side), None, (-1, -1), False, 0))
-
-
-def _sum(values: Int32, half: int) -> Float64:
-    """Sum over the square around each cell: of whole numbers, which float64 adds exactly."""
-    side = 2 * half + 1
-    return np.asarray(cv2.boxFilter(values, cv2.CV_64F, (side, side), None, (-1, -1), False, 0))
-
-
-def _crack_cells(depth_m: Float64, sigma_m: Float64, measured: Bool, config: CrackDetection) -> UInt8:
-    """Cells of valleys that are deep enough, 1 or 0."""
-    seen = 2 * _count(measured, _MEASURED_HALF) >= (2 * _MEASURED_HALF + 1) ** 2
-    depth_m = np.where(seen, depth_m, 0.0)
-    nearby = cv2.dilate(depth_m, np.ones((LINE_CELLS, LINE_CELLS), np.uint8))
-    least = np.maximum(config.weak_sigmas * sigma_m, config.min_valley_m)
-    weak = (depth_m >= least) & (depth_m >= config.nearby_share * nearby)
-    strong = weak & (depth_m >= config.strong_sigmas * sigma_m)
+def _grown(strong: Bool, weak: Bool) -> UInt8:
+    """Weak cells that strong ones reach, 1 or 0."""
     found, allowed = strong.astype(np.uint8), weak.astype(np.uint8)
     square = np.ones((3, 3), np.uint8)
     leap = np.ones((5, 5), np.uint8)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+import shapely
 
 from roadscan.kernels.quantiles_along import quantiles_along
 from roadscan.model.distress import CrackDetection, CrackJoining
@@ -16,7 +19,9 @@ from roadscan.surfaces.crack_network import join_cracks
 from roadscan.surfaces.cracks import crack_pieces
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.lowest import LowestReadings
-from roadscan.surfaces.valleys import LINE_HALF, flank_cells
+from roadscan.surfaces.valley_lines import LINE_HALF, flank_cells
+
+Float64 = npt.NDArray[np.float64]
 
 CELL_M, FINE = 0.005, 5
 CELLS = (112, 130)
@@ -73,23 +78,77 @@ def test_a_crack_narrower_than_a_cell_is_as_deep_as_the_simulators(
     assert unknown < 0.75 * depth_m  # half of it is not in the cells
 
 
-def test_a_crack_wider_than_two_cells_has_its_depth_from_robust_heights() -> None:
+def test_the_depth_of_a_wide_crack_is_that_of_robust_heights_as_well() -> None:
     window = cells_of(0.020, 0.015, wrong=WRONG)
     mean, greatest = depths(window)
     plain, plain_greatest = depths(replace(window, lowest=None))
-    assert mean == pytest.approx(0.015, rel=0.05) and mean == pytest.approx(plain, rel=0.02)
+    assert mean == pytest.approx(0.015, rel=0.05) and mean == pytest.approx(plain, rel=0.05)
     assert greatest == pytest.approx(plain_greatest, rel=0.05)
 
 
-def test_a_crack_that_heights_hardly_show_is_found_by_lowest_readings() -> None:
+def test_a_crack_that_heights_hardly_show_is_found_by_lowest_readings_alone() -> None:
     window = cells_of(0.003, 0.005)
-    found, alone = (
-        sum(p.length_m for p in crack_pieces(one, CrackDetection(max_width_m=0.02, lowered_m=lowered)))
-        for one, lowered in ((window, 0.002), (window, 0.0))
-    )
+    alone = CrackDetection(max_width_m=0.02, lowest_alone=True)
+    found, bridged = (sum(p.length_m for p in crack_pieces(window, config)) for config in (alone, CONFIG))
     border = LINE_HALF + 3 * flank_cells(CONFIG, CELL_M)[-1]  # where nothing is found
-    assert found == pytest.approx((CELLS[0] - 2 * border) * CELL_M, rel=0.1) and alone < 0.7 * found
-    assert crack_pieces(cells_of(0.003, 1e-6, wrong=WRONG), CONFIG) == []
+    assert found == pytest.approx((CELLS[0] - 2 * border) * CELL_M, rel=0.1) and bridged < 0.7 * found
+    assert crack_pieces(cells_of(0.003, 1e-6, wrong=WRONG), alone) == []
+
+
+def of_readings(height_m: Float64, seed: int = 1) -> HeightWindow:
+    """Cells of readings (rows, columns, n) with noise."""
+    readings = height_m + np.random.default_rng(seed).normal(300.0, 0.0003, height_m.shape)
+    robust = np.nanmedian(readings, axis=2)
+    lowest = LowestReadings(
+        (robust - np.nanmin(readings, axis=2)).astype(np.float32), (~np.isnan(readings)).sum(axis=2).astype(np.uint16)
+    )
+    return HeightWindow(robust, robust, CELL_M, 0.0003, lowest=lowest)
+
+
+def low_profile(height_m: Float64) -> None:
+    height_m[60, :, :2] -= 0.003  # a fifth of the row's readings
+
+
+def standing(height_m: Float64) -> None:
+    height_m[:60, :, 10:] = height_m[61:, :, 10:] = np.nan  # ten readings a cell, eighty in one row
+    height_m[60, :, 40] -= 0.003
+
+
+@pytest.mark.parametrize("fault", [low_profile, standing])
+def test_what_lowest_readings_alone_show_is_no_crack(fault: Callable[[Float64], None]) -> None:
+    height = np.zeros((120, 150, 80 if fault is standing else 10))
+    fault(height)
+    window = of_readings(height)
+    assert crack_pieces(window, CONFIG) == []
+    (row,) = crack_pieces(window, CrackDetection(max_width_m=0.02, lowest_alone=True))
+    assert row.length_m > 0.3
+    height[:, 70, :8] -= 0.006  # a crack across it
+    (crack,) = join_cracks(crack_pieces(of_readings(height), CONFIG), 0.0, CELL_M, CrackJoining())
+    assert crack.ends == 2 and np.ptp(shapely.get_coordinates(crack.line)[:, 0]) < 0.02
+
+
+def test_lowest_readings_lead_from_one_stretch_to_the_next() -> None:
+    height = np.zeros((130, 120, 10))
+    height[:, 60, :8] -= 0.006
+    height[55:80, 60, 2:8] += 0.006  # two of ten readings show it
+    window = of_readings(height)
+    (whole,) = crack_pieces(window, CONFIG)
+    parts = crack_pieces(window, CrackDetection(max_width_m=0.02, lowered_m=0.0))
+    assert len(parts) == 2 and sum(p.length_m for p in parts) < whole.length_m - 10 * CELL_M
+    assert whole.depth_sum_m2 / whole.measured_m == pytest.approx(0.006, rel=0.05)
+    height[80:, 60, :8] = 0.0
+    (end,) = crack_pieces(of_readings(height), CONFIG)  # leads nowhere
+    assert end.length_m == pytest.approx(min(p.length_m for p in parts), abs=10 * CELL_M)
+
+
+@pytest.mark.parametrize("count", [5, 25])
+def test_a_level_floor_is_not_deeper_than_it_is(count: int) -> None:
+    y, x = np.indices((110, 120))
+    share = np.clip(1.2 - np.abs(x + 0.5 - 60 - 0.02 * (y - 55)), 0.0, 1.0)  # 1.4 cells wide, aslant
+    hit = np.random.default_rng(4).random((110, 120, count)) < share[:, :, None]
+    height = np.random.default_rng(5).normal(0.0, 0.0005, hit.shape) - 0.004 * hit
+    (crack,) = join_cracks(crack_pieces(of_readings(height), CONFIG), 0.0, CELL_M, CrackJoining())
+    assert crack.depth_mean_m == pytest.approx(0.004, rel=0.07)  # the lowest of 25 lies a millimetre lower
 
 
 def test_heights_of_several_readings_below_are_no_impulses() -> None:
@@ -112,7 +171,7 @@ def test_where_no_lowest_reading_is_known_robust_heights_are_taken() -> None:
 
 
 def test_the_depth_changes_gradually_with_the_width() -> None:
-    width = np.array([0.9, NARROW_CELLS, 2.0, WIDE_CELLS, 4.0, 1.0])
+    width = np.array([0.9, NARROW_CELLS, 3.0, WIDE_CELLS, 4.0, 1.0])
     bottom = np.array([0.01, 0.01, 0.01, 0.01, 0.01, np.nan])
     found = blended(bottom, np.full(6, 0.006), width)
     np.testing.assert_allclose(found, [0.01, 0.01, 0.008, 0.006, 0.006, 0.006])

@@ -18,8 +18,7 @@ class CrackDetection(Strict):
     0: heights alone."""
     lowest_alone: bool = False
     """Cracks begin and end where lowest readings alone show them as well: of cracks of 3 mm more is found in cells of
-    5 mm. But a single profile that lies lower than its neighbours is a crack then, and so is a row of cells with many
-    times the readings of those beside it, where a vehicle stood and its profiler went on."""
+    5 mm. But a single profile that lies lower than its neighbours is a crack then."""
     strong_sigmas: float = Field(default=6.0, gt=0.0)
     """A crack begins where a line of cells lies deeper than its flanks by this many σ of such lines nearby …"""
     weak_sigmas: float = Field(default=3.0, gt=0.0)

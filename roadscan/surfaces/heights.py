@@ -106,13 +106,14 @@ class HeightWindow:
         """The same, lowered to the lowest reading of a cell where it is known, but by `most_m` at most.
 
         A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
-        reading decides that: it must not outweigh the cells around.
+        reading decides that: it must not outweigh the cells around. Nor must cells with many times the readings of
+        those around them (``surfaces/lowest.py``): the lowest of 300 readings lies lower than that of 10.
         """
         heights = self.cleaned_m()
         if self.lowest is None or most_m <= 0.0:
             return heights
         drop = np.minimum(self.lowest.drop_m, np.float32(most_m))
-        return np.asarray(heights - np.where(np.isnan(drop), np.float32(0.0), drop))
+        return np.asarray(heights - np.where(np.isnan(drop) | self.lowest.crowded(), np.float32(0.0), drop))
 
     def map_m(self, row: npt.ArrayLike, column: npt.ArrayLike) -> Float64:
         """Easting and northing (n, 2) of places in cells within the window; .5 is a cell's middle."""

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from roadscan.kernels.valleys import add_bend, deepen, fill_holes, line_sums
 from roadscan.model.distress import CrackDetection
 from roadscan.surfaces.heights import HEIGHT_STEP_M
+from roadscan.surfaces.lowest import CROWD_CELLS
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
@@ -77,8 +78,8 @@ def flank_cells(config: CrackDetection, cell_m: float) -> list[int]:
 
 
 def line_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells around one on which its lines depend, and whether they are a crack's."""
-    lines = LINE_HALF + FAR * flank_cells(config, cell_m)[-1] + _fill_cells(config, cell_m)
+    """Cells around one on which its lines depend, lowered heights included, and whether they are a crack's."""
+    lines = LINE_HALF + FAR * flank_cells(config, cell_m)[-1] + _fill_cells(config, cell_m) + CROWD_CELLS
     return lines + 2 * _texture_half(cell_m) + LINE_HALF
 
 

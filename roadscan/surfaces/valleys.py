@@ -9,8 +9,7 @@
    25 lowers its cell by no more. Cracks go on where these are valleys beyond `weak_sigmas`, and begin where they are
    beyond `strong_sigmas` and heights alone beyond 5/6 of that. What lowest readings alone show must lead from one
    stretch that heights show to another (:attr:`Valleys.bridge`), because a single profile that lies lower than its
-   neighbours is such a valley too, and so is a row of cells with many times the readings of those beside it. With
-   `lowest_alone` cracks begin and end there as well.
+   neighbours is such a valley too. With `lowest_alone` cracks begin and end there as well.
 4. *Skeleton*: thinned to lines (Guo & Hall 1989, "Parallel thinning with two-subiteration algorithms", CACM 32,
    algorithm A1). What is not thin after as many passes as the widest crack needs is a pit and left out.
 

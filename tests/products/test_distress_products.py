@@ -25,7 +25,7 @@ from roadscan.surfaces.window import GridWindow
 from roadscan.tables.schema import table_schema
 
 CELL_M = 0.005
-HALO = 200
+HALO = 210
 AROUND = 540
 """Cells that are seen before smoothing."""
 WEST, SOUTH = TileId(553_211, 6_020_119), TileId(553_212, 6_020_119)

@@ -53,7 +53,7 @@ class PlannedTiles(DrivenTiles):
     @cached_property
     def ids(self) -> tuple[TileId, ...]:
         """All tiles."""
-        return tuple(map(TileId, self.column.tolist(), self.row.tolist()))
+        return tuple(map(TileId._make, zip(self.column.tolist(), self.row.tolist(), strict=True)))
 
     @cached_property
     def number(self) -> dict[TileId, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NewType, Self, TypeVar
+from typing import Final, NamedTuple, NewType, Self, TypeVar
 
 from roadscan.model.errors import ConfigError
 
@@ -50,9 +50,8 @@ class LanePass:
 _TILE = re.compile(r"^(-?\d+)[_,](-?\d+)$")
 
 
-@dataclass(frozen=True, order=True)
-class TileId:
-    """A tile of the survey's grid: column counts east, row counts north.
+class TileId(NamedTuple):
+    """A tile of the survey's grid: column counts east, row counts north. A network has millions.
 
     The tile covers easting [column, column + 1) · size and northing [row, row + 1) · size.
     """

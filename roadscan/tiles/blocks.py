@@ -27,7 +27,7 @@ class Block:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """As one array: a tile each takes longer to send than the rest of a task."""
-        packed = np.array([(t.column, t.row) for t in self.tiles], np.int32).reshape(-1, 2)
+        packed = np.array(self.tiles, np.int32).reshape(-1, 2)
         return _unpacked, (packed, self.halo_tiles)
 
     def box(self) -> tuple[int, int, int, int]:
@@ -44,7 +44,7 @@ class Block:
 
 
 def _unpacked(packed: npt.NDArray[np.int32], halo_tiles: int) -> Block:
-    return Block(tuple(map(TileId, *packed.T.tolist())), halo_tiles)
+    return Block(tuple(map(TileId._make, packed.tolist())), halo_tiles)
 
 
 def halo_tiles_for(halo_m: float, grid: TileGrid) -> int:

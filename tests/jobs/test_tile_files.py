@@ -58,6 +58,7 @@ def test_another_format_takes_the_old_files_away(tmp_path: Path) -> None:
             store.write_bytes(f"tiles/pavement_intensity/7_8{suffix}", kind.encode())
             record = {"product": name, "unit": "7_8", "path": f"tiles/pavement_intensity/7_8{suffix}"}
             manifest.add([_record(record)])
+    manifest.settle()
     assert [Path(f).name for f in store.files("tiles")] == ["7_8.bmp", "7_8.bpw"]
 
 

@@ -17,7 +17,7 @@ import psutil
 from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.on_dask import QUIET_CLUSTER
+from roadscan.jobs.on_dask import QUIET_CLIENT, QUIET_CLUSTER
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]
@@ -77,7 +77,7 @@ def running_scheduler(workers: int) -> Iterator[tuple[Any, Watched]]:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             address = process.stdout.readline().strip()  # type: ignore[union-attr]
-            with Client(address, timeout="60s") as client:
+            with dask.config.set(QUIET_CLIENT), Client(address, timeout="60s") as client:
                 client.wait_for_workers(workers, timeout=60)
                 yield client, Watched(client, process.pid)
         finally:

@@ -22,8 +22,12 @@ from roadscan.model.errors import RoadscanError
 T = TypeVar("T")
 R = TypeVar("R")
 
-FEW_MESSAGES_KEPT = {"distributed.admin.low-level-log-length": 50}
-"""Setting of Dask: its log of messages holds whole tasks, by default the last 1,000 of each worker."""
+QUIET_CLIENT = {
+    "distributed.admin.low-level-log-length": 50,
+    "distributed.admin.large-graph-warning-threshold": "1GB",
+}
+"""Settings of Dask: its log of messages holds whole tasks, by default the last 1,000 of each worker; and nobody who
+runs a survey can change how large a task is."""
 
 MEMORY_KEPT = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
@@ -41,7 +45,7 @@ memory, whose first touch costs a sixth of a worker's time. Only glibc reads the
 ONE_THREAD = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
 """Environment of a worker, as Dask sets it by default: there is a process a core."""
 
-QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
+QUIET_CLUSTER = QUIET_CLIENT | {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
@@ -49,16 +53,15 @@ QUIET_CLUSTER = FEW_MESSAGES_KEPT | {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
-    "distributed.admin.large-graph-warning-threshold": "1GB",
     "distributed.comm.timeouts.connect": "60s",
     "distributed.scheduler.allowed-failures": 0,
     "distributed.deploy.lost-worker-timeout": "1d",
     "distributed.nanny.pre-spawn-environ": MEMORY_KEPT | ONE_THREAD,
 }
 """Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
-and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second, nor can change
-how large a task is; what is tried again when a worker dies, :meth:`OnDask.map` decides; and a worker that dies twice
-within Dask's 15 s would not be started anew, but closed."""
+and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second; what is tried
+again when a worker dies, :meth:`OnDask.map` decides; and a worker that dies twice within Dask's 15 s would not be
+started anew, but closed."""
 
 _HELD_A_THREAD = 2
 """Tasks of each worker thread that the scheduler holds at least, while there are any …"""
@@ -183,7 +186,7 @@ def connected(scheduler: str) -> Iterator[OnDask]:
     RoadscanError
         No scheduler answers.
     """
-    with dask.config.set(FEW_MESSAGES_KEPT):
+    with dask.config.set(QUIET_CLIENT):
         try:
             client = Client(scheduler, timeout="30s")
         except (OSError, ValueError) as error:

@@ -20,15 +20,15 @@ from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.reach import group_spans, touched_tiles
+from roadscan.jobs.reach import group_spans, opened, touched_by
 from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
 from roadscan.points.place import FATE_NAMES, Window
 from roadscan.points.reach import Touched, joined
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store, file_digest
-from roadscan.tables.writer import write_parquet
+from roadscan.tables.store import Store, bytes_digest
+from roadscan.tables.writer import parquet_bytes
 
 PRODUCT = "footprints"
 
@@ -138,10 +138,12 @@ def index_footprints(
 def footprint_task(task: FootprintTask) -> OutputRecord:
     """Index one data file (runs on a worker): by bounds; by placing all readings where there is no bound."""
     one = task.slice
-    if one.source.table == "cloud":
+    with opened(task.store, one) as file:
+        spans = group_spans(one, file)
+        bounded = None if one.source.table == "cloud" else touched_by(task.store, task.ground, one, file)
+    if bounded is None:
         pairs, fates = _placed(task, range(len(one.groups)))
     else:
-        bounded = touched_tiles(task.store, task.ground, one)
         pairs, fates = bounded, None
         beyond = np.flatnonzero(bounded.unbounded).tolist()
         if beyond:
@@ -149,14 +151,12 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
         apart = sorted(set(range(len(one.groups))) - set(pairs.group.tolist()))
         if apart:  # no tile tells what became of their readings
             fates = _placed(task, apart)[1]
-    rows = _ranges(pairs, one, group_spans(task.store, one))
-    schema = table_schema(PRODUCT)
-    with task.store.scratch() as folder:
-        path = folder / "footprints.parquet"
-        write_parquet(path, rows.cast(schema.arrow()), schema)
-        size, digest = path.stat().st_size, file_digest(path)
-        task.store.publish(path, task.target)
-    return OutputRecord(PRODUCT, one.file, task.key, task.target, size, digest, _detail(rows, fates))
+    rows, schema = _ranges(pairs, one, spans), table_schema(PRODUCT)
+    content = parquet_bytes(rows.cast(schema.arrow()), schema)
+    task.store.write_bytes(task.target, content)
+    return OutputRecord(
+        PRODUCT, one.file, task.key, task.target, len(content), bytes_digest(content), _detail(rows, fates)
+    )
 
 
 def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.NDArray[np.int64]]:

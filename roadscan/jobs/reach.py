@@ -29,29 +29,36 @@ _KEPT = threading.local()
 
 def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
     """Tiles that the row groups of a slice of scans or returns may touch; groups by their place in the slice."""
+    with opened(store, one) as file:
+        return touched_by(store, ground, one, file)
+
+
+def touched_by(store: Store, ground: Ground, one: RawSlice, file: pq.ParquetFile) -> Touched:
+    """As :func:`touched_tiles`, of a file that is open."""
     reach = _reach(store, ground, one)
     if reach is None:
         return joined([])
     geometry = geometry_of(one.source)
-    with _opened(store, one) as file:
-        if geometry is None:
-            return _of_returns(reach, one, file)
-        counts = [file.metadata.row_group(g).num_rows for g in one.groups]
+    if geometry is None:
+        return _of_returns(reach, one, file)
+    counts = [file.metadata.row_group(g).num_rows for g in one.groups]
+    if geometry.kind == "polar":
+        epochs, spans = _read_spans(store, one, counts, geometry)
+        whole = spans.whole(geometry)
+        spans = spans if reach.is_loose(whole, geometry) else whole
+    else:
         stored = [c for c in _SPAN_COLUMNS if c in file.schema_arrow.names]
         rows = file.read_row_groups(list(one.groups), columns=["epoch_gps_ns", *stored], use_threads=False)
-        spans = _stored_spans(rows, geometry)
-        if reach.is_loose(spans, geometry):
-            spans = _read_spans(store, one, counts, geometry)
+        epochs, spans = rows.column("epoch_gps_ns").to_numpy(), _stored_spans(rows, geometry)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return reach.profiles(_on_time(one, rows.column("epoch_gps_ns").to_numpy()), spans, starts, geometry)
+    return reach.profiles(_on_time(one, epochs), spans, starts, geometry)
 
 
-def group_spans(store: Store, one: RawSlice) -> npt.NDArray[np.int64]:
+def group_spans(one: RawSlice, file: pq.ParquetFile) -> npt.NDArray[np.int64]:
     """First and last epoch (groups, 2), on time (GPS ns), of the row groups of a slice, from the file's own footer."""
-    with _opened(store, one) as file:
-        metadata = file.metadata
-        column = metadata.schema.names.index("epoch_gps_ns")
-        spans = [_limits(metadata.row_group(g), column) or _span(file, g, "epoch_gps_ns") for g in one.groups]
+    metadata = file.metadata
+    column = metadata.schema.names.index("epoch_gps_ns")
+    spans = [_limits(metadata.row_group(g), column) or _span(file, g, "epoch_gps_ns") for g in one.groups]
     return _on_time(one, np.array(spans, dtype=np.int64).ravel()).reshape(-1, 2)
 
 
@@ -87,7 +94,8 @@ def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence
 
 
 @contextmanager
-def _opened(store: Store, one: RawSlice) -> Iterator[pq.ParquetFile]:
+def opened(store: Store, one: RawSlice) -> Iterator[pq.ParquetFile]:
+    """The file of a slice; a :class:`StoreError` where it cannot be read."""
     try:
         with store.fs.open(store.path(one.file), "rb") as stream:
             yield pq.ParquetFile(stream)
@@ -111,16 +119,19 @@ def _stored_spans(rows: pa.Table, geometry: ScanGeometry) -> RangeSpans:
     return RangeSpans.of_profiles(low, high, geometry)
 
 
-def _read_spans(store: Store, one: RawSlice, counts: Sequence[int], geometry: ScanGeometry) -> RangeSpans:
-    """Spans of ranges of the parts of each profile, from the readings."""
+def _read_spans(
+    store: Store, one: RawSlice, counts: Sequence[int], geometry: ScanGeometry
+) -> tuple[npt.NDArray[np.int64], RangeSpans]:
+    """Epochs of the profiles as stored, and spans of ranges of the parts of each profile, from the readings."""
     step = max(_CHUNK_READINGS // (max(counts) * geometry.readings), 1)
     reader = ProfileReader(store, one.file)
-    parts = [
-        RangeSpans.of_ranges(reader.read(one.groups[start : start + step]).range)
-        for start in range(0, len(one.groups), step)
-    ]
+    epochs, parts = [], []
+    for start in range(0, len(one.groups), step):
+        rows = reader.read(one.groups[start : start + step])
+        epochs.append(rows.epoch_gps_ns.copy())
+        parts.append(RangeSpans.of_ranges(rows.range))
     low, high = (np.concatenate([getattr(p, name) for p in parts]) for name in ("low", "high"))
-    return RangeSpans(low, high, parts[0].block_readings)
+    return np.concatenate(epochs), RangeSpans(low, high, parts[0].block_readings)
 
 
 def _of_returns(reach: Reach, one: RawSlice, file: pq.ParquetFile) -> Touched:

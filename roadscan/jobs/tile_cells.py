@@ -209,8 +209,7 @@ class _Source:
         epochs = rows.epoch_gps_ns if clock is None else clock.applied(rows.epoch_gps_ns)
         own = epochs
         if geometry is not None and geometry.reading_period_ns:
-            readings = np.arange(epochs.size * geometry.readings)
-            own = geometry.reading_epochs(epochs[readings // geometry.readings], readings % geometry.readings)
+            own = geometry.all_epochs(epochs)
         counting.profiles(epochs, rows.range, rows.intensity, self._passes(own, accumulator))
 
     def _count_returns(

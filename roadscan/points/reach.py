@@ -71,6 +71,12 @@ class RangeSpans:
         low, high = block_ranges(np.ascontiguousarray(ranges), BLOCK_READINGS)
         return cls(low, high, BLOCK_READINGS)
 
+    def whole(self, geometry: ScanGeometry) -> RangeSpans:
+        """Spans of whole profiles."""
+        known = np.where(self.high > 0, self.low, 65_535).min(axis=1)
+        high = self.high.max(axis=1)
+        return RangeSpans.of_profiles(np.where(high > 0, known, 0).astype(np.uint16), high, geometry)
+
 
 @dataclass(frozen=True)
 class Reach:

@@ -58,6 +58,11 @@ class ScanGeometry(Strict):
         kept = 1 + np.flatnonzero((every[1:] >= range_min_m) & (every[1:] <= range_max_m))
         return (int(kept[0]), int(kept[-1])) if kept.size else (1, 0)
 
+    def all_epochs(self, epochs_gps_ns: Int64) -> Int64:
+        """Epochs (n · m,) of all readings of profiles, profile by profile, from the epochs of these (n,)."""
+        later_ns = self.reading_epochs(np.zeros(self.readings, np.int64), np.arange(self.readings))
+        return (epochs_gps_ns[:, None] + later_ns).reshape(-1)
+
     def reading_epochs(self, epochs_gps_ns: Int64, reading: npt.NDArray[np.integer[Any]]) -> Int64:
         """Epochs (n,) of readings by their numbers in the profile (n,), from the epochs of their profiles (n,)."""
         if not self.reading_period_ns:

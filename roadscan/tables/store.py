@@ -41,6 +41,11 @@ def file_digest(path: Path) -> str:
     return f"{_ALGORITHM}{_hashed(path, blake3()).digest(length=16).hex()}"
 
 
+def bytes_digest(content: bytes) -> str:
+    """As :func:`file_digest`, of the bytes that a file will have."""
+    return f"{_ALGORITHM}{blake3(content).digest(length=16).hex()}"
+
+
 def digest_holds(path: Path, digest: str) -> bool:
     """True if a file still has the content of `digest`.
 

@@ -143,6 +143,18 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     if schema.compression == "lz4" and is_number_table(rows.schema):
         write_number_table(path, rows, schema.row_group_rows)
         return
+    _write_by_arrow(path, rows, schema)
+
+
+def parquet_bytes(rows: pa.Table, schema: TableSchema) -> bytes:
+    """Content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
+    stream = pa.BufferOutputStream()
+    _write_by_arrow(stream, rows, schema)
+    content: bytes = stream.getvalue().to_pybytes()
+    return content
+
+
+def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchema) -> None:
     encodings: dict[str, str] = {}
     strings: list[str] = []
     for column in schema.columns:
@@ -158,7 +170,7 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
             encodings[leaf] = "DELTA_BINARY_PACKED"
     pq.write_table(
         rows,
-        path,
+        to,
         row_group_size=schema.row_group_rows,
         compression=schema.compression,
         compression_level=1 if schema.compression == "zstd" else None,

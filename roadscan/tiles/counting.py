@@ -121,8 +121,7 @@ class Counting:
 
     def _mirror(self, geometry: ScanGeometry, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
         m = geometry.readings
-        readings = np.arange(epochs.size * m)
-        own_epochs = geometry.reading_epochs(epochs[readings // m], readings % m)
+        own_epochs = geometry.all_epochs(epochs)
         scale = geometry.range_offset_m, geometry.range_step_m
 
         def pile(ends: Any, piles: Any, first: int) -> int:

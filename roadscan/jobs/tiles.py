@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -113,20 +114,21 @@ def compute_tiles(task: TileTask) -> TaskResult:
     fates = Fates()
     waiting = dict(zip(task.block.tiles, task.keys, strict=True))
     empty: list[tuple[TileId, str]] = []
-    for computed in computed_tiles(task, fates):
-        key = waiting.pop(computed.tile, None)
-        if key is None:
-            continue  # a tile of the halo
-        if computed.failure:
-            failures.append((str(computed.tile), computed.failure))
-            continue
-        if computed.content is None or computed.evidence is None:
-            empty.append((computed.tile, key))
-            continue
-        try:
-            records += _write_tile(task, key, computed.content, computed.evidence)
-        except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
-            failures.append((str(computed.tile), reason_of(error)))
+    with task.store.scratch() as folder:
+        for computed in computed_tiles(task, fates):
+            key = waiting.pop(computed.tile, None)
+            if key is None:
+                continue  # a tile of the halo
+            if computed.failure:
+                failures.append((str(computed.tile), computed.failure))
+                continue
+            if computed.content is None or computed.evidence is None:
+                empty.append((computed.tile, key))
+                continue
+            try:
+                records += _write_tile(task, key, computed.content, computed.evidence, folder)
+            except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
+                failures.append((str(computed.tile), reason_of(error)))
     for tile, key in [*empty, *waiting.items()]:
         records.append(OutputRecord(TILE, str(tile), key, "", 0, "", json.dumps({"points": 0})))
     return TaskResult.of([_with_fates(r, fates) for r in records], failures)
@@ -155,23 +157,22 @@ def summary_of(record: OutputRecord) -> TileSummary | None:
     return TileSummary(tile=TileId.parse(record.unit), **figures)
 
 
-def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence) -> list[OutputRecord]:
+def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence, folder: Path) -> list[OutputRecord]:
     cells, unit = content.cells, str(content.cells.tile)
     context = dataclasses.replace(task.context, date=utc_from_gps_ns(evidence.first_epoch_gps_ns).date())
     records: list[OutputRecord] = []
-    with task.store.scratch() as folder:
-        for wanted in task.products:
-            records += write_product(wanted, content, context, key, task.store, folder)
-        path = folder / "overviews.parquet"
-        write_overviews(path, content.overviews)
-        target = f"tiles/overviews/{unit}.parquet"
-        records.append(publish_file(task.store, path, target, OVERVIEWS, unit, key))
-        path = folder / "cells.parquet"
-        write_cells(path, cells, task.cell_table)
-        detail = json.dumps(_figures(cells, evidence))
-        records.append(
-            publish_file(task.store, path, f"tiles/cells/{unit}.parquet", TILE, unit, key, detail)
-        )  # last: a tile is current only with all its files
+    for wanted in task.products:
+        records += write_product(wanted, content, context, key, task.store, folder)
+    path = folder / "overviews.parquet"
+    write_overviews(path, content.overviews)
+    target = f"tiles/overviews/{unit}.parquet"
+    records.append(publish_file(task.store, path, target, OVERVIEWS, unit, key))
+    path = folder / "cells.parquet"
+    write_cells(path, cells, task.cell_table)
+    detail = json.dumps(_figures(cells, evidence))
+    records.append(
+        publish_file(task.store, path, f"tiles/cells/{unit}.parquet", TILE, unit, key, detail)
+    )  # last: a tile is current only with all its files
     return records
 
 

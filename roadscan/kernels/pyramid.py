@@ -10,6 +10,8 @@ from roadscan.kernels.options import bare, kernel
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
 """Added and taken away again, it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""
 
+_SAMPLE = 4096
+
 TO_WHOLE = 1.5 * 2.0**52
 """Added and taken away again, it rounds a number below 2⁵¹ to a whole one (intensities)."""
 
@@ -88,18 +90,70 @@ def _means(cells, points, above, light, base, out_count, out_cells, out_height, 
 
 
 @bare
+def _is_scattered(column, row):
+    """True where fewer than half of the cells have one beside them, by a sample: it does not pay to look for runs."""
+    beside, looked = 0, 0
+    for k in range(1, row.size, 1 + row.size // _SAMPLE):
+        looked += 1
+        beside += np.int64((row[k] == row[k - 1]) & (column[k] == column[k - 1] + 1))
+    return 2 * beside < looked
+
+
+@bare
+def _add_cells(column, factor, count, height, intensity, base, cells, above, points, light):
+    """Add cells one by one to the sums of their pixels; returns the first pixel and the one behind the last."""
+    west, east = cells.size, 0
+    for i in range(column.size):
+        pixel = np.int64(column[i] >> 1) if factor == 2 else np.int64(column[i]) // factor
+        number = np.float64(count[i])
+        cells[pixel] += 1.0
+        points[pixel] += number
+        above[pixel] += ((height[i] - base) + TO_HEIGHT_UNIT) - TO_HEIGHT_UNIT
+        light[pixel] += (np.float64(intensity[i]) * number + TO_WHOLE) - TO_WHOLE
+        west, east = min(west, pixel), max(east, pixel + 1)
+    return west, east
+
+
+@bare
+def _write_pixels(
+    cells, points, above, light, west, east, base, line, at,
+    out_column, out_row, out_count, out_cells, out_height, out_intensity,
+):  # fmt: skip
+    """Write pixels one by one; returns where the next one goes."""
+    for pixel in range(west, east):
+        if cells[pixel] > 0.0:
+            out_column[at], out_row[at] = pixel, line
+            out_cells[at], out_count[at] = np.uint32(cells[pixel]), np.uint32(points[pixel])
+            out_height[at] = base + above[pixel] / cells[pixel]
+            out_intensity[at] = light[pixel] / points[pixel]
+            at += 1
+    return at
+
+
+@bare
 def _reduce(
     column, row, count, height, intensity, base, factors, edges, starts, sums,
     out_column, out_row, out_count, out_cells, out_height, out_intensity, written, west, east,
 ):  # fmt: skip
     """:func:`reduce_cells`; west, east : (levels,) int64, edges[0] and 0, pixels of a strip that have sums."""
     n = row.size
+    scattered = _is_scattered(column, row)
     levels = factors.size
     written[:] = 0
     i = 0
     while i < n:
         strip = row[i] // factors[0]
-        while i < n and row[i] // factors[0] == strip:
+        beyond = (np.int64(strip) + 1) * factors[0]
+        if scattered:
+            end = i + 1
+            while end < n and row[end] < beyond:
+                end += 1
+            west[0], east[0] = _add_cells(
+                column[i:end], factors[0], count[i:end], height[i:end], intensity[i:end], base,
+                sums[0, 0], sums[0, 2], sums[0, 1], sums[0, 3],
+            )  # fmt: skip
+            i = end
+        while i < n and row[i] < beyond:
             end, first = run_end(column, row, i, n), np.int64(column[i])
             _add_run(first, factors[0], count[i:end], height[i:end], intensity[i:end], base, sums[0])
             west[0] = min(west[0], first // factors[0])
@@ -109,6 +163,12 @@ def _reduce(
         for level in range(levels):
             at = starts[level] + written[level]
             here, end = sums[level], west[level]
+            if scattered:
+                at = _write_pixels(
+                    here[0], here[1], here[2], here[3], west[level], east[level], base, line, at,
+                    out_column, out_row, out_count, out_cells, out_height, out_intensity,
+                )  # fmt: skip
+                end = east[level]
             while end < east[level]:
                 pixel = end
                 while pixel < east[level] and here[0, pixel] == 0.0:

@@ -6,16 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 _TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _BINARY, _LIST, _STRUCT = 1, 2, 3, 4, 5, 6, 8, 9, 12
 _LONGEST_DELTA: Final = 15
 _SHORT: Final = [bytes([number]) for number in range(128)]
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """A value with its type."""
 
     kind: int

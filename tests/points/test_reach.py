@@ -160,6 +160,16 @@ def test_whole_profiles_of_a_far_seeing_beam_are_loose() -> None:
     assert not reach.is_loose(RangeSpans.unknown(9, PROFILER), PROFILER)
 
 
+def test_spans_of_whole_profiles_are_those_of_their_parts() -> None:
+    rng = np.random.default_rng(4)
+    ranges = rng.integers(0, 65_536, (50, 80)).astype(np.uint16) * (rng.random((50, 80)) < 0.1)
+    whole = RangeSpans.of_ranges(ranges).whole(MIRROR)
+    for profile, low, high in zip(ranges, whole.low[:, 0], whole.high[:, 0], strict=True):
+        there = profile[profile > 0]
+        assert (low, high) == ((there.min(), there.max()) if there.size else (0, 0))
+
+
+
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("mountings", [ONE, DATED], ids=["one mounting", "dated mountings"])
 @pytest.mark.parametrize("rate_hz", [2, 100])

@@ -169,7 +169,6 @@ def test_spans_of_whole_profiles_are_those_of_their_parts() -> None:
         assert (low, high) == ((there.min(), there.max()) if there.size else (0, 0))
 
 
-
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("mountings", [ONE, DATED], ids=["one mounting", "dated mountings"])
 @pytest.mark.parametrize("rate_hz", [2, 100])

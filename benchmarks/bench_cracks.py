@@ -8,7 +8,7 @@ cross slope. Once more with σ 0.5 mm, 2 % impulses and 5 % dropouts, and with a
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,8 +109,12 @@ def seen(
     seed: int,
     reading_m: float = READING_M,
     faults: Faults = CLEAN,
+    change: Callable[[Float64, Float64, Float64], Float64] | None = None,
 ) -> Seen:
-    """A patch from station 10 and offset 0.5 on: medians of readings, their lowest; then smoothed."""
+    """A patch from station 10 and offset 0.5 on: medians of readings, their lowest; then smoothed.
+
+    change : what becomes of heights at these offsets and stations; all (rows, columns) of readings.
+    """
     scene = Scene(seed=seed).changed(map={"azimuth_deg": 0.0}, road={**ROAD, **road})
     surface = Surface(scene)
     per = round(cell_m / reading_m)
@@ -126,6 +130,9 @@ def seen(
         height += rng.normal(0.0, faults.sigma_m, height.shape)
         height += np.where(rng.random(height.shape) < faults.impulses, rng.uniform(-0.03, 0.03, height.shape), 0.0)
         height[rng.random(height.shape) < faults.dropouts] = np.nan
+        if change is not None:
+            places = np.broadcast_arrays((east - scene.map.easting_m)[None], (north - scene.map.northing_m)[:, None])
+            height = change(*places, height)
         cells = height.reshape(b - a, per, columns, per).swapaxes(1, 2).reshape(b - a, columns, -1)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -139,6 +139,8 @@ def _thinnings(config: CrackDetection, cell_m: float) -> int:
 def _grown(strong: Bool, weak: Bool) -> UInt8:
     """Weak cells that strong ones reach, 1 or 0."""
     found, allowed = strong.astype(np.uint8), weak.astype(np.uint8)
+    if not found.any():
+        return found
     square = np.ones((3, 3), np.uint8)
     leap = np.ones((5, 5), np.uint8)
     for step in range(1, _GROWTHS + 1):

@@ -68,7 +68,14 @@ def ingest(survey_file: SurveyFile, workers: Workers = None, scheduler: Schedule
 @app.command()
 def navigate(survey_file: SurveyFile) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
+    from roadscan.jobs.ingest import survey_records
+    from roadscan.jobs.navigate import plan_trajectories
+    from roadscan.model.survey import Survey
+
     _run(survey_file, _stages("navigate"), 0, None)
+    survey, store = Survey.load(survey_file), _store(survey_file)
+    if not plan_trajectories(survey, store, survey_records(survey, store)):
+        typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
 
 @app.command()
@@ -82,6 +89,9 @@ def clocks(survey_file: SurveyFile) -> None:
          f"{e.correction.drift * 1e6:+.3f}", f"{e.correction.sigma_drift * 1e6:.2g}", e.method)
         for e in kept_estimates(_store(survey_file))
     ]  # fmt: skip
+    if not rows:
+        typer.echo("no clock to estimate: no log has clock = {…, pairs = …}, and the survey file names no [[clocks]]")
+        return
     _table(("run", "sensor", "added s", "σ s", "drift ppm", "σ ppm", "found from"), rows)
 
 

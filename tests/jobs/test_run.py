@@ -14,7 +14,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import rasterio
+from typer.testing import CliRunner
 
+from roadscan.cli import app
 from roadscan.jobs.compute import Inline
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.selection import Selection
@@ -131,6 +133,13 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
     assert all(line.startswith(("known:", *stages)) for line in _lines(run))
     assert {p: store.fs.modified(store.path(p)) for p in outputs(store)} == before
     assert survey_status(Survey.load(finished.survey_file), store).is_complete
+
+
+@pytest.mark.parametrize(
+    ("command", "said"), [("navigate", "no trajectory to compute"), ("clocks", "no clock to estimate")]
+)
+def test_what_has_nothing_to_do_says_so(finished: Simulated, command: str, said: str) -> None:
+    assert said in CliRunner().invoke(app, [command, str(finished.survey_file)]).output
 
 
 def test_reprocessing_a_tile_reads_little_and_gives_the_same_bytes(finished: Simulated) -> None:

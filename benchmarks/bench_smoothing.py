@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,27 @@ def figures(_: Path) -> Iterator[Figure]:
             yield from quality(sensor, f"{width_m * 1e3:.0f} × {depth_m * 1e3:.0f} mm", ((width_m, depth_m),))
         yield from quality(sensor, "all cracks", CLASSES_M)
     yield from quality(SICK, "20 × 30 mm across the road", None)
+    for width_m, depth_m in (*CLASSES_M[1:], (0.01, 0.03), (0.02, 0.02)):
+        yield from known_line(width_m, depth_m)
+
+
+def known_line(width_m: float, depth_m: float) -> Iterator[Figure]:
+    """How deep cells of a SICK are where a crack is known to run, beside what is left of it after smoothing.
+
+    A mean over known cells, impulses left out.
+    """
+    ways: dict[str, Callable[[int], Patch]] = {
+        "along": lambda seed: cracked(SICK, 150, ((width_m, depth_m),), seed),
+        "across": lambda seed: across(SICK, 150, width_m, depth_m, seed),
+    }
+    for name, way in ways.items():
+        patches = [way(seed) for seed in SEEDS]
+        seen = [np.where(p.impulse, np.nan, p.measured_m) for p in patches]
+        known = float(np.mean([depth_bias(p, height) for p, height in zip(patches, seen, strict=True)]))
+        smooth = [smooth_surface(p.measured_m, SurfaceSmoothing(sigma_m=SICK.sigma_m)) for p in patches]
+        left = float(np.mean([depth_bias(p, height) for p, height in zip(patches, smooth, strict=True)]))
+        what = f"SICK, {width_m * 1e3:.0f} × {depth_m * 1e3:.0f} mm {name} the road: depth bias of a known line"
+        yield Figure(what, 100 * known, "%", 100 * left, "after smoothing")
 
 
 def speed() -> Iterator[Figure]:

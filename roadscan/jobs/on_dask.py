@@ -79,28 +79,33 @@ _LOST_S = 30.0
 class OnDask:
     """Runs tasks on a Dask cluster; a bounded number is handed out at a time."""
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
+    def __init__(self, client: Client, workers: int | None = None) -> None:
+        """`workers` is how many there are when all are alive, where that is known."""
+        self._client, self._workers = client, workers
 
     @property
     def workers(self) -> int:
-        """Threads of all workers."""
+        """Threads of all workers, also of those that are started anew."""
+        return self._alive() if self._workers is None else self._workers
+
+    def _alive(self) -> int:
         return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks, most of them at the same time; a task is tried once more if its worker dies.
 
         Those that waited at the same worker die with it. So all of them are tried again when the others have ended, on
-        half of the threads, where none waits behind another: what dies there is at fault itself.
+        half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
+        itself.
         """
         threads = self.workers
         died: list[T] = []
-        for done in self._ended(function, tasks, _HELD_A_THREAD * threads, _MORE_HELD):
+        for done in self._ended(function, tasks, lambda left: _HELD_A_THREAD * threads + min(_MORE_HELD, left // 4)):
             if isinstance(done.error, KilledWorker):
                 died.append(done.task)
             else:
                 yield done
-        for done in self._ended(function, died, max(1, threads // 2), 0):
+        for done in self._ended(function, died, lambda _: max(1, min(threads // 2, self._alive()))):
             yield Done(done.task, None, _death()) if isinstance(done.error, KilledWorker) else done
 
     def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
@@ -112,14 +117,16 @@ class OnDask:
         sent = [pickle.dumps((function, task)) for task in tasks]
         return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
 
-    def _ended(self, function: Callable[[T], R], tasks: Sequence[T], least: int, more: int) -> Iterator[Done[T, R]]:
-        """Tasks as they end; the scheduler holds `least` of them, and up to `more` beside while many wait."""
+    def _ended(
+        self, function: Callable[[T], R], tasks: Sequence[T], held: Callable[[int], int]
+    ) -> Iterator[Done[T, R]]:
+        """Tasks as they end; `held` says how many the scheduler holds while so many are left to hand out."""
         running: dict[str, T] = {}
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
         def hand_out(first: int) -> int:
-            held = least + min(more, (len(tasks) - first) // 4)
-            chosen = tasks[first : first + max(held - len(running), 0)]
+            left = len(tasks) - first
+            chosen = tasks[first : first + max(held(left) - len(running), 0)] if left else []
             if chosen:
                 futures = self.send(function, chosen)
                 running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
@@ -136,7 +143,7 @@ class OnDask:
             for future, task in zip(futures, own, strict=True):
                 error = future.exception() if future.status != "finished" else None
                 future.release()
-                yield Done(task, None if error is not None else results.pop(future.key), error)
+                yield Done(task, None if error is not None else pickle.loads(results.pop(future.key)), error)
 
 
 def _death() -> RoadscanError:
@@ -159,10 +166,14 @@ def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
     return taken
 
 
-def _called(sent: bytes) -> Any:
-    """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker)."""
+def _called(sent: bytes) -> bytes:
+    """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
+
+    It is made to bytes while the task runs: a result that cannot be is the task's error then, and one whose worker dies
+    of it counts as a death.
+    """
     function, task = pickle.loads(sent)
-    result = function(task)
+    result: bytes = pickle.dumps(function(task))
     _freeze()
     return result
 
@@ -210,8 +221,9 @@ def embedded(workers: int | None = None) -> Iterator[OnDask]:
         ) as cluster,
         Client(cluster) as client,
     ):
-        _keep_alive(cluster, len(cluster.workers))
-        yield OnDask(client)
+        workers = len(cluster.workers)
+        _keep_alive(cluster, workers)
+        yield OnDask(client, workers)
 
 
 def _keep_alive(cluster: LocalCluster, workers: int) -> None:

@@ -279,7 +279,12 @@ def load_corrections(store: Store, run: str) -> Corrections | None:
     """Corrections of a run's trajectory, None where no adjustment wrote any."""
     if not store.exists(CORRECTIONS):
         return None
-    rows = store.read_table(CORRECTIONS)
+    try:
+        rows = store.read_table(CORRECTIONS)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise StoreError(
+            f"the trajectories' corrections cannot be read ({error})", change="compute them again", file=CORRECTIONS
+        ) from error
     rows = rows.filter(pa.compute.equal(rows.column("run"), run))
     if rows.num_rows == 0:
         return None

@@ -173,21 +173,17 @@ class Manifest:
             self._merge()
 
     def _merge(self) -> None:
-        """Bring the last parts into one, which says the same as these in their order."""
+        """Bring the last parts into one, which says the same as these in their order, but not which files moved."""
+        self.settle()
         rows = self._parts[-1].rows
         first = len(self._parts) - 1
         while first and (first > _MOST_PARTS // 2 or self._parts[first - 1].rows <= 2 * rows):
             first -= 1
             rows += self._parts[first].rows
         old = self._parts[first:]
-        table, moved = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
-        if moved:  # no record tells of them once these parts are one
-            self._moved += moved
-            self.settle()
+        table, _ = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
         del self._parts[first:]
-        merged = self._write(Packed.of(table, "lz4"), old[-1].number + 1)
-        known = [part for part in self._behind if part not in old]
-        self._behind = known if known == self._behind else [*known, merged]
+        self._write(Packed.of(table, "lz4"), old[-1].number + 1)
         for part in old:  # where these stay, the new part says once more what they say
             self._store.remove(part.path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Iterator
 
@@ -35,6 +36,13 @@ def test_an_error_is_the_tasks_own(cluster: OnDask) -> None:
     assert isinstance(done.error, ZeroDivisionError)
 
 
+@pytest.mark.parametrize(("made", "kind"), [("unsendable", TypeError), ("deadly", RoadscanError)])
+def test_a_result_that_cannot_be_sent_is_its_tasks_error(cluster: OnDask, made: str, kind: type[Exception]) -> None:
+    ended = {done.task: done for done in cluster.map(result_of, [made, "sound"])}
+    assert isinstance(ended[made].error, kind)
+    assert ended["sound"].result == "sound"
+
+
 def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(on_dask, "_LOST_S", 0.5)
     with embedded(1) as alone:
@@ -56,6 +64,15 @@ def squared(number: int) -> int:
         os._exit(9)
     time.sleep(0.01)
     return number**2
+
+
+class Deadly:
+    def __reduce__(self) -> str:
+        os._exit(9)
+
+
+def result_of(name: str) -> object:
+    return {"unsendable": threading.Lock(), "deadly": Deadly()}.get(name, name)
 
 
 def inverse(number: int) -> float:

@@ -155,6 +155,17 @@ def test_a_file_that_another_unit_names_stays(store: Store, way: str, monkeypatc
     assert manifest.is_current("pic", "1_0", "k1")
 
 
+def test_an_older_name_goes_before_its_record_is_forgotten(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(manifest_module, "_MOST_PARTS", 3)
+    manifest = Manifest(store)
+    for suffix in (".png", ".bmp"):
+        manifest.add_packed(filed(store, record("pic", 6, suffix, suffix)))
+    manifest.forget("pic", ["6_0"])
+    manifest.add_packed(packed(record("pic", 7, "k", "")))  # parts are merged, and the run is killed
+    Manifest(store).settle()
+    assert paths(store) == ["pic/6_0.bmp"]
+
+
 def test_a_file_that_came_back_stays(store: Store) -> None:
     manifest = Manifest(store)
     for key, suffix in (("k1", ".png"), ("k2", ".bmp")):

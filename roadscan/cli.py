@@ -70,24 +70,22 @@ def navigate(survey_file: SurveyFile) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
     from roadscan.jobs.ingest import survey_records
     from roadscan.jobs.navigate import plan_trajectories
-    from roadscan.model.survey import Survey
 
-    _run(survey_file, _stages("navigate"), 0, None)
-    survey, store = Survey.load(survey_file), _store(survey_file)
-    if not plan_trajectories(survey, store, survey_records(survey, store)):
+    run = _run(survey_file, _stages("navigate"), 0, None)
+    if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
         typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
 
 @app.command()
 def clocks(survey_file: SurveyFile) -> None:
     """Clocks of sensors as they were estimated; estimates those that are missing or out of date."""
-    _run(survey_file, _stages("navigate"), 0, None)
     from roadscan.jobs.clock_tables import kept_estimates
 
+    run = _run(survey_file, _stages("navigate"), 0, None)
     rows = [
         (e.run, e.sensor, f"{e.correction.offset_s:+.6f}", f"{e.correction.sigma_offset_s:.2g}",
          f"{e.correction.drift * 1e6:+.3f}", f"{e.correction.sigma_drift * 1e6:.2g}", e.method)
-        for e in kept_estimates(_store(survey_file))
+        for e in kept_estimates(run.store)
     ]  # fmt: skip
     if not rows:
         typer.echo("no clock to estimate: no log has clock = {…, pairs = …}, and the survey file names no [[clocks]]")

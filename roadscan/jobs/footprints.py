@@ -20,7 +20,7 @@ from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.compute import Compute
 from roadscan.jobs.fingerprint import key_of
 from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.reach import group_spans, opened, touched_by
+from roadscan.jobs.reach import group_spans, opened, touched_tiles
 from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
 from roadscan.points.place import FATE_NAMES, Window
@@ -140,7 +140,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
     one = task.slice
     with opened(task.store, one) as file:
         spans = group_spans(one, file)
-        bounded = None if one.source.table == "cloud" else touched_by(task.store, task.ground, one, file)
+        bounded = None if one.source.table == "cloud" else touched_tiles(task.store, task.ground, one, file)
     if bounded is None:
         pairs, fates = _placed(task, range(len(one.groups)))
     else:

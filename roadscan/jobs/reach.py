@@ -27,14 +27,8 @@ _WINDOW_NS = 120 * NS_PER_S
 _KEPT = threading.local()
 
 
-def touched_tiles(store: Store, ground: Ground, one: RawSlice) -> Touched:
-    """Tiles that the row groups of a slice of scans or returns may touch; groups by their place in the slice."""
-    with opened(store, one) as file:
-        return touched_by(store, ground, one, file)
-
-
-def touched_by(store: Store, ground: Ground, one: RawSlice, file: pq.ParquetFile) -> Touched:
-    """As :func:`touched_tiles`, of a file that is open."""
+def touched_tiles(store: Store, ground: Ground, one: RawSlice, file: pq.ParquetFile) -> Touched:
+    """Tiles that row groups of a slice of scans or returns, open as `file`, may touch; groups by place in the slice."""
     reach = _reach(store, ground, one)
     if reach is None:
         return joined([])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.kernels.copies import copy_values
 from roadscan.kernels.georeference import CLASS_KEPT
 from roadscan.kernels.options import inlined, kernel
 
@@ -163,13 +164,6 @@ def count_kept(kinds):
 
 
 @kernel
-def copy_kinds(source, target):
-    """Copy (n,) uint8; a slice's assignment compiles five times as long."""
-    for j in range(source.size):
-        target[j] = source[j]
-
-
-@kernel
 def mark_off_road(y, up, height, spread, settings, trail, trial, best, kinds):
     """Step 4: readings that are not connected with the carriageway: the connected surface with most readings.
 
@@ -179,7 +173,7 @@ def mark_off_road(y, up, height, spread, settings, trail, trial, best, kinds):
     n = y.size
     every = count_kept(kinds)
     most, found = 0, 0
-    copy_kinds(kinds, best)
+    copy_values(kinds, best)
     for share in (8, 4, 12, 2, 14):
         start, seen = np.int64(-1), 0
         for j in range(n):
@@ -190,11 +184,11 @@ def mark_off_road(y, up, height, spread, settings, trail, trial, best, kinds):
                 seen += 1
         if start < 0 or (most > 0 and best[start] == CLASS_KEPT):
             continue
-        copy_kinds(kinds, trial)
+        copy_values(kinds, trial)
         found = road_from(start, y, up, height, spread, settings, trail, trial)
         if found > most:
             most = found
-            copy_kinds(trial, best)
+            copy_values(trial, best)
         if 2 * most >= every:
             break
-    copy_kinds(best, kinds)
+    copy_values(best, kinds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.cell_runs import run_end
+from roadscan.kernels.copies import copy_values
 from roadscan.kernels.lanes import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
 from roadscan.kernels.options import bare, bare_inlined, kernel
 
@@ -109,12 +110,6 @@ def _light_steps(intensity, out):
 
 
 @bare
-def _copy(values, out):
-    for k in range(out.size):
-        out[k] = np.int32(values[k])
-
-
-@bare
 def fill_strip(column, row, height, intensity, count, start, base, first_row, rows, strip, listed):
     """Lay the cells from `start` on out in a strip, as far as its rows reach.
 
@@ -144,7 +139,7 @@ def fill_strip(column, row, height, intensity, count, start, base, first_row, ro
         else:
             _micrometres(height[i:end], base, heights[at:to])
             _light_steps(intensity[i:end], lights[at:to])
-            _copy(count[i:end], counts[at:to])
+            copy_values(count[i:end], counts[at:to])
         for patch in range(west // rows, (west + end - i - 1) // rows + 1):
             listed[patch] = 1
         i = end

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.arithmetic_coder import HEAD, WHOLE, finished, model, number_models, put_number, put_symbol
+from roadscan.kernels.copies import copy_values
 from roadscan.kernels.options import bare, bare_inlined, kernel
 
 _U = np.uint64
@@ -173,12 +174,6 @@ def is_model(points):
 
 
 @bare
-def _copy(values, out):
-    for k in range(out.size):
-        out[k] = values[k]
-
-
-@bare
 def _sized(sizes, layer, size):
     for k in range(_SIZE):
         sizes[_SIZE * layer + k] = (size >> _U(8 * k)) & _U(255)
@@ -196,7 +191,7 @@ def _chunk(points, start, models, seen, widths, out):
     sizes = sizes[_SIZE:]
     for layer in range(LAYERS + further):
         _sized(sizes, layer, _U(0))
-    _copy(start, models)
+    copy_values(start, models)
     to = _U(counted + _SIZE * (1 + LAYERS + further))
     end = _places(points, models, seen, widths, out, to)
     _sized(sizes, _XY, end - to)
@@ -215,7 +210,7 @@ def _chunk(points, start, models, seen, widths, out):
     for k in range(further):
         if not _changes(points, _POINT + k, _POINT + k + 1):
             continue
-        _copy(start[np.int64(_BYTE_AT) :], models[np.int64(_BYTE_AT) :])
+        copy_values(start[np.int64(_BYTE_AT) :], models[np.int64(_BYTE_AT) :])
         end = _bytes(points, _POINT + k, models, out, to)
         _sized(sizes, LAYERS + k, end - to)
         to = end

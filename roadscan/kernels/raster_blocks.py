@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.kernels.copies import copy_values
 from roadscan.kernels.options import bare
 
 EMPTY_LINE = (0x7F, 0xC0 - 0x7F, 0x100 - 0xC0, 0)
@@ -38,12 +39,6 @@ def round_values(values, per_step, step, rounded):
     """Round (n,) values of any kind to multiples of `step`; rounded (n,) float32, out."""
     for k in range(rounded.size):
         rounded[k] = np.rint(values[k] * per_step) * step
-
-
-@bare
-def _copy(values, out):
-    for i in range(out.size):
-        out[i] = values[i]
 
 
 @bare
@@ -99,7 +94,7 @@ def encode_block(column, values, first, last, west, out, line, pixels, differenc
         filled += n
         if column[end - 1] - column[start] == n - 1:
             at = np.int64(column[start]) - west
-            _copy(values[start:end], line[at : at + n])
+            copy_values(values[start:end], line[at : at + n])
         else:
             _scatter(column[start:end], values[start:end], west, line)
         _subtract(pixels[4:], pixels[:-4], by_byte[4:])

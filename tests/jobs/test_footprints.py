@@ -10,7 +10,7 @@ import pytest
 
 from roadscan.jobs.footprints import Footprints, load_footprints, load_ranges
 from roadscan.jobs.plan import SurveyPlan, plan_survey
-from roadscan.jobs.reach import touched_tiles
+from roadscan.jobs.reach import opened, touched_tiles
 from roadscan.jobs.readings import Placer
 from roadscan.model.errors import StoreError
 from roadscan.model.survey import Survey
@@ -91,7 +91,8 @@ def test_files_without_spans_of_ranges_or_statistics_are_bounded_too(indexed, ta
     written = tmp_path / "bare.parquet"
     pq.write_table(rows, written, row_group_size=first_group_rows(plan, one.file), write_statistics=False)
     store.write_bytes(one.file, written.read_bytes())
-    bare = touched_tiles(store, plan.ground, one)
+    with opened(store, one) as file:
+        bare = touched_tiles(store, plan.ground, one, file)
     assert not bare.unbounded.any()
     pairs = set(zip(bare.group.tolist(), bare.column.tolist(), bare.row.tolist(), strict=True))
     placer = Placer(plan.store, plan.ground, [one])

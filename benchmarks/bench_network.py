@@ -2,7 +2,8 @@
 
 Everything but the readings is real: plans and tasks of :mod:`roadscan.jobs`, a Dask scheduler with two workers in
 processes of their own, and the loops that hand tasks out and keep the records. A survey is a day's drive; footprints
-and tiles of all are scheduled as in a run, products of one.
+and tiles of all are scheduled as in a run, products of one. The network is run twice: its graph alone, where a task of
+tiles ends at once and leaves nothing, and then with four records of each tile, which are made, packed, sent and kept.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import psutil
 
 from benchmarks.network import Region
-from benchmarks.scheduler import running_scheduler
+from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.jobs.bundles import Bundle, Ended
@@ -30,10 +31,12 @@ from roadscan.jobs.products import OutputTask, make_products, product_context, w
 from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.jobs.tiles import TaskResult, compute_tiles, run_tasks
 from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.records import Packed
+from roadscan.tables.records import Packed, Row
 from roadscan.tables.store import Store
 
 _BAR_S = 120.0
+_Work: TypeAlias = Callable[[Any], Any]
+_NOTHING = TaskResult.of([])
 _TILE_FIGURES = (
     '"height_mean_m": 87.1, "height_max_m": 88.2, "height_std_median_m": 0.0004, "intensity_mean": 90.2, "passes": [1],'
     ' "first_epoch_gps_ns": 1454644800000000000, "last_epoch_gps_ns": 1454644800360000000, "sigma_horizontal_m": null,'
@@ -62,45 +65,62 @@ class _Seen:
     products: _Stage = field(default_factory=_Stage)
     tiles_touched: int = 0
     manifest_s: float = 0.0
+    whole_s: float = 0.0
+    planner_s: float = 0.0
+    """Processor time of the planning process; then of the scheduler, and of the workers."""
+    scheduler_s: float = 0.0
+    workers_s: float = 0.0
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """The whole network, a survey after another; the products of the first."""
+    """The whole network, a survey after another: its graph, then with all records; the products of the first."""
     size = Settings.current()
     regions = max(1, round(size.network_km / size.network_region_km))
     first = Region.of(1000 * size.network_region_km, folder)
-    seen, me = _Seen(), psutil.Process()
+    me = psutil.Process()
     with running_scheduler(workers=2) as (client, scheduler), rare_collections():
         client.run(_imports)
-        _network(first.moved(0, folder / "warm"), client, _Seen()).compact()
+        _network(first.moved(0, folder / "warm"), client, _Seen(), stand_in).compact()
         before, warm = me.memory_info().rss, scheduler.rss_bytes()
-        mine, its, theirs = time.process_time(), scheduler.cpu_s(), scheduler.workers_cpu_s()
-        started = time.perf_counter()
-        for number in range(regions):
-            _network(first.moved(number, folder / f"{number}"), client, seen).compact()
-        whole = time.perf_counter() - started
-        mine, its = time.process_time() - mine, scheduler.cpu_s() - its
-        theirs = scheduler.workers_cpu_s() - theirs
+        graph = _all(first, folder / "graph", regions, client, scheduler, no_op)
+        seen = _all(first, folder / "kept", regions, client, scheduler, stand_in)
         end, peak, most = scheduler.rss_bytes(), scheduler.peak_bytes(), scheduler.most_tasks()
         grown = me.memory_info().rss - before
         region = first.moved(0, folder / "products")
-        _products(region, _network(region, client, _Seen()), client, seen)
+        _products(region, _network(region, client, _Seen(), stand_in), client, seen)
     name = f"{seen.tiles.km:,.0f} km"
     yield Figure(f"{name}: tiles", seen.tiles_touched / seen.tiles.km, "/km")
     yield from _of_stage("footprints", seen.footprints)
     yield from _of_stage("tiles", seen.tiles)
     yield Figure(f"{name}: of this, records in the manifest", seen.manifest_s, "s")
-    yield Figure(f"{name}: footprints and tiles, planned, run and kept", whole, "s", _BAR_S, "bar")
-    yield Figure(f"{name}: the same, processor time of the planning process", mine, "s")
-    yield Figure(f"{name}: the same, processor time of the scheduler", its, "s")
-    yield Figure(f"{name}: the same, processor time of the workers", theirs, "s")
-    tasks, planning = seen.tiles.tasks + seen.footprints.tasks, seen.tiles.plan_s + seen.footprints.plan_s
-    yield Figure(f"{name}: throughput", tasks / (whole - planning), "tasks/s")
+    yield from _of_network(f"{name}: footprints and tiles, the graph planned and run", graph)
+    yield from _of_network(f"{name}: footprints and tiles, planned, run, all records kept", seen)
     yield Figure(f"{name}: tasks that the scheduler holds, at most", most, "")
     yield Figure(f"{name}: memory of the scheduler at the end", end / 2**20, "MiB", warm / 2**20, "after one survey")
     yield Figure(f"{name}: peak memory of the scheduler", peak / 2**20, "MiB")
     yield Figure(f"{name}: growth of the planning process", grown / 2**20, "MiB")
     yield from _of_stage("products", seen.products)
+
+
+def _all(first: Region, folder: Path, regions: int, client: Any, scheduler: Watched, work: _Work) -> _Seen:
+    """Every survey of the network, one after another, with what that takes."""
+    seen = _Seen()
+    started, mine = time.perf_counter(), time.process_time()
+    its, theirs = scheduler.cpu_s(), scheduler.workers_cpu_s()
+    for number in range(regions):
+        _network(first.moved(number, folder / f"{number}"), client, seen, work).compact()
+    seen.whole_s, seen.planner_s = time.perf_counter() - started, time.process_time() - mine
+    seen.scheduler_s, seen.workers_s = scheduler.cpu_s() - its, scheduler.workers_cpu_s() - theirs
+    return seen
+
+
+def _of_network(name: str, seen: _Seen) -> Iterator[Figure]:
+    yield Figure(name, seen.whole_s, "s", _BAR_S, "bar")
+    yield Figure(f"{name}, processor time of the planning process", seen.planner_s, "s")
+    yield Figure(f"{name}, processor time of the scheduler", seen.scheduler_s, "s")
+    yield Figure(f"{name}, processor time of the workers", seen.workers_s, "s")
+    tasks, planning = seen.tiles.tasks + seen.footprints.tasks, seen.tiles.plan_s + seen.footprints.plan_s
+    yield Figure(f"{name}, throughput", tasks / (seen.whole_s - planning), "tasks/s")
 
 
 def _of_stage(name: str, stage: _Stage) -> Iterator[Figure]:
@@ -112,12 +132,12 @@ def _of_stage(name: str, stage: _Stage) -> Iterator[Figure]:
     yield Figure(f"{length}, planned and run", stage.whole_s, "s")
 
 
-def _network(region: Region, client: Any, seen: _Seen) -> Manifest:
+def _network(region: Region, client: Any, seen: _Seen, work: _Work) -> Manifest:
     """Plan the footprints and tiles of a survey, run their tasks, keep their records."""
     plan, manifest = region.plan, _Timed(region.plan.store, seen)
-    with _timed(seen.footprints, region, client) as compute:
+    with _timed(seen.footprints, region, client, work) as compute:
         _check(index_footprints(plan, manifest, compute))
-    with _timed(seen.tiles, region, client) as compute:
+    with _timed(seen.tiles, region, client, work) as compute:
         context = product_context(plan)
         wanted = tuple(wanted_tile_products(plan.survey, context))
         tiles = plan_tiles(region.footprints, plan)
@@ -131,7 +151,7 @@ def _network(region: Region, client: Any, seen: _Seen) -> Manifest:
 
 def _products(region: Region, manifest: Manifest, client: Any, seen: _Seen) -> None:
     """The same for its sheets, pictures and tables."""
-    with _timed(seen.products, region, client) as compute:
+    with _timed(seen.products, region, client, stand_in) as compute:
         _check(make_products(region.plan, manifest, compute))
 
 
@@ -141,10 +161,10 @@ def _check(failures: Sequence[object]) -> None:
 
 
 @contextmanager
-def _timed(stage: _Stage, region: Region, client: Any) -> Iterator[_NoKernels]:
+def _timed(stage: _Stage, region: Region, client: Any, work: _Work) -> Iterator[_NoKernels]:
     """Where the tasks of a stage go; what they and the stage take is added to what was seen."""
     started = time.perf_counter()
-    yield _NoKernels(client, stage)
+    yield _NoKernels(client, stage, work)
     stage.km += region.length_m / 1000
     stage.whole_s += time.perf_counter() - started
 
@@ -155,11 +175,11 @@ def _imports() -> None:
 
 
 class _NoKernels(OnDask):
-    """The real way to Dask, with :func:`stand_in` for what workers do."""
+    """The real way to Dask, with other work for the workers."""
 
-    def __init__(self, client: Any, stage: _Stage) -> None:
+    def __init__(self, client: Any, stage: _Stage, work: _Work) -> None:
         super().__init__(client)
-        self._stage, self._begun = stage, time.perf_counter()
+        self._stage, self._work, self._begun = stage, work, time.perf_counter()
 
     def map(self, _: Callable[..., Any], tasks: Sequence[Any]) -> Iterator[Any]:
         """Run the tasks without kernels, whatever function is asked for."""
@@ -173,7 +193,7 @@ class _NoKernels(OnDask):
             self._stage.plan_s += time.perf_counter() - started
             return task
 
-        return super().map(stand_in, Made(range(len(tasks)), planned))
+        return super().map(self._work, Made(range(len(tasks)), planned))
 
     def send(self, function: Callable[..., Any], tasks: Sequence[Any]) -> list[Any]:
         """As the way to Dask, timed."""
@@ -183,6 +203,11 @@ class _NoKernels(OnDask):
         return futures
 
 
+def no_op(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
+    """What a worker returns at least: nothing of tiles, and of other pieces that they ended."""
+    return _NOTHING if isinstance(task, TileTask) else stand_in(task)
+
+
 def stand_in(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
     """What a worker returns, without the work: records with the figures of a tile, a data file or a sheet."""
     if isinstance(task, TileTask):
@@ -190,15 +215,15 @@ def stand_in(task: TileTask | Bundle[Any]) -> TaskResult | list[Ended]:
     return [Ended(_piece_record(piece)) for piece in task.pieces]
 
 
-def _tile_records(task: TileTask) -> Iterator[OutputRecord]:
+def _tile_records(task: TileTask) -> Iterator[Row]:
     files = [item for wanted in task.products for item in wanted.files.items()]
     for tile, key in zip(map(str, task.block.tiles), task.keys, strict=True):
         number, own_key, digest = hash(key) & 0xFFFFFF, key[8:] + key[:8], "blake3:" + key + key
         for name, suffix in files:
-            yield OutputRecord(name, tile, own_key, f"tiles/{name}/{tile}{suffix}", number, digest)
-        yield OutputRecord(OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", number, digest)
+            yield name, tile, own_key, f"tiles/{name}/{tile}{suffix}", number, digest, ""
+        yield OVERVIEWS, tile, key, f"tiles/overviews/{tile}.parquet", number, digest, ""
         figures = f'{{"points": {number}, "cells": {number}, "height_min_m": 86.{number}, ' + _TILE_FIGURES
-        yield OutputRecord(TILE, tile, key, f"tiles/cells/{tile}.parquet", number, digest, figures)
+        yield TILE, tile, key, f"tiles/cells/{tile}.parquet", number, digest, figures
 
 
 def _piece_record(piece: FootprintTask | OutputTask) -> OutputRecord:

@@ -235,6 +235,7 @@ def _tasks(
 ) -> list[OutputTask]:
     tasks: list[OutputTask] = []
     drives = Drives.of(plan) if product.needs_lanes else None
+    own_key = _product_key(product, options, context)
     driven = [] if drives is None else [drives.key()]
     bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # they have a surface, and no reading
     for planned in product.outputs(list(summaries.values()), options, context) if summaries else []:
@@ -242,7 +243,7 @@ def _tasks(
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
-        key = key_of(_product_key(product, options, context), output.name, parts, *driven)
+        key = key_of(own_key, output.name, parts, *driven)
         tasks.append(
             OutputTask(
                 plan.store,

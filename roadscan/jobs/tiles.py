@@ -23,7 +23,7 @@ from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.products.base import Tile, TileSummary
 from roadscan.tables.manifest import Manifest
-from roadscan.tables.records import OutputRecord, Packed, table_of
+from roadscan.tables.records import OutputRecord, Packed, Row, table_of
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.cells import TileCells
@@ -39,7 +39,7 @@ class TaskResult:
     """Tiles that failed, with the reason."""
 
     @classmethod
-    def of(cls, records: Sequence[OutputRecord], failures: Sequence[tuple[str, str]] = ()) -> TaskResult:
+    def of(cls, records: Sequence[Row], failures: Sequence[tuple[str, str]] = ()) -> TaskResult:
         """Finished outputs as the manifest will keep them, so that the run has only to write them."""
         return cls(Packed.of(table_of(records)), tuple(failures))
 

@@ -78,14 +78,15 @@ class Kilometre(SurveyProduct):
         """Sheets of each view and pixel, followed by the index that joins them."""
         settings = cast(KilometreOptions, options)
         everything = frozenset(one.tile for one in tiles)
-        found: list[Output] = []
-        for raster in _rasters(settings, context):
-            sheets = cut_sheets(raster.stem, everything, settings.sheet_m, raster.context.grid)
-            found += [
-                Output(s.name, with_neighbours(s, everything) if raster.view == "shaded" else s.tiles) for s in sheets
-            ]
-            found += index_output(raster.stem, sheets)
-        return found
+        sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, names without stem
+        index = index_output("", sheets)
+        plain = [Output(s.name, s.tiles) for s in sheets] + index
+        shaded = [Output(s.name, with_neighbours(s, everything)) for s in sheets] + index
+        return [
+            replace(one, name=raster.stem + one.name)
+            for raster in _rasters(settings, context)
+            for one in (shaded if raster.view == "shaded" else plain)
+        ]
 
     def write(
         self,

@@ -10,6 +10,7 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.model.errors import StoreError
 from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, table_of, unpacked
 from roadscan.tables.store import Store
 
@@ -18,6 +19,8 @@ __all__ = ["Manifest", "OutputRecord", "read_failures", "write_failures"]
 _FOLDER: Final = "manifest/outputs"
 _MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
+_LOOKS: Final = 10
+"""How often parts are listed at most, where a run at work merges them while they are read."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +49,9 @@ class Manifest:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._parts: list[_Part] = []
-        tables = [RECORDS.empty_table()]
-        for path in store.files(_FOLDER, ".parquet"):
-            tables.append(unpacked(store.read_bytes(path)))
-            self._parts.append(_Part(path, tables[-1].num_rows))
-        self._table, self._moved = latest(pa.concat_tables(tables))
+        read = _read_parts(store)
+        self._parts = [_Part(path, table.num_rows) for path, table in read]
+        self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(table for _, table in read)]))
         self._behind: list[_Part] = []  # parts that the table does not know yet
         self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, of products that were asked for
 
@@ -67,6 +67,10 @@ class Manifest:
     def all(self) -> list[OutputRecord]:
         """All records, by product and unit."""
         return list(map(OutputRecord._make, rows_of(self._current())))
+
+    def table(self) -> pa.Table:
+        """The same, as a table."""
+        return self._current()
 
     def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
         """Records of some products, of all units but these."""
@@ -195,6 +199,38 @@ class Manifest:
         self._store.write_bytes(path, records.content)
         self._parts.append(_Part(path, records.rows, records if keep else None))
         return self._parts[-1]
+
+
+def _read_parts(store: Store) -> list[tuple[str, pa.Table]]:
+    """Parts and their records, in order; listed again where a run at work has merged some of them meanwhile.
+
+    Raises
+    ------
+    StoreError
+        A part cannot be read.
+    """
+    looks = 0
+    while True:
+        looks += 1
+        paths = store.files(_FOLDER, ".parquet")
+        try:
+            return [(path, _whole(store, path)) for path in paths]
+        except StoreError:
+            if looks == _LOOKS or all(map(store.exists, paths)):
+                raise
+
+
+def _whole(store: Store, path: str) -> pa.Table:
+    content = store.read_bytes(path)
+    try:
+        return unpacked(content).cast(RECORDS)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise StoreError(
+            f"this part of the manifest is damaged: {error}",
+            expected="a Parquet file of records of outputs",
+            change="remove it and run again: what it alone tells of is made anew",
+            file=store.path(path),
+        ) from error
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:

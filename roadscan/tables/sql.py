@@ -9,11 +9,12 @@ import pyarrow as pa
 
 from roadscan.model.errors import RoadscanError, StoreError
 from roadscan.tables.logs import DataFile, read_log_records
+from roadscan.tables.manifest import Manifest
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 
-_SMALL = ("clocks", "clock_residuals", "corrections", "mountings")
-"""Tables of results, held in one file each."""
+_HELD_WHOLE = ("footprints", "regions", "clocks", "clock_residuals", "corrections", "mountings")
+"""Tables without partitions."""
 _DISTRESS = ("cracks", "potholes")
 _PER_TILE = ("cells", "overviews")
 _ALWAYS = ("rejects",)
@@ -53,12 +54,11 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
     for table in _ALWAYS:
         if table not in files:
             connection.register(table, table_schema(table).arrow().empty_table())
-    held_whole = [(name, f"tables/{name}") for name in ("footprints", "regions")] + [("outputs", "manifest/outputs")]
-    for name, folder in held_whole + [(name, f"tables/{name}") for name in _SMALL]:
-        found = store.files(folder, ".parquet")
-        if found:
-            _view(connection, name, [_url(store, f) for f in found], hive=False)
-    places = {"cells": "tiles/cells", "overviews": "tiles/overviews", "tiles": "products/tile_table"}
+    made = Manifest(store).table()  # not its files: a later record replaces an earlier one
+    if made.num_rows:
+        connection.register("outputs", made)
+    places = {name: f"tables/{name}" for name in _HELD_WHOLE}
+    places |= {"cells": "tiles/cells", "overviews": "tiles/overviews", "tiles": "products/tile_table"}
     places |= {name: f"products/{name}" for name in _DISTRESS}
     for name, folder in places.items():
         found = store.files(folder, ".parquet")

@@ -11,9 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from roadscan.model.errors import StoreError
 from roadscan.tables import manifest as manifest_module
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.records import Packed, latest, rows_of, table_of
+from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 from tests.tables.killed import dies_at_removal
 
@@ -72,6 +74,53 @@ def test_parts_that_others_wrote_are_read(store: Store) -> None:
     (file,) = store.files("manifest/outputs")
     statement = f"SELECT {', '.join(_COLUMNS)} FROM read_parquet('{store.path(file)}')"
     assert duckdb.sql(statement).fetchall() == [rows[k] for k in (3, 1, 5)]
+
+
+def test_sql_shows_what_is_there_now(store: Store) -> None:
+    """Between the parts of a run at work, too: an earlier record is replaced, a forgotten one gone."""
+    manifest = Manifest(store)
+    manifest.add([record("pic", 1, "k1"), record("pic", 2, "k1"), record("tile", 1, "k1", "")])
+    manifest.add([record("pic", 1, "k2")])
+    manifest.forget("pic", ["2_0"])
+    found = query(store, "SELECT product, unit, key FROM outputs ORDER BY ALL").to_pylist()
+    assert [tuple(row.values()) for row in found] == [("pic", "1_0", "k2"), ("tile", "1_0", "k1")]
+
+
+@pytest.mark.parametrize("merged", [1, 3])
+def test_parts_that_a_run_merges_meanwhile_are_read_from_their_successor(
+    store: Store, merged: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = Manifest(store)
+    for number in range(4):
+        writer.add([record("pic", number, "k")])
+    read, before = store.read_bytes, []
+
+    def while_a_run_works(path: str) -> bytes:
+        if len(before) < merged:
+            before.append(path)
+            writer.add([record("pic", 4 + len(before), "k")])
+            writer.compact()
+        return read(path)
+
+    monkeypatch.setattr(store, "read_bytes", while_a_run_works)
+    assert Manifest(store).all() == writer.all()
+    assert len(writer.all()) == 4 + merged == 4 + len(before)
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
+def test_a_damaged_part_is_named(store: Store, damage: str) -> None:
+    manifest = Manifest(store)
+    manifest.add([record("pic", 1, "k")])
+    manifest.add([record("pic", 2, "k")])
+    first, _ = store.files("manifest/outputs")
+    file = Path(store.path(first))
+    if damage == "other":
+        pq.write_table(pa.table({"name": ["x"]}), file)
+    else:
+        file.write_bytes(file.read_bytes()[: 100 if damage == "cut" else 0])
+    with pytest.raises(StoreError, match="part of the manifest is damaged") as raised:
+        Manifest(store)
+    assert first in str(raised.value)
 
 
 def test_packed_and_single_records_say_the_same(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

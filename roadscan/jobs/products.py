@@ -167,6 +167,12 @@ def make_products(
     return [(f"{task.product.name}/{task.output.name}", reason) for task, reason in failed]
 
 
+def recorded_folders() -> list[str]:
+    """Folders of the store that hold nothing but files with a record in the manifest."""
+    of_survey = (f"products/{name}" for name, p in products().items() if isinstance(p, SurveyProduct))
+    return ["tables/footprints", "tables/regions", "tiles", *of_survey]
+
+
 def write_output(task: OutputTask) -> OutputRecord:
     """Write one file of a survey product (runs on a worker)."""
     with task.store.scratch() as folder:

@@ -14,7 +14,7 @@ from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.products import make_products, product_context, wanted_tile_products
+from roadscan.jobs.products import make_products, product_context, recorded_folders, wanted_tile_products
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.surface_colours import check_cameras, check_colours, colour_notes
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
@@ -25,7 +25,7 @@ from roadscan.jobs.tiles import compute_tiles, run_tasks
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
-from roadscan.tables.manifest import Manifest, OutputRecord, write_failures
+from roadscan.tables.manifest import Manifest, OutputRecord, begin_changes, end_changes, write_failures
 from roadscan.tables.store import Store
 
 
@@ -53,6 +53,8 @@ class Run:
     """Stage, unit and reason of everything that failed."""
     raw_bytes_read: int = 0
     """Compressed bytes of readings that the tiles stage asked for."""
+    goes_on: bool | None = None
+    """True where a run before this one did not come to its end; None before the first stage."""
 
     def handed_out(self, task: TileTask) -> TileTask:
         """Count what a task reads."""
@@ -137,6 +139,8 @@ def run_products(run: Run) -> None:
     manifest = Manifest(run.store)
     run.failed("products", make_products(plan, manifest, run.compute, _bar(run, "products")))
     manifest.compact()
+    if run.selection is None and not run.failures:  # else files without a record may be due
+        end_changes(run.store, manifest, recorded_folders() if run.goes_on else ())
 
 
 @dataclass(frozen=True)
@@ -176,6 +180,8 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
 
 def run_stage(run: Run, stage: Stage) -> None:
     """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
+    if run.goes_on is None:
+        run.goes_on = begin_changes(run.store)
     try:
         with rare_collections():
             stage.run(run)

@@ -103,6 +103,8 @@ def retire_log(store: Store, record: LogRecord) -> None:
 
     Used when the same bytes were read again under other settings (a corrected clock, say).
     """
+    store.write_bytes(f"superseded/{_FOLDER}/{record.key}.json", store.read_bytes(f"{_FOLDER}/{record.key}.json"))
+    store.remove(f"{_FOLDER}/{record.key}.json")  # before its rows go: no log is half there
     for table in record.tables:
         if store.is_folder and store.exists(record.folder(table)):
             aside = f"superseded/{record.folder(table)}"
@@ -110,8 +112,6 @@ def retire_log(store: Store, record: LogRecord) -> None:
             target = store.path(aside)
             store.fs.makedirs(target.rsplit("/", 1)[0], exist_ok=True)
             store.fs.mv(store.path(record.folder(table)), target, recursive=True)
-    store.write_bytes(f"superseded/{_FOLDER}/{record.key}.json", store.read_bytes(f"{_FOLDER}/{record.key}.json"))
-    store.remove(f"{_FOLDER}/{record.key}.json")
 
 
 def _parse(content: bytes, path: str) -> LogRecord:

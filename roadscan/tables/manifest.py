@@ -14,9 +14,10 @@ from roadscan.model.errors import StoreError
 from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, table_of, unpacked
 from roadscan.tables.store import Store
 
-__all__ = ["Manifest", "OutputRecord", "read_failures", "write_failures"]
+__all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
 
 _FOLDER: Final = "manifest/outputs"
+_CHANGING: Final = "manifest/changing"
 _MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
 _LOOKS: Final = 10
@@ -139,6 +140,7 @@ class Manifest:
         """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
         known = [(product, u) for u in units if u in self._of(product)]
         if known:
+            begin_changes(self._store)
             self._forget(known)
 
     def compact(self) -> None:
@@ -231,6 +233,28 @@ def _whole(store: Store, path: str) -> pa.Table:
             change="remove it and run again: what it alone tells of is made anew",
             file=store.path(path),
         ) from error
+
+
+def begin_changes(store: Store) -> bool:
+    """Note that files may lie in the store from now on that no record names; True where that was noted before.
+
+    A run that is killed leaves files that it had not recorded yet. With other settings the next one would make others,
+    and those would stay.
+    """
+    if store.exists(_CHANGING):
+        return True
+    store.write_bytes(_CHANGING, b"")
+    return False
+
+
+def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> None:
+    """Remove the files below some folders that no record names, once all that is due has one."""
+    listed = set(manifest.table().column("path").to_pylist())
+    for folder in folders:
+        for path in store.files(folder):
+            if path not in listed:
+                store.remove(path)
+    store.remove(_CHANGING)
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:

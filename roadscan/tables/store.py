@@ -29,6 +29,11 @@ from blake3 import blake3
 
 from roadscan.model.errors import StoreError
 
+try:
+    import fcntl
+except ImportError:  # no such locks on this system
+    fcntl = None  # type: ignore[assignment]
+
 _STAGING: Final = ".staging"
 _CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
 _ALGORITHM: Final = "blake3:"
@@ -212,28 +217,24 @@ class Store:
 
     def _take(self, file: Path) -> None:
         me = f"{socket.gethostname()} {os.getpid()}"
-        for _ in range(2):
-            try:
-                with file.open("x") as stream:
-                    stream.write(me)
-                return
-            except FileExistsError:
-                owner = file.read_text().split()
-                if len(owner) == 2 and (owner[0] != socket.gethostname() or _alive(int(owner[1]))):
-                    raise StoreError(
-                        f"process {owner[1]} on {owner[0]} is working on this store",
-                        expected="one run at a time",
-                        change=f"wait for it, or remove {file} if that process is gone",
-                    ) from None
-                file.unlink(missing_ok=True)
-        raise StoreError("the store's lock cannot be taken", file=file)
+        with _alone_in(file.parent):
+            for _ in range(2):
+                try:
+                    with file.open("x") as stream:
+                        stream.write(me)
+                    return
+                except FileExistsError:
+                    _check_dead(file)
+                    file.unlink(missing_ok=True)
+        raise StoreError("the store's lock cannot be taken", change="run again", file=file)
 
     def _clear_staging(self) -> None:
         parent = Path(self.path(_STAGING))
-        for folder in parent.glob("*-*") if parent.is_dir() else ():
-            if not _alive(int(folder.name.split("-")[0])):
-                shutil.rmtree(folder, ignore_errors=True)
-                folder.unlink(missing_ok=True) if folder.is_file() else None
+        for left in parent.iterdir() if parent.is_dir() else ():
+            maker = left.name.split("-")[0]
+            if not (maker.isdigit() and _alive(int(maker))):
+                shutil.rmtree(left, ignore_errors=True)
+                left.unlink(missing_ok=True) if left.is_file() else None
 
 
 def _made(folder: Path, write: Callable[[], _T]) -> _T:
@@ -245,10 +246,41 @@ def _made(folder: Path, write: Callable[[], _T]) -> _T:
         return write()
 
 
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes of this machine out: of several that find the lock of a dead run, one takes it."""
+    with contextlib.ExitStack() as stack:
+        if fcntl is not None:
+            opened = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, opened)
+            with contextlib.suppress(OSError):  # a file system without such locks
+                fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+
+
+def _check_dead(lock: Path) -> None:
+    """StoreError where the process that a lock names may be at work; words that no run writes name none."""
+    try:
+        owner = lock.read_text().split()
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise StoreError(
+            f"the store's lock cannot be read: {error}", change="remove it if no run is at work", file=lock
+        ) from error
+    if len(owner) != 2 or not owner[1].isdigit() or (owner[0] == socket.gethostname() and not _alive(int(owner[1]))):
+        return
+    raise StoreError(
+        f"process {owner[1]} on {owner[0]} is working on this store",
+        expected="one run at a time",
+        change=f"wait for it, or remove {lock} if that process is gone",
+    )
+
+
 def _alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True

@@ -337,6 +337,29 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
     assert_same_files(finished.store(), store)
 
 
+def test_files_that_a_stopped_run_had_not_recorded_go_with_the_next(
+    finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    unit = next(u for u, r in Manifest(store).of("tile").items() if r.path)
+    beside = store.path("products/calibration/calibration.txt")
+    store.fs.makedirs(store.fs._parent(beside))
+    store.fs.pipe_file(beside, b"of no product")
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Manifest, "add_packed", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            copy.run(selection=Selection(named=(TileId.parse(unit),)), products__make=["pavement_intensity"])
+    assert any(path.startswith("tiles/pavement_intensity/") for path in store.files("tiles"))
+    copy.run()
+    store.remove("products/calibration/calibration.txt")
+    assert_same_files(finished.store(), store)
+
+
 def test_a_log_listed_twice_adds_nothing(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     raw = copy.survey_file.parent / "raw/run-1"

@@ -6,6 +6,8 @@ import itertools
 import os
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import duckdb
@@ -17,7 +19,7 @@ import pytest
 from roadscan.model.errors import StoreError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.tables import manifest as manifest_module
-from roadscan.tables.logs import DataFile, LogRecord, read_log_records, write_log_record
+from roadscan.tables.logs import DataFile, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.merge import merged
 from roadscan.tables.schema import table_schema
@@ -189,6 +191,63 @@ def test_second_run_is_kept_out_and_a_dead_one_forgotten(tmp_path: Path) -> None
     with store.lock():
         assert not leftover.exists()
     assert not lock.exists()
+
+
+def test_of_runs_that_begin_at_once_one_has_the_store(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s1")
+    inside: list[int] = []
+    together: list[int] = []
+
+    def try_often(me: int) -> None:
+        for _ in range(300):
+            try:
+                with store.lock():
+                    inside.append(me)
+                    together.append(len(inside))
+                    time.sleep(0.0002)
+                    inside.pop()
+            except StoreError as error:
+                assert "is working on this store" in str(error)
+
+    with ThreadPoolExecutor(3) as threads:
+        list(threads.map(try_often, range(3)))
+    assert set(together) == {1}
+
+
+@pytest.mark.parametrize("words", ["", "two words", "here 99999999999999999999", "\0\0\0"])
+def test_a_lock_that_names_no_process_is_taken(tmp_path: Path, words: str) -> None:
+    store = Store(str(tmp_path), "s1")
+    lock = Path(store.path("manifest/lock"))
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    lock.write_text(words.replace("here", os.uname().nodename))
+    stray = Path(store.path(".staging/no-process"))
+    stray.mkdir(parents=True)
+    with store.lock():
+        assert not stray.exists()
+
+
+def test_a_lock_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s1")
+    Path(store.path("manifest/lock")).mkdir(parents=True)
+    with pytest.raises(StoreError, match=r"manifest/lock: .*remove it if no run is at work"), store.lock():
+        pass
+
+
+def test_a_log_whose_retiring_is_cut_short_is_not_half_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(str(tmp_path), "s1")
+    write(store, [returns(START * NS_PER_S + np.arange(5, dtype=np.int64))])
+    (record,) = read_log_records(store)
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(store.fs), "mv", killed)
+        with pytest.raises(KeyboardInterrupt):
+            retire_log(store, record)
+    assert not has_log(store, record.key)
+    assert store.exists(f"superseded/manifest/logs/{record.key}.json")
+    assert all(store.exists(f.path) for files in record.tables.values() for f in files)
 
 
 def test_publishing_a_folder_replaces_it_at_once(store: Store) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.compute import Compute, Done, Inline
 from roadscan.jobs.planned_logs import PlannedLog, grid_folder, plan_logs
+from roadscan.jobs.sources import stamp_of
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
@@ -103,6 +104,7 @@ def ingest_log(task: IngestTask) -> IngestResult:
         for item in _items(log, header):
             _take(writer, item)
         writer.finish()
+        _check_unchanged(log)
         for old in task.replaces:
             retire_log(store, old)
         tables = writer.publish(store, log.run, log.sensor, log.key)
@@ -124,11 +126,22 @@ def ingest_log(task: IngestTask) -> IngestResult:
     return IngestResult(record, fresh=True)
 
 
+def _check_unchanged(log: PlannedLog) -> None:
+    """Its key is that of the bytes that were fingerprinted: rows of others must not go by it."""
+    path, options = log.source.path, log.source.options
+    try:
+        same = stamp_of(path, log.format, log.format.companions(path, options)) == log.stamp
+    except OSError:
+        same = False
+    if not same:
+        raise FormatError("the log changed while it was read", change="run again when its upload has ended", file=path)
+
+
 def survey_records(survey: Survey, store: Store) -> list[LogRecord]:
     """Records of the survey file's logs; a log that was never ingested is an error."""
     planned, unplanned = plan_logs(survey, store)
     missing = [str(u.error) for u in unplanned]
-    missing += [f"{p.config.path} is not ingested" for p in planned if not has_log(store, p.key)]
+    missing += [f"{p.config.path} is not ingested, or has changed since" for p in planned if not has_log(store, p.key)]
     if missing:
         raise RunError(
             f"{len(missing)} logs are not in the store: " + " | ".join(missing),

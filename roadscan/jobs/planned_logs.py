@@ -34,6 +34,8 @@ class PlannedLog:
     key: str
     content: str
     bytes: int
+    stamp: str
+    """Sizes and times of its files when it was fingerprinted (:func:`roadscan.jobs.sources.stamp_of`)."""
 
     @property
     def is_trajectory(self) -> bool:
@@ -117,7 +119,7 @@ def _plan_log(
         raise RoadscanError(
             "the log names no sensor", expected=f"sensor = one of {', '.join(survey.rig.sensors)}", file=path
         )
-    content, size = sources.end(path, format_, opened.files)
+    content, size, stamp = sources.end(path, format_, opened.files)
     source = LogSource(
         path=path,
         options=options,
@@ -137,4 +139,4 @@ def _plan_log(
         [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)] if in_map else None,
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
-    return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size)
+    return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size, stamp)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from roadscan.model.errors import FormatError
+from roadscan.model.errors import FormatError, StoreError
 from roadscan.sensors.base import LogFormat, format_named, format_of
 from roadscan.tables.store import Store, digest_holds, file_digest
 
@@ -27,11 +27,18 @@ class Sources:
     def __init__(self, store: Store, threads: ThreadPoolExecutor) -> None:
         self._store = store
         self._threads = threads
-        self._before: dict[str, Any] = json.loads(store.read_bytes(_SOURCES)) if store.exists(_SOURCES) else {}
+        self._before, self._forgotten = _remembered(store)
         self._now: dict[str, Any] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
         """Format of a log: as stated, as remembered, or found from its bytes."""
+        if self._forgotten and not path.exists():
+            raise FormatError(
+                "the log does not exist",
+                change="check its path in the survey file; if it was moved away, put it back for one run: "
+                "the store's list of logs was damaged",
+                file=path,
+            )
         if stated is None and not path.exists() and str(path) in self._before:
             stated = str(self._before[str(path)]["format"])
         return format_named(stated) if stated else format_of(path)
@@ -40,8 +47,7 @@ class Sources:
         """Start to fingerprint a log's files and companions, by their names: hashing runs in threads."""
         before = self._before.get(str(path), {"files": {}})["files"]
         if path.exists():
-            named = {_name(file, path): file for file in format_.files(path)}
-            named |= {f"beside:{file.name}": file for file in companions if file not in named.values()}
+            named = _named(path, format_, companions)
             missing = next((file for file in named.values() if not file.exists()), None)
             if missing is not None:
                 raise FormatError("a file that the log's options name does not exist", file=missing)
@@ -50,22 +56,29 @@ class Sources:
             return {name: _done(known) for name, known in before.items()}
         raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
 
-    def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int]:
-        """Fingerprint over names and contents of a log's files and companions, and their bytes in all."""
+    def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int, str]:
+        """Fingerprint over names and contents of a log's files and companions, their bytes in all, and their stamp as
+        of :func:`stamp_of`.
+        """
         files = {name: future.result() for name, future in begun.items()}
         self._now[str(path)] = {"format": format_.name, "files": files}
         combined = hashlib.blake2b(digest_size=16)
         for name, (_, _, digest) in files.items():
             combined.update(f"{name}\0{digest}\n".encode())
-        return combined.hexdigest(), sum(size for size, _, _ in files.values())
+        stamp = _stamp({name: (size, changed_ns) for name, (size, changed_ns, _) in files.items()})
+        return combined.hexdigest(), sum(size for size, _, _ in files.values()), stamp
 
     def save(self) -> None:
-        """Keep what was learnt; logs that are no longer listed stay known."""
+        """Keep what was learnt; logs that are no longer listed stay known.
+
+        Who may only read the store can ask it all the same, and learns it each time.
+        """
         if {**self._before, **self._now} != self._before:
-            self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
+            with contextlib.suppress(StoreError):
+                self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
 
 
-@contextmanager
+@contextlib.contextmanager
 def open_sources(store: Store) -> Iterator[Sources]:
     """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end."""
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -76,6 +89,39 @@ def open_sources(store: Store) -> Iterator[Sources]:
             threads.shutdown(cancel_futures=True)
             raise
         sources.save()
+
+
+def stamp_of(path: Path, format_: LogFormat, companions: list[Path]) -> str:
+    """Hash of the sizes and times of a log's files and companions: another one says that it changes, being uploaded.
+
+    Raises
+    ------
+    OSError
+        A file is gone.
+    """
+    stats = {name: file.stat() for name, file in _named(path, format_, companions).items()}
+    return _stamp({name: (stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()})
+
+
+def _stamp(files: dict[str, tuple[int, int]]) -> str:
+    return hashlib.blake2b(json.dumps(files, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+def _named(path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Path]:
+    """Files of a log and its companions by the names that they have in its fingerprint."""
+    named = {_name(file, path): file for file in format_.files(path)}
+    return named | {f"beside:{file.name}": file for file in companions if file not in named.values()}
+
+
+def _remembered(store: Store) -> tuple[dict[str, Any], bool]:
+    """What is known of logs by path, and whether that was damaged: then their files are read again."""
+    if not store.exists(_SOURCES):
+        return {}, False
+    try:
+        known = json.loads(store.read_bytes(_SOURCES))
+        return {path: {"format": log["format"], "files": dict(log["files"])} for path, log in known.items()}, False
+    except (StoreError, ValueError, KeyError, TypeError, AttributeError):
+        return {}, True
 
 
 def _name(file: Path, log: Path) -> str:

@@ -84,7 +84,7 @@ def write_log_record(store: Store, record: LogRecord) -> None:
 def read_log_records(store: Store, keys: Iterable[str] | None = None) -> list[LogRecord]:
     """Records of all logs in the store, or of those named, sorted by run, sensor, start and key."""
     paths = store.files(_FOLDER, ".json") if keys is None else [f"{_FOLDER}/{k}.json" for k in keys]
-    records = [_parse(store.read_bytes(p), p) for p in paths]
+    records = [_parse(store.read_bytes(p), store.path(p)) for p in paths]
     return sorted(records, key=lambda r: (r.run, r.sensor, _start(r), r.key))
 
 

@@ -17,6 +17,7 @@ from roadscan.tables.store import Store
 __all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
 
 _FOLDER: Final = "manifest/outputs"
+_FAILURES: Final = "manifest/failures.json"
 _CHANGING: Final = "manifest/changing"
 _MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
@@ -259,11 +260,17 @@ def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> Non
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:
     """Keep what failed in the last run, for `roadscan status`."""
-    store.write_bytes("manifest/failures.json", json.dumps(failures, indent=1).encode())
+    store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode())
 
 
 def read_failures(store: Store) -> list[dict[str, str]]:
     """What failed in the last run: unit, error."""
-    if not store.exists("manifest/failures.json"):
+    if not store.exists(_FAILURES):
         return []
-    return list(json.loads(store.read_bytes("manifest/failures.json")))
+    try:
+        return [
+            {name: str(told[name]) for name in ("stage", "unit", "reason")}
+            for told in json.loads(store.read_bytes(_FAILURES))
+        ]
+    except (StoreError, ValueError, KeyError, TypeError) as error:
+        return [{"stage": "the list of failures", "unit": _FAILURES, "reason": f"it is damaged ({error}); run again"}]

@@ -114,6 +114,8 @@ class Store:
             return bytes(self.fs.cat_file(self.path(relative)))
         except FileNotFoundError as error:
             raise StoreError("the file is missing from the store", file=self.path(relative)) from error
+        except IsADirectoryError as error:
+            raise StoreError("a folder stands where a file belongs", change="remove it", file=error.filename) from error
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Content of a small Parquet file.
@@ -121,11 +123,23 @@ class Store:
         Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
         """
-        file = pq.ParquetFile(pa.BufferReader(self.read_bytes(relative)))
-        return file.read(None if columns is None else list(columns), use_threads=False)
+        content = self.read_bytes(relative)
+        try:
+            file = pq.ParquetFile(pa.BufferReader(content))
+            return file.read(None if columns is None else list(columns), use_threads=False)
+        except (pa.ArrowException, OSError) as error:
+            raise StoreError(
+                f"the file is damaged: {error}",
+                change="`roadscan verify` finds all such files, and the next run makes them again",
+                file=self.path(relative),
+            ) from error
 
     def write_bytes(self, relative: str, content: bytes) -> None:
-        """Write a small file at once."""
+        """Write a small file at once; StoreError where the store cannot be written."""
+        with _in_words(self.path(relative)):
+            self._write_bytes(relative, content)
+
+    def _write_bytes(self, relative: str, content: bytes) -> None:
         if not self.is_folder:
             with self.scratch() as folder:
                 temporary = folder / "content"
@@ -207,8 +221,9 @@ class Store:
             yield
             return
         file = Path(self.path("manifest/lock"))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        self._take(file)
+        with _in_words(str(file)):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._take(file)
         try:
             self._clear_staging()
             yield
@@ -244,6 +259,19 @@ def _made(folder: Path, write: Callable[[], _T]) -> _T:
     except FileNotFoundError:
         folder.mkdir(parents=True, exist_ok=True)
         return write()
+
+
+@contextlib.contextmanager
+def _in_words(file: str) -> Iterator[None]:
+    """A disk that is full or must not be written is no fault of the program."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"the store cannot be written: {error.strerror or error}",
+            change="see to room, rights and the disk itself, and run again: what is finished stays",
+            file=file,
+        ) from error
 
 
 @contextlib.contextmanager

@@ -17,8 +17,8 @@ from blake3 import blake3
 
 from roadscan.jobs.compute import Compute, Done, Inline, R, T
 from roadscan.jobs.ingest import ingest
-from roadscan.jobs.status import verify_store
-from roadscan.model.errors import RunError
+from roadscan.jobs.status import survey_status, verify_store
+from roadscan.model.errors import RunError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.store import Store, digest_holds, file_digest
@@ -190,3 +190,68 @@ def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatc
     with pytest.raises(RunError, match=r"1 of 2 logs .*0\.arrow: the log cannot be read: Input/output error"):
         ingest(survey_of(tmp_path, 2), store)
     assert len(read_log_records(store)) == 1
+
+
+class Uploading(Inline):
+    """While logs are read, one of them grows; the bytes of another are replaced by as many others."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        with (self.folder / "0.arrow").open("ab") as stream:
+            stream.write(b"more")
+        write_log(self.folder / "1.arrow", 17)
+        yield from super().map(function, tasks)
+
+
+def test_a_log_that_changes_while_it_is_read_is_read_when_it_rests(tmp_path: Path) -> None:
+    """Its rows would stand under the fingerprint of other bytes, and come back with these."""
+    survey = survey_of(tmp_path, 3)
+    before = {name: (tmp_path / name).read_bytes() for name in ("0.arrow", "1.arrow")}
+    store, untouched = Store(str(tmp_path / "store"), "s"), Store(str(tmp_path / "untouched"), "s")
+    ingest(survey, untouched)
+    with pytest.raises(RunError, match=r"2 of 3 logs .*1\.arrow: the log changed while it was read; run again"):
+        ingest(survey, store, compute=Uploading(tmp_path))
+    assert [r.run for r in read_log_records(store)] == ["r2"]
+    for name, content in before.items():
+        (tmp_path / name).write_bytes(content)
+    ingest(survey, store)
+    assert tables_of(store) == tables_of(untouched)
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"\xff\xfe{not", b"[]", b'{"a": {"format": 1}}'])
+def test_a_damaged_list_of_logs_or_failures_costs_itself(tmp_path: Path, damage: bytes) -> None:
+    survey = survey_of(tmp_path, 2)
+    store = Store(str(tmp_path / "store"), "s")
+    ingest(survey, store)
+    whole = json.loads(store.read_bytes("manifest/sources.json"))
+    for name in ("sources", "failures"):
+        store.write_bytes(f"manifest/{name}.json", damage)
+    assert [log["state"] for log in survey_status(survey, store).logs] == ["ingested", "ingested"]
+    assert json.loads(store.read_bytes("manifest/sources.json")) == whole
+    store.write_bytes("manifest/sources.json", damage)
+    (tmp_path / "1.arrow").rename(tmp_path / "away")
+    with pytest.raises(RunError, match=r"1\.arrow: the log does not exist; .* put it back for one run"):
+        ingest(survey, store)
+    (tmp_path / "away").rename(tmp_path / "1.arrow")
+    assert [r.fresh for r in ingest(survey, store)] == [False, False]
+
+
+def test_who_may_only_read_the_store_can_ask_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = survey_of(tmp_path, 2)
+    store = Store(str(tmp_path / "store"), "s")
+    ingest(survey, store)
+    os.utime(tmp_path / "0.arrow")
+    before = tables_of(store)
+
+    def refused(path: Path, mode: str = "r", *_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system", str(path))
+
+    with monkeypatch.context() as patch:
+        for name in ("replace", "mkdir", "unlink"):
+            patch.setattr(Path, name, refused)
+        assert [log["state"] for log in survey_status(survey, store).logs] == ["ingested", "ingested"]
+        with pytest.raises(StoreError, match=r"manifest/lock: the store cannot be written: Read-only file system; see"):
+            verify_store(store)
+    assert tables_of(store) == before

@@ -27,6 +27,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from roadscan.model.strict import meanings
 from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
 from roadscan.tables.schema import TableSchema, schema_names, table_schema
@@ -80,8 +81,9 @@ def fields(target: str) -> str:
 
 def fields_table(model: type[BaseModel]) -> str:
     """Table of a model's settings: key, type, default, meaning."""
+    said = meanings(model)
     rows = [
-        (f"`{name}`", type_words(info), default_words(info), one_line(info.description or ""))
+        (f"`{name}`", type_words(info), default_words(info), one_line(said[name]))
         for name, info in model.model_fields.items()
     ]
     return markdown_table(("key", "type", "default", "meaning"), rows)

@@ -341,6 +341,7 @@ def list_formats(
     name: Annotated[str | None, typer.Argument(help="Show the settings of one format.", show_default=False)] = None,
 ) -> None:
     """Raw formats that can be read, and what they yield."""
+    from roadscan.model.strict import meanings
     from roadscan.sensors.base import format_named, log_formats
 
     if name is None:
@@ -349,9 +350,10 @@ def list_formats(
         return
     found = format_named(name)
     typer.echo(f"{found.name}: {found.title}\nyields: {', '.join(found.yields)}\ntime: {found.time}")
-    for field, info in found.options.model_fields.items():
+    for field, meaning in meanings(found.options).items():
+        info = found.options.model_fields[field]
         default = "required" if info.is_required() else f"default {info.default!r}"
-        typer.echo(f"  options.{field} ({default}): {info.description or ''}")
+        typer.echo(f"  options.{field} ({default}): {meaning}")
 
 
 @app.command("inspect")

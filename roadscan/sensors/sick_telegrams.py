@@ -17,6 +17,7 @@ length alone.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,8 @@ _PIECE_BYTES: Final = 1 << 20
 _CARRIED_BEFORE: Final = 16
 """Bytes before a telegram that are seen together with it: a stamp, acknowledges."""
 _POLYNOMIAL: Final = 0x8005
-_BLOCK: Final = 1 << 10
+_LARGEST_BLOCK: Final = 1 << 10
+"""Bytes of a block of 1 MB, over whose blocks the checksums go side by side."""
 
 
 # --- checksum --------------------------------------------------------------------------------------
@@ -87,7 +89,7 @@ def _powers(count: int) -> UInt16:
     return out
 
 
-_POWERS: Final = _powers(max(_BLOCK, LONGEST_PAYLOAD + OVERHEAD_BYTES) + 1)
+_POWERS: Final = _powers(max(_LARGEST_BLOCK, LONGEST_PAYLOAD + OVERHEAD_BYTES) + 1)
 
 
 def _times(a: UInt16, b: UInt16) -> UInt16:
@@ -98,9 +100,20 @@ def _times(a: UInt16, b: UInt16) -> UInt16:
     return out
 
 
-# x to the power of a block's bytes, times each value of a remainder's low and high byte.
-_LOW_OVER_BLOCK: Final = _times(np.arange(256, dtype=np.uint16), _POWERS[_BLOCK:][:1]).tolist()
-_HIGH_OVER_BLOCK: Final = _times(np.arange(256, dtype=np.uint16) << np.uint16(8), _POWERS[_BLOCK:][:1]).tolist()
+@functools.cache
+def _over_block(block: int) -> tuple[list[int], list[int]]:
+    """Each value of a remainder's low byte and of its high byte, times x to the power of a block's bytes."""
+    values = np.arange(256, dtype=np.uint16)
+    low, high = (_times(part, _POWERS[block : block + 1]) for part in (values, values << np.uint16(8)))
+    return low.tolist(), high.tolist()
+
+
+def _block_of(count: int) -> int:
+    """Bytes of a block for a buffer of `count`: about its square root, so that a short one takes few steps."""
+    block = 1 << 5
+    while block < _LARGEST_BLOCK and block * block < count:
+        block <<= 1
+    return block
 
 
 class Checksums:
@@ -113,22 +126,24 @@ class Checksums:
 
     def __init__(self, data: UInt8) -> None:
         self._data = data
-        rows = data.size // _BLOCK + 1
-        inputs = np.zeros((rows, _BLOCK), dtype=np.uint16)
+        self._block = block = _block_of(data.size)
+        rows = data.size // block + 1
+        inputs = np.zeros((rows, block), dtype=np.uint16)
         flat = inputs.reshape(-1)
         flat[: data.size] = data
         flat[1 : data.size + 1] ^= data.astype(np.uint16) << np.uint16(8)
         # Column by column all blocks advance at once, each from 0; what stands before a block is added below.
         columns = np.ascontiguousarray(inputs.T)
         state = np.zeros(rows, dtype=np.uint16)
-        for k in range(_BLOCK):
+        for k in range(block):
             state = _shifted(state) ^ columns[k]
             columns[k] = state
         self._within = columns
+        low, high = _over_block(block)
         before = [0]
         for own in state[:-1].tolist():
             last = before[-1]
-            before.append(_HIGH_OVER_BLOCK[last >> 8] ^ _LOW_OVER_BLOCK[last & 0xFF] ^ own)
+            before.append(high[last >> 8] ^ low[last & 0xFF] ^ own)
         self._before = np.array(before, dtype=np.uint16)
 
     def of(self, starts: Int64, ends: Int64) -> UInt16:
@@ -141,7 +156,7 @@ class Checksums:
 
     def _running(self, counts: Int64) -> UInt16:
         """Remainder (k,) after the buffer's first `counts` (k,) bytes."""
-        row, column = np.divmod(counts - 1, _BLOCK)
+        row, column = np.divmod(counts - 1, self._block)
         out: UInt16 = self._within[column, row] ^ _times(self._before[row], _POWERS[column + 1])
         out[counts == 0] = 0
         return out

@@ -9,7 +9,7 @@ import pytest
 from pydantic import Field, ValidationError, model_validator
 
 from roadscan.model.errors import ConfigError
-from roadscan.model.strict import Strict, load_toml
+from roadscan.model.strict import Strict, load_toml, meanings
 
 
 class Wheel(Strict):
@@ -19,6 +19,12 @@ class Wheel(Strict):
     """Radius (m)."""
     side: Literal["left", "right"] = "left"
     """Side."""
+
+
+class Steel(Wheel):
+    """A wheel of its own."""
+
+    alloy: str = ""
 
 
 class Car(Strict):
@@ -86,8 +92,10 @@ def test_values_cannot_be_changed_afterwards() -> None:
         wheel.radius_m = 2.0  # type: ignore[misc]
 
 
-def test_docstrings_of_fields_are_kept() -> None:
-    assert Wheel.model_fields["radius_m"].description == "Radius (m)."
+def test_docstrings_of_fields_are_found() -> None:
+    assert list(meanings(Wheel)) == list(Wheel.model_fields)
+    assert meanings(Wheel)["radius_m"] == "Radius (m)."
+    assert meanings(Steel) == {**meanings(Wheel), "alloy": ""}
 
 
 def test_toml_faults_name_file_and_line(tmp_path: Path) -> None:

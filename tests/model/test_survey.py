@@ -15,7 +15,7 @@ from roadscan.model import survey as survey_module
 from roadscan.model.errors import ConfigError, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, TimeSystem, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
-from roadscan.model.strict import Strict
+from roadscan.model.strict import Strict, meanings
 from roadscan.model.survey import Survey, SurveyConfig
 
 MINIMAL: dict[str, Any] = {
@@ -187,4 +187,4 @@ MODELS = [
 @pytest.mark.parametrize("model", MODELS)
 def test_every_setting_is_documented(model: type[Strict]) -> None:
     assert model.__doc__
-    assert [name for name, field in model.model_fields.items() if not field.description] == []
+    assert [name for name, meaning in meanings(model).items() if not meaning] == []

@@ -418,10 +418,11 @@ def test_no_scan_is_no_log(tmp_path: Path) -> None:
 # --- the search itself ------------------------------------------------------------------------------
 
 
-def test_checksums_of_all_pieces() -> None:
+@pytest.mark.parametrize("size", [30, 5_000, 1 << 20])
+def test_checksums_of_all_pieces(size: int) -> None:
     draw = np.random.default_rng(3)
-    data = draw.integers(0, 256, 5000, dtype=np.uint8)
-    starts = draw.integers(0, 4990, 200)
+    data = draw.integers(0, 256, size, dtype=np.uint8)
+    starts = draw.integers(0, size - 10, 200)
     starts[0] = 0
     ends = np.minimum(starts + draw.integers(1, 1500, 200), data.size)
     found = Checksums(data).of(starts, ends)

@@ -20,9 +20,9 @@ SCENE = Scene(id="city", length_m=20.0, lidar={"on": False}, profilers={"spacing
 """Twenty metres of road, one pass, two profilers, no noise and no lost reading."""
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def prefect_api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrefectApi]:
-    """The server; flows that run in this process use it too."""
+    """The server; flows that run in this process use it too. It ends with these tests: idle, it takes 5 % of a core."""
     folder = tmp_path_factory.mktemp("prefect")
     with running_server(folder) as api, pytest.MonkeyPatch.context() as patch:
         patch.setenv("DO_NOT_TRACK", "1")

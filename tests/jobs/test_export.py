@@ -36,7 +36,7 @@ from .conftest import small_scene
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Survey:
     """A simulated survey without noise, ingested."""
-    scene = small_scene(profilers={"spacing_m": 0.05, "readings": 200}).noiseless()
+    scene = small_scene(length_m=24.0, profilers={"spacing_m": 0.05, "readings": 200}).noiseless()
     loaded = Survey.load(simulate(scene, tmp_path_factory.mktemp("export") / "survey").survey_file)
     ingest(loaded, store_of(loaded))
     return loaded

@@ -22,7 +22,7 @@ from .conftest import Simulated, small_scene
 
 @pytest.fixture(scope="module")
 def noiseless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scene = small_scene().noiseless()
+    scene = small_scene(lidar={"range_max_m": 12.0}).noiseless()
     return simulate(scene, tmp_path_factory.mktemp("noiseless") / "survey", write_hits=True).survey_file
 
 

@@ -28,7 +28,7 @@ class DetailedSettings(Strict):
     max_gap_m: float = Field(default=0.3, gt=0.0, le=100.0)
     """Widest hole that is bridged: no surface is made where a disc of this diameter holds no point."""
     slopes: SlopeKind = "cubic"
-    """`cubic` follows the ground most closely; `quadratic` is the paper's, and calmer where heights are noisy."""
+    """`cubic` follows the ground as closely as the heights' noise allows; `quadratic` is the paper's."""
 
     @property
     def halo_m(self) -> float:

@@ -19,6 +19,8 @@ _DISTRESS = ("cracks", "potholes")
 _PER_TILE = ("cells", "overviews")
 _ALWAYS = ("rejects",)
 """Tables that answer even before they have a row: no rejects is news too."""
+_HIVE = {"survey": "VARCHAR", "run": "VARCHAR", "sensor": "VARCHAR", "log": "VARCHAR", "gps_bin_s": "BIGINT"}
+"""Columns that a file's folders name."""
 
 
 def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyConnection:
@@ -42,8 +44,10 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
         for table, own in record.tables.items():
             files.setdefault(table, []).extend(own)
     for table, held in files.items():
-        _view(connection, table, [_url(store, f.path) for f in held])
         partition_s = table_schema(table).partition_s
+        _view(
+            connection, table, [_url(store, f.path) for f in held], hive=_hive_columns(store, partition_s is not None)
+        )
         if partition_s is not None:
             connection.execute(
                 f"CREATE MACRO {table}_between(first_gps_ns, last_gps_ns) AS TABLE SELECT * FROM {table} "
@@ -63,7 +67,7 @@ def connect(store: Store, logs: Iterable[str] | None = None) -> duckdb.DuckDBPyC
     for name, folder in places.items():
         found = store.files(folder, ".parquet")
         if found:
-            _view(connection, name, [_url(store, f) for f in found], hive=False, filename=name in _PER_TILE)
+            _view(connection, name, [_url(store, f) for f in found], filename=name in _PER_TILE)
     return connection
 
 
@@ -80,16 +84,28 @@ def query(store: Store, statement: str, logs: Iterable[str] | None = None) -> pa
 
 
 def _view(
-    connection: duckdb.DuckDBPyConnection, name: str, urls: list[str], *, hive: bool = True, filename: bool = False
+    connection: duckdb.DuckDBPyConnection, name: str, urls: list[str], *, hive: str = "", filename: bool = False
 ) -> None:
     listed = ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls))
     options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
-    if filename:
+    if filename or "filename" in hive:
         options += ", filename = true"
     try:
-        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet([{listed}], {options})")
+        connection.execute(f"CREATE VIEW {name} AS SELECT {hive or '*'} FROM read_parquet([{listed}], {options})")
     except duckdb.Error as error:
         raise StoreError(f"table '{name}' cannot be opened: {error}") from error
+
+
+def _hive_columns(store: Store, in_time: bool) -> str:
+    """What a view of a table with partitions selects: DuckDB takes a column from the first folder that names it, which
+    may stand above the store. Then the last one is asked, and partitions are not left out by their names.
+    """
+    above = {folder.split("=")[0] for folder in store.root.split("/")[:-1] if "=" in folder}
+    if not above & _HIVE.keys():
+        return "*"
+    columns = {name: kind for name, kind in _HIVE.items() if in_time or name != "gps_bin_s"}
+    own = (f"regexp_extract(filename, '.*/{name}=([^/]*)/', 1)::{kind} AS {name}" for name, kind in columns.items())
+    return f"* EXCLUDE (filename) REPLACE ({', '.join(own)})"
 
 
 def _url(store: Store, path: str) -> str:

@@ -77,7 +77,7 @@ class Store:
     def __init__(self, url: str, survey_id: str) -> None:
         self.url = url
         self.survey_id = survey_id
-        self.fs, base = fsspec.core.url_to_fs(url)
+        self.fs, base = _opened(url)
         self.root = f"{base.rstrip('/')}/survey={survey_id}"
         self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
 
@@ -259,6 +259,15 @@ def _made(folder: Path, write: Callable[[], _T]) -> _T:
     except FileNotFoundError:
         folder.mkdir(parents=True, exist_ok=True)
         return write()
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    """File system and path of a store; a folder's name may hold what chains file systems in URLs (``::``)."""
+    if "://" in url:
+        opened: tuple[Any, str] = fsspec.core.url_to_fs(url)
+        return opened
+    folders = fsspec.filesystem("file")
+    return folders, folders._strip_protocol(url)
 
 
 @contextlib.contextmanager

@@ -158,6 +158,22 @@ def test_tables_open_without_roadscan(tmp_path: Path) -> None:
     assert row == (20, "r", 2)
 
 
+@pytest.mark.parametrize("above", ["run=other/gps_bin_s=7/survey=x", "a::b", "it's 5 %20"])
+def test_folders_above_the_store_say_nothing(tmp_path: Path, above: str) -> None:
+    root = tmp_path / above
+    store = Store(str(root), "s1")
+    rows = returns(np.arange(START, START + 40, dtype=np.int64) * NS_PER_S)
+    broken = np.where(np.arange(40) == 3, np.nan, 1.0).astype(np.float32)
+    tables = write(store, [rows.set_column(2, rows.schema.field(2), pa.array(broken))])
+    assert all((root / "survey=s1" / f.path).is_file() for f in tables["returns"])
+    (row,) = query(store, "SELECT DISTINCT survey, run, sensor, log FROM returns").to_pylist()
+    assert row == {"survey": "s1", "run": "r", "sensor": "lidar", "log": "abc"}
+    asked = f"SELECT count(*) AS n FROM returns_between({(START + 9) * NS_PER_S}, {(START + 12) * NS_PER_S})"
+    assert query(store, asked).to_pylist() == [{"n": 4}]
+    reject = query(store, "SELECT run, sensor, record FROM rejects").to_pylist()
+    assert reject == [{"run": "r", "sensor": "lidar", "record": 3}]
+
+
 def test_manifest_survives_and_forgets(store: Store) -> None:
     manifest = Manifest(store)
     for k in range(70):

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.footprints import PRODUCT
+from roadscan.jobs.footprints import PRODUCT, stale_footprints
 from roadscan.jobs.navigate import known_keys
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.planned_logs import plan_logs
@@ -40,6 +40,8 @@ class Status:
     """Logs in the store that the survey file no longer lists."""
     readings: dict[str, int] = field(default_factory=dict)
     """Readings by fate."""
+    footprints_stale: int = 0
+    """Data files of which it is not known, or not known any more, which tiles they touch: these are not counted."""
     tiles_current: int = 0
     tiles_stale: int = 0
     surfaces_stale: int = 0
@@ -61,7 +63,7 @@ class Status:
     def is_complete(self) -> bool:
         """True if nothing is missing, stale or failed."""
         ingested = all(log["state"] == "ingested" for log in self.logs)
-        done = not (self.tiles_stale or self.surfaces_stale or self.products_stale)
+        done = not (self.footprints_stale or self.tiles_stale or self.surfaces_stale or self.products_stale)
         return ingested and done and not self.failures and not self.note
 
 
@@ -115,9 +117,14 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     plan = plan_survey(survey, store)
     status.notes = outdated_calibrations(plan)
     status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.footprints_stale = len(stale_footprints(plan, manifest))
     if not any(manifest.of(PRODUCT)):
-        status.next_run = {"footprints": len(plan.slices()), "raw_bytes": plan.raw_bytes}
+        status.next_run = {"footprints": status.footprints_stale, "raw_bytes": plan.raw_bytes}
         return
+    if status.footprints_stale:
+        status.notes.append(
+            f"{status.footprints_stale:,} data files have no footprints, or old ones: more tiles than these may be due"
+        )
     work = plan_tile_work(Run(survey, store, Inline()), manifest)
     tasks = list(work.planned.tasks(work.chosen))
     stale = {str(tile) for t in tasks for tile in t.block.tiles}
@@ -129,6 +136,7 @@ def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifes
     status.products_stale = len(plan_outputs(work.planned.plan, manifest)[0])
     largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
     status.next_run = {
+        "footprints": status.footprints_stale,
         "tasks": len(tasks),
         "tiles": len(stale),
         "surfaces": status.surfaces_stale,

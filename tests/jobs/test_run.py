@@ -34,7 +34,7 @@ from roadscan.tiles.blocks import Block
 from roadscan.tiles.grid import Bounds
 from tests.conftest import REPOSITORY
 
-from .conftest import Simulated, outputs
+from .conftest import Simulated, changed, outputs
 
 LONGEST_S = 2.6
 """Processor time within which a run is killed: one that has nothing to do takes 1 s, a whole one 4.5 s."""
@@ -382,7 +382,12 @@ def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_
         run["logs"] = [log for log in run["logs"] if log["sensor"] != "lidar"]
     copy.run(runs=runs[:1], passes=[])
     before = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
+    both = changed(Survey.load(copy.survey_file), {"runs": runs, "passes": []})
+    ingest(both, copy.store())
+    told = survey_status(both, copy.store())
+    assert (told.footprints_stale, told.is_complete) == (sum(len(run["logs"]) - 1 for run in runs[1:]), False)
     copy.run(runs=runs, passes=[])
+    assert survey_status(both, copy.store()).is_complete
     after = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
     assert any(after[u] == key for u, key in before.items())
     swapped = copy.run("store-b", runs=runs[::-1], passes=[])

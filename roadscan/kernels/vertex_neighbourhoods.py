@@ -9,7 +9,7 @@ import numpy as np
 from roadscan.kernels.options import kernel
 from roadscan.kernels.vertex_rings import MOST_RINGS, grow, is_narrow, offset_squares, whitening
 
-RINGS, FEWEST, LEAST, MOST = 2, 10, 20, 40
+RINGS, FEWEST, LEAST, MOST = 2, 10, 20, 32
 """Rings that are taken; neighbours without which there is no spline, fewer than which another ring is taken, and kept.
 """
 UNIT_COUNT = 18.0

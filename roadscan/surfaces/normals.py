@@ -29,7 +29,7 @@ meshes are as well conditioned as square ones; the normal matrix is scaled to a 
 falls below 0.01. ``cubic``: the same for the polynomial's normal matrix, weighted by the inverse covariance.
 Another ring is taken, up to the fourth, while neighbours are too few, refused (``quadratic``), or *narrow*: spread
 eight times less across than along, so that the scatter of one profile would pass for the slope across it. After the
-fourth ring narrow neighbours have to do. Of more than 40 neighbours a spline takes the nearest (whitened). What
+fourth ring narrow neighbours have to do. Of more than 32 neighbours a spline takes the nearest (whitened). What
 ``cubic`` refuses, and sites with fewer than ten neighbours, are left to ``quadratic``; what that refuses gets a plane;
 and where neighbours lie on a line (or there are none) the slope is zero.
 """

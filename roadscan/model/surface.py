@@ -38,8 +38,8 @@ class SurfaceConfig(Strict):
     """Widest hole that is filled (m), along the grid's rows or columns, by a straight line between its rims; such cells
     are marked as filled (origin 3). Water and glass give no reading. 0: holes stay open."""
     slopes: SlopeKind = "quadratic"
-    """`points`: how the slope at a reading is found: `quadratic` is calm where heights are noisy, `cubic` follows exact
-    heights most closely."""
+    """`points`: how the slope at a reading is found: `quadratic` is the paper's, `cubic` follows the ground as closely
+    as the noise of the heights allows."""
     regions: Literal["everywhere", "polygons", "found"] = "everywhere"
     """`points`: where the surface is made: wherever there are readings; inside the polygons of a layer; or where the
     coarse model of the profiles varies in depth more than its street does."""

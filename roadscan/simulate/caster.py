@@ -130,6 +130,8 @@ class World:
         key : random key of the first ray; each ray takes its own, so count on by g · m.
         """
         groups, count = direction.shape[:2]
+        direction = direction.view()
+        direction.flags.writeable = False  # as those that are one for all groups: the kernel is compiled once
         flat = np.ascontiguousarray(interval_gps_ns.reshape(-1, 2))
         at, rotation = drive.poses(flat.reshape(-1)).sensor(mount, body_from_axes)
         middle = at[at.shape[0] // 2]

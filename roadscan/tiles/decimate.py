@@ -13,6 +13,7 @@ import numpy.typing as npt
 from roadscan.kernels.decimate import decimate_cells
 from roadscan.kernels.decimate_fours import AT_ONCE, SCRATCH_ROWS, SUMS, decimate_fours
 from roadscan.kernels.lanes import LANES
+from roadscan.kernels.options import read_only
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
@@ -90,7 +91,7 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
         *(np.empty(room, np.uint32) for _ in range(2)), np.empty(room, np.bool_),
     ]  # fmt: skip
     some = cells.height_robust_m[:: max(len(cells) // _SAMPLE, 1)]
-    base = math.floor(float(np.median(some))) if len(cells) else 0.0
+    base = float(np.floor(np.median(some))) if len(cells) else 0.0
     written = _fours(cells, base, out) if patch == side == 2 else _squares(cells, base, patch, side, out)
     return Squares(*(values[:written] for values in out))
 
@@ -99,7 +100,7 @@ def _fours(cells: TileCells, base: float, out: Sequence[npt.NDArray[Any]]) -> in
     """Squares of two by two cells, each a patch; returns how many."""
     starts = np.searchsorted(cells.row, np.arange(cells.cells_per_edge + 1))
     found, sums = np.empty((SCRATCH_ROWS, AT_ONCE), np.int32), np.empty((SUMS, AT_ONCE), np.int64)
-    values = cells.height_robust_m, cells.intensity_mean, cells.count
+    values = read_only(cells.height_robust_m), cells.intensity_mean, cells.count
     return int(decimate_fours(cells.column, starts, *values, base, FLOOR_UM, found, sums, *out))
 
 
@@ -108,7 +109,7 @@ def _squares(cells: TileCells, base: float, patch: int, side: int, out: Sequence
     edge = cells.cells_per_edge
     heights, lights, counts = np.empty((3, patch * edge), np.int32)
     scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
-    values = cells.height_robust_m, cells.intensity_mean, cells.count
+    values = read_only(cells.height_robust_m), cells.intensity_mean, cells.count
     strips = heights, lights, counts, scratch
     return int(decimate_cells(cells.column, cells.row, *values, base, edge, patch, side, FLOOR_UM, *strips, *out))
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.kernels.options import read_only
 from roadscan.kernels.pyramid import reduce_cells
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
@@ -90,7 +91,7 @@ def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
     written = np.zeros(len(factors), np.int64)
     base = float(np.rint(cells.height_robust_m[0])) if len(cells) else 0.0
     reduce_cells(
-        cells.column, cells.row, cells.count, cells.height_robust_m, cells.intensity_mean, base,
+        cells.column, cells.row, cells.count, read_only(cells.height_robust_m), cells.intensity_mean, base,
         steps, edges, starts, np.zeros((len(factors), 4, edges[0])),
         column, row, count, covered, height, intensity, written,
     )  # fmt: skip

@@ -10,6 +10,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from roadscan.kernels.georeference import CLASS_KEPT, CLASS_NO_POSE, CLASS_NO_RETURN, CLASS_TOO_FAR, FATES
+from roadscan.kernels.options import read_only
 from roadscan.kernels.placing import STEP_NS, place_mirror, place_returns
 from roadscan.model.crs import LOCAL_WORLD, Anchor, MapFrame
 from roadscan.navigation.trajectory import Trajectory
@@ -36,7 +37,8 @@ def outputs(n: int) -> tuple[np.ndarray, ...]:
 
 def placed(start: int, end: int, epochs: np.ndarray, xyz: np.ndarray, how: tuple) -> tuple[np.ndarray, ...]:
     out = outputs(end - start)
-    place_returns(start, end, epochs, *(np.ascontiguousarray(xyz[:, a]) for a in range(3)), *how, *out)
+    columns = (read_only(np.ascontiguousarray(xyz[:, a])) for a in range(3))
+    place_returns(start, end, read_only(epochs), *columns, *how, *out)
     return out
 
 
@@ -83,7 +85,7 @@ def mirror(path: Trajectory, limits=WIDE) -> tuple:
     ranges = rng.integers(1, 65_000, (40, 181)).astype(np.uint16)
     ranges[3, 50] = 0
     epochs = START + 13_333_333 * np.arange(40)
-    return epochs, ranges, *rays, (0.5, 0.0015), 37_037.04, *common(path, YARD, limits)
+    return read_only(epochs), read_only(ranges), *rays, (0.5, 0.0015), 37_037.04, *common(path, YARD, limits)
 
 
 def test_readings_of_a_mirror_lie_where_exact_poses_put_them() -> None:

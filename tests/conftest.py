@@ -11,6 +11,9 @@ from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+# One thread for linear algebra, as on workers: those of two processes would wait for one another, busily.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # On a build server the same examples each time; at home new ones.
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):

@@ -70,12 +70,12 @@ def test_gap_has_no_pose_and_is_named() -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 1900), st.integers(10, 90), st.integers(0, 2**31))
+@given(st.integers(0, 300), st.integers(10, 90), st.integers(0, 2**31))
 def test_poses_do_not_depend_on_how_much_was_loaded(start: int, length: int, seed: int) -> None:
-    knots = np.sort(np.random.default_rng(seed).choice(200_000, 2000, replace=False)) * 1e-4
+    knots = np.sort(np.random.default_rng(seed).choice(40_000, 400, replace=False)) * 1e-4
     whole = trajectory(knots, max_gap_s=0.05)
     part = trajectory(knots[start : start + length], max_gap_s=0.05)
-    inner = whole.epochs_gps_ns[start + 3 : min(start + length, 2000) - 3]
+    inner = whole.epochs_gps_ns[start + 3 : min(start + length, 400) - 3]
     if inner.size < 2:
         return
     asked = np.linspace(inner[0], inner[-1], 50).astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -482,6 +483,9 @@ def main() -> None:
     """Run the command line; an error the user can mend is printed without a traceback."""
     from roadscan.model.errors import RoadscanError
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that knows no "─" or "σ" stops nothing
     try:
         app()
     except RoadscanError as error:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from roadscan.jobs.compute import Compute, Done, Inline, R, T
+from roadscan.model.errors import ConfigError
 
 if TYPE_CHECKING:
     from roadscan.jobs.on_dask import OnDask
@@ -54,7 +55,14 @@ def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iter
     ----------
     workers : number of worker processes; 0 computes in this process; None takes one a core.
     scheduler : address such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    ConfigError
+        for a negative number of workers: nobody would do the tasks.
     """
+    if workers is not None and workers < 0:
+        raise ConfigError(f"{workers} workers", expected="0 (compute in this process) or more")
     if scheduler is None and workers == 0:
         yield Inline()
         return

@@ -188,6 +188,8 @@ def _reason(done: Done[IngestTask, IngestResult]) -> str:
     error = done.error or StoreError("no result", file=done.task.log.source.path)
     if isinstance(error, RoadscanError):
         return str(error)
+    if isinstance(error, OSError):  # of reading, a format has told
+        return f"{done.task.log.source.path}: its rows cannot be kept: {error}; see to the store's disk"
     if type(error).__name__ == "KilledWorker":
         return f"{done.task.log.source.path}: the worker process died twice while it read this log"
     raise error

@@ -159,10 +159,9 @@ class Store:
     def scratch(self) -> Iterator[Path]:
         """A temporary local folder, on the store's own disk where it is a folder."""
         if self.is_folder:
-            parent = Path(self.path(_STAGING))
-            parent.mkdir(parents=True, exist_ok=True)
-            folder = parent / f"{os.getpid()}-{uuid.uuid4().hex}"
-            folder.mkdir()
+            folder = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+            with _in_words(str(folder)):
+                folder.mkdir(parents=True)
         else:
             folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
         try:

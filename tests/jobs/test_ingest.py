@@ -255,3 +255,25 @@ def test_who_may_only_read_the_store_can_ask_it(tmp_path: Path, monkeypatch: pyt
         with pytest.raises(StoreError, match=r"manifest/lock: the store cannot be written: Read-only file system; see"):
             verify_store(store)
     assert tables_of(store) == before
+
+
+def test_a_full_disk_costs_the_logs_it_cannot_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, rows: pa.Table, *_: object) -> None:
+        if rows.num_rows > 50:
+            raise OSError(28, "No space left on device", str(path))
+        pq.write_table(rows, path)
+
+    survey = survey_of(tmp_path, 3)
+    short = pa.ipc.open_file(tmp_path / "1.arrow").read_all().slice(0, 20)
+    with pa.OSFile(str(tmp_path / "1.arrow"), "wb") as sink, pa.ipc.new_file(sink, short.schema) as writer:
+        writer.write_table(short)
+    store = Store(str(tmp_path / "store"), "s")
+    with monkeypatch.context() as patch:
+        patch.setattr("roadscan.tables.writer.write_parquet", full)
+        with pytest.raises(
+            RunError, match=r"2 of 3 logs .*2\.arrow: its rows cannot be kept: .*No space left .*see to"
+        ):
+            ingest(survey, store)
+    assert [r.run for r in read_log_records(store)] == ["r1"]
+    assert store.files(".staging") == []
+    assert [r.fresh for r in ingest(survey, store)] == [True, False, True]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.jobs.compute import Inline
+from roadscan.jobs.compute_on import compute_on
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.stages import Run, plan_tile_work
@@ -288,6 +290,20 @@ def test_help_is_quick() -> None:
     started = time.perf_counter()
     subprocess.run([sys.executable, "-m", "roadscan", "--help"], capture_output=True, check=True)
     assert time.perf_counter() - started < 10
+
+
+def test_fewer_than_no_workers_are_refused() -> None:
+    with pytest.raises(ConfigError, match="-1 workers; expected 0"), compute_on(-1):
+        pass
+
+
+def test_a_pipe_that_knows_few_letters_gets_the_others_replaced() -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
+    command = [sys.executable, "-m", "roadscan", "formats"]
+    found = subprocess.run(command, capture_output=True, check=True, env=environment)
+    first, line, *rows = found.stdout.decode("latin-1").splitlines()
+    assert (first.split(), set(line)) == (["format", "yields", "what"], {"?", " "})
+    assert any(row.startswith("velodyne_pcap ") for row in rows)
 
 
 def _lines(run: object) -> list[str]:

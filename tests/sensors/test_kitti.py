@@ -222,10 +222,10 @@ def test_the_head_turns_clockwise_and_sweeps_are_not_compensated(
     assert abs(leftover_turn(turned, poses, period_s)) < 0.15
     # The other sense is wrong by twice the turn; sweeps taken as compensated would lie half way between.
     other = read_drive(drive, recordings, rotation="counterclockwise")
-    assert leftover_turn(other, poses, period_s) > 1.5
+    assert leftover_turn(other, poses, period_s, every=24) > 1.5
 
 
-def leftover_turn(log: Readings, poses: np.ndarray, period_s: float) -> float:
+def leftover_turn(log: Readings, poses: np.ndarray, period_s: float, every: int = 12) -> float:
     """Share of a turn's motion left in the returns: weighted mean over pairs of sweeps."""
     stamps_gps_ns = np.array([round(s * 1000) * 10**6 for s in poses[:, 1]]) + (15 - 315_964_800) * 10**9
     times_s = (stamps_gps_ns - stamps_gps_ns[0]) / 1e9
@@ -249,7 +249,7 @@ def leftover_turn(log: Readings, poses: np.ndarray, period_s: float) -> float:
 
     draw = np.random.default_rng(0)
     shares, weights = [], []
-    for first in range(60, 147, 12):
+    for first in range(60, 147, every):
         here, shift_here, _ = cloud(first)
         there, shift_there, height = cloud(first + 3)
         chosen = draw.choice(np.flatnonzero(height > -1.2), 8000, replace=False)

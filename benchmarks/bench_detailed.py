@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import Delaunay
 
-from benchmarks.timing import Figure, thread_seconds
+from benchmarks.timing import Figure, in_turns, thread_seconds
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings, detailed_surface
 from roadscan.surfaces.normals import slopes_at
@@ -67,28 +67,25 @@ def _patch() -> Iterator[Figure]:
     local = points[:, :2] - ORIGIN[:2]
     asked = np.stack([v.ravel() for v in np.meshgrid(*window.nodes_m())], axis=1) - ORIGIN[:2]
     scipy = CloughTocher2DInterpolator(Delaunay(local), points[:, 2])
-    qhull = _ms(lambda: Delaunay(local))
-    other = _ms(lambda: scipy(asked))
-    yield Figure("order, duplicates", _ms(lambda: sites(points)), "ms")
-    yield Figure(
-        f"triangulation, {POINTS:,} points",
-        _ms(lambda: triangulate(places, 0.3)),
-        "ms",
-        qhull,
-        "Qhull alone",
+    triangles, qhull = (1e3 * s for s in in_turns([lambda: triangulate(places, 0.3), lambda: Delaunay(local)], 5))
+    heights, both, other = (
+        1e3 * s
+        for s in in_turns(
+            [
+                lambda: surface.heights(window),
+                lambda: cubic_surface(places, mesh, slopes).heights(window),
+                lambda: scipy(asked),
+            ]
+        )
     )
+    yield Figure("order, duplicates", _ms(lambda: sites(points)), "ms")
+    yield Figure(f"triangulation, {POINTS:,} points", triangles, "ms", qhull, "Qhull alone")
     yield Figure("slopes, cubic", _ms(lambda: slopes_at(places, mesh, "cubic")), "ms")
     yield Figure("slopes, quadratic", _ms(lambda: slopes_at(places, mesh, "quadratic")), "ms")
     yield Figure("control points", _ms(lambda: cubic_surface(places, mesh, slopes)), "ms")
     nodes = f"{window.rows * window.columns:,} nodes (bar: a fifth)"
-    yield Figure(f"heights, {nodes}", _ms(lambda: surface.heights(window)), "ms", other, "SciPy, slopes given")
-    yield Figure(
-        "control points and heights",
-        _ms(lambda: cubic_surface(places, mesh, slopes).heights(window)),
-        "ms",
-        other,
-        "SciPy, slopes given",
-    )
+    yield Figure(f"heights, {nodes}", heights, "ms", other, "SciPy, slopes given")
+    yield Figure("control points and heights", both, "ms", other, "SciPy, slopes given")
     yield Figure(
         "whole detailed stage (bar: 500)",
         _ms(lambda: detailed_surface(points, window, settings)),

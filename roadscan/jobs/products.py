@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from roadscan.jobs.bundles import run_bundles
 from roadscan.jobs.cell_files import read_cells, read_overview
@@ -87,7 +88,16 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
                 f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
                 change="add the section [surface] to the survey file, or leave the product out",
             )
-    return [(p, p.options.parse(config.options.get(p.name, {}))) for p in wanted]
+    return [(p, _stated_options(p, config.options.get(p.name, {}))) for p in wanted]
+
+
+def _stated_options(product: Product, values: dict[str, Any]) -> Strict:
+    try:
+        return product.options.parse(values)
+    except ConfigError as error:
+        raise ConfigError(
+            f"[products.options.{product.name}] {error.arrived}", expected=error.expected, change=error.change
+        ) from error
 
 
 def _default_names(cell_m: float, with_surface: bool) -> list[str]:

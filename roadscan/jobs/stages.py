@@ -14,7 +14,13 @@ from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
 from roadscan.jobs.navigate import navigate
 from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.products import make_products, product_context, recorded_folders, wanted_tile_products
+from roadscan.jobs.products import (
+    make_products,
+    product_context,
+    recorded_folders,
+    wanted_products,
+    wanted_tile_products,
+)
 from roadscan.jobs.selection import Selection
 from roadscan.jobs.surface_colours import check_cameras, check_colours, colour_notes
 from roadscan.jobs.surface_plan import SURFACE, checked_surface, files_without_surface, plan_surface_work
@@ -70,6 +76,7 @@ class Run:
 
 def run_ingest(run: Run) -> None:
     """Raw logs → tables."""
+    wanted_products(run.survey)  # a wrong name or option is told before a log is read
     check_cameras(run.survey)
     ingest(run.survey, run.store, run.reporter.line, run.compute)
 

@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 
 from roadscan.jobs import products
+from roadscan.jobs.compute import Inline
 from roadscan.jobs.drives import Drives
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.products import StoredTiles, wanted_products
+from roadscan.jobs.stages import Run, run_stages
 from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext, product_named
 from roadscan.simulate.truth import load
 from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
 from tests.jobs.conftest import changed
 
@@ -34,6 +37,21 @@ def test_what_a_product_reads_is_made_with_it(simulated):
     assert found["crack_pieces"].spur_m == 0.05
     with pytest.raises(ConfigError, match="made of the reconstructed surface, and the survey has none"):
         wanted_products(changed(survey, {"products": make}))
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"make": ["las"], "options": {"las": {"spacing": 0.1}}}, r"\[products\.options\.las\] .*spacing"),
+        ({"make": ["lass"]}, "lass"),
+    ],
+)
+def test_wrong_products_are_told_before_a_log_is_read(simulated, tmp_path, values, told):
+    survey = changed(Survey.load(simulated.survey_file), {"products": values})
+    store = Store(str(tmp_path), survey.config.id)
+    with pytest.raises(RoadscanError, match=told):
+        run_stages(Run(survey, store, Inline()))
+    assert not store.files("tables") + store.files("logs")
 
 
 def test_files_of_tiles_are_read_from_the_store(simulated):

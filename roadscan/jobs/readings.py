@@ -281,9 +281,11 @@ def load_corrections(store: Store, run: str) -> Corrections | None:
         return None
     try:
         rows = store.read_table(CORRECTIONS)
-    except (OSError, pa.ArrowInvalid) as error:
+    except StoreError as error:
         raise StoreError(
-            f"the trajectories' corrections cannot be read ({error})", change="compute them again", file=CORRECTIONS
+            f"the trajectories' corrections cannot be read ({error.arrived})",
+            change="compute them again",
+            file=CORRECTIONS,
         ) from error
     rows = rows.filter(pa.compute.equal(rows.column("run"), run))
     if rows.num_rows == 0:

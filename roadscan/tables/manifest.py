@@ -68,28 +68,24 @@ class Manifest:
 
     def all(self) -> list[OutputRecord]:
         """All records, by product and unit."""
-        return list(map(OutputRecord._make, rows_of(self._current())))
-
-    def table(self) -> pa.Table:
-        """The same, as a table."""
-        return self._current()
+        return list(map(OutputRecord._make, rows_of(self.table())))
 
     def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
         """Records of some products, of all units but these."""
-        table = self._current()
+        table = self.table()
         own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
         due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
         return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
 
     def without_file(self, product: str) -> set[str]:
         """Units of a product that are finished and have no file."""
-        table = self._current()
+        table = self.table()
         found = pc.and_(pc.equal(table.column("product"), product), pc.equal(table.column("path"), ""))
         return set(table.column("unit").filter(found).to_pylist())
 
     def files(self) -> dict[str, int]:
         """How many files there are, by product."""
-        table = self._current()
+        table = self.table()
         found = table.column("product").filter(pc.not_equal(table.column("path"), ""))
         return {one["values"]: one["counts"] for one in found.value_counts().to_pylist()}
 
@@ -120,7 +116,7 @@ class Manifest:
 
     def settle(self) -> None:
         """Remove files under older names that no output has any more, also those that a run that was killed left."""
-        table = self._current()
+        table = self.table()
         if self._moved:
             moved = pa.array(sorted(set(self._moved)), pa.string())
             for path in moved.filter(pc.invert(pc.is_in(moved, table.column("path")))).to_pylist():
@@ -156,12 +152,12 @@ class Manifest:
         """Rows of a product by unit."""
         rows = self._rows.get(product)
         if rows is None:
-            table = self._current()
+            table = self.table()
             own = rows_of(table.filter(pc.equal(table.column("product"), product)))
             rows = self._rows[product] = {row[1]: row for row in own}
         return rows
 
-    def _current(self) -> pa.Table:
+    def table(self) -> pa.Table:
         """Every record, by product and unit."""
         if self._behind:
             news, self._behind = list(map(self._read, self._behind)), []

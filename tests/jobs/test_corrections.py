@@ -13,8 +13,9 @@ import pytest
 
 from roadscan.jobs.clock_tables import CLOCKS
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.readings import MOUNTINGS
+from roadscan.jobs.readings import CORRECTIONS, MOUNTINGS, load_corrections
 from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.model.errors import StoreError
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.survey import Survey
 from roadscan.simulate import simulate
@@ -117,3 +118,11 @@ def heights(simulated: Simulated) -> dict[str, np.ndarray]:
         cloud = laspy.read(simulated.store().path(path))
         found[path] = np.stack([cloud.gps_time, cloud.z], axis=-1)
     return found
+
+
+def test_damaged_corrections_are_named_with_what_to_do(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "s")
+    store.write_bytes(CORRECTIONS, b"PAR1 and no more")
+    with pytest.raises(StoreError, match=r"corrections cannot be read .*; compute them again$") as raised:
+        load_corrections(store, "run-1")
+    assert raised.value.file == CORRECTIONS

@@ -18,32 +18,31 @@ class Figure:
     against: str = ""
 
 
-def best_seconds(
-    function: Callable[[], object], runs: int = 3, clock: Callable[[], float] = time.perf_counter
-) -> float:
-    """Shortest time of `runs` calls by a clock, after one that is not counted (compilation, caches)."""
-    function()
-    times = []
-    for _ in range(runs):
-        started = clock()
-        function()
-        times.append(clock() - started)
-    return min(times)
+def in_turns(
+    functions: Sequence[Callable[[], object]], runs: int = 15, clock: Callable[[], float] = time.thread_time
+) -> list[float]:
+    """Shortest time of `runs` calls of each by a clock, after one that is not counted (compilation, caches).
 
-
-def thread_seconds(function: Callable[[], object], runs: int = 5) -> float:
-    """The same by the processor time of the calling thread."""
-    return best_seconds(function, runs, time.thread_time)
-
-
-def in_turns(functions: Sequence[Callable[[], object]], runs: int = 15) -> list[float]:
-    """The same of several functions that take turns, so that one clock of the machine holds for all."""
+    They take turns, so that one clock of the machine holds for all.
+    """
     for function in functions:
         function()
     times: list[list[float]] = [[] for _ in functions]
     for _ in range(runs):
         for function, own in zip(functions, times, strict=True):
-            started = time.thread_time()
+            started = clock()
             function()
-            own.append(time.thread_time() - started)
+            own.append(clock() - started)
     return list(map(min, times))
+
+
+def best_seconds(
+    function: Callable[[], object], runs: int = 3, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """The same of one function."""
+    return in_turns([function], runs, clock)[0]
+
+
+def thread_seconds(function: Callable[[], object], runs: int = 5) -> float:
+    """The same by the processor time of the calling thread."""
+    return best_seconds(function, runs, time.thread_time)

@@ -81,7 +81,8 @@ class Kilometre(SurveyProduct):
         sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, names without stem
         index = index_output("", sheets)
         plain = [Output(s.name, s.tiles) for s in sheets] + index
-        shaded = [Output(s.name, with_neighbours(s, everything)) for s in sheets] + index
+        wanted = sheets if "shaded" in settings.views else ()
+        shaded = [Output(s.name, with_neighbours(s, everything)) for s in wanted] + index
         return [
             replace(one, name=raster.stem + one.name)
             for raster in _rasters(settings, context)

@@ -1,34 +1,22 @@
-"""Clough–Tocher patches on a regular grid, triangle by triangle: no point is ever searched for."""
+"""Clough–Tocher patches on a regular grid, triangle by triangle: no point is ever searched for.
+
+The nodes of a triangle are noted row by row, then their heights are computed side by side (``kernels.patch_heights``).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.clough_tocher import BY_CORNER, BY_EDGE, CENTRE, EDGE, INNER
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.clough_tocher import POINTS
+from roadscan.kernels.options import bare, inlined, kernel
+from roadscan.kernels.patch_heights import AT_ONCE, SCALE, heights_of_eight
 
-ZERO, ONE, TWO = np.uint64(0), np.uint64(1), np.uint64(2)
-FROM_CORNER, FROM_EDGE, FROM_INNER = np.uint64(BY_CORNER), np.uint64(BY_EDGE), np.uint64(INNER)
-FIRST_EDGE, SECOND_EDGE = np.uint64(EDGE), np.uint64(EDGE + 1)
-"""Unsigned: an index that could be negative costs a test."""
+ROOM = 64
+"""Nodes of a triangle that are collected before their heights are computed."""
+SHORT = 4
+"""Nodes that are noted at once: most rows of a triangle have fewer, and a loop over them would end unforeseen."""
 MARGIN = 1e-6
 """Of a cell: more than the rounding of where an edge meets a row. Nodes are then asked exactly."""
-
-
-@inlined
-def height(patch, l0, l1, l2):
-    """Height of a patch at barycentric coordinates: from the cubic of the third that the smallest of them names."""
-    least = min(l0, l1, l2)
-    k = ZERO if l0 == least else (ONE if l1 == least else TWO)
-    i, j = (ONE if k == ZERO else (TWO if k == ONE else ZERO)), (TWO if k == ZERO else (ZERO if k == ONE else ONE))
-    u = (l1 if k == ZERO else (l2 if k == ONE else l0)) - least
-    v = (l2 if k == ZERO else (l0 if k == ONE else l1)) - least
-    w = 3.0 * least
-    towards = 3.0 * (u * patch[FROM_INNER + i] + v * patch[FROM_INNER + j]) + w * patch[CENTRE]
-    sides = u * u * patch[FROM_CORNER + i] + 2.0 * u * v * patch[FROM_EDGE + k] + v * v * patch[FROM_CORNER + j]
-    near = u * u * (u * patch[i] + 3.0 * v * patch[FIRST_EDGE + k + k])
-    far = v * v * (v * patch[j] + 3.0 * u * patch[SECOND_EDGE + k + k])
-    return near + far + w * (3.0 * sides + w * towards)
 
 
 @inlined
@@ -56,6 +44,21 @@ def narrowed(line, bounds, up, low, high):
     return max(low, meets + bounds[1]), min(high, meets + bounds[2])
 
 
+@bare
+def write_heights(edges, patches, patch, nodes, count, heights):
+    """Heights of a triangle at the nodes that are noted; each is asked exactly whether it lies in the triangle.
+
+    edges, patches, patch : as in ``heights_of_eight``; nodes : tuple of x, y : (ROOM + AT_ONCE,) float64 (m), places :
+    (ROOM + AT_ONCE,) int64, of the first `count` nodes in `heights`, and scratch : as x.
+    """
+    x, y, places, found = nodes
+    for first in range(np.uint64(0), np.uint64(count), np.uint64(AT_ONCE)):
+        heights_of_eight(edges, patches, patch, x, y, found, first)
+    for k in range(np.uint64(count)):
+        place = np.uint64(places[k])
+        heights[place] = heights[place] if np.isnan(found[k]) else found[k]
+
+
 @kernel
 def evaluate(x, y, triangles, patches, node_x, node_y, cell_x, cell_y, heights):
     """Heights of the patches at the nodes of a grid.
@@ -70,6 +73,11 @@ def evaluate(x, y, triangles, patches, node_x, node_y, cell_x, cell_y, heights):
     heights : (r, c) float64, changed where a triangle lies.
     """
     columns, rows, per_x, per_y = node_x.size, node_y.size, 1.0 / cell_x, 1.0 / cell_y
+    size = ROOM + AT_ONCE
+    own_x, own_y, places, found = np.zeros(size), np.zeros(size), np.zeros(size, np.int64), np.zeros(size)
+    edges, patches, heights = np.zeros(SCALE + 1), patches.reshape(-1), heights.reshape(-1)
+    wide_x = np.zeros(columns + SHORT)
+    wide_x[:columns] = node_x
     for t in range(triangles.shape[0]):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         south, north = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])
@@ -80,21 +88,24 @@ def evaluate(x, y, triangles, patches, node_x, node_y, cell_x, cell_y, heights):
             continue
         line0, line1, line2 = edge_line(x, y, b, c), edge_line(x, y, c, a), edge_line(x, y, a, b)
         bounds0, bounds1, bounds2 = bound(line0), bound(line1), bound(line2)
-        scale = 1.0 / ((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
-        patch = patches[t]
+        edges[0], edges[1], edges[2], edges[3] = line0
+        edges[4], edges[5], edges[6], edges[7] = line1
+        edges[8], edges[9], edges[10], edges[11] = line2
+        edges[SCALE] = 1.0 / ((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
+        patch, count = np.uint64(t * POINTS), np.uint64(0)
         for row in range(first, end):
             up = node_y[row]
             low, high = narrowed(line0, bounds0, up, west, east)
             low, high = narrowed(line1, bounds1, up, low, high)
             low, high = narrowed(line2, bounds2, up, low, high)
-            left = max(int(np.ceil((low - node_x[0]) * per_x - MARGIN)), 0)
+            left = min(max(int(np.ceil((low - node_x[0]) * per_x - MARGIN)), 0), columns)
             right = min(int(np.floor((high - node_x[0]) * per_x + MARGIN)) + 1, columns)
-            across0, across1 = line0[2] * (up - line0[1]), line1[2] * (up - line1[1])
-            across2 = line2[2] * (up - line2[1])
-            for column in range(left, right):
-                over = node_x[column]
-                s0 = across0 - line0[3] * (over - line0[0])
-                s1 = across1 - line1[3] * (over - line1[0])
-                s2 = across2 - line2[3] * (over - line2[0])
-                if s0 >= 0.0 and s1 >= 0.0 and s2 >= 0.0:
-                    heights[row, column] = height(patch, s0 * scale, s1 * scale, s2 * scale)
+            for start in range(left, max(right, left + 1), SHORT):
+                for k in range(np.uint64(SHORT)):
+                    own_x[count + k], own_y[count + k] = wide_x[np.uint64(start) + k], up
+                    places[count + k] = row * columns + start + np.int64(k)
+                count += np.uint64(min(max(right - start, 0), SHORT))
+                if count >= np.uint64(ROOM):
+                    write_heights(edges, patches, patch, (own_x, own_y, places, found), count, heights)
+                    count = np.uint64(0)
+        write_heights(edges, patches, patch, (own_x, own_y, places, found), count, heights)

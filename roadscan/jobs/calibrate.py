@@ -7,15 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from roadscan.jobs.calibration_evidence import Collected, collect
 from roadscan.jobs.fingerprint import key_of, solver_version
-from roadscan.jobs.plan import SurveyPlan, plan_survey
-from roadscan.jobs.readings import MOUNTINGS
+from roadscan.jobs.plan import DatedMountings, SurveyPlan, plan_survey
+from roadscan.jobs.readings import load_mountings
 from roadscan.model.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
-from roadscan.model.errors import ConfigError, RunError, nearest
+from roadscan.model.errors import ConfigError, DamagedError, RunError, nearest
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.ids import ALL_RUNS
 from roadscan.model.survey import Survey
@@ -24,6 +21,7 @@ from roadscan.navigation.calibration.evidence import Directions, Evidence, Orien
 from roadscan.navigation.calibration.report import mounting_rows, report
 from roadscan.navigation.calibration.unknowns import Estimate, ObjectPose
 from roadscan.products.pictures.calibration import draw_calibration
+from roadscan.tables.held import held_path, read_held, write_held
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 
@@ -66,7 +64,8 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
             expected='[[calibration]] with kind = "overlap", "object", "stop_and_go" or "reference"',
         )
     settings = config.navigation.calibration
-    plan = plan_survey(survey, store)
+    calibrated = _sound_mountings(store, say)
+    plan = plan_survey(survey, store, calibrated)
     collected: list[Collected] = []
     for entry in config.calibration:
         say(f"evidence: {entry.kind}")
@@ -96,7 +95,7 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
         estimated_at=dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         key=_key(plan, sensors),
     )
-    _keep(store, rows)
+    _keep(store, rows, say)
     text = report(calibration)
     store.write_bytes(TEXT, text.encode())
     with store.scratch() as folder:
@@ -183,10 +182,9 @@ def _prior(survey: Survey, name: str) -> Prior:
 
 def outdated_calibrations(plan: SurveyPlan) -> list[str]:
     """In words, the calibrations of the table that were made from other logs, rig, settings or code than there are."""
-    if not plan.store.exists(MOUNTINGS):
-        return []
     by_key: dict[str, dict[str, str]] = {}
-    for row in plan.store.read_table(MOUNTINGS).to_pylist():
+    table = read_held(plan.store, "mountings")
+    for row in () if table is None else table.to_pylist():
         if row["calibration"]:
             by_key.setdefault(row["calibration"], {})[row["sensor"]] = row["estimated_at"] or ""
     return [
@@ -217,18 +215,24 @@ def _key(plan: SurveyPlan, sensors: Iterable[str]) -> str:
     )
 
 
-def _keep(store: Store, rows: list[dict[str, Any]]) -> None:
+def _sound_mountings(store: Store, say: Report) -> DatedMountings:
+    """What the table holds; where it is damaged, readings are found by the rig file's mountings meanwhile."""
+    try:
+        return load_mountings(store)
+    except DamagedError as error:
+        say(f"the table `mountings` is damaged ({error.arrived}): the rig file's mountings are taken to begin with")
+        return {}
+
+
+def _keep(store: Store, rows: list[dict[str, Any]], say: Report) -> None:
     """Put rows into the table; those of the same run, sensor and instant are replaced, all others stay."""
-    schema = table_schema("mountings")
-    known: list[dict[str, Any]] = []
-    if store.exists(MOUNTINGS):
-        known = store.read_table(MOUNTINGS).to_pylist()
-    places = {tuple(row[c] for c in schema.sort) for row in rows}
-    kept = [row for row in known if tuple(row[c] for c in schema.sort) not in places]
-    ordered = sorted([*kept, *rows], key=lambda row: tuple(row[c] for c in schema.sort))
-    table = pa.Table.from_pylist(
-        [{c.name: row.get(c.name) for c in schema.columns} for row in ordered], schema=schema.arrow()
-    )
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
-    store.write_bytes(MOUNTINGS, sink.getvalue().to_pybytes())
+    sort = table_schema("mountings").sort
+    try:
+        table = read_held(store, "mountings")
+    except DamagedError:
+        table = None
+        aside = store.set_aside(held_path("mountings"))
+        say(f"the damaged table was set aside ({aside}): mountings that only it held have to be calibrated again")
+    known = [] if table is None else table.to_pylist()
+    places = {tuple(row[c] for c in sort) for row in rows}
+    write_held(store, "mountings", [*(row for row in known if tuple(row[c] for c in sort) not in places), *rows])

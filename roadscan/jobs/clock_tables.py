@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
+from roadscan.model.errors import DamagedError
 from roadscan.navigation.clocks import ClockCorrection, Residuals
-from roadscan.tables.schema import table_schema
+from roadscan.tables.held import held_path, read_held, write_held
 from roadscan.tables.store import Store
-
-CLOCKS: Final = "tables/clocks/part-00000.parquet"
-CLOCK_RESIDUALS: Final = "tables/clock_residuals/part-00000.parquet"
 
 
 @dataclass(frozen=True)
@@ -49,10 +44,8 @@ def load_clocks(store: Store) -> dict[tuple[str, str], ClockCorrection]:
 
 def kept_estimates(store: Store, *, with_residuals: bool = True) -> list[ClockEstimate]:
     """What the tables hold."""
-    if not store.exists(CLOCKS):
-        return []
-    rows = _read(store, CLOCKS)
-    left = _read(store, CLOCK_RESIDUALS) if with_residuals and store.exists(CLOCK_RESIDUALS) else []
+    rows = _read(store, "clocks")
+    left = _read(store, "clock_residuals") if with_residuals else []
     return [
         ClockEstimate(
             run=row["run"],
@@ -95,9 +88,21 @@ def _residuals(rows: list[dict[str, Any]]) -> Residuals | None:
     )
 
 
-def _read(store: Store, path: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = store.read_table(path).to_pylist()
-    return rows
+def _read(store: Store, name: str) -> list[dict[str, Any]]:
+    table = read_held(store, name)
+    return [] if table is None else list(table.to_pylist())
+
+
+def set_damaged_clocks_aside(store: Store) -> list[str]:
+    """Move tables that cannot be read out of the way, so that the clocks are estimated anew; returns what was done."""
+    done: list[str] = []
+    for name in ("clocks", "clock_residuals"):
+        try:
+            _read(store, name)
+        except DamagedError as error:
+            aside = store.set_aside(held_path(name))
+            done.append(f"the table `{name}` is damaged ({error.arrived}) and was set aside ({aside}): it is made anew")
+    return done
 
 
 def keep_estimates(store: Store, estimates: Sequence[ClockEstimate]) -> None:
@@ -139,13 +144,5 @@ def keep_estimates(store: Store, estimates: Sequence[ClockEstimate]) -> None:
         }
         for e in estimates
     ]
-    _write(store, "clock_residuals", CLOCK_RESIDUALS, residuals)
-    _write(store, "clocks", CLOCKS, clocks)
-
-
-def _write(store: Store, table: str, path: str, rows: list[dict[str, Any]]) -> None:
-    schema = table_schema(table)
-    content = pa.Table.from_pylist(rows, schema.arrow()).sort_by([(c, "ascending") for c in schema.sort])
-    buffer = io.BytesIO()
-    pq.write_table(content, buffer, row_group_size=schema.row_group_rows)
-    store.write_bytes(path, buffer.getvalue())
+    write_held(store, "clock_residuals", residuals)
+    write_held(store, "clocks", clocks)

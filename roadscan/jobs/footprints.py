@@ -125,19 +125,28 @@ def index_footprints(
     plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None] = lambda _a, _b: None
 ) -> list[tuple[str, str]]:
     """Index the data files whose footprints are missing or stale; returns what failed."""
-    stale = stale_footprints(plan, manifest)
-    due = {one.file for one in plan.slices()}
+    tasks = _tasks(plan)
+    due = {t.slice.file for t in tasks}
     manifest.remove(r for unit, r in manifest.of(PRODUCT).items() if unit not in due)
+    stale = _stale(tasks, manifest)
     failed = run_bundles(footprint_task, stale, lambda t: t.work, _ROW_GROUPS, manifest, compute, report)
     return [(task.slice.file, reason) for task, reason in failed]
 
 
 def stale_footprints(plan: SurveyPlan, manifest: Manifest) -> list[FootprintTask]:
     """A task for each data file whose footprints are missing or stale."""
-    tasks = (
+    return _stale(_tasks(plan), manifest)
+
+
+def _tasks(plan: SurveyPlan) -> list[FootprintTask]:
+    """A task for each data file."""
+    return [
         FootprintTask(plan.store, plan.ground, one, key_of(one.source.key, one.file, digest))
         for one, digest in zip(plan.slices(), _digests(plan), strict=True)
-    )
+    ]
+
+
+def _stale(tasks: Sequence[FootprintTask], manifest: Manifest) -> list[FootprintTask]:
     return [t for t in tasks if not manifest.is_current(PRODUCT, t.slice.file, t.key)]
 
 

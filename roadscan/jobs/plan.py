@@ -6,6 +6,7 @@ import datetime as dt
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import TypeAlias
 
 from roadscan.jobs.centre_line import CentreLines
 from roadscan.jobs.clocks import load_clocks
@@ -14,7 +15,6 @@ from roadscan.jobs.fingerprint import code_version, grid_digest, key_of
 from roadscan.jobs.ingest import DATA_TABLES
 from roadscan.jobs.navigate import records_with_trajectories
 from roadscan.jobs.readings import (
-    CORRECTIONS,
     Ground,
     RawSlice,
     ReadingSource,
@@ -28,9 +28,13 @@ from roadscan.model.ids import LanePass, RunId, of_run
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.survey import Survey
 from roadscan.points.place import HeightLimits
+from roadscan.tables.held import held_path, read_held
 from roadscan.tables.logs import DataFile, LogRecord
 from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
+
+DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
+"""Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
 
 _UNMOUNTED = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
@@ -71,8 +75,11 @@ class SurveyPlan:
         return [RawSlice.whole(source, f) for source, files in self.sources for f in files]
 
 
-def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
-    """Put together what the tables and the survey file say; reads no readings."""
+def plan_survey(survey: Survey, store: Store, calibrated: DatedMountings | None = None) -> SurveyPlan:
+    """Put together what the tables and the survey file say; reads no readings.
+
+    `calibrated` stand in for the table of mountings where they are given.
+    """
     records = tuple(records_with_trajectories(survey, store))
     config = survey.config
     f = config.filters
@@ -91,7 +98,8 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
         grids=None if config.map.grids is None else str(survey.resolve(config.map.grids)),
         marks=f.keep_marked,
     )
-    sources = tuple(_sources(survey, store, records, ground))
+    known = load_mountings(store) if calibrated is None else calibrated
+    sources = tuple(_sources(survey, store, records, ground, known))
     if not sources:
         raise RunError(
             "the survey has no readings", expected="at least one log of scans, returns or points with rows in it"
@@ -108,11 +116,10 @@ def plan_survey(survey: Survey, store: Store) -> SurveyPlan:
 
 
 def _sources(
-    survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground
+    survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground, calibrated: DatedMountings
 ) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
-    calibrated = load_mountings(store)
     clocks = load_clocks(store)
-    adjusted = store.read_bytes(CORRECTIONS).hex() if store.exists(CORRECTIONS) else None
+    adjusted = _adjusted(store)
     found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
     for record in records:
         for table in DATA_TABLES:
@@ -151,9 +158,14 @@ def _sources(
     return found
 
 
-def mountings_of(
-    run: str, sensor: str, nominal: Mounting, calibrated: Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
-) -> Mountings:
+def _adjusted(store: Store) -> str | None:
+    """What the table of corrections says, None without one. Damage is told here, before tiles are asked to bear it."""
+    if read_held(store, "corrections") is None:
+        return None
+    return store.read_bytes(held_path("corrections")).hex()
+
+
+def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:
     """The rig file's mounting of a sensor, until the first calibrated one of its run (or of all), and so on."""
     dated = list(of_run(calibrated, run, sensor) or [])
     if not dated or dated[0][0] > 0:

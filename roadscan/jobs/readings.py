@@ -34,13 +34,11 @@ from roadscan.points.place import (
 from roadscan.points.readings import ScanGeometry
 from roadscan.points.road_profiles import RoadFinder
 from roadscan.points.turns import TICK_NS, WINDOW_NS
+from roadscan.tables.held import read_held
 from roadscan.tables.logs import DataFile
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
-
-CORRECTIONS: str = "tables/corrections/part-00000.parquet"
-MOUNTINGS: str = "tables/mountings/part-00000.parquet"
 
 _CHUNK_READINGS = 1 << 20
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
@@ -277,16 +275,9 @@ def load_trajectory(
 
 def load_corrections(store: Store, run: str) -> Corrections | None:
     """Corrections of a run's trajectory, None where no adjustment wrote any."""
-    if not store.exists(CORRECTIONS):
+    rows = read_held(store, "corrections")
+    if rows is None:
         return None
-    try:
-        rows = store.read_table(CORRECTIONS)
-    except StoreError as error:
-        raise StoreError(
-            f"the trajectories' corrections cannot be read ({error.arrived})",
-            change="compute them again",
-            file=CORRECTIONS,
-        ) from error
     rows = rows.filter(pa.compute.equal(rows.column("run"), run))
     if rows.num_rows == 0:
         return None
@@ -299,10 +290,9 @@ def load_corrections(store: Store, run: str) -> Corrections | None:
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:
     """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
-    if not store.exists(MOUNTINGS):
-        return {}
+    table = read_held(store, "mountings")
     found: dict[tuple[str, str], list[tuple[int, Mounting]]] = {}
-    for row in store.read_table(MOUNTINGS).sort_by("valid_from_gps_ns").to_pylist():
+    for row in () if table is None else table.sort_by("valid_from_gps_ns").to_pylist():
         rotation = rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
         rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
         lever = (row["lever_forward_m"], row["lever_right_m"], row["lever_down_m"])

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from roadscan.jobs.calibrate import outdated_calibrations
+from roadscan.jobs.clock_tables import set_damaged_clocks_aside
 from roadscan.jobs.clocks import estimate_clocks
 from roadscan.jobs.compute import Compute, Made, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
@@ -83,6 +84,8 @@ def run_ingest(run: Run) -> None:
 
 def run_navigate(run: Run) -> None:
     """GNSS, IMU and odometer → trajectories; shared motion → clocks."""
+    for done in set_damaged_clocks_aside(run.store):
+        run.reporter.line(f"note: {done}")
     if any(evidence.against != "trajectory" for evidence in run.survey.config.clocks):
         estimate_clocks(run.survey, run.store, before_navigation=True)
     navigate(run.survey, run.store, run.reporter.line)

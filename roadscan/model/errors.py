@@ -91,6 +91,10 @@ class StoreError(RoadscanError):
     """The store is damaged, locked or not a roadscan store."""
 
 
+class DamagedError(StoreError):
+    """A file of the store can be read, and does not hold what was written."""
+
+
 class RunError(RoadscanError):
     """Some units of a run failed; the rest is finished and kept."""
 

@@ -27,7 +27,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from blake3 import blake3
 
-from roadscan.model.errors import StoreError
+from roadscan.model.errors import DamagedError, StoreError
 
 try:
     import fcntl
@@ -37,6 +37,9 @@ except ImportError:  # no such locks on this system
 _STAGING: Final = ".staging"
 _CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
 _ALGORITHM: Final = "blake3:"
+
+MADE_AGAIN: Final = "`roadscan verify` finds all such files, and the next run makes them again"
+"""What mends a damaged product."""
 
 _T = TypeVar("_T")
 
@@ -116,23 +119,25 @@ class Store:
             raise StoreError("the file is missing from the store", file=self.path(relative)) from error
         except IsADirectoryError as error:
             raise StoreError("a folder stands where a file belongs", change="remove it", file=error.filename) from error
+        except OSError as error:
+            raise StoreError(
+                f"the file cannot be read: {error.strerror or error}",
+                change="see to its rights and to the disk",
+                file=self.path(relative),
+            ) from error
 
-    def read_table(self, relative: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Content of a small Parquet file.
+    def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
+        """Content of a small Parquet file; `change` says what mends it. Pages that have a checksum are held against it.
 
         Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
         """
         content = self.read_bytes(relative)
         try:
-            file = pq.ParquetFile(pa.BufferReader(content))
+            file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
             return file.read(None if columns is None else list(columns), use_threads=False)
         except (pa.ArrowException, OSError) as error:
-            raise StoreError(
-                f"the file is damaged: {error}",
-                change="`roadscan verify` finds all such files, and the next run makes them again",
-                file=self.path(relative),
-            ) from error
+            raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
     def write_bytes(self, relative: str, content: bytes) -> None:
         """Write a small file at once; StoreError where the store cannot be written."""
@@ -204,6 +209,20 @@ class Store:
         doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
         _made(doomed.parent, lambda: path.rename(doomed))
         shutil.rmtree(doomed, ignore_errors=True)
+
+    def set_aside(self, relative: str) -> str:
+        """Move a damaged file below ``damaged/``, for whoever wants to look at it; returns its name there."""
+        aside, number = f"damaged/{relative}", 1
+        while self.exists(aside):
+            number += 1
+            aside = f"damaged/{relative}.{number}"
+        with _in_words(self.path(aside)):
+            if self.is_folder:
+                Path(self.path(aside)).parent.mkdir(parents=True, exist_ok=True)
+                Path(self.path(relative)).rename(self.path(aside))
+            else:
+                self.fs.mv(self.path(relative), self.path(aside))
+        return aside
 
     def local_copy(self, relative: str, folder: Path) -> Path:
         """Path of a local file with the content of a stored one (itself, where the store is a folder)."""

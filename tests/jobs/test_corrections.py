@@ -11,14 +11,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.clock_tables import CLOCKS
 from roadscan.jobs.compute import Inline
-from roadscan.jobs.readings import CORRECTIONS, MOUNTINGS, load_corrections
+from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.stages import STAGES, Run, run_stages
-from roadscan.model.errors import StoreError
+from roadscan.model.errors import DamagedError
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.survey import Survey
 from roadscan.simulate import simulate
+from roadscan.tables.held import held_path, read_held, write_held
 from roadscan.tables.schema import table_schema
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
@@ -34,13 +34,6 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     made = Simulated(simulate(small_scene(**SHORT), tmp_path_factory.mktemp("right") / "survey").survey_file)
     made.run(**PRODUCTS)
     return made
-
-
-def write_table(store: Store, path: str, name: str, rows: list[dict[str, Any]]) -> None:
-    full = [{c.name: row.get(c.name) for c in table_schema(name).columns} for row in rows]
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.Table.from_pylist(full, schema=table_schema(name).arrow()), sink)
-    store.write_bytes(path, sink.getvalue().to_pybytes())
 
 
 def clock_row(sensor: str, offset_s: float, drift_ppm: float, reference_gps_ns: int) -> dict[str, Any]:
@@ -68,7 +61,7 @@ def test_an_estimated_clock_puts_readings_where_a_right_one_does(right: Simulate
     drift = -40.0 / (1.0 + 40e-6)
     reference = start + 500_000_000
     table = [clock_row(s, -0.5, drift, reference) for s in ("profiler_left", "profiler_right")]
-    write_table(wrong.store(), CLOCKS, "clocks", table)
+    write_held(wrong.store(), "clocks", table)
     # The stage `navigate` would take the rows away: the survey file names no evidence for them.
     survey = changed(Survey.load(wrong.survey_file), PRODUCTS)
     run_stages(Run(survey, wrong.store(), Inline()), [s for s in STAGES if s.name != "navigate"])
@@ -95,12 +88,12 @@ def test_a_calibrated_mounting_holds_from_its_epoch_on(right: Simulated) -> None
         **dict(zip(("qw", "qx", "qy", "qz"), q, strict=True)),
     }  # fmt: skip
     before = heights(right)
-    write_table(store, MOUNTINGS, "mountings", [row])
+    write_held(store, "mountings", [row])
     try:
         run = right.run(**PRODUCTS)
         after = heights(right)
     finally:
-        store.remove(MOUNTINGS)
+        store.remove(held_path("mountings"))
     assert run.raw_bytes_read > 0
     times, low = np.concatenate(list(before.values())).T
     high = np.concatenate(list(after.values()))[:, 1]
@@ -120,9 +113,60 @@ def heights(simulated: Simulated) -> dict[str, np.ndarray]:
     return found
 
 
-def test_damaged_corrections_are_named_with_what_to_do(tmp_path: Path) -> None:
-    store = Store(str(tmp_path), "s")
-    store.write_bytes(CORRECTIONS, b"PAR1 and no more")
-    with pytest.raises(StoreError, match=r"corrections cannot be read .*; compute them again$") as raised:
-        load_corrections(store, "run-1")
-    assert raised.value.file == CORRECTIONS
+def damaged(content: bytes, damage: str) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.table({"name": ["x"]}), sink)
+    place = content.index(b"run-1")  # within a page: what only its checksum tells
+    return {
+        "cut": content[: len(content) // 2],
+        "empty": b"",
+        "flipped": content[:place] + b"s" + content[place + 1 :],
+        "other": sink.getvalue().to_pybytes(),
+    }[damage]
+
+
+MENDED_BY = {
+    "clocks": "`roadscan clocks`",
+    "clock_residuals": "`roadscan clocks`",
+    "mountings": "`roadscan calibrate`",
+    "corrections": "compute it again",
+}
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "flipped", "other"])
+@pytest.mark.parametrize("name", sorted(MENDED_BY))
+def test_a_damaged_table_says_what_mends_it(tmp_path: Path, name: str, damage: str) -> None:
+    store, path = Store(str(tmp_path), "s"), held_path(name)
+    values = {"string": "run-1", "int64": 0, "float64": 0.5, "uint8": 1, "int32": 1}
+    write_held(store, name, [{c.name: values.get(c.type) for c in table_schema(name).columns}])
+    store.write_bytes(path, damaged(store.read_bytes(path), damage))
+    with pytest.raises(DamagedError) as raised:
+        read_held(store, name)
+    assert MENDED_BY[name] in raised.value.change and "`roadscan verify`" not in str(raised.value)
+    assert raised.value.file == store.path(path)
+
+
+@pytest.mark.parametrize("name", ["mountings", "corrections"])
+def test_a_run_does_not_go_on_without_a_damaged_table(right: Simulated, name: str) -> None:
+    """Without it, readings would be placed elsewhere."""
+    store = right.run(**PRODUCTS).store
+    before = outputs(store)
+    store.write_bytes(held_path(name), b"PAR1 and no more")
+    try:
+        for _ in range(2):
+            with pytest.raises(DamagedError, match=f"{name}/part-00000.parquet: the file is damaged"):
+                right.run(**PRODUCTS)
+        assert outputs(store) == before
+    finally:
+        store.remove(held_path(name))
+    assert right.run(**PRODUCTS).raw_bytes_read == 0
+
+
+def test_damaged_clocks_are_estimated_anew(right: Simulated) -> None:
+    store = right.store()
+    store.write_bytes(held_path("clocks"), b"PAR1 and no more")
+    with pytest.raises(DamagedError, match="`roadscan clocks`"):
+        plan_survey(Survey.load(right.survey_file), store)
+    said = right.run(**PRODUCTS).reporter.lines
+    assert [line for line in said if line.startswith("note: the table `clocks` is damaged")]
+    assert store.read_bytes("damaged/" + held_path("clocks")) == b"PAR1 and no more"

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.georeference import KEPT
-from roadscan.kernels.line_access import STORES_SOME, VECTOR, fetch_line, store_heights
+from roadscan.kernels.line_access import VECTOR, fetch_line, store_heights
 from roadscan.kernels.options import bare, bare_inlined
 from roadscan.kernels.run_lines import AT_ONCE, find_known_lines, lowest_bit
 from roadscan.kernels.runs import find_runs, sum_up
@@ -32,8 +32,8 @@ SLOTS = 28
 """Heights of a line."""
 HEADERS = 8
 """Numbers of 64 bits in a line; the last one is its header."""
-LAST = SLOTS if STORES_SOME else LINE - VECTOR
-"""Heights that a line may hold already when a run is stored in it."""
+LAST = LINE - VECTOR
+"""Heights that a line may hold already when a whole vector is stored behind them."""
 FARTHEST = 32_000
 """Largest difference (quanta) between a height and the base of its line."""
 NOWHERE = -(1 << 30)
@@ -54,16 +54,20 @@ Pass number p has the bit p mod 24 in lines of the word p div 24; a line has one
 
 
 def work_arrays(tiles: int) -> tuple[Any, ...]:
-    """Arrays that readings are worked on in, a piece at a time, and a mark for each of so many active tiles."""
-    return (
-        np.empty(PIECE, np.int32),
-        np.empty(PIECE, np.int32),
-        np.zeros(PIECE + VECTOR, np.int32),
+    """Arrays that readings are worked on in, a piece at a time, and a mark for each of so many active tiles.
+
+    Column, row and height of each reading; of runs the first reading, the sum of intensities before each reading, the
+    cell's column, row and line; the marks.
+    """
+    of_runs = (
         np.empty(PIECE + 1, np.uint32),
         np.empty(PIECE + 1, np.uint32),
+        np.zeros(PIECE + AT_ONCE, np.int32),
+        np.zeros(PIECE + AT_ONCE, np.int32),
         np.empty(PIECE + AT_ONCE, np.int32),
-        np.zeros(tiles, np.uint8),
     )
+    heights = np.zeros(PIECE + VECTOR, np.int32)
+    return np.empty(PIECE, np.int32), np.empty(PIECE, np.int32), heights, of_runs, np.zeros(tiles, np.uint8)
 
 
 @bare_inlined
@@ -109,7 +113,7 @@ def line_with_room(own, size, low, high, word, heads, bases, chain):
         header = heads[line * HEADERS + HEADERS - 1]
         used = np.int64(header & np.uint64(COUNTS))
         base = np.int64(bases[line])
-        fits = (used + size <= SLOTS) & (used <= LAST) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+        fits = (used + size <= SLOTS) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
         if fits & ((used == 0) | (header & np.uint64(WORDS << WORD_SHIFT) == word)):
             return line
         line = np.int64(chain[line])
@@ -155,6 +159,20 @@ def line_of_run(own, heights, first, end, word, heads, bases, chain, free, spare
 
 
 @bare_inlined
+def store_run(heights, first, size, base, lines, line, used):
+    """Write the heights of a run behind the `used` ones of the line that begins at `line`.
+
+    A whole vector is written, not the part of one, which takes AMD's Zen 4 twenty cycles: what lies beyond the run's
+    heights is overwritten by the next run, or by the header, which is written last.
+    """
+    if used <= np.uint64(LAST):
+        store_heights(heights, first, base, lines, line + used)
+        return
+    for k in range(size):
+        lines[line + used + k] = np.int16(heights[first + k] - base)
+
+
+@bare_inlined
 def tile_at(x, y, edge, tile_rows):
     """South-west cell of the tile that holds cell (x, y), and its row in `groups`, −1 where it is not active."""
     across, along = x // edge, y // edge
@@ -163,8 +181,11 @@ def tile_at(x, y, edge, tile_rows):
 
 
 @bare
-def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells):
-    """First line of each run's cell, −1 outside the active tiles; cells : (n + 16,) int32, out. Takes new groups."""
+def find_lines(columns, rows, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells):
+    """First line of each run's cell, −1 outside the active tiles; cells : (n + 16,) int32, out. Takes new groups.
+
+    columns, rows : (n + 16,) int32, cells of the runs; starts : (n + 1,) uint32, their first readings.
+    """
     _, heads, bases, chain, free, _, held = pool
     per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
     table = groups.reshape(-1)
@@ -173,12 +194,11 @@ def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool
     while block < runs:
         own = (np.int32(west), np.int32(south), np.int32(edge if tile >= 0 else 0), np.int32(per_row))
         at = np.uint64(max(tile, 0) * per_tile)
-        unknown = find_known_lines(column, row, starts, block, runs, own, np.int32(NOWHERE), table, at, cells)
+        unknown = find_known_lines(columns, rows, block, runs, own, np.int32(NOWHERE), table, at, cells)
         while unknown:
             run = block + lowest_bit(unknown)
             unknown &= unknown - np.uint64(1)
-            first = np.uint64(starts[run])
-            x, y = np.int64(column[first]), np.int64(row[first])
+            x, y = np.int64(columns[run]), np.int64(rows[run])
             if not (west <= x < west + edge and south <= y < south + edge):
                 west, south, tile = tile_at(x, y, edge, tile_rows)
                 if tile >= 0:
@@ -188,7 +208,7 @@ def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool
             place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
             found = table[place]
             if found < 0:
-                found = new_group(heads, bases, chain, free, held, heights[first])
+                found = new_group(heads, bases, chain, free, held, heights[np.uint64(starts[run])])
                 table[place] = found
             cells[run] = found * LANES + ((x - west) & 15)
         block += np.uint64(AT_ONCE)
@@ -196,8 +216,7 @@ def find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool
 
 @bare
 def accumulate(
-    column, row, heights, low, high, intensity, gain, number, starts, sums, cells, tile_rows, groups, edge, pool,
-    touched,
+    column, row, heights, low, high, intensity, gain, number, of_runs, tile_rows, groups, edge, pool, touched
 ):  # fmt: skip
     """Count readings into the cells of active tiles.
 
@@ -209,7 +228,7 @@ def accumulate(
     low, high : int, no height lies below or above.
     intensity : (n,) unsigned; gain : uint32; their product takes at most 16 bits.
     number : int, of the readings' pass among the accumulator's.
-    starts, sums : (n + 1,) uint32, cells : (n + 1,) int32, work.
+    of_runs : arrays to work in, see :func:`work_arrays`.
     tile_rows : (rows, columns) int32, row of each tile in `groups`; −1 for tiles that are not active.
     groups : (a, edge · ⌈edge / 16⌉) int32, element of each group of a tile, −1 where it has none.
     edge : int64, cells along a tile's edge.
@@ -224,11 +243,12 @@ def accumulate(
     int, how many readings were counted; the other wanted ones lie outside the active tiles.
     """
     lines, heads, bases, chain, free, spare, held = pool
+    starts, sums, columns, rows, cells = of_runs
     mark = header_of_pass(number)
     word = mark & np.uint64(WORDS << WORD_SHIFT)
     sum_up(intensity, sums)
-    runs = find_runs(column, row, starts)
-    find_lines(column, row, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells)
+    runs = find_runs(column, row, starts, columns, rows)
+    find_lines(columns, rows, heights, starts, runs, tile_rows, groups, edge, pool, touched, cells)
     counted = np.int64(0)
     for run in range(runs):
         fetch_line(lines, np.uint64(cells[run + np.uint64(AHEAD)]) * np.uint64(LINE))
@@ -243,8 +263,7 @@ def accumulate(
             at = line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
             header = heads[at]
             used = header & np.uint64(COUNTS)
-            fits = (used + size <= np.uint64(SLOTS)) & (used <= np.uint64(LAST))
-            fits &= (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+            fits = (used + size <= np.uint64(SLOTS)) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
             if not (fits & (header & np.uint64(WORDS << WORD_SHIFT) == word)):
                 other = line_of_run(own, heights, first, first + size, word, heads, bases, chain, free, spare, held)
                 if other < 0:
@@ -258,8 +277,7 @@ def accumulate(
                 base, at = np.int64(bases[line]), line * np.uint64(HEADERS) + np.uint64(HEADERS - 1)
                 header = heads[at]
                 used = header & np.uint64(COUNTS)
-            # What is stored beyond the run's heights, if anything, is overwritten by the next run, or by the header.
-            store_heights(heights, first, size, np.int32(base), lines, line * np.uint64(LINE) + used)
+            store_run(heights, first, size, np.int32(base), lines, line * np.uint64(LINE), used)
             shine = np.uint64(gain) * np.uint64(sums[first + size] - sums[first])
             heads[at] = (header + size + (shine << np.uint64(LIGHT_SHIFT))) | mark
             first += size
@@ -285,7 +303,7 @@ def accumulate_cells(
     int, the reading before which the pool ran short of free elements; n at the end.
     """
     free, held = pool[4], pool[6]
-    _, _, _, starts, sums, cells, touched = work
+    of_runs, touched = work[3:]
     start = first
     while start < column.size:
         if free.size - held[0] < 2 * PIECE:
@@ -296,7 +314,7 @@ def accumulate_cells(
         low, high = bounds_of(heights[start:end])
         fates[KEPT] += accumulate(
             column[start:end], row[start:end], heights[start : end + VECTOR], low, high, intensity[start:end],
-            np.uint32(1), passes[start], starts, sums, cells, tile_rows, groups, edge, pool, touched,
+            np.uint32(1), passes[start], of_runs, tile_rows, groups, edge, pool, touched,
         )  # fmt: skip
         start = end
     return start
@@ -320,7 +338,7 @@ def accumulate_points(
     int, the point before which the pool ran short of free elements; n at the end.
     """
     free, held = pool[4], pool[6]
-    column, row, heights, starts, sums, cells, touched = work
+    column, row, heights, of_runs, touched = work
     start = first
     while start < x.size:
         if free.size - held[0] < 2 * PIECE:
@@ -334,8 +352,8 @@ def accumulate_points(
             heights[j] = height[start + j]
         low, high = bounds_of(heights[:n])
         accumulate(
-            column[:n], row[:n], heights, low, high, intensity[start:end], np.uint32(1), passes[start], starts, sums,
-            cells, tile_rows, groups, edge, pool, touched,
+            column[:n], row[:n], heights, low, high, intensity[start:end], np.uint32(1), passes[start], of_runs,
+            tile_rows, groups, edge, pool, touched,
         )  # fmt: skip
         start = end
     return start

@@ -193,7 +193,7 @@ def accumulate_profiles(
     """
     count = ranges.shape[1]
     per_cell = np.float32(1.0 / cell_quanta)
-    column, row, height, starts, sums, cells, touched = work
+    column, row, height, of_runs, touched = work
     knots, free, held = poses[1], pool[4], pool[6]
     for tile in range(touched.size):
         touched[tile] = 0
@@ -231,8 +231,7 @@ def accumulate_profiles(
             if good > 0 and passes[i] >= 0:
                 counted += accumulate(
                     column[:n], row[:n], height, low, high,
-                    intensity[i, start:end], gain, passes[i], starts, sums, cells, tile_rows, groups, edge, pool,
-                    touched,
+                    intensity[i, start:end], gain, passes[i], of_runs, tile_rows, groups, edge, pool, touched,
                 )  # fmt: skip
         fates[KEPT] += counted
         fates[OUTSIDE] += wanted - counted

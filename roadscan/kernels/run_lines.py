@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 
 from roadscan.kernels.options import Kernel, bare
 from roadscan.kernels.processor import compiles_for
-from roadscan.kernels.vectors import I8, I16, I32, I64, constant, everywhere, instruction, start, store
+from roadscan.kernels.vectors import I8, I16, I32, I64, constant, everywhere, instruction, load, start, store
 
 AT_ONCE = 16
 
@@ -26,20 +26,15 @@ def _gathered(builder, array, index, mask):
 
 
 @intrinsic
-def _found(typingctx, column, row, starts, first, runs, tile, nowhere, table, at, cells):
+def _found(typingctx, columns, rows, first, runs, tile, nowhere, table, at, cells):
     def write(context, builder, signature, arguments):
-        columns, rows, begins, groups, out = (start(context, builder, signature, arguments, k) for k in (0, 1, 2, 7, 9))
-        first, runs, tile, nowhere, at = (arguments[k] for k in (3, 4, 5, 6, 8))
+        across, up, groups, out = (start(context, builder, signature, arguments, k) for k in (0, 1, 6, 8))
+        first, runs, tile, nowhere, at = (arguments[k] for k in (2, 3, 4, 5, 7))
         west, south, edge, per_row = (everywhere(builder, _ROW, builder.extract_value(tile, k)) for k in range(4))
         left = everywhere(builder, _ROW, builder.trunc(builder.sub(runs, first), I32))
-        there = builder.icmp_unsigned("<", constant(_ROW, range(AT_ONCE)), left)
-        begin = builder.gep(begins, [first])
-        begin = instruction(
-            builder, "llvm.masked.load.v16i32.p0", _ROW, builder.bitcast(begin, _ROW.as_pointer()), I32(4), there,
-            constant(_ROW, [0] * AT_ONCE),
-        )  # fmt: skip
-        x, y = (_gathered(builder, array, begin, there) for array in (columns, rows))
-        wanted = builder.and_(there, builder.icmp_signed("!=", x, everywhere(builder, _ROW, nowhere)))
+        x, y = (load(builder, builder.gep(array, [first]), _ROW) for array in (across, up))
+        wanted = builder.icmp_signed("!=", x, everywhere(builder, _ROW, nowhere))
+        wanted = builder.and_(wanted, builder.icmp_unsigned("<", constant(_ROW, range(AT_ONCE)), left))
         x, y = builder.sub(x, west), builder.sub(y, south)
         inside = builder.and_(builder.icmp_unsigned("<", x, edge), builder.icmp_unsigned("<", y, edge))
         inside = builder.and_(inside, wanted)
@@ -52,16 +47,15 @@ def _found(typingctx, column, row, starts, first, runs, tile, nowhere, table, at
         unknown = builder.bitcast(builder.and_(wanted, builder.not_(known)), I16)
         return builder.zext(unknown, I64)
 
-    arguments = column, row, starts, first, runs, tile, nowhere, table, at, cells
-    return types.uint64(*arguments), write
+    return types.uint64(columns, rows, first, runs, tile, nowhere, table, at, cells), write
 
 
 @bare
-def _none_found(column, row, starts, first, runs, tile, nowhere, table, at, cells):
+def _none_found(columns, rows, first, runs, tile, nowhere, table, at, cells):
     unknown, bit = np.uint64(0), np.uint64(1)
     for run in range(first, min(first + np.uint64(AT_ONCE), runs)):
         cells[run] = -1
-        unknown |= bit if column[starts[run]] != nowhere else np.uint64(0)
+        unknown |= bit if columns[run] != nowhere else np.uint64(0)
         bit <<= np.uint64(1)
     return unknown
 
@@ -82,10 +76,10 @@ lowest_bit: Kernel = _lowest_by_numpy if numba.config.DISABLE_JIT else _lowest
 """lowest_bit(bits): number of the lowest bit that is set of a uint64 other than 0."""
 
 find_known_lines: Kernel = _found if _GATHERS else _none_found
-"""find_known_lines(column, row, starts, first, runs, tile, nowhere, table, at, cells): lines of sixteen runs.
+"""find_known_lines(columns, rows, first, runs, tile, nowhere, table, at, cells): lines of sixteen runs.
 
-column, row : (n,) int32, cells of readings; starts : (≥ runs,) uint32, each run's first reading; first, runs : uint64,
-the first of the sixteen runs, and how many there are in all; tile : (4,) tuple of int32, the tile's south-west cell,
+columns, rows : (≥ first + 16,) int32, cells of runs, of meaning for `runs` of them; first, runs : uint64, the first of
+the sixteen, and how many there are in all; tile : (4,) tuple of int32, the tile's south-west cell,
 cells along its edge, groups along its edge; nowhere : int32, column of readings that do not count; table : int32,
 element of each group, −1 for none; at : uint64, where the tile's groups begin; cells : (≥ first + 16,) int32, out, the
 line of each run's cell, −1 where it has none, lies elsewhere or nowhere. Returns a bit for each run that does count,

@@ -21,48 +21,53 @@ _COMPILED = not numba.config.DISABLE_JIT
 
 
 @bare_inlined
-def _starts_one_by_one(column, row, first, end, starts, runs):
+def _starts_one_by_one(column, row, first, end, starts, columns, rows, runs):
     """Note the readings from `first` to `end` − 1 whose cell is not that of the reading before."""
     for j in range(first, end):
-        starts[runs] = j
+        starts[runs], columns[runs], rows[runs] = j, column[j], row[j]
         runs += np.uint64((column[j] != column[j - np.uint64(1)]) | (row[j] != row[j - np.uint64(1)]))
     return runs
 
 
 @intrinsic
-def _starts_of_sixteen(typingctx, column, row, first, starts, runs):
+def _starts_of_sixteen(typingctx, column, row, first, starts, columns, rows, runs):
     """As `_starts_one_by_one` for the sixteen readings from `first`; returns how many runs there are now."""
 
     def write(context, builder, signature, arguments):
-        first, runs = arguments[2], arguments[4]
+        first, runs = arguments[2], arguments[6]
         before = builder.sub(first, I64(1))
-        differ = []
+        cells, differ = [], []
         for k in (0, 1):
-            cells = start(context, builder, signature, arguments, k)
-            own, last = (load(builder, builder.gep(cells, [at]), _ROW) for at in (first, before))
+            at = start(context, builder, signature, arguments, k)
+            own, last = (load(builder, builder.gep(at, [place]), _ROW) for place in (first, before))
+            cells.append(own)
             differ.append(builder.icmp_signed("!=", own, last))
         new = builder.or_(*differ)
         numbers = builder.add(everywhere(builder, _ROW, builder.trunc(first, I32)), constant(_ROW, range(AT_ONCE)))
-        place = builder.gep(start(context, builder, signature, arguments, 3), [runs])
-        # Into a register, then to memory: some processors take a hundred cycles for both in one (AMD's Zen 4).
-        packed = instruction(builder, "llvm.x86.avx512.mask.compress.v16i32", _ROW, numbers, numbers, new)
-        store(builder, packed, place)
+        for k, values in zip((3, 4, 5), (numbers, *cells), strict=True):
+            # Into a register, then to memory: AMD's Zen 4 takes a hundred cycles for both in one instruction.
+            packed = instruction(builder, "llvm.x86.avx512.mask.compress.v16i32", _ROW, values, values, new)
+            store(builder, packed, builder.gep(start(context, builder, signature, arguments, k), [runs]))
         count = builder.ctpop(builder.bitcast(new, ir.IntType(AT_ONCE)))
         return builder.add(runs, builder.zext(count, I64))
 
-    return types.uint64(column, row, first, starts, runs), write
+    return types.uint64(column, row, first, starts, columns, rows, runs), write
 
 
 @bare
-def find_runs(column, row, starts):
-    """Where readings of another cell begin: (n + 1,) uint32, out, the last one n. Returns how many runs there are."""
-    starts[0] = 0
+def find_runs(column, row, starts, columns, rows):
+    """Where readings of another cell begin. Returns how many such runs there are.
+
+    column, row : (n,) int32, cells of readings; starts : (n + 1,) uint32, out, each run's first reading, n behind the
+    last; columns, rows : (n,) int32, out, its cell.
+    """
+    starts[0], columns[0], rows[0] = 0, column[0], row[0]
     runs, j, n = np.uint64(1), np.uint64(1), np.uint64(column.size)
     if _COMPRESSES:
         while j + np.uint64(AT_ONCE) <= n:
-            runs = _starts_of_sixteen(column, row, j, starts, runs)
+            runs = _starts_of_sixteen(column, row, j, starts, columns, rows, runs)
             j += np.uint64(AT_ONCE)
-    runs = _starts_one_by_one(column, row, j, n, starts, runs)
+    runs = _starts_one_by_one(column, row, j, n, starts, columns, rows, runs)
     starts[runs] = n
     return runs
 

@@ -261,13 +261,19 @@ def sql(
 ) -> None:
     """Ask the tables a question."""
     from roadscan.jobs.navigate import known_keys
+    from roadscan.model.errors import StoreError
     from roadscan.model.survey import Survey
     from roadscan.tables.sql import query
     from roadscan.tables.store import Store
 
     loaded = Survey.load(survey_file)
     store = Store(loaded.store_url, loaded.config.id)
-    result = query(store, statement, known_keys(loaded, store))
+    damaged: list[StoreError] = []
+    try:
+        result = query(store, statement, known_keys(loaded, store), damaged)
+    finally:
+        for error in damaged:
+            typer.echo(f"not shown: {error}", err=True)
     if csv:
         import pyarrow.csv
 
@@ -612,6 +618,8 @@ def _print_status(found: Status, survey_file: Path) -> None:
     )
     if found.outputs:
         typer.echo("files: " + ", ".join(f"{n} {c:,}" for n, c in sorted(found.outputs.items())))
+    for record in found.damaged:
+        typer.echo(f"damaged: {record}")
     for note in found.notes:
         typer.echo(f"note: {note}")
     for failure in found.failures:

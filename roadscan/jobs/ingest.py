@@ -17,7 +17,14 @@ from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.sensors.base import LogHeader, Reject, Rows
-from roadscan.tables.logs import LogRecord, has_log, read_log_records, retire_log, write_log_record
+from roadscan.tables.logs import (
+    LogRecord,
+    has_log,
+    read_log_records,
+    record_path,
+    retire_log,
+    write_log_record,
+)
 from roadscan.tables.store import Store
 from roadscan.tables.writer import LogWriter
 
@@ -96,6 +103,7 @@ def ingest_log(task: IngestTask) -> IngestResult:
     store, log = task.store, task.log
     if has_log(store, log.key):
         return IngestResult(read_log_records(store, [log.key])[0], fresh=False)
+    _check_there(task)
     if task.grids is not None:
         add_grid_folder(task.grids)
     header = log.format.header(log.source)
@@ -124,6 +132,19 @@ def ingest_log(task: IngestTask) -> IngestResult:
     )
     write_log_record(store, record)
     return IngestResult(record, fresh=True)
+
+
+def _check_there(task: IngestTask) -> None:
+    """A log that was ingested and moved away is planned as it was; it is missed where the store lost its record."""
+    if task.log.source.path.exists():
+        return
+    aside = f"damaged/{record_path(task.log.key)}"
+    why = f": its record was damaged ({aside})" if task.store.exists(aside) else ""
+    raise FormatError(
+        f"the log does not exist, and the store holds it no more{why}",
+        change="put the log back for one run",
+        file=task.log.source.path,
+    )
 
 
 def _check_unchanged(log: PlannedLog) -> None:

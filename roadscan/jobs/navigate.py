@@ -88,7 +88,7 @@ def known_keys(survey: Survey, store: Store) -> list[str]:
     planned, _ = plan_logs(survey, store)
     keys = [log.key for log in planned if has_log(store, log.key)]
     try:
-        solutions = plan_trajectories(survey, store, read_log_records(store, keys))
+        solutions = plan_trajectories(survey, store, read_log_records(store, keys, damaged=[]))
     except ConfigError:
         return keys
     return keys + [p.key for p in solutions if has_log(store, p.key)]

@@ -33,6 +33,7 @@ from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.tables.manifest import Manifest, OutputRecord, begin_changes, end_changes, write_failures
+from roadscan.tables.mend import mend_records
 from roadscan.tables.store import Store
 
 
@@ -191,6 +192,7 @@ def run_stages(run: Run, stages: Sequence[Stage] = STAGES) -> None:
 def run_stage(run: Run, stage: Stage) -> None:
     """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
     if run.goes_on is None:
+        mend_records(run.store, lambda text: run.reporter.line(f"note: {text}"))
         run.goes_on = begin_changes(run.store)
     try:
         with rare_collections():

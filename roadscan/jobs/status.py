@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,14 @@ from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.surface_plan import plan_surface_work
 from roadscan.jobs.tile_fates import told
 from roadscan.jobs.tile_plan import TILE
-from roadscan.model.errors import RoadscanError
+from roadscan.model.errors import RoadscanError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.products.base import products
-from roadscan.tables.logs import has_log, read_log_records
+from roadscan.tables.held import WAY_OUT, read_held
+from roadscan.tables.logs import copy_path, has_log, read_log_records, record_path
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
-from roadscan.tables.store import Store, digest_holds
+from roadscan.tables.mend import fault_of
+from roadscan.tables.store import Store
 from roadscan.tiles.accumulator import MOST_BYTES
 
 
@@ -54,6 +56,8 @@ class Status:
     """What failed in the last run."""
     next_run: dict[str, int] = field(default_factory=dict)
     """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
+    damaged: list[str] = field(default_factory=list)
+    """Records of the store that are damaged; the next run mends them."""
     notes: list[str] = field(default_factory=list)
     """What the user should know, beside what is to do."""
     note: str = ""
@@ -64,7 +68,7 @@ class Status:
         """True if nothing is missing, stale or failed."""
         ingested = all(log["state"] == "ingested" for log in self.logs)
         done = not (self.footprints_stale or self.tiles_stale or self.surfaces_stale or self.products_stale)
-        return ingested and done and not self.failures and not self.note
+        return ingested and done and not (self.failures or self.damaged or self.note)
 
 
 BYTES_PER_READING = 100
@@ -78,9 +82,12 @@ def survey_status(survey: Survey, store: Store) -> Status:
     status = Status(failures=read_failures(store))
     planned, unplanned = plan_logs(survey, store)
     status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unplanned]
+    damaged: list[StoreError] = []
+    manifest = Manifest(store, damaged)
+    records = {r.key: r for r in read_log_records(store, damaged=damaged)}
+    status.damaged = list(map(str, damaged))
     for log in planned:
-        ingested = has_log(store, log.key)
-        record = read_log_records(store, [log.key])[0] if ingested else None
+        record = records.get(log.key)
         status.logs.append(
             {
                 "run": log.run,
@@ -89,16 +96,15 @@ def survey_status(survey: Survey, store: Store) -> Status:
                 "format": log.format.name,
                 "rows": record.rows if record else 0,
                 "rejected": record.rejected if record else 0,
-                "state": "ingested" if record else "waiting",
+                "state": "ingested" if record else "damaged" if has_log(store, log.key) else "waiting",
                 "bytes": log.bytes,
             }
         )
     keys = {*(log.key for log in planned), *known_keys(survey, store)}
-    status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in read_log_records(store) if r.key not in keys]
-    manifest = Manifest(store)
+    status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
-    if unplanned or any(log["state"] == "waiting" for log in status.logs):
-        waiting = [log for log in status.logs if log["state"] == "waiting"]
+    waiting = [log for log in status.logs if log["state"] != "ingested"]
+    if unplanned or waiting:
         status.next_run = {
             "logs": len(waiting),
             "raw_bytes": sum(log["bytes"] for log in waiting),
@@ -115,7 +121,7 @@ def survey_status(survey: Survey, store: Store) -> Status:
 
 def _tile_status(status: Status, survey: Survey, store: Store, manifest: Manifest) -> None:
     plan = plan_survey(survey, store)
-    status.notes = outdated_calibrations(plan)
+    status.notes += outdated_calibrations(plan)
     status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
     status.footprints_stale = len(stale_footprints(plan, manifest))
     if not any(manifest.of(PRODUCT)):
@@ -156,14 +162,16 @@ def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _
 
 
 def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
-    faults: list[str] = []
-    manifest = Manifest(store)
-    data = [f for r in read_log_records(store) for own in r.tables.values() for f in own]
+    damaged: list[StoreError] = []
+    manifest = Manifest(store, damaged)
+    logs = read_log_records(store, damaged=damaged)
+    faults = [*map(str, damaged), *_copy_faults(store, [r.key for r in logs]), *_held_faults(store)]
+    data = [f for r in logs for own in r.tables.values() for f in own]
     outputs = [r for r in manifest.all() if r.path]
     total = len(data) + len(outputs)
     with store.scratch() as folder:
         for number, file in enumerate(data, 1):
-            fault = _check_digest(store, folder, file.path, file.bytes, file.digest)
+            fault = fault_of(store, folder, file.path, file.bytes, file.digest)
             key = file.path.split("/log=")[1].split("/")[0]
             faults += [f"{fault}; to ingest it again, remove manifest/logs/{key}.json"] if fault else []
             report(number, total)
@@ -176,19 +184,30 @@ def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
     return faults
 
 
-def _check_digest(store: Store, folder: Path, path: str, size: int, digest: str) -> str | None:
-    found = store.size(path)
-    if found is None:
-        return f"{path}: missing"
-    if found != size:
-        return f"{path}: {found} bytes, expected {size}"
-    if not digest_holds(store.local_copy(path, folder), digest):
-        return f"{path}: the content has changed (digest differs)"
-    return None
+def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
+    """Copies of sound log records that differ from them; they are set aside, so that the next run writes them anew."""
+    faults: list[str] = []
+    for key in keys:
+        copy = copy_path(key)
+        if store.exists(copy) and store.read_bytes(copy) != store.read_bytes(record_path(key)):
+            aside = store.set_aside(copy)
+            faults.append(f"{copy}: differs from the log's record and was set aside ({aside}); the next run copies it")
+    return faults
+
+
+def _held_faults(store: Store) -> list[str]:
+    """Tables without a record that cannot be read."""
+    faults: list[str] = []
+    for name in WAY_OUT:
+        try:
+            read_held(store, name)
+        except StoreError as error:
+            faults.append(str(error))
+    return faults
 
 
 def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
-    fault = _check_digest(store, folder, record.path, record.bytes, record.digest)
+    fault = fault_of(store, folder, record.path, record.bytes, record.digest)
     if fault is not None:
         return fault
     local = store.local_copy(record.path, folder)

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
-from roadscan.model.errors import StoreError
-from roadscan.tables.store import Store
+from roadscan.model.errors import DamagedError, StoreError
+from roadscan.tables.store import Store, bytes_digest
 
 _FOLDER: Final = "manifest/logs"
+_COPIES: Final = "manifest/log_copies"
+_SEAL: Final = b',\n "checksum": "%b"'
+_END: Final = b"\n}"
 
 
 @dataclass(frozen=True)
@@ -75,17 +78,45 @@ def log_folder(table: str, run: str, sensor: str, key: str) -> str:
     return f"tables/{table}/run={run}/sensor={sensor}/log={key}"
 
 
+def record_path(key: str) -> str:
+    """File of a log's record, relative to the survey's root."""
+    return f"{_FOLDER}/{key}.json"
+
+
+def copy_path(key: str) -> str:
+    """File of its copy: raw logs may be archived, and nothing else says how their rows are to be understood."""
+    return f"{_COPIES}/{key}.json"
+
+
 def write_log_record(store: Store, record: LogRecord) -> None:
     """Make a log part of the store."""
-    text = json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True)
-    store.write_bytes(f"{_FOLDER}/{record.key}.json", text.encode())
+    content = _sealed(json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True).encode())
+    store.write_bytes(copy_path(record.key), content)
+    store.write_bytes(record_path(record.key), content)
 
 
-def read_log_records(store: Store, keys: Iterable[str] | None = None) -> list[LogRecord]:
-    """Records of all logs in the store, or of those named, sorted by run, sensor, start and key."""
-    paths = store.files(_FOLDER, ".json") if keys is None else [f"{_FOLDER}/{k}.json" for k in keys]
-    records = [_parse(store.read_bytes(p), store.path(p)) for p in paths]
+def read_log_records(
+    store: Store, keys: Iterable[str] | None = None, damaged: list[StoreError] | None = None
+) -> list[LogRecord]:
+    """Records of all logs in the store, or of those named, sorted by run, sensor, start and key.
+
+    One that is damaged is an error, or joins `damaged` and is left out.
+    """
+    records: list[LogRecord] = []
+    for key in log_keys(store) if keys is None else keys:
+        path = record_path(key)
+        try:
+            records.append(parse_log_record(store.read_bytes(path), key, store.path(path)))
+        except StoreError as error:
+            if damaged is None:
+                raise
+            damaged.append(error)
     return sorted(records, key=lambda r: (r.run, r.sensor, _start(r), r.key))
+
+
+def log_keys(store: Store) -> list[str]:
+    """Keys of all logs in the store, also of those whose record is damaged."""
+    return [path.rsplit("/", 1)[1].removesuffix(".json") for path in store.files(_FOLDER, ".json")]
 
 
 def _start(record: LogRecord) -> int:
@@ -94,8 +125,8 @@ def _start(record: LogRecord) -> int:
 
 
 def has_log(store: Store, key: str) -> bool:
-    """True if the log of this key is in the store."""
-    return store.exists(f"{_FOLDER}/{key}.json")
+    """True if the log of this key is in the store, be its record damaged or not."""
+    return store.exists(record_path(key))
 
 
 def retire_log(store: Store, record: LogRecord) -> None:
@@ -103,8 +134,10 @@ def retire_log(store: Store, record: LogRecord) -> None:
 
     Used when the same bytes were read again under other settings (a corrected clock, say).
     """
-    store.write_bytes(f"superseded/{_FOLDER}/{record.key}.json", store.read_bytes(f"{_FOLDER}/{record.key}.json"))
-    store.remove(f"{_FOLDER}/{record.key}.json")  # before its rows go: no log is half there
+    path = record_path(record.key)
+    store.write_bytes(f"superseded/{path}", store.read_bytes(path))
+    store.remove(path)  # before its rows go: no log is half there
+    store.remove(copy_path(record.key))
     for table in record.tables:
         if store.is_folder and store.exists(record.folder(table)):
             aside = f"superseded/{record.folder(table)}"
@@ -114,9 +147,27 @@ def retire_log(store: Store, record: LogRecord) -> None:
             store.fs.mv(store.path(record.folder(table)), target, recursive=True)
 
 
-def _parse(content: bytes, path: str) -> LogRecord:
+def _sealed(text: bytes) -> bytes:
+    """A JSON object with its checksum as last member."""
+    return text.removesuffix(_END) + _SEAL % bytes_digest(text).encode() + _END
+
+
+def _unsealed(content: bytes) -> bytes:
+    """The object without its checksum, if it has one, as records of older versions have not."""
+    mark, _, _ = _SEAL.partition(b"%b")
+    start = content.rfind(mark)
+    if start < 0:
+        return content
+    text = content[:start] + _END
+    if content != _sealed(text):
+        raise ValueError("its checksum differs")
+    return text
+
+
+def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
+    """The record of the log `key`, from the content of the file `path`."""
     try:
-        raw = json.loads(content)
+        raw = json.loads(_unsealed(content))
         raw["tables"] = {
             name: tuple(
                 DataFile(
@@ -130,10 +181,13 @@ def _parse(content: bytes, path: str) -> LogRecord:
             )
             for name, files in raw["tables"].items()
         }
-        return LogRecord(**raw)
-    except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(
-            f"the log record cannot be read ({error})",
-            change="remove it; the next run reads the log again",
+        record = LogRecord(**raw)
+        if record.key != key:
+            raise ValueError(f"it is the record of the log {record.key}")
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise DamagedError(
+            f"the log record is damaged ({error})",
+            change="the next run puts its copy in its place, or reads the log again",
             file=path,
         ) from error
+    return record

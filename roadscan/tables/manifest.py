@@ -10,8 +10,8 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from roadscan.model.errors import StoreError
-from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, table_of, unpacked
+from roadscan.model.errors import DamagedError, StoreError
+from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
 from roadscan.tables.store import Store
 
 __all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
@@ -34,11 +34,6 @@ class _Part:
     records: Packed | None = None
     """What it holds, where that was written a moment ago and is soon merged."""
 
-    @property
-    def number(self) -> int:
-        """Its place among the parts."""
-        return int(self.path.rsplit("-", 1)[1].removesuffix(".parquet"))
-
 
 class Manifest:
     """All output records; one writer at a time (the run that holds the store's lock).
@@ -49,11 +44,18 @@ class Manifest:
     Records stay in tables; only those of products that are asked for one by one become Python's.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, damaged: list[StoreError] | None = None) -> None:
+        """Read the parts. One that is damaged is an error, or joins `damaged`: what is sound of it counts then."""
         self._store = store
-        read = _read_parts(store)
-        self._parts = [_Part(path, table.num_rows) for path, table in read]
-        self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(table for _, table in read)]))
+        read = read_parts(store)
+        faults = [one.fault for one in read if one.fault is not None]
+        if faults and damaged is None:
+            raise faults[0]
+        if damaged is not None:
+            damaged += faults
+        self._parts = [_Part(one.path, one.table.num_rows) for one in read if one.fault is None]
+        self._next = read[-1].number + 1 if read else 0
+        self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(one.table for one in read)]))
         self._behind: list[_Part] = []  # parts that the table does not know yet
         self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, of products that were asked for
 
@@ -144,7 +146,7 @@ class Manifest:
         """Bring all parts into one, without what is no more."""
         self.settle()
         old, self._parts = self._parts, []
-        self._write(Packed.of(self._table, "lz4"), old[-1].number + 1 if old else 0)
+        self._write(Packed.of(self._table, "lz4"))
         for part in old:
             self._store.remove(part.path)
 
@@ -171,7 +173,7 @@ class Manifest:
         self._append(Packed.of(table_of([(product, unit, "", "", 0, "", "") for product, unit in outputs])))
 
     def _append(self, records: Packed) -> None:
-        self._behind.append(self._write(records, self._parts[-1].number + 1 if self._parts else 0, keep=True))
+        self._behind.append(self._write(records, keep=True))
         if len(self._parts) > _MOST_PARTS:
             self._merge()
 
@@ -186,50 +188,75 @@ class Manifest:
         old = self._parts[first:]
         table, _ = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
         del self._parts[first:]
-        self._write(Packed.of(table, "lz4"), old[-1].number + 1)
+        self._write(Packed.of(table, "lz4"))
         for part in old:  # where these stay, the new part says once more what they say
             self._store.remove(part.path)
 
     def _read(self, part: _Part) -> pa.Table:
         return unpacked(self._store.read_bytes(part.path)) if part.records is None else part.records.table()
 
-    def _write(self, records: Packed, number: int, keep: bool = False) -> _Part:
-        path = f"{_FOLDER}/part-{number:08d}.parquet"
+    def _write(self, records: Packed, keep: bool = False) -> _Part:
+        path = part_path(self._next)
         self._store.write_bytes(path, records.content)
+        self._next += 1
         self._parts.append(_Part(path, records.rows, records if keep else None))
         return self._parts[-1]
 
 
-def _read_parts(store: Store) -> list[tuple[str, pa.Table]]:
+@dataclass(frozen=True)
+class ReadPart:
+    """A part as it was found."""
+
+    path: str
+    table: pa.Table
+    """Its records; of a damaged one those that are sound."""
+    fault: StoreError | None
+
+    @property
+    def number(self) -> int:
+        """Its place among the parts."""
+        return int(self.path.rsplit("-", 1)[1].removesuffix(".parquet"))
+
+
+def part_path(number: int) -> str:
+    """File of a part, relative to the survey's root."""
+    return f"{_FOLDER}/part-{number:08d}.parquet"
+
+
+def read_parts(store: Store) -> list[ReadPart]:
     """Parts and their records, in order; listed again where a run at work has merged some of them meanwhile.
 
     Raises
     ------
     StoreError
-        A part cannot be read.
+        Parts vanish again and again while they are read.
     """
     looks = 0
     while True:
         looks += 1
         paths = store.files(_FOLDER, ".parquet")
         try:
-            return [(path, _whole(store, path)) for path in paths]
+            return [_read_part(store, path) for path in paths]
         except StoreError:
-            if looks == _LOOKS or all(map(store.exists, paths)):
+            if looks == _LOOKS:
                 raise
 
 
-def _whole(store: Store, path: str) -> pa.Table:
-    content = store.read_bytes(path)
+def _read_part(store: Store, path: str) -> ReadPart:
     try:
-        return unpacked(content).cast(RECORDS)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise StoreError(
-            f"this part of the manifest is damaged: {error}",
-            expected="a Parquet file of records of outputs",
-            change="remove it and run again: what it alone tells of is made anew",
-            file=store.path(path),
-        ) from error
+        content = store.read_bytes(path)
+    except StoreError as error:
+        if not store.exists(path):
+            raise
+        return ReadPart(path, RECORDS.empty_table(), error)
+    table, reason = sound_rows(content)
+    fault = DamagedError(
+        f"this part of the manifest is damaged: {reason}",
+        expected="a Parquet file of records of outputs",
+        change="the next run sets it aside and makes again what it alone told of",
+        file=store.path(path),
+    )
+    return ReadPart(path, table, fault if reason else None)
 
 
 def begin_changes(store: Store) -> bool:

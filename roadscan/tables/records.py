@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from collections.abc import Sequence
@@ -25,6 +26,12 @@ RECORDS: Final = pa.schema(
         ("detail", pa.string()),
     ]
 )
+
+_GROUP_ROWS: Final = 8192
+"""Rows that a damaged page costs at most."""
+
+_DAMAGE: Final = (pa.ArrowException, OSError, ValueError)
+"""What comes of reading damaged files."""
 
 Row: TypeAlias = tuple[str, str, str, str, int, str, str]
 
@@ -73,7 +80,10 @@ class Packed:
     def of(cls, table: pa.Table, compression: str = "none") -> Packed:
         """A table of records, packed; to be compressed where it is long kept, which takes twice the time."""
         buffer = io.BytesIO()
-        pq.write_table(table, buffer, compression=compression, use_dictionary=["product"], write_statistics=False)
+        pq.write_table(
+            table, buffer, row_group_size=_GROUP_ROWS, compression=compression, use_dictionary=["product"],
+            write_statistics=False, write_page_checksum=True,
+        )  # fmt: skip
         return cls(buffer.getvalue(), table.num_rows)
 
     def table(self) -> pa.Table:
@@ -83,7 +93,28 @@ class Packed:
 
 def unpacked(content: bytes) -> pa.Table:
     """Records of such a file; read by this thread alone, as :meth:`Store.read_table` does."""
-    return pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+    return _opened(content).read(use_threads=False)
+
+
+def sound_rows(content: bytes) -> tuple[pa.Table, str]:
+    """Records of such a file without the row groups that are damaged, and what is wrong with these; empty if nothing
+    is.
+    """
+    try:
+        return unpacked(content).cast(RECORDS), ""
+    except _DAMAGE as error:
+        reason = str(error)
+    sound = [RECORDS.empty_table()]
+    with contextlib.suppress(*_DAMAGE):
+        file = _opened(content)
+        for group in range(file.num_row_groups):
+            with contextlib.suppress(*_DAMAGE):
+                sound.append(file.read_row_group(group, use_threads=False).cast(RECORDS))
+    return pa.concat_tables(sound), reason
+
+
+def _opened(content: bytes) -> pq.ParquetFile:
+    return pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
 
 
 def latest(table: pa.Table, *, forgotten: bool = False) -> tuple[pa.Table, list[str]]:

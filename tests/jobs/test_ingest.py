@@ -163,10 +163,12 @@ def test_a_store_with_older_digests_stays_sound_and_current(tmp_path: Path) -> N
     ingest(survey, store)
     for path in store.files("manifest/logs"):
         record = json.loads(store.read_bytes(path))
+        del record["checksum"]
         for files in record["tables"].values():
             for file in files:
                 file["digest"] = hashlib.blake2b(store.read_bytes(file["path"]), digest_size=16).hexdigest()
         store.write_bytes(path, json.dumps(record).encode())
+    store.remove("manifest/log_copies")
     assert verify_store(store) == []
     for file in older:
         os.utime(file)  # copied: another time, the same bytes

@@ -7,17 +7,23 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
 
 1. *Lines*: medians of seven cells in eight directions, 22.5° apart.
 2. *Ground*: the median of seven in a row, of seven such in a column, every third cell: 19 × 19 cells, so that 20
-   cells of crack do not fill it.
+   cells of crack do not fill it. At borders the missing side is the other mirrored, else a slope would stand out.
 3. *Detail*: where a line's median differs from the ground by `detail_sigmas` of its own σ, at seven or more of the
    49 cells around (a crack as long as a line; outliers that meet by chance make fewer), then on to neighbours above
    `edge_sigmas` twice, and one cell more for the foot of its walls.
-4. On detail the median along one line: the direction whose medians fit the heights of the 25 cells around best, each
-   misfit cut off at `outlier_sigmas`, so that an outlier has no say. On level ground the median of seven in a row, of
-   seven such in a column, side by side; of these the mean of 7 × 7, every second one (a median of medians smooths no
-   more: it keeps whatever rises or falls steadily). Cells with detail are left out.
+4. *Direction*: the one whose medians have the least risk at the 49 cells around. Risk is Stein's (1981) unbiased
+   estimate of the squared error: misfit² + 2 σ² for each cell that is its own median. Without the second term lines
+   across a wall would win: their median is the cell in the middle, noise and all. A misfit is cut off at
+   `outlier_sigmas`, so that an outlier has no say.
+5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
+   on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
+   (outliers replaced by the line's median), and of all five that of least risk (``kernels/supports.py``).
+6. *Level ground*: the median of seven in a row, of seven such in a column, side by side; of these the mean of 7 × 7,
+   every second one (a median of medians smooths no more: it keeps whatever rises or falls steadily). Cells with
+   detail are left out.
 
-What is not measured counts nowhere, and places beyond the grid are like that. In the mean a cell counts only together
-with its mirror image, so that a slope has no say at borders and holes.
+What is not measured counts nowhere, and places beyond the grid are like that. In means and fits a cell counts only
+together with its mirror image, so that a slope has no say at borders and holes.
 """
 
 from __future__ import annotations
@@ -27,7 +33,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.line_medians import CELLS, judge_lines, keep_better, line_means, line_medians, window_sums
+from roadscan.kernels.line_medians import (
+    CELLS,
+    judge_lines,
+    keep_better,
+    line_means,
+    line_medians,
+    mirrored_line_medians,
+    window_sums,
+)
+from roadscan.kernels.supports import SUPPORTS, heights_by_support, least_risk
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 
 Float64 = npt.NDArray[np.float64]
@@ -46,8 +61,18 @@ _LEAST_CELLS = 5
 MEDIAN_SIGMA = 1.25
 """σ of the median of n normal values, times √n (its limit for large n; 1.21 for seven)."""
 
-REACH = _HALF * _GROUND_STEP + _HALF + _GROWTHS + 1 + _HALF * (1 + _LEVEL_STEP)
-"""Cells to each side that the median of a cell depends on: ground, its count, growth, foot, level ground."""
+_ACROSS_ROWS = 4
+"""Which of the directions runs along a column."""
+_FIT_REACH = 6
+_CHOICE = 0.12
+"""How much a cell has more part in what lies along its line, because eight directions were tried on its height (of pure
+noise: covariance 0.23 with the median along the line of least risk, 0.12 of it the median's own)."""
+
+_DETAIL_REACH = _HALF * _GROUND_STEP + 2 * _HALF + _GROWTHS + 1
+"""Ground and the columns in it, its count, growth, foot."""
+REACH = _DETAIL_REACH + _HALF * (1 + _LEVEL_STEP)
+"""Cells to each side that the median of a cell depends on: detail, and level ground. A height on detail reaches no
+farther: its risk, detail there or the fit and the outliers in it."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +82,31 @@ class DetailMedian:
     height_m: Float64
     """(rows, columns); NaN where nothing was measured."""
     detail: Bool
-    """(rows, columns), True where it is one along a line."""
+    """(rows, columns), True on a crack, an edge or a stone."""
 
 
 def directions() -> Int64:
     """(8, 7, 2) rows and columns of the cells of each line, from its middle; halves are rounded to the middle."""
+    return _lines(_HALF)
+
+
+def _lines(half: int) -> Int64:
     angle = np.arange(8) * np.pi / 8
     step = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     step /= np.abs(step).max(axis=-1, keepdims=True)
-    away = step[:, None, :] * np.arange(-_HALF, _HALF + 1)[None, :, None]
+    away = step[:, None, :] * np.arange(-half, half + 1)[None, :, None]
     return np.asarray(np.sign(away) * np.ceil(np.abs(away) - 0.5 - 1e-9), dtype=np.int64)
+
+
+def lines_onward() -> Int64:
+    """(8, 6, 2) one half of the same lines, farther."""
+    return np.ascontiguousarray(_lines(_FIT_REACH)[:, _FIT_REACH + 1 :])
+
+
+def detail_pairs() -> Int64:
+    """(40, 2) one cell of each pair about the middle of 9 × 9, those of smaller squares first."""
+    away = [(i, j) for i in range(5) for j in range(-4, 5) if i > 0 or j > 0]
+    return np.array(sorted(away, key=lambda cell: (max(cell[0], abs(cell[1])), cell)), dtype=np.int64)
 
 
 def detail_median(height_m: Float64, config: SurfaceSmoothing) -> DetailMedian:
@@ -78,13 +118,13 @@ def detail_median(height_m: Float64, config: SurfaceSmoothing) -> DetailMedian:
     """
     measured = ~np.isnan(height_m)
     heights = np.where(measured, height_m, _ABSENT)
-    found = _Lines(heights, measured, config)
-    detail = found.detail()
+    lines = _Lines(heights, measured, config)
+    detail = lines.detail()
     plain = measured & ~detail
-    level = _square_median(np.where(plain, heights, _ABSENT), 1)
+    level = _square_median(np.where(plain, heights, _ABSENT))
     level = _square_mean(np.where(plain, level, _ABSENT), _LEVEL_STEP)
-    median = np.where(detail, found.median_m, level)
-    return DetailMedian(np.where(measured, median, np.nan), detail)
+    level[detail] = lines.supported(heights, detail)
+    return DetailMedian(np.where(measured, level, np.nan), detail)
 
 
 class _Lines:
@@ -92,22 +132,46 @@ class _Lines:
 
     def __init__(self, heights: Float64, measured: Bool, config: SurfaceSmoothing) -> None:
         self.measured, self.config = measured, config
-        ground = _square_median(heights, _GROUND_STEP)
-        padded = _padded(heights, _HALF)
-        limit = config.outlier_sigmas * config.sigma_m
         shape = heights.shape
+        padded = _padded(heights, _HALF)
+        median, count = np.empty(shape), np.empty(shape)
+        own, risk = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        line_medians(padded, _HALF, directions()[_ACROSS_ROWS], _ABSENT, median, count, own)
+        ground = _ground(heights, median)
         self.contrast = np.zeros(shape, np.float32)
         """Greatest difference of a line's median from the ground, in σ of that median."""
         self.median_m = np.full(shape, _ABSENT)
-        """The median along the line that fits best."""
+        """The median along the line of least risk."""
+        self.own, self.direction = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+        """Share of the cell itself in that median, and which line it is."""
         least = np.full(shape, np.inf, np.float32)
-        median, count = np.empty(shape), np.empty(shape)
-        misfit = np.empty(shape, np.float32)
-        for line in directions():
-            line_medians(padded, _HALF, line, _ABSENT, median, count)
-            judge_lines(heights, ground, median, count, _LEAST_CELLS, limit, _ABSENT, self.contrast, misfit)
-            keep_better(_sums(misfit, 2).ravel(), median.ravel(), least.ravel(), self.median_m.ravel())
-        self.contrast /= np.float32(MEDIAN_SIGMA * config.sigma_m)
+        best = (least.ravel(), self.median_m.ravel(), self.own.ravel(), self.direction.ravel())
+        sigma_m, limit = config.sigma_m, config.outlier_sigmas
+        for direction, line in enumerate(directions()):
+            line_medians(padded, _HALF, line, _ABSENT, median, count, own)
+            judge_lines(heights, ground, median, count, own, _LEAST_CELLS, sigma_m, limit, _ABSENT, self.contrast, risk)
+            keep_better(_sums(risk, _HALF).ravel(), median.ravel(), own.ravel(), np.uint8(direction), *best)
+        self.contrast /= np.float32(MEDIAN_SIGMA * sigma_m)
+
+    def supported(self, heights: Float64, detail: Bool) -> Float64:
+        """Heights (n,) of the cells on detail, each over the support of least risk."""
+        row, column = np.nonzero(detail)
+        middle, sigma_m = self.median_m[detail], self.config.sigma_m
+        with np.errstate(invalid="ignore"):
+            outlier = np.abs(heights - self.median_m) > self.config.outlier_sigmas * sigma_m
+        clean = _padded(np.where(outlier & self.measured, self.median_m, heights), _FIT_REACH)
+        off, own = np.empty((row.size, SUPPORTS), np.float32), np.empty((row.size, SUPPORTS), np.float32)
+        heights_by_support(
+            clean, _FIT_REACH, row, column, middle, self.own[detail], _CHOICE, self.direction[detail],
+            lines_onward(), detail_pairs(), _ABSENT, off, own,
+        )  # fmt: skip
+        number = np.full(detail.shape, -1, np.int32)
+        number[detail] = np.arange(row.size, dtype=np.int32)
+        number = np.pad(number, _HALF, constant_values=-1)
+        chosen = np.empty(row.size, np.float32)
+        height = heights[detail] - middle
+        least_risk(row, column, number, height, off, own, sigma_m, self.config.outlier_sigmas, chosen)
+        return np.asarray(middle + chosen)
 
     def detail(self) -> Bool:
         """Cells on a crack, an edge or a stone, with the foot of its walls."""
@@ -123,12 +187,25 @@ def _beside(cells: Bool) -> Bool:
     return np.asarray(_sums(cells.astype(np.float32), 1) > 0.5)
 
 
-def _square_median(heights: Float64, step: int) -> Float64:
-    """Median of seven in a row, of seven of these in a column, `step` cells apart."""
-    across, down, margin = _cross(step)
+def _square_median(heights: Float64) -> Float64:
+    """Median of seven in a row, of seven of these in a column, side by side."""
+    across, down, margin = _cross(1)
     first, second, count = np.empty(heights.shape), np.empty(heights.shape), np.empty(heights.shape)
-    line_medians(_padded(heights, margin), margin, across, _ABSENT, first, count)
-    line_medians(_padded(first, margin), margin, down, _ABSENT, second, count)
+    own = np.empty(heights.shape, np.float32)
+    line_medians(_padded(heights, margin), margin, across, _ABSENT, first, count, own)
+    line_medians(_padded(first, margin), margin, down, _ABSENT, second, count, own)
+    return second
+
+
+def _ground(heights: Float64, column_median: Float64) -> Float64:
+    """Median of seven in a row, of seven of these in a column, every third; what is missing is mirrored.
+
+    A row is mirrored about the median of seven in the column, which has no slope across.
+    """
+    across, down, margin = _cross(_GROUND_STEP)
+    first, second = np.empty(heights.shape), np.empty(heights.shape)
+    mirrored_line_medians(_padded(heights, margin), margin, across, column_median, _ABSENT, first)
+    mirrored_line_medians(_padded(first, margin), margin, down, first, _ABSENT, second)
     return second
 
 

@@ -35,8 +35,8 @@ until F is the minimum. It begins where the paper begins, at the mean of P and P
 on what else is in the window, so the number of steps follows from the proof instead: the first n with qⁿ ≤ `tolerance`;
 then ‖F_n − F*‖ ≤ tolerance ‖F_0 − F*‖. With the paper's weights q = 0.60: 14 steps for 1/1000.
 
-**Windows**. A step sees four cells, the choice two, the median 24. A cell farther than :func:`halo_cells` from the
-window's border (82 cells with the paper's weights) has the same bits in every window, because each cell's arithmetic
+**Windows**. A step sees four cells, the choice two, the median 27. A cell farther than :func:`halo_cells` from the
+window's border (85 cells with the paper's weights) has the same bits in every window, because each cell's arithmetic
 is the same and in the same order everywhere. Conjugate gradients would need fewer steps, but have no such halo: their
 sums run over the whole window.
 

@@ -7,9 +7,11 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import eigsh, spsolve
 
-from roadscan.kernels.line_medians import line_means, line_medians
+from roadscan.kernels.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
+from roadscan.kernels.supports import heights_by_support, least_risk
 from roadscan.model.errors import RoadscanError
 from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.surfaces.detail_median import REACH, detail_median, detail_pairs, lines_onward
 from roadscan.surfaces.smoothing import FILTER_BOUND, Smoothing, halo_cells, smooth_surface, steps
 from tests.surfaces.patches import (
     PROFILER_1,
@@ -151,6 +153,16 @@ def test_same_bits_in_any_window():
         )
 
 
+def test_median_has_the_same_bits_in_any_window():
+    height = bumpy((300, 330), seed=7)
+    whole = detail_median(height, CONFIG)
+    for top, left in ((0, 0), (40, 61), (83, 90), (111, 144), (150, 170)):
+        window = (slice(top, top + 150), slice(left, left + 160))
+        part = detail_median(height[window], CONFIG)
+        inner = (slice(REACH, -REACH),) * 2
+        np.testing.assert_array_equal(part.height_m[inner], whole.height_m[window][inner])
+
+
 def test_holes_stay_and_nothing_crosses_them():
     height = bumpy((40, 60))
     height[:, 25 : 25 + 10] = np.nan
@@ -172,21 +184,135 @@ def test_a_plane_stays_a_plane_up_to_its_border():
     assert np.abs(smooth_surface(plane, CONFIG) - plane)[30:-30, 30:-30].max() < 1e-9
 
 
+def scattered(shape, share, seed=0):
+    """Normal values, some missing."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=shape)
+    values[rng.random(shape) < share] = np.inf
+    return values
+
+
+BENT = np.array([(-3, -2), (-2, -1), (-1, -1), (0, 0), (1, 1), (2, 1), (3, 2)])
+
+
 def test_lines_like_numpy():
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(14, 17))
-    values[rng.random(values.shape) < 0.3] = np.inf
-    line = np.array([(-3, -2), (-2, -1), (-1, -1), (0, 0), (1, 1), (2, 1), (3, 2)])
-    median, count, mean = np.empty((8, 11)), np.empty((8, 11)), np.empty((8, 11))
-    line_medians(values, 3, line, np.inf, median, count)
-    line_means(values, 3, line, np.inf, mean)
+    values = scattered((14, 17), 0.3)
+    median, count, mean, own = *(np.empty((8, 11)) for _ in range(3)), np.empty((8, 11), np.float32)
+    line_medians(values, 3, BENT, np.inf, median, count, own)
+    line_means(values, 3, BENT, np.inf, mean)
     for i, j in np.ndindex(8, 11):
-        own = values[i + 3 + line[:, 0], j + 3 + line[:, 1]]
-        there = own[np.isfinite(own)]
+        line = values[i + 3 + BENT[:, 0], j + 3 + BENT[:, 1]]
+        there = line[np.isfinite(line)]
         assert count[i, j] == there.size
         assert median[i, j] == (np.median(there) if there.size else np.inf)
-        paired = own[np.isfinite(own) & np.isfinite(own[::-1])]
-        assert mean[i, j] == (pytest.approx(paired.mean()) if np.isfinite(own[3]) else np.inf)
+        paired = line[np.isfinite(line) & np.isfinite(line[::-1])]
+        assert mean[i, j] == (pytest.approx(paired.mean()) if np.isfinite(line[3]) else np.inf)
+
+
+def test_share_of_a_cell_in_its_median_is_the_derivative():
+    values = scattered((14, 17), 0.3)
+    median, moved, count = (np.empty((8, 11)) for _ in range(3))
+    own, other = np.empty((8, 11), np.float32), np.empty((8, 11), np.float32)
+    line_medians(values, 3, BENT, np.inf, median, count, own)
+    for i, j in np.ndindex(8, 11):
+        if np.isfinite(values[i + 3, j + 3]):
+            shifted = values.copy()
+            shifted[i + 3, j + 3] += 1e-6
+            line_medians(shifted, 3, BENT, np.inf, moved, count, other)
+            assert own[i, j] == pytest.approx((moved - median)[i, j] / 1e-6, abs=1e-3)
+    assert set(np.unique(own)) >= {0.0, 0.5, 1.0}
+
+
+def test_risk_of_a_line_like_numpy():
+    heights = scattered((8, 11), 0.3)
+    ground, median, count, own = scattered((4, 8, 11), 0.0, seed=2)
+    own, contrast = own.astype(np.float32), np.full((8, 11), 0.5, np.float32)
+    count, risk = 4.0 + np.abs(count).round(), np.empty((8, 11), np.float32)
+    judge_lines(heights, ground, median, count, own, 5, 0.4, 3.0, np.inf, contrast, risk)
+    there = np.isfinite(heights)
+    misfit = np.minimum(np.abs(heights - median) / 0.4, 3.0)
+    np.testing.assert_allclose(risk, np.where(there, misfit**2 + 2.0 * own, 0.0), rtol=1e-5)
+    away = np.where(there & (count >= 5), np.abs(median - ground) * np.sqrt(count), 0.0)
+    np.testing.assert_allclose(contrast, np.maximum(away, 0.5), rtol=1e-6)
+
+
+def test_medians_at_a_border_do_not_lean():
+    y, x = np.indices((30, 40))
+    slope = np.pad(1.0 * x - 0.5 * y, 3, constant_values=np.inf)
+    line = np.stack([np.zeros(7, np.int64), np.arange(-3, 4)], axis=-1)
+    median, plain, count, own = *(np.empty((30, 40)) for _ in range(3)), np.empty((30, 40), np.float32)
+    mirrored_line_medians(slope, 3, line, slope[3:-3, 3:-3], np.inf, median)
+    line_medians(slope, 3, line, np.inf, plain, count, own)
+    assert np.abs(plain - slope[3:-3, 3:-3]).max() == 1.5
+    lean = np.abs(median - slope[3:-3, 3:-3])
+    assert lean.max() == 0.5  # where one cell alone is missing
+    assert lean[:, [0, 1, -2, -1]].max() == 0.0
+    one = scattered((7, 7), 0.0)
+    one[3, [1]] = np.inf  # a single dropout is not mirrored
+    mirrored_line_medians(one, 3, line, np.full((1, 1), -9.0), np.inf, median[:1, :1])
+    assert median[0, 0] == np.median(one[3][np.isfinite(one[3])])
+
+
+def test_a_slope_has_no_detail_up_to_its_border():
+    rng = np.random.default_rng(3)
+    y, x = np.indices((160, 160))
+    slope = 560.0 + 0.025 * 0.005 * x + 0.01 * 0.005 * y + rng.normal(0.0, 0.0005, x.shape)
+    assert detail_median(slope, CONFIG).detail.mean() < 0.01
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_heights_by_support_like_least_squares(share):
+    values = scattered((19, 23), share)
+    values[9, 9:14] = np.arange(5) * 0.1
+    row, column = np.full(5, 3), np.arange(3, 8)
+    pairs, onward = detail_pairs(), lines_onward()
+    off, own = np.empty((5, 5), np.float32), np.empty((5, 5), np.float32)
+    middle, direction = np.linspace(-1, 1, 5), np.arange(5, dtype=np.uint8)
+    heights_by_support(
+        values, 6, row, column, middle, np.full(5, 0.5), 0.25, direction, onward, pairs, np.inf, off, own
+    )
+    for t in range(5):
+        i, j = row[t] + 6, column[t] + 6
+
+        def both(cells, i=i, j=j):
+            """Heights of the cells whose mirror image is measured as well, and where they are."""
+            found = [(c, values[i + c[0], j + c[1]]) for c in [*cells, *(-cells)]]
+            whole = [(c, z) for c, z in found if np.isfinite(z) and np.isfinite(values[i - c[0], j - c[1]])]
+            return np.array([c for c, _ in whole]).reshape(-1, 2), np.array([z for _, z in whole])
+
+        assert (off[t, 0], own[t, 0]) == (0.0, 0.75)
+        for k, n in ((1, 1), (2, 6)):
+            _, z = both(onward[t, :n])
+            if z.size >= n:
+                assert off[t, k] + middle[t] == pytest.approx((z.sum() + values[i, j]) / (z.size + 1), abs=1e-6)
+                assert own[t, k] == pytest.approx(1 / (z.size + 1) + (0.25 if z.size else 0.0))
+        for k, n in ((3, 24), (4, 40)):
+            cells, z = both(pairs[:n])
+            cells, z = np.vstack([cells, [(0, 0)]]), np.append(z, values[i, j])
+            design = [np.ones(z.size), (cells**2).sum(axis=1)]
+            if share == 0.0:  # nothing changes with all the terms of a paraboloid
+                design += [cells[:, 0], cells[:, 1], cells[:, 0] * cells[:, 1], cells[:, 0] ** 2]
+            solved = np.linalg.pinv(np.stack(design, axis=-1).astype(float))[0]
+            assert off[t, k] + middle[t] == pytest.approx(solved @ z, abs=1e-6)
+            assert own[t, k] == pytest.approx(solved[-1], abs=1e-6)
+
+
+def test_support_of_least_risk():
+    rng = np.random.default_rng(5)
+    row, column = (a.ravel() for a in np.indices((9, 12)))
+    number = np.pad(np.arange(108, dtype=np.int32).reshape(9, 12), 3, constant_values=-1)
+    off = rng.normal(0.0, 0.3, (108, 5)).astype(np.float32)
+    own = rng.uniform(0.0, 0.5, (108, 5)).astype(np.float32)
+    height = rng.normal(size=108)
+    height[::17] += 30.0
+    cost = np.minimum(np.abs(height[:, None] - off) / 0.7, 4.0) ** 2 + 2.0 * own
+    expected = np.empty(108)
+    for t in range(108):
+        near = (np.abs(row - row[t]) <= 3) & (np.abs(column - column[t]) <= 3)
+        expected[t] = off[t, np.argmin(cost[near].sum(axis=0))]
+    chosen = np.empty(108, np.float32)
+    least_risk(row, column, number, height, off, own, 0.7, 4.0, chosen)
+    np.testing.assert_array_equal(chosen, expected.astype(np.float32))
 
 
 def test_says_what_a_grid_is():
@@ -199,6 +325,7 @@ def test_says_what_a_grid_is():
     [
         (PROFILER_5, ((0.006, 0.01), (0.02, 0.03)), 0.1),
         (PROFILER_1, ((0.003, 0.005), (0.006, 0.01), (0.01, 0.02)), 0.1),
+        (PROFILER_1, ((0.02, 0.005),), 0.03),  # wide and flat: the 9 × 9 median is right within 0.05
         (SICK, ((0.02, 0.03),), 0.15),  # two cells wide, three σ deep; the raw cells are off by 0.06 as well
     ],
     ids=lambda v: getattr(v, "name", ""),

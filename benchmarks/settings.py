@@ -13,10 +13,10 @@ VARIABLE = "ROADSCAN_BENCH_SETTINGS"
 class Settings:
     """How large the surveys are and how often they run."""
 
-    pair_m: float = 250.0
+    pair_m: float = 400.0
     """Length of the pair's drive (m): 4 million readings and 12 MB of raw log a metre."""
-    hdl_s: float = 60.0
-    """Duration of the HDL-32E's drive (s)."""
+    hdl_s: float = 300.0
+    """Duration of the HDL-32E's drive (s): in a minute a quarter of the time would be the workers' start."""
     sick_s: float = 3600.0
     """Duration of the SICK's drive (s)."""
     repeats: int = 5

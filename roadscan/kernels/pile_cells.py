@@ -13,7 +13,17 @@ import numpy as np
 from roadscan.kernels.full_cells import select_arrays, statistics_of_full
 from roadscan.kernels.lanes import LANES, statistics_of, statistics_of_64
 from roadscan.kernels.options import bare, bare_inlined
-from roadscan.kernels.row_piles import BLOCK, COLUMN, LIGHT, LIGHT_SHIFT, free_row, height_of, last_block, size_of
+from roadscan.kernels.row_piles import (
+    BLOCK,
+    COLUMN,
+    LIGHT,
+    LIGHT_SHIFT,
+    fetch_block,
+    free_row,
+    height_of,
+    last_block,
+    size_of,
+)
 
 statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
 
@@ -67,6 +77,7 @@ def sort_row(end, piles, sums, ends, used, heights):
     one = np.int64(1) << COUNT_SHIFT
     block = last_block(end)
     while block >= 0:
+        fetch_block(np.int64(before[block]), records)
         first = np.uint64(block) * np.uint64(BLOCK)
         for k in range(np.uint64(size_of(block, end, sizes))):
             record = records[first + np.uint64(k)]

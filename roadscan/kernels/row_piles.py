@@ -194,6 +194,14 @@ def height_of(record):
 
 
 @bare_inlined
+def fetch_block(block, records):
+    """A block's readings are wanted soon; −1 for none."""
+    first = np.uint64(max(block, 0)) * np.uint64(BLOCK)
+    for k in range(np.uint64(0), np.uint64(BLOCK), np.uint64(_LINE)):
+        fetch_line(records, first + k)
+
+
+@bare_inlined
 def last_block(end):
     """Number of the last block of a pile that ends at `end`, −1 without readings."""
     return (np.int64(end) - 1) >> _BITS

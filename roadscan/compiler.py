@@ -8,6 +8,11 @@ an empty cache want the same functions at the same moment. Without a lock each o
 that store variants of one function at once, Numba's index keeps only one. A process waits for a function's lock with
 at most the locks of that function's callers in hand, and functions do not call one another in circles: nobody waits
 for ever. The system gives back the locks of a process that dies.
+
+Each compilation has a number of its own in the names of its machine code, whichever process it ran in. Numba counts
+from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
+name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
+(numba/numba, issue 10486).
 """
 
 from __future__ import annotations
@@ -15,12 +20,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import secrets
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import llvmlite.binding
 import numba
+from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
@@ -127,4 +134,10 @@ def _use_whole_registers() -> None:
         numba.config.reload_config()
 
 
+def _number_apart() -> None:
+    """Number compilations so that no two processes use a number twice."""
+    FunctionIdentity._unique_ids = iter(lambda: secrets.randbits(63), None)
+
+
 _use_whole_registers()
+_number_apart()

@@ -168,7 +168,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
             fates = _placed(task, apart)[1]
     rows, schema = _ranges(pairs, one, spans), table_schema(PRODUCT)
     content = parquet_bytes(rows.cast(schema.arrow()), schema)
-    task.store.write_bytes(task.target, content)
+    task.store.write_bytes(task.target, content, lasting=False)
     return OutputRecord(
         PRODUCT, one.file, task.key, task.target, len(content), bytes_digest(content), _detail(rows, fates)
     )

@@ -128,7 +128,8 @@ def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[st
     """Row groups of a data file."""
     try:
         with store.fs.open(store.path(file), "rb") as stream:
-            return pq.ParquetFile(stream).read_row_groups(list(groups), columns=columns, use_threads=False)
+            opened = pq.ParquetFile(stream, page_checksum_verification=True)
+            return opened.read_row_groups(list(groups), columns=columns, use_threads=False)
     except (OSError, pa.ArrowInvalid) as error:
         raise StoreError(
             f"ingested rows cannot be read ({error})",

@@ -91,7 +91,7 @@ def copy_path(key: str) -> str:
 def write_log_record(store: Store, record: LogRecord) -> None:
     """Make a log part of the store."""
     content = _sealed(json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True).encode())
-    store.write_bytes(copy_path(record.key), content)
+    store.write_bytes(copy_path(record.key), content, lasting=False)
     store.write_bytes(record_path(record.key), content)
 
 

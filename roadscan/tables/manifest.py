@@ -283,7 +283,7 @@ def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> Non
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:
     """Keep what failed in the last run, for `roadscan status`."""
-    store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode())
+    store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode(), lasting=False)
 
 
 def read_failures(store: Store) -> list[dict[str, str]]:

@@ -7,6 +7,9 @@
 
 A store is a folder or an object-store URL (fsspec). A file is written under a temporary name, then
 published by rename (folder) or by one upload (object store); readers never see half of it.
+
+In a folder, what other files are judged by (records, small tables) and what cannot be made again (ingested rows) is on
+the disk before its name is seen: a power loss leaves it whole or absent. Files of products are not waited for.
 """
 
 from __future__ import annotations
@@ -139,12 +142,15 @@ class Store:
         except (pa.ArrowException, OSError) as error:
             raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
-    def write_bytes(self, relative: str, content: bytes) -> None:
-        """Write a small file at once; StoreError where the store cannot be written."""
-        with _in_words(self.path(relative)):
-            self._write_bytes(relative, content)
+    def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:
+        """Write a small file at once; StoreError where the store cannot be written.
 
-    def _write_bytes(self, relative: str, content: bytes) -> None:
+        One that is `lasting` is on the disk when this returns, with its name.
+        """
+        with _in_words(self.path(relative)):
+            self._write_bytes(relative, content, lasting)
+
+    def _write_bytes(self, relative: str, content: bytes, lasting: bool) -> None:
         if not self.is_folder:
             with self.scratch() as folder:
                 temporary = folder / "content"
@@ -153,9 +159,12 @@ class Store:
             return
         temporary = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
         try:
-            with _made(temporary.parent, lambda: temporary.open("wb")) as stream:
+            with _made(temporary.parent, lambda: temporary.open("wb"), lasting=True) as stream:
                 stream.write(content)
-            self.publish(temporary, relative)
+                if lasting:
+                    stream.flush()
+                    os.fsync(stream.fileno())
+            self.publish(temporary, relative, lasting=lasting)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -166,7 +175,7 @@ class Store:
         if self.is_folder:
             folder = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
             with _in_words(str(folder)):
-                folder.mkdir(parents=True)
+                _made(folder.parent, folder.mkdir, lasting=True)
         else:
             folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
         try:
@@ -174,23 +183,29 @@ class Store:
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def publish(self, local: Path, relative: str) -> None:
-        """Move a finished local file into the store under its final name."""
+    def publish(self, local: Path, relative: str, *, lasting: bool = False) -> None:
+        """Move a finished local file into the store under its final name; on the disk itself if it is `lasting`."""
         target = self.path(relative)
         if self.is_folder:
-            _made(Path(target).parent, lambda: local.replace(target))
+            _made(Path(target).parent, lambda: local.replace(target), lasting)
+            if lasting:
+                _sync_folder(Path(target).parent)
         else:
             self.fs.put_file(str(local), target)
             local.unlink()
 
     def publish_folder(self, local: Path, relative: str) -> None:
-        """Move a finished local folder into the store, in place of one of that name."""
+        """Move a finished local folder into the store, in place of one of that name, once all of it is on the disk."""
         if self.is_folder:
+            for path in (local, *local.rglob("*")):
+                sync = _sync_folder if path.is_dir() else _sync_file
+                sync(path)
             target = Path(self.path(relative))
-            target.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(target.parent, lasting=True)
             if target.exists():
                 self.remove(relative)
             local.rename(target)
+            _sync_folder(target.parent)
             return
         self.remove(relative)
         for file in sorted(p for p in local.rglob("*") if p.is_file()):
@@ -240,7 +255,7 @@ class Store:
             return
         file = Path(self.path("manifest/lock"))
         with _in_words(str(file)):
-            file.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(file.parent, lasting=True)
             self._take(file)
         try:
             self._clear_staging()
@@ -270,13 +285,37 @@ class Store:
                 left.unlink(missing_ok=True) if left.is_file() else None
 
 
-def _made(folder: Path, write: Callable[[], _T]) -> _T:
+def _made(folder: Path, write: Callable[[], _T], lasting: bool = False) -> _T:
     """What comes of `write`, which needs the folder: it is made where it is missing."""
     try:
         return write()
     except FileNotFoundError:
-        folder.mkdir(parents=True, exist_ok=True)
+        _make_folder(folder, lasting)
         return write()
+
+
+def _make_folder(folder: Path, lasting: bool) -> None:
+    """Make a folder and those above it that are missing; on the disk itself if they are to be `lasting`."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()] if lasting else []
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in missing:
+        _sync_folder(one.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can do that."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def _sync_file(path: Path) -> None:
+    """Bring a file's bytes to the disk; OSError where it does not take them."""
+    with path.open("rb+") as stream:
+        os.fsync(stream.fileno())
 
 
 def _opened(url: str) -> tuple[Any, str]:

@@ -177,6 +177,7 @@ def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchem
         use_dictionary=strings,
         column_encoding=encodings,
         write_statistics=[c.name for c in schema.columns if not c.is_list],
+        write_page_checksum=True,
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from roadscan.jobs.compute import Compute, reason_of
+from roadscan.jobs.compute import Compute, damaged_file, reason_of
 from roadscan.tables.manifest import Manifest, OutputRecord
 
 T = TypeVar("T")
@@ -28,6 +28,8 @@ class Ended:
     record: OutputRecord | None
     reason: str = ""
     """Why there is no record."""
+    damaged: str = ""
+    """File of the store that the piece found damaged."""
 
 
 def cut_bundles(work: Sequence[float], most: float, workers: int) -> list[range]:
@@ -86,8 +88,9 @@ def run_bundles(
             if done.result is None and len(own) > 1:
                 again += own
                 continue
-            ended = done.result or [Ended(None, reason_of(done.error))]
+            ended = done.result or [_failed(done.error)]
             manifest.add([e.record for e in ended if e.record is not None])
+            manifest.doubt_files({e.damaged for e in ended if e.damaged})
             failures += [(piece, e.reason) for piece, e in zip(own, ended, strict=True) if e.record is None]
             finished += len(own)
             report(finished, len(pieces))
@@ -103,4 +106,8 @@ def _ended(function: Callable[[T], OutputRecord], piece: T) -> Ended:
     try:
         return Ended(function(piece))
     except Exception as error:  # noqa: BLE001  one piece's fault must not stop the others
-        return Ended(None, reason_of(error))
+        return _failed(error)
+
+
+def _failed(error: Exception | None) -> Ended:
+    return Ended(None, reason_of(error), damaged_file(error))

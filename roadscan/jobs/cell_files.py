@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +21,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.model.errors import StoreError
+from roadscan.model.errors import DamagedError, StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import CellColumns
-from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.manifest import OutputRecord, read_recorded
 from roadscan.tables.plane_table import write_plane_table
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
+from roadscan.tables.store import MADE_AGAIN, Store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level
 
@@ -96,7 +97,7 @@ def write_overviews(path: Path, levels: Sequence[Level]) -> None:
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
     """Cells of a finished tile; what a ``surface`` leaves out is NaN, and it names no passes."""
-    rows = store.read_table(record.path)
+    rows = store.parse_table(read_recorded(store, record), record.path)
     n = rows.num_rows
     known: dict[str, Any] = {name: rows.column(name).to_numpy() for name in rows.column_names if name != "passes"}
     for column in table_schema("cells").columns:
@@ -113,18 +114,31 @@ def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileC
     )
 
 
-def read_overview(store: Store, relative: str, factor: int) -> Level:
-    """One overview of a finished tile, from its file in the store."""
-    with store.fs.open(store.path(relative), "rb") as stream:
-        file = pq.ParquetFile(stream)
-        held = {int(file.metadata.row_group(k).column(0).statistics.min): k for k in range(file.num_row_groups)}
-        if factor not in held:
-            raise StoreError(
-                f"there is no overview of {factor} cells a pixel",
-                expected=", ".join(map(str, sorted(held))) or "none: the tile is too small for overviews",
-                file=relative,
-            )
-        rows = file.read_row_group(held[factor])
+def read_overview(store: Store, record: OutputRecord, factor: int) -> Level:
+    """One overview of a finished tile; nothing else of its file is read, so its size and checksums tell if it is whole.
+
+    Raises
+    ------
+    DamagedError
+        It is not.
+    """
+    path = store.path(record.path)
+    try:
+        with store.fs.open(path, "rb") as stream:
+            size = stream.seek(0, os.SEEK_END)
+            if record.bytes and size != record.bytes:
+                raise DamagedError(f"the file has {size} bytes of {record.bytes}", change=MADE_AGAIN, file=path)
+            file = pq.ParquetFile(stream, page_checksum_verification=True)
+            held = {int(file.metadata.row_group(k).column(0).statistics.min): k for k in range(file.num_row_groups)}
+            rows = file.read_row_group(held[factor], use_threads=False) if factor in held else None
+    except (pa.ArrowException, OSError, AttributeError) as error:
+        raise DamagedError(f"the file is damaged: {error}", change=MADE_AGAIN, file=path) from error
+    if rows is None:
+        raise StoreError(
+            f"there is no overview of {factor} cells a pixel",
+            expected=", ".join(map(str, sorted(held))) or "none: the tile is too small for overviews",
+            file=path,
+        )
     return Level(factor, **{f.name: rows.column(f.name).to_numpy() for f in dataclasses.fields(Level)[1:]})
 
 

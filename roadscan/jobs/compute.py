@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from roadscan.model.errors import RoadscanError
+from roadscan.model.errors import DamagedError, RoadscanError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -31,6 +31,11 @@ def reason_of(error: Exception | None) -> str:
     if error is None:
         return "the worker gave no result"
     return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
+
+
+def damaged_file(error: Exception | None) -> str:
+    """File of the store that a task found damaged, empty where it failed for another reason."""
+    return (error.file or "") if isinstance(error, DamagedError) else ""
 
 
 class Made(Sequence[T]):

@@ -25,7 +25,7 @@ from roadscan.jobs.readings import Ground, Placer, RawSlice
 from roadscan.model.errors import StoreError
 from roadscan.points.place import FATE_NAMES, Window
 from roadscan.points.reach import Touched, joined
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
 from roadscan.tables.writer import parquet_bytes
@@ -269,7 +269,7 @@ def load_ranges(
         record = manifest.get(PRODUCT, one.file)
         if record is None or (files is not None and one.file not in files) or _is_apart(record, window):
             continue
-        table = plan.store.read_table(record.path, _LOADED)
+        table = plan.store.parse_table(read_recorded(plan.store, record), record.path, _LOADED)
         if wanted is not None:
             table = table.filter(wanted)
         tables.append(table)

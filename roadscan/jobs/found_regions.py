@@ -34,7 +34,7 @@ from roadscan.products.geo_table import read_geo_table, write_geo_table
 from roadscan.surfaces.coarse import CoarseSettings, Stretch, coarse_model
 from roadscan.surfaces.regions import Region, find_regions
 from roadscan.tables.logs import DataFile
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, file_digest
 
@@ -279,8 +279,8 @@ def load_found_regions(plan: SurveyPlan, manifest: Manifest) -> FoundRegions:
     current = {p.unit for p in pieces} - {p.unit for p in due}
     records = manifest.of(REGIONS)
     context = product_context(plan)
-    paths = [records[unit].path for unit in sorted(current) if records[unit].path]
-    shapes = [np.empty(0, object), *(read_geo_table(plan.store.read_bytes(p), context)[1] for p in paths)]
+    files = [records[unit] for unit in sorted(current) if records[unit].path]
+    shapes = [np.empty(0, object), *(read_geo_table(read_recorded(plan.store, r), context)[1] for r in files)]
     known = {p.unit for p in pieces}
     gone = tuple(r for unit, r in records.items() if unit not in known)
     return FoundRegions(Regions(np.concatenate(shapes)), tuple(due), gone)

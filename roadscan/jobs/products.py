@@ -35,7 +35,7 @@ from roadscan.products.base import (
 )
 from roadscan.products.lane_direction import LaneDirections
 from roadscan.surfaces.reconstruction import SurfaceGrid
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.store import Store, file_digest
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level, pyramid_of
@@ -224,7 +224,7 @@ class StoredTiles:
     def file(self, product: str, tile: TileId) -> bytes | None:
         """Content of a tile's file of a surface product; None where there is none."""
         record = self._files.get((product, str(tile)))
-        return None if record is None else self._store.read_bytes(record.path)
+        return None if record is None else read_recorded(self._store, record)
 
     def lanes(self) -> LaneDirections:
         """Which way the lanes run; nowhere known for a product that does not need it."""
@@ -234,7 +234,7 @@ class StoredTiles:
         """Overview of a tile; made from its cells where none was stored with them."""
         record = self._overviews.get(str(tile))
         if record is not None:
-            return read_overview(self._store, record.path, factor)
+            return read_overview(self._store, record, factor)
         cells = self(tile)
         return None if cells is None else pyramid_of(cells, (factor,))[0]
 

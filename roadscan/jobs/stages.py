@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from roadscan.jobs.calibrate import outdated_calibrations
 from roadscan.jobs.clock_tables import set_damaged_clocks_aside
 from roadscan.jobs.clocks import estimate_clocks
-from roadscan.jobs.compute import Compute, Made, rare_collections
+from roadscan.jobs.compute import Compute, Made, damaged_file, rare_collections
 from roadscan.jobs.footprints import index_footprints, load_ranges
 from roadscan.jobs.found_regions import find_due_regions, searched_sources
 from roadscan.jobs.ingest import ingest
@@ -198,6 +198,8 @@ def run_stage(run: Run, stage: Stage) -> None:
         with rare_collections():
             stage.run(run)
     except RoadscanError as error:
+        if damaged := damaged_file(error):
+            Manifest(run.store).doubt_files({damaged})  # the next run makes it again
         if not run.failures:
             raise
         run.failed(stage.name, [("as a whole", error)])

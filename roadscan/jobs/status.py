@@ -168,6 +168,7 @@ def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
     faults = [*map(str, damaged), *_copy_faults(store, [r.key for r in logs]), *_held_faults(store)]
     data = [f for r in logs for own in r.tables.values() for f in own]
     outputs = [r for r in manifest.all() if r.path]
+    odd: list[OutputRecord] = []
     total = len(data) + len(outputs)
     with store.scratch() as folder:
         for number, file in enumerate(data, 1):
@@ -179,8 +180,9 @@ def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
             fault = _check_output(store, folder, record)
             if fault:
                 faults.append(f"{fault}; the next run makes it again")
-                manifest.forget(record.product, [record.unit])
+                odd.append(record)
             report(number, total)
+    manifest.doubt(odd)
     return faults
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.jobs.cell_files import read_cells
-from roadscan.jobs.compute import reason_of
+from roadscan.jobs.compute import damaged_file, reason_of
 from roadscan.jobs.surface_colours import Painter
 from roadscan.jobs.surface_plan import SURFACE, SurfaceTask
 from roadscan.jobs.tile_files import publish_product
@@ -37,6 +37,7 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
     painter = Painter(task.pictures)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
+    damaged: set[str] = set()
     for tile, key, date in zip(task.block.tiles, task.keys, task.dates, strict=True):
         context = dataclasses.replace(task.context, date=date)
         try:
@@ -45,7 +46,8 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
             records += _write(task, key, surface, context, painter)
         except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
             failures.append((str(tile), reason_of(error)))
-    return TaskResult.of(records, failures)
+            damaged.add(damaged_file(error))
+    return TaskResult.of(records, failures, damaged)
 
 
 class Source(Protocol):

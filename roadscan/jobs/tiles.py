@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -37,11 +37,15 @@ class TaskResult:
     records: Packed
     failures: tuple[tuple[str, str], ...]
     """Tiles that failed, with the reason."""
+    damaged: frozenset[str] = frozenset()
+    """Files of the store that were found damaged."""
 
     @classmethod
-    def of(cls, records: Sequence[Row], failures: Sequence[tuple[str, str]] = ()) -> TaskResult:
+    def of(
+        cls, records: Sequence[Row], failures: Sequence[tuple[str, str]] = (), damaged: Collection[str] = ()
+    ) -> TaskResult:
         """Finished outputs as the manifest will keep them, so that the run has only to write them."""
-        return cls(Packed.of(table_of(records)), tuple(failures))
+        return cls(Packed.of(table_of(records)), tuple(failures), frozenset(damaged) - {""})
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ def run_tasks(
             if done.result is not None:
                 manifest.add_packed(done.result.records)
                 failures.extend(done.result.failures)
+                manifest.doubt_files(done.result.damaged)
             elif len(tiles) > 1:
                 again.extend(tiles)
                 continue

@@ -12,13 +12,15 @@ import pyarrow.compute as pc
 
 from roadscan.model.errors import DamagedError, StoreError
 from roadscan.tables.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
-from roadscan.tables.store import Store
+from roadscan.tables.store import MADE_AGAIN, Store, bytes_hold
 
 __all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
 
 _FOLDER: Final = "manifest/outputs"
 _FAILURES: Final = "manifest/failures.json"
 _CHANGING: Final = "manifest/changing"
+_DAMAGED: Final = "damaged"
+"""Key of outputs whose files are not as recorded."""
 _MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
 _LOOKS: Final = 10
@@ -142,6 +144,17 @@ class Manifest:
             begin_changes(self._store)
             self._forget(known)
 
+    def doubt(self, records: Iterable[OutputRecord]) -> None:
+        """Count outputs as stale whose files are damaged; their records stay, so that whoever reads them is told."""
+        self.add(record._replace(key=_DAMAGED) for record in records)
+
+    def doubt_files(self, paths: Collection[str]) -> None:
+        """The same of files by their full paths, as errors name them; those of no output are passed over."""
+        if paths:
+            table = self.table()
+            own = pa.array(sorted(path.removeprefix(f"{self._store.root}/") for path in paths), pa.string())
+            self.doubt(map(OutputRecord._make, rows_of(table.filter(pc.is_in(table.column("path"), own)))))
+
     def compact(self) -> None:
         """Bring all parts into one, without what is no more."""
         self.settle()
@@ -257,6 +270,25 @@ def _read_part(store: Store, path: str) -> ReadPart:
         file=store.path(path),
     )
     return ReadPart(path, table, fault if reason else None)
+
+
+def read_recorded(store: Store, record: OutputRecord) -> bytes:
+    """Content of an output's file, as it was recorded.
+
+    Raises
+    ------
+    DamagedError
+        It is missing, or another.
+    """
+    try:
+        content = store.read_bytes(record.path)
+    except StoreError as error:
+        if store.exists(record.path):
+            raise
+        raise DamagedError(error.arrived, change=MADE_AGAIN, file=error.file) from error
+    if record.digest and not bytes_hold(content, record.digest):
+        raise DamagedError("the file is not as it was recorded", change=MADE_AGAIN, file=store.path(record.path))
+    return content
 
 
 def begin_changes(store: Store) -> bool:

@@ -107,7 +107,7 @@ def _view(
         connection.execute(f"CREATE VIEW {name} AS SELECT {hive or '*'} FROM read_parquet([{listed}], {options})")
     except duckdb.Error as error:
         fault = StoreError(
-            f"table '{name}' cannot be opened: {error}",
+            f"table '{name}' cannot be opened: {str(error).splitlines()[0]}",
             change="`roadscan verify` finds damaged files and says what to do",
         )
         if damaged is None:

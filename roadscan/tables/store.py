@@ -67,6 +67,13 @@ def digest_holds(path: Path, digest: str) -> bool:
     return bool(_hashed(path, hashlib.blake2b(digest_size=16)).hexdigest() == digest)
 
 
+def bytes_hold(content: bytes, digest: str) -> bool:
+    """As :func:`digest_holds`, of a file's content."""
+    if ":" in digest:
+        return bytes_digest(content) == digest
+    return hashlib.blake2b(content, digest_size=16).hexdigest() == digest
+
+
 def _hashed(path: Path, state: Any) -> Any:
     # Read, not mapped: a sector that the disk cannot read is an OSError then, and no signal that ends the process.
     buffer = bytearray(_CHUNK)
@@ -135,7 +142,12 @@ class Store:
         Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
         """
-        content = self.read_bytes(relative)
+        return self.parse_table(self.read_bytes(relative), relative, columns, change)
+
+    def parse_table(
+        self, content: bytes, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN
+    ) -> pa.Table:
+        """The same, of content that was read from there."""
         try:
             file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
             return file.read(None if columns is None else list(columns), use_threads=False)
@@ -187,7 +199,11 @@ class Store:
         """Move a finished local file into the store under its final name; on the disk itself if it is `lasting`."""
         target = self.path(relative)
         if self.is_folder:
-            _made(Path(target).parent, lambda: local.replace(target), lasting)
+            try:
+                _made(Path(target).parent, lambda: local.replace(target), lasting)
+            except IsADirectoryError:
+                self.set_aside(relative)
+                local.replace(target)
             if lasting:
                 _sync_folder(Path(target).parent)
         else:

@@ -96,13 +96,16 @@ def test_same_cells_give_same_bytes(cells, columns, tmp_path):
 def test_one_overview_is_read_without_the_others(cells, tmp_path):
     levels = pyramid_of(cells, overview_factors(cells.cells_per_edge))
     assert [level.factor for level in levels] == [2, 8, 40]
-    store = Store(str(tmp_path), "yard")
+    store, record = (
+        Store(str(tmp_path), "yard"),
+        OutputRecord("overviews", "-3_7", "k", "tiles/overviews/t.parquet", 0, ""),
+    )
     with store.scratch() as scratch:
         write_overviews(scratch / "overviews", levels)
         store.publish(scratch / "overviews", "tiles/overviews/t.parquet")
     assert pq.read_metadata(store.path("tiles/overviews/t.parquet")).num_row_groups == 3
     for level in levels:
-        back = read_overview(store, "tiles/overviews/t.parquet", level.factor)
+        back = read_overview(store, record, level.factor)
         for name in ("column", "row", "count", "cells"):
             assert np.array_equal(getattr(back, name), getattr(level, name)), name
         assert np.abs(back.height_m - level.height_m).max() <= 2.0**-21
@@ -112,4 +115,4 @@ def test_one_overview_is_read_without_the_others(cells, tmp_path):
     ).fetchall()
     assert total == [(2, 20_000), (8, 20_000), (40, 20_000)]
     with pytest.raises(StoreError, match="no overview of 16 cells a pixel; expected 2, 8, 40"):
-        read_overview(store, "tiles/overviews/t.parquet", 16)
+        read_overview(store, record, 16)

@@ -21,7 +21,7 @@ from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext, product_named
 from roadscan.simulate.truth import load
 from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.store import Store
+from roadscan.tables.store import Store, bytes_digest
 from roadscan.tiles.grid import TileGrid
 from tests.jobs.conftest import changed
 
@@ -59,7 +59,7 @@ def test_files_of_tiles_are_read_from_the_store(simulated):
     with store.scratch() as folder:
         (folder / "one").write_bytes(b"pieces")
         store.publish(folder / "one", "tiles/crack_pieces/3_4.parquet")
-    record = OutputRecord("crack_pieces", "3_4", "key", "tiles/crack_pieces/3_4.parquet", 6, "digest")
+    record = OutputRecord("crack_pieces", "3_4", "key", "tiles/crack_pieces/3_4.parquet", 6, bytes_digest(b"pieces"))
     tiles = StoredTiles(store, (), (), ProductContext("s", "", MapFrame(None, "yard"), TileGrid(), (), DAY), (record,))
     assert tiles.file("crack_pieces", TileId(3, 4)) == b"pieces"
     assert tiles.file("crack_pieces", TileId(3, 5)) is None

@@ -26,6 +26,7 @@ from roadscan.jobs.stages import STAGES, Run, run_stages
 from roadscan.jobs.status import verify_store
 from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles, plan_surface_work
 from roadscan.jobs.surfaces import _Cells, source_of
+from roadscan.jobs.tile_plan import TILE
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -238,18 +239,23 @@ def test_what_is_stale_is_made_again(cells: Reconstructed) -> None:
 def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructed) -> None:
     cells.forget()
     survey = cells.survey(CELLS, {"make": ["surface"], "options": {}})
+    due = set(map(str, cells.plan(survey).keys))
     tile = str(next(iter(cells.plan(survey).keys)))
-    path = Path(cells.store.path(f"tiles/cells/{tile}.parquet"))
+    record = Manifest(cells.store).of(TILE)[tile]
+    path = Path(cells.store.path(record.path))
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(Exception, match="surfaces"):
         cells.run(survey)
     column, row = map(int, tile.split("_"))
-    lost = set(map(str, cells.plan(survey).keys)) - set(Manifest(cells.store).of(SURFACE))
+    lost = due - set(Manifest(cells.store).of(SURFACE))
     assert tile in lost and all(
         abs(int(u.split("_")[0]) - column) < 2 and abs(int(u.split("_")[1]) - row) < 2 for u in lost
     )
+    work = plan_surface_work(survey, cells.store, None, Manifest(cells.store))
+    assert "run `roadscan tiles`" in work.note and not lost & set(map(str, work.chosen))
     path.write_bytes(content)
+    Manifest(cells.store).add([record])  # as the tiles stage makes it again
     assert set(cells.run(survey)[0]) == lost
 
 

@@ -103,8 +103,14 @@ class Store:
         return f"{self.root}/{relative}"
 
     def exists(self, relative: str) -> bool:
-        """True if the file or folder is there."""
-        return bool(self.fs.exists(self.path(relative)))
+        """True if the file or folder is there; StoreError where the store does not answer."""
+        try:
+            return bool(self.fs.exists(self.path(relative)))
+        except Exception as error:  # each library of an object store has its own
+            raise StoreError(
+                f"the store {self.url} cannot be reached: {error}",
+                change="see to its address, the network and your keys",
+            ) from error
 
     def size(self, relative: str) -> int | None:
         """Bytes of a file, None where it is missing."""
@@ -335,9 +341,19 @@ def _sync_file(path: Path) -> None:
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """File system and path of a store; a folder's name may hold what chains file systems in URLs (``::``)."""
+    """File system and path of a store; a folder's name may hold what chains file systems in URLs (``::``).
+
+    Lists of what an object store holds are not kept: workers write to it at the same time.
+    """
     if "://" in url:
-        opened: tuple[Any, str] = fsspec.core.url_to_fs(url)
+        try:
+            opened: tuple[Any, str] = fsspec.core.url_to_fs(url, use_listings_cache=False)
+        except (ImportError, ValueError) as error:
+            raise StoreError(
+                f"the store {url} cannot be opened: {error}",
+                expected="a folder, or the URL of an object store",
+                change="S3 needs `pip install 'roadscan[s3]'`; other stores need their package of fsspec",
+            ) from error
         return opened
     folders = fsspec.filesystem("file")
     return folders, folders._strip_protocol(url)

@@ -13,9 +13,11 @@ from typing import Any, Final
 
 from roadscan.model.errors import FormatError, StoreError
 from roadscan.sensors.base import LogFormat, format_named, format_of
+from roadscan.tables.sealed import seal, unseal
 from roadscan.tables.store import Store, digest_holds, file_digest
 
 _SOURCES: Final = "manifest/sources.json"
+_COPY: Final = "manifest/sources_copy.json"
 
 Known = list[Any]
 """Size (bytes), time of the last change (ns) and digest of a file."""
@@ -27,7 +29,8 @@ class Sources:
     def __init__(self, store: Store, threads: ThreadPoolExecutor) -> None:
         self._store = store
         self._threads = threads
-        self._before, self._forgotten = _remembered(store)
+        known, self._is_whole = _remembered(store)
+        self._before, self._forgotten = known or {}, known is None
         self._now: dict[str, Any] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
@@ -73,9 +76,11 @@ class Sources:
 
         Who may only read the store can ask it all the same, and learns it each time.
         """
-        if {**self._before, **self._now} != self._before:
+        known = {**self._before, **self._now}
+        if known and (known != self._before or not self._is_whole):
             with contextlib.suppress(StoreError):
-                self._store.write_bytes(_SOURCES, json.dumps({**self._before, **self._now}).encode())
+                self._store.write_bytes(_COPY, seal(known), lasting=False)
+                self._store.write_bytes(_SOURCES, seal(known))
 
 
 @contextlib.contextmanager
@@ -113,15 +118,29 @@ def _named(path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, 
     return named | {f"beside:{file.name}": file for file in companions if file not in named.values()}
 
 
-def _remembered(store: Store) -> tuple[dict[str, Any], bool]:
-    """What is known of logs by path, and whether that was damaged: then their files are read again."""
+def damaged_sources(store: Store) -> list[str]:
+    """In words, whether what is known of logs is damaged; the next run mends it."""
+    known, is_whole = _remembered(store)
+    if is_whole:
+        return []
+    cost = "its copy is used" if known is not None else "logs that were moved away have to be put back for one run"
+    return [f"{_SOURCES}: the list of logs is damaged; {cost}, and the next run writes it anew"]
+
+
+def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
+    """What is known of logs by path, and whether that is as it was kept. It may be that of the copy, or None: then
+    their files are read again.
+    """
     if not store.exists(_SOURCES):
-        return {}, False
-    try:
-        known = json.loads(store.read_bytes(_SOURCES))
-        return {path: {"format": log["format"], "files": dict(log["files"])} for path, log in known.items()}, False
-    except (StoreError, ValueError, KeyError, TypeError, AttributeError):
         return {}, True
+    for path in (_SOURCES, _COPY):
+        try:
+            known = unseal(store.read_bytes(path))
+            logs = {log: {"format": of["format"], "files": dict(of["files"])} for log, of in known.items()}
+        except (StoreError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+        return logs, path == _SOURCES
+    return None, False
 
 
 def _name(file: Path, log: Path) -> str:

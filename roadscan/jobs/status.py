@@ -17,6 +17,7 @@ from roadscan.jobs.navigate import known_keys
 from roadscan.jobs.plan import plan_survey
 from roadscan.jobs.planned_logs import plan_logs
 from roadscan.jobs.products import plan_outputs
+from roadscan.jobs.sources import damaged_sources
 from roadscan.jobs.stages import Run, plan_tile_work
 from roadscan.jobs.surface_plan import plan_surface_work
 from roadscan.jobs.tile_fates import told
@@ -165,7 +166,12 @@ def _verify(store: Store, report: Callable[[int, int], None]) -> list[str]:
     damaged: list[StoreError] = []
     manifest = Manifest(store, damaged)
     logs = read_log_records(store, damaged=damaged)
-    faults = [*map(str, damaged), *_copy_faults(store, [r.key for r in logs]), *_held_faults(store)]
+    faults = [
+        *map(str, damaged),
+        *damaged_sources(store),
+        *_copy_faults(store, [r.key for r in logs]),
+        *_held_faults(store),
+    ]
     data = [f for r in logs for own in r.tables.values() for f in own]
     outputs = [r for r in manifest.all() if r.path]
     odd: list[OutputRecord] = []

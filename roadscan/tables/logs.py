@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 from roadscan.model.errors import DamagedError, StoreError
-from roadscan.tables.store import Store, bytes_digest
+from roadscan.tables.sealed import seal, unseal
+from roadscan.tables.store import Store
 
 _FOLDER: Final = "manifest/logs"
 _COPIES: Final = "manifest/log_copies"
-_SEAL: Final = b',\n "checksum": "%b"'
-_END: Final = b"\n}"
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def copy_path(key: str) -> str:
 
 def write_log_record(store: Store, record: LogRecord) -> None:
     """Make a log part of the store."""
-    content = _sealed(json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True).encode())
+    content = seal(dataclasses.asdict(record))
     store.write_bytes(copy_path(record.key), content, lasting=False)
     store.write_bytes(record_path(record.key), content)
 
@@ -147,27 +145,10 @@ def retire_log(store: Store, record: LogRecord) -> None:
             store.fs.mv(store.path(record.folder(table)), target, recursive=True)
 
 
-def _sealed(text: bytes) -> bytes:
-    """A JSON object with its checksum as last member."""
-    return text.removesuffix(_END) + _SEAL % bytes_digest(text).encode() + _END
-
-
-def _unsealed(content: bytes) -> bytes:
-    """The object without its checksum, if it has one, as records of older versions have not."""
-    mark, _, _ = _SEAL.partition(b"%b")
-    start = content.rfind(mark)
-    if start < 0:
-        return content
-    text = content[:start] + _END
-    if content != _sealed(text):
-        raise ValueError("its checksum differs")
-    return text
-
-
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """The record of the log `key`, from the content of the file `path`."""
     try:
-        raw = json.loads(_unsealed(content))
+        raw = unseal(content)
         raw["tables"] = {
             name: tuple(
                 DataFile(

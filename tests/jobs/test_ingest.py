@@ -234,6 +234,12 @@ def test_a_damaged_list_of_logs_or_failures_costs_itself(tmp_path: Path, damage:
     assert json.loads(store.read_bytes("manifest/sources.json")) == whole
     store.write_bytes("manifest/sources.json", damage)
     (tmp_path / "1.arrow").rename(tmp_path / "away")
+    assert any("the list of logs is damaged; its copy is used" in fault for fault in verify_store(store))
+    assert [r.fresh for r in ingest(survey, store)] == [False, False]
+    assert verify_store(store) == []
+    for name in ("sources", "sources_copy"):
+        store.write_bytes(f"manifest/{name}.json", damage)
+    assert any("logs that were moved away have to be put back" in fault for fault in verify_store(store))
     with pytest.raises(RunError, match=r"1\.arrow: the log does not exist; .* put it back for one run"):
         ingest(survey, store)
     (tmp_path / "away").rename(tmp_path / "1.arrow")

@@ -6,8 +6,8 @@ import numpy as np
 
 from roadscan.kernels.options import inlined, kernel
 
-SUPPORTS = 5
-"""The median of seven along the line, means of 3 and of 13 along it, paraboloids over 7 × 7 and 9 × 9."""
+SUPPORTS = 6
+"""The median of seven along the line, means of 3 and of 13 along it, paraboloids over 7 × 7 and 9 × 9, a strip."""
 
 
 @inlined
@@ -60,7 +60,7 @@ def heights_by_support(
         chosen by the same heights. direction : (n,) uint8, of the line.
     lines : (directions, 6, 2) int64, cells of one half of each line, from the nearest.
     pairs : (40, 2) int64, one cell of each pair of 9 × 9, the nearest squares first.
-    off : (n, 5) float32, out, height less `middle`; own : the same, the share of the cell itself.
+    off : (n, 6) float32, out but for the strip's, height less `middle`; own : the same, the share of the cell itself.
     """
     for t in range(row.size):
         i, j, z, line = margin + row[t], margin + column[t], middle[t], lines[direction[t]]
@@ -93,7 +93,7 @@ def least_risk(row, column, number, height, off, own, sigma, limit, chosen):
     ----------
     row, column : (n,) int64; number : (rows + 6, columns + 6) int32, which cell lies there, −1 for none, three cells
         more at each end.
-    height : (n,) float64, less the middle (m); off, own : (n, 5) float32, `own` is overwritten.
+    height : (n,) float64, less the middle (m); off, own : (n, 6) float32, `own` is overwritten.
     sigma : 1 σ of a height (m); limit : greatest misfit (σ).
     chosen : (n,) float32, out, of `off` that of the support chosen.
     """

@@ -17,8 +17,10 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    `outlier_sigmas`, so that an outlier has no say.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
    on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
-   (outliers replaced by the line's median), and of all five that of least risk (``kernels/supports.py``).
-6. *Level ground*: the median of seven in a row, of seven such in a column, side by side; of these the mean of 7 × 7,
+   (outliers replaced by the line's median), and of all that of least risk (``kernels/supports.py``).
+6. *Strips*: a crack too shallow for lines of seven may stand out over 21 cells (``surfaces/long_lines.py``). Its cells
+   are detail as well, and the strip is a sixth support.
+7. *Level ground*: the median of seven in a row, of seven such in a column, side by side; of these the mean of 7 × 7,
    every second one (a median of medians smooths no more: it keeps whatever rises or falls steadily). Cells with
    detail are left out.
 
@@ -44,6 +46,8 @@ from roadscan.kernels.line_medians import (
 )
 from roadscan.kernels.supports import SUPPORTS, heights_by_support, least_risk
 from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.surfaces.long_lines import REACH as STRIP_REACH
+from roadscan.surfaces.long_lines import Chains
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -68,8 +72,14 @@ _CHOICE = 0.12
 """How much a cell has more part in what lies along its line, because eight directions were tried on its height (of pure
 noise: covariance 0.23 with the median along the line of least risk, 0.12 of it the median's own)."""
 
-_DETAIL_REACH = _HALF * _GROUND_STEP + 2 * _HALF + _GROWTHS + 1
-"""Ground and the columns in it, its count, growth, foot."""
+_FAVOUR = 0.5
+"""A strip that stands out so far is left for another support where that is better by 1 σ² a cell or more: where risks
+alone decide, a third of what strips show is smoothed away again."""
+
+_GROUND_REACH = _HALF * _GROUND_STEP + _HALF
+"""Every third cell, and the columns that borders are mirrored about."""
+_DETAIL_REACH = _GROUND_REACH + max(_HALF + _GROWTHS + 1, STRIP_REACH)
+"""Ground, then its count, growth and foot, or the strips."""
 REACH = _DETAIL_REACH + _HALF * (1 + _LEVEL_STEP)
 """Cells to each side that the median of a cell depends on: detail, and level ground. A height on detail reaches no
 farther: its risk, detail there or the fit and the outliers in it."""
@@ -83,6 +93,8 @@ class DetailMedian:
     """(rows, columns); NaN where nothing was measured."""
     detail: Bool
     """(rows, columns), True on a crack, an edge or a stone."""
+    drawn: Bool
+    """(rows, columns), True on a crack that only a long strip shows."""
 
 
 def directions() -> Int64:
@@ -124,7 +136,7 @@ def detail_median(height_m: Float64, config: SurfaceSmoothing) -> DetailMedian:
     level = _square_median(np.where(plain, heights, _ABSENT))
     level = _square_mean(np.where(plain, level, _ABSENT), _LEVEL_STEP)
     level[detail] = lines.supported(heights, detail)
-    return DetailMedian(np.where(measured, level, np.nan), detail)
+    return DetailMedian(np.where(measured, level, np.nan), detail, detail & (lines.strips.gain > 0.0))
 
 
 class _Lines:
@@ -147,11 +159,15 @@ class _Lines:
         least = np.full(shape, np.inf, np.float32)
         best = (least.ravel(), self.median_m.ravel(), self.own.ravel(), self.direction.ravel())
         sigma_m, limit = config.sigma_m, config.outlier_sigmas
+        chains = Chains(ground, sigma_m, _ABSENT)
+        onward = _lines(CELLS)
         for direction, line in enumerate(directions()):
             line_medians(padded, _HALF, line, _ABSENT, median, count, own)
             judge_lines(heights, ground, median, count, own, _LEAST_CELLS, sigma_m, limit, _ABSENT, self.contrast, risk)
+            chains.add(direction, onward[direction], median, count)
             keep_better(_sums(risk, _HALF).ravel(), median.ravel(), own.ravel(), np.uint8(direction), *best)
         self.contrast /= np.float32(MEDIAN_SIGMA * sigma_m)
+        self.strips = chains.strips(heights, self.contrast, sigma_m)
 
     def supported(self, heights: Float64, detail: Bool) -> Float64:
         """Heights (n,) of the cells on detail, each over the support of least risk."""
@@ -165,6 +181,9 @@ class _Lines:
             clean, _FIT_REACH, row, column, middle, self.own[detail], _CHOICE, self.direction[detail],
             lines_onward(), detail_pairs(), _ABSENT, off, own,
         )  # fmt: skip
+        drawn = self.strips.gain[detail] > 0.0
+        off[:, -1] = np.where(drawn, self.strips.height_m[detail] - middle, 0.0)
+        own[:, -1] = np.where(drawn, self.strips.own[detail] - _FAVOUR, own[:, 0])
         number = np.full(detail.shape, -1, np.int32)
         number[detail] = np.arange(row.size, dtype=np.int32)
         number = np.pad(number, _HALF, constant_values=-1)
@@ -180,7 +199,7 @@ class _Lines:
         found = strong & (_sums(strong.astype(np.float32), _HALF) >= _STRONG_CELLS)
         for _ in range(_GROWTHS):
             found |= weak & _beside(found)
-        return np.asarray(_beside(found) & self.measured)
+        return np.asarray((_beside(found) | (self.strips.gain > 0.0)) & self.measured)
 
 
 def _beside(cells: Bool) -> Bool:

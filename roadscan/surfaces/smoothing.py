@@ -18,7 +18,8 @@ time keeps |Cᵢ(ω)|² ≤ 0.73, near the 0.58 that 1/λ_M allows with λ_C = 5
 five together have 2.45, and the explicit iteration bursts. So here: C₅ (all around) where it finds no more than
 `filter_sigmas` · σ in P_M; else the directional filter that finds least, if that is no more: it smooths along a
 crack or an edge and not across; else none, because every filter would flatten what is there (even C₁ has two
-neighbours across the line, and would take 6 % of the depth of a crack one cell wide). The choice rests on P_M and
+neighbours across the line, and would take 6 % of the depth of a crack one cell wide). None either on a crack that only
+a long strip shows: no cell of it finds much. The choice rests on P_M and
 stays, so that E is one quadratic function.
 
 **W** is the identity, but for heights farther than `outlier_sigmas` · σ from P_M: these are impulses, of which
@@ -35,8 +36,8 @@ until F is the minimum. It begins where the paper begins, at the mean of P and P
 on what else is in the window, so the number of steps follows from the proof instead: the first n with qⁿ ≤ `tolerance`;
 then ‖F_n − F*‖ ≤ tolerance ‖F_0 − F*‖. With the paper's weights q = 0.60: 14 steps for 1/1000.
 
-**Windows**. A step sees four cells, the choice two, the median 27. A cell farther than :func:`halo_cells` from the
-window's border (85 cells with the paper's weights) has the same bits in every window, because each cell's arithmetic
+**Windows**. A step sees four cells, the choice two, the median 88. A cell farther than :func:`halo_cells` from the
+window's border (146 cells with the paper's weights) has the same bits in every window, because each cell's arithmetic
 is the same and in the same order everywhere. Conjugate gradients would need fewer steps, but have no such halo: their
 sums run over the whole window.
 
@@ -64,6 +65,7 @@ from roadscan.surfaces.detail_median import detail_median
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
 
 FILTER_BOUND = 38.0 / 21.0
 """Upper bound of the spectral norm of SᵀS, one filter a cell, any cells missing."""
@@ -129,10 +131,11 @@ class Smoothing:
                 expected="a grid (rows, columns) of finite heights in metres",
                 change="put NaN where nothing was measured",
             )
-        median = detail_median(heights, config).height_m
+        found = detail_median(heights, config)
+        median = found.height_m
         with np.errstate(invalid="ignore"):
             weight = np.abs(heights - median) <= config.outlier_sigmas * config.sigma_m
-        chosen, own, residual = _choose(median, config.filter_sigmas * config.sigma_m)
+        chosen, own, residual = _choose(median, found.drawn, config.filter_sigmas * config.sigma_m)
         return cls(heights, median, weight.astype(np.float32), chosen, own, residual, config)
 
     def minimum(self) -> Float64:
@@ -165,10 +168,12 @@ class Smoothing:
             yield before[inner]
 
 
-def _choose(median_m: Float64, limit_m: float) -> tuple[UInt8, Float32, Float32]:
+def _choose(median_m: Float64, drawn: Bool, limit_m: float) -> tuple[UInt8, Float32, Float32]:
     measured = ~np.isnan(median_m)
     shape = median_m.shape
     chosen, own, residual = (np.empty(shape, np.float32) for _ in range(3))
     surface = np.pad(np.where(measured, median_m, 0.0), _FILTER_REACH)
     choose_filters(surface, np.pad(measured.astype(np.float64), _FILTER_REACH), limit_m, chosen, own, residual)
+    for field in (chosen, own, residual):
+        field[drawn] = 0.0
     return chosen.astype(np.uint8), own, residual

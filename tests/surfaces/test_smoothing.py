@@ -266,7 +266,7 @@ def test_heights_by_support_like_least_squares(share):
     values[9, 9:14] = np.arange(5) * 0.1
     row, column = np.full(5, 3), np.arange(3, 8)
     pairs, onward = detail_pairs(), lines_onward()
-    off, own = np.empty((5, 5), np.float32), np.empty((5, 5), np.float32)
+    off, own = np.empty((5, 6), np.float32), np.empty((5, 6), np.float32)
     middle, direction = np.linspace(-1, 1, 5), np.arange(5, dtype=np.uint8)
     heights_by_support(
         values, 6, row, column, middle, np.full(5, 0.5), 0.25, direction, onward, pairs, np.inf, off, own
@@ -301,8 +301,8 @@ def test_support_of_least_risk():
     rng = np.random.default_rng(5)
     row, column = (a.ravel() for a in np.indices((9, 12)))
     number = np.pad(np.arange(108, dtype=np.int32).reshape(9, 12), 3, constant_values=-1)
-    off = rng.normal(0.0, 0.3, (108, 5)).astype(np.float32)
-    own = rng.uniform(0.0, 0.5, (108, 5)).astype(np.float32)
+    off = rng.normal(0.0, 0.3, (108, 6)).astype(np.float32)
+    own = rng.uniform(0.0, 0.5, (108, 6)).astype(np.float32)
     height = rng.normal(size=108)
     height[::17] += 30.0
     cost = np.minimum(np.abs(height[:, None] - off) / 0.7, 4.0) ** 2 + 2.0 * own

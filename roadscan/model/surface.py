@@ -70,4 +70,7 @@ class SurfaceConfig(Strict):
 
     def smoothing_settings(self) -> SurfaceSmoothing | None:
         """The smoothing with its noise; None where it is off."""
-        return SurfaceSmoothing(sigma_m=self.sigma_m, **self.smoothing.model_dump()) if self.smooth else None
+        if not self.smooth:
+            return None
+        own = self.method == "cells"
+        return SurfaceSmoothing(sigma_m=self.sigma_m, independent=own, **self.smoothing.model_dump())

@@ -31,3 +31,6 @@ class SurfaceSmoothing(SmoothingWeights):
 
     sigma_m: float = Field(default=0.0005, gt=0.0, le=1.0)
     """1 σ of the noise of one cell's height (m): 0.0005 for a triangulation profiler, 0.006 for a SICK LMS."""
+    independent: bool = True
+    """Whether cells have noise of their own. Interpolated between readings they share it, so that lines of it pass for
+    cracks: then no crack is looked for that single cells do not show."""

@@ -47,7 +47,7 @@ from roadscan.kernels.line_medians import (
 from roadscan.kernels.supports import SUPPORTS, heights_by_support, least_risk
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.long_lines import REACH as STRIP_REACH
-from roadscan.surfaces.long_lines import Chains
+from roadscan.surfaces.long_lines import Chains, no_strips
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -159,15 +159,16 @@ class _Lines:
         least = np.full(shape, np.inf, np.float32)
         best = (least.ravel(), self.median_m.ravel(), self.own.ravel(), self.direction.ravel())
         sigma_m, limit = config.sigma_m, config.outlier_sigmas
-        chains = Chains(ground, sigma_m, _ABSENT)
+        chains = Chains(ground, sigma_m, _ABSENT) if config.independent else None
         onward = _lines(CELLS)
         for direction, line in enumerate(directions()):
             line_medians(padded, _HALF, line, _ABSENT, median, count, own)
             judge_lines(heights, ground, median, count, own, _LEAST_CELLS, sigma_m, limit, _ABSENT, self.contrast, risk)
-            chains.add(direction, onward[direction], median, count)
+            if chains is not None:
+                chains.add(direction, onward[direction], median, count)
             keep_better(_sums(risk, _HALF).ravel(), median.ravel(), own.ravel(), np.uint8(direction), *best)
         self.contrast /= np.float32(MEDIAN_SIGMA * sigma_m)
-        self.strips = chains.strips(heights, self.contrast, sigma_m)
+        self.strips = no_strips(heights) if chains is None else chains.strips(heights, self.contrast, sigma_m)
 
     def supported(self, heights: Float64, detail: Bool) -> Float64:
         """Heights (n,) of the cells on detail, each over the support of least risk."""

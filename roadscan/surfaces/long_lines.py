@@ -76,6 +76,12 @@ class Strips:
     """Share of the cell itself in it."""
 
 
+def no_strips(heights: Float64) -> Strips:
+    """Where none are looked for; heights (rows, columns)."""
+    nothing = np.zeros(heights.shape, np.float32)
+    return Strips(nothing, heights, nothing)
+
+
 class Chains:
     """The deepest chain of three lines about each cell."""
 

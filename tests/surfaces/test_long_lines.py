@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.kernels.long_lines import FIELDS, HALF_CUT, chain_lines, draw_strips, fit_strips, line_depths, mark_peaks
+from roadscan.model.surface import SurfaceConfig
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH, detail_median
 from roadscan.surfaces.long_lines import confirmed_strips
@@ -170,6 +171,17 @@ def test_cracks_that_single_cells_hardly_show(way, sensor, crack):
         assert abs(width_change_cells(seen, found)) < 2
         assert depth_bias(seen, median) < -0.85
     assert abs(np.mean(biases)) < 0.1
+
+
+def test_no_strips_where_cells_share_their_noise():
+    """A SICK's crack of 20 × 20 mm: seen in cells, and left as before in cells that are interpolated."""
+    patch = cracked(SICK, 160, ((0.02, 0.02),))
+    off = {}
+    for method in ("cells", "points"):
+        settings = SurfaceConfig(method=method, sigma_m=SICK.sigma_m).smoothing_settings()
+        assert settings is not None
+        off[method] = depth_bias(patch, smooth_surface(patch.measured_m, settings))
+    assert off["cells"] > -0.1 and off["points"] < -0.2
 
 
 def test_no_filter_flattens_a_strip():

@@ -104,6 +104,20 @@ def row_of_line(values, margin, line, k, i, n):
     return values[i + margin + line[k, 0], first : first + n]
 
 
+@inlined
+def rows_of_line(values, margin, line, i, n):
+    """The seven cells of these lines, a row (n,) each."""
+    return (
+        row_of_line(values, margin, line, 0, i, n),
+        row_of_line(values, margin, line, 1, i, n),
+        row_of_line(values, margin, line, 2, i, n),
+        row_of_line(values, margin, line, 3, i, n),
+        row_of_line(values, margin, line, 4, i, n),
+        row_of_line(values, margin, line, 5, i, n),
+        row_of_line(values, margin, line, 6, i, n),
+    )
+
+
 @kernel
 def line_medians(values, margin, line, absent, median, count, own):
     """Median of the seven cells of a line through each cell.
@@ -117,13 +131,7 @@ def line_medians(values, margin, line, absent, median, count, own):
     rows, n = median.shape
     for i in range(rows):
         median_row(
-            row_of_line(values, margin, line, 0, i, n),
-            row_of_line(values, margin, line, 1, i, n),
-            row_of_line(values, margin, line, 2, i, n),
-            row_of_line(values, margin, line, 3, i, n),
-            row_of_line(values, margin, line, 4, i, n),
-            row_of_line(values, margin, line, 5, i, n),
-            row_of_line(values, margin, line, 6, i, n),
+            *rows_of_line(values, margin, line, i, n),
             absent,
             median[i],
             count[i],
@@ -140,13 +148,7 @@ def mirrored_line_medians(values, margin, line, middle, absent, median):
     rows, n = median.shape
     for i in range(rows):
         mirrored_median_row(
-            row_of_line(values, margin, line, 0, i, n),
-            row_of_line(values, margin, line, 1, i, n),
-            row_of_line(values, margin, line, 2, i, n),
-            row_of_line(values, margin, line, 3, i, n),
-            row_of_line(values, margin, line, 4, i, n),
-            row_of_line(values, margin, line, 5, i, n),
-            row_of_line(values, margin, line, 6, i, n),
+            *rows_of_line(values, margin, line, i, n),
             middle[i],
             absent,
             median[i],
@@ -176,13 +178,7 @@ def line_means(values, margin, line, absent, mean):
     rows, n = mean.shape
     for i in range(rows):
         mean_row(
-            row_of_line(values, margin, line, 0, i, n),
-            row_of_line(values, margin, line, 1, i, n),
-            row_of_line(values, margin, line, 2, i, n),
-            row_of_line(values, margin, line, 3, i, n),
-            row_of_line(values, margin, line, 4, i, n),
-            row_of_line(values, margin, line, 5, i, n),
-            row_of_line(values, margin, line, 6, i, n),
+            *rows_of_line(values, margin, line, i, n),
             absent,
             mean[i],
         )

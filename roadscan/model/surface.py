@@ -72,5 +72,5 @@ class SurfaceConfig(Strict):
         """The smoothing with its noise; None where it is off."""
         if not self.smooth:
             return None
-        own = self.method == "cells"
-        return SurfaceSmoothing(sigma_m=self.sigma_m, independent=own, **self.smoothing.model_dump())
+        weights = self.smoothing.model_dump()
+        return SurfaceSmoothing(sigma_m=self.sigma_m, independent=self.method == "cells", **weights)

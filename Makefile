@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check lint types contracts docs docs-check pytest fuzz bench format venv install install-dev constraints clean
+.PHONY: help demo test check lint types contracts docs docs-check pytest nightly test-library fuzz bench format venv install install-dev constraints clean
 
 help:  ## Show the targets.
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -35,7 +35,7 @@ lint: $(VENV)/.installed-dev  ## Style and formatting.
 
 types: $(VENV)/.installed-dev  ## Static types.
 	$(BIN)/mypy
-	$(BIN)/mypy docs
+	$(BIN)/mypy --explicit-package-bases docs
 
 contracts: $(VENV)/.installed-dev  ## Import contracts: layers, and who may import what.
 	$(BIN)/lint-imports --no-logo
@@ -49,6 +49,11 @@ docs-check: $(VENV)/.installed-dev  ## Fail where a generated page is out of dat
 # The last lines of the output are pytest's summary.
 pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/model -n0" narrows them.
 	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
+
+nightly: $(VENV)/.installed-dev  ## What takes too long for every change: core tests on a processor without AVX-512.
+	$(BIN)/python -m pytest -q -n 2 -m nightly $(PYTEST_ARGS)
+test-library: export ROADSCAN_CODECS := library
+test-library: pytest  ## Tests with libraries in place of the own codecs.
 
 fuzz: $(VENV)/.installed-dev  ## Every reader on 10,000 damaged files (an hour or two); FUZZ_ARGS="--format sbet" narrows it.
 	$(BIN)/python -m tests.fuzz --mutants 10000 $(FUZZ_ARGS)

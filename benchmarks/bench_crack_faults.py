@@ -18,8 +18,8 @@ from benchmarks.bench_cracks import BENT, CLEAN, FEW, MANY, SEEDS, Faults, Seen,
 from benchmarks.timing import Figure
 from roadscan.model.distress import CrackDetection, CrackJoining
 from roadscan.model.surface_smoothing import SurfaceSmoothing
-from roadscan.surfaces.crack_network import Crack, join_cracks
-from roadscan.surfaces.cracks import crack_pieces
+from roadscan.surfaces.distress.crack_network import Crack, join_cracks
+from roadscan.surfaces.distress.cracks import crack_pieces
 from roadscan.surfaces.lowest import LowestReadings
 from roadscan.surfaces.smoothing import smooth_surface
 

@@ -22,13 +22,13 @@ from roadscan.model.distress import CrackDetection, CrackJoining, PotholeDetecti
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surfaces.crack_network import Crack, join_cracks
-from roadscan.surfaces.cracks import crack_pieces
+from roadscan.surfaces.distress.crack_network import Crack, join_cracks
+from roadscan.surfaces.distress.cracks import crack_pieces
+from roadscan.surfaces.distress.potholes import join_potholes, pothole_pieces
+from roadscan.surfaces.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.lowest import LowestReadings
-from roadscan.surfaces.potholes import join_potholes, pothole_pieces
 from roadscan.surfaces.smoothing import smooth_surface
-from roadscan.surfaces.valley_lines import LINE_HALF, flank_cells
 
 SEEDS = (1, 2, 3)
 READING_M, SIGMA_M = 0.001, 0.0003

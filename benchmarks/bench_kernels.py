@@ -13,14 +13,14 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.kernels.georeference import FATES
-from roadscan.kernels.placing import CHUNK, place_returns
+from roadscan.kernels.georeferencing.readings import FATES, Placed, Returns
+from roadscan.kernels.georeferencing.timed_readings import CHUNK, place_returns
 from roadscan.model.crs import MapFrame, world_from_geodetic
 from roadscan.model.ids import TileId
 from roadscan.model.rig import Mountings, Sensor
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import charts_along
-from roadscan.points.cloud import QUANTA_PER_M, TilePoints
+from roadscan.points.cloud import TilePoints
 from roadscan.points.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.points.readings import ScanGeometry
 from roadscan.tiles.grid import TileGrid
@@ -74,10 +74,10 @@ def figures(_: Path) -> Iterator[Figure]:
         proj,
         "PROJ, the map step alone",
     )
-    work = np.empty((3, CHUNK)), np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32), np.zeros(FATES, np.int64)
+    places = Placed(*np.empty((3, CHUNK)), np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32))
     yield Figure(
         "lidar returns, placed only (no rows written)",
-        rate(N, lambda: placed_only(placement, batch, *work)),
+        rate(N, lambda: placed_only(placement, batch, places)),
         "M/s",
         proj,
         "PROJ, the map step alone",
@@ -155,21 +155,14 @@ def mirror_profiles(path: Trajectory) -> tuple[pa.RecordBatch, ScanGeometry]:
     return pa.RecordBatch.from_pydict({"epoch_gps_ns": epochs, "range": lists[0], "intensity": lists[1]}), geometry
 
 
-def placed_only(
-    placement: Placement,
-    batch: pa.RecordBatch,
-    enh: np.ndarray,
-    classes: np.ndarray,
-    found: np.ndarray,
-    fates: np.ndarray,
-) -> None:
+def placed_only(placement: Placement, batch: pa.RecordBatch, places: Placed) -> None:
     """What every way from returns to points or cells begins with."""
     columns = [batch.column(c).to_numpy() for c in ("pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m")]
     ((_, mounting),) = placement.mountings.pieces(columns[0])
-    common = (*placement.poses(mounting), placement.limits, float(QUANTA_PER_M))
+    georeference, fates = placement.georeference(mounting), np.zeros(FATES, np.int64)
     for start in range(0, columns[0].size, CHUNK):
         end = min(start + CHUNK, columns[0].size)
-        place_returns(start, end, *columns, *common, *enh, classes, found, fates)
+        place_returns(start, end, Returns(*columns), georeference, places, fates)
 
 
 def tile(rng: np.random.Generator) -> TilePoints:

@@ -23,13 +23,13 @@ from benchmarks.network import Region
 from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.jobs.bundles import Bundle, Ended
-from roadscan.jobs.compute import Made, rare_collections
-from roadscan.jobs.footprints import PRODUCT, FootprintTask, index_footprints
-from roadscan.jobs.on_dask import OnDask
+from roadscan.jobs.engine.bundles import Bundle, Ended
+from roadscan.jobs.engine.compute import Made, rare_collections
+from roadscan.jobs.engine.on_dask import OnDask
 from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
-from roadscan.jobs.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
-from roadscan.jobs.tiles import TaskResult, compute_tiles, run_tasks
+from roadscan.jobs.tiles.footprints import PRODUCT, FootprintTask, index_footprints
+from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
+from roadscan.jobs.tiles.tiles import TaskResult, compute_tiles, run_tasks
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.records import Packed, Row
 from roadscan.tables.store import Store
@@ -171,7 +171,7 @@ def _timed(stage: _Stage, region: Region, client: Any, work: _Work) -> Iterator[
 
 def _imports() -> None:
     """What every worker does once, before its first task."""
-    importlib.import_module("roadscan.jobs.stages")
+    importlib.import_module("roadscan.jobs.run")
 
 
 class _NoKernels(OnDask):

@@ -16,6 +16,8 @@ import rasterio
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.timing import Figure, thread_seconds
+from roadscan.codecs.cog import Band
+from roadscan.codecs.gdal import raster_settings
 from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, Tile, TileSummary
@@ -23,7 +25,7 @@ from roadscan.products.hillshade import HillshadeOptions, shade
 from roadscan.products.kilometre import Kilometre, KilometreOptions
 from roadscan.products.model_las import ModelLas, ModelLasFine
 from roadscan.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
-from roadscan.products.raster import Band, CellBox, SparseRaster, paste_tile, raster_settings
+from roadscan.products.raster import CellBox, SparseRaster, paste_tile
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.decimate import decimate
 from roadscan.tiles.grid import TileGrid

@@ -10,10 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.timing import Figure
-from roadscan.jobs.compute import Inline
 from roadscan.jobs.demo import summarise
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate
@@ -26,7 +28,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     """One core throughout: tasks run in this process."""
     long = road(folder / "2km", 2000.0, spacing_m=0.05, lidar=True)
     seconds = {}
-    for stage in STAGES:
+    for stage in stages():
         started = time.perf_counter()
         run_stages(run_of(long), [stage])
         seconds[stage.name] = time.perf_counter() - started
@@ -64,7 +66,7 @@ def peak_mb(survey_file: Path) -> float:
     """Peak resident memory of `roadscan run --workers 0` (MB)."""
     script = (
         "import json, resource, sys; from benchmarks.bench_pipeline import run_of; from pathlib import Path;"
-        "from roadscan.jobs.stages import run_stages; run_stages(run_of(Path(sys.argv[1])));"
+        "from roadscan.jobs.run import run_stages; run_stages(run_of(Path(sys.argv[1])));"
         "print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))"
     )
     out = subprocess.run([sys.executable, "-c", script, str(survey_file)], check=True, capture_output=True, text=True)
@@ -84,7 +86,7 @@ def road(folder: Path, length_m: float, *, spacing_m: float, lidar: bool) -> Pat
     return simulate(scene, folder).survey_file
 
 
-def run_of(survey_file: Path, selection: Selection | None = None) -> Run:
+def run_of(survey_file: Path, selection: Selection | None = None) -> Session:
     """A run in this process."""
     survey = Survey.load(survey_file)
-    return Run(survey, Store(survey.store_url, survey.config.id), Inline(), selection)
+    return Session(survey, Store(survey.store_url, survey.config.id), Inline(), selection)

@@ -15,13 +15,15 @@ import numpy as np
 from benchmarks import surveys
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import STAGES, Run, run_stages
-from roadscan.jobs.surface_plan import SurfacePlan, plan_surface_work
-from roadscan.jobs.surfaces import compute_surfaces, source_of
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.surface_work import plan_surface_work
+from roadscan.jobs.surfaces.surface_plan import SurfacePlan
+from roadscan.jobs.surfaces.surfaces import compute_surfaces, source_of
 from roadscan.model.survey import Survey
 from roadscan.surfaces.reconstruction import surface_of
-from roadscan.tables.manifest import Manifest
 from roadscan.tables.store import Store
 
 PAIR_M, SICK_S = 5.0, 60.0
@@ -41,8 +43,8 @@ def figures(folder: Path) -> Iterator[Figure]:
 def _measured(name: str, file: Path, folder: Path, surface: dict[str, Any], make: tuple[str, ...]) -> Iterator[Figure]:
     survey = _changed(Survey.load(file), surface, make)
     store = Store(str(folder), survey.config.id)
-    run_stages(Run(survey, store, Inline()), [s for s in STAGES if s.name not in ("surfaces", "products")])
-    planned = plan_surface_work(survey, store, None, Manifest(store)).planned
+    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name not in ("surfaces", "products")])
+    planned = plan_surface_work(Session(survey, store)).planned
     if planned is None:
         return
     held = {t: r.figures()["cells"] for t, r in planned.cells.items()}

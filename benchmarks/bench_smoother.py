@@ -1,10 +1,10 @@
-"""The smoother: its speed, a real drive under masked GNSS, and 50 simulated drives against their covariances."""
+"""The smoother: its speed, a real drive and simulated walks under masked GNSS, 50 simulated drives and their σ."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,9 @@ from scipy.stats import chi2
 from benchmarks.timing import Figure
 from roadscan.model.imu import ImuGrade
 from roadscan.model.smoothing import SmootherConfig
+from roadscan.navigation.inertial.adaptive import solve_adaptively
+from roadscan.navigation.inertial.outcome import figures_of
+from roadscan.navigation.inertial.readings import Solution
 from roadscan.navigation.inertial.smoother import solve
 from tests.navigation.inertial_drives import (
     DRIVE_CONFIG,
@@ -24,17 +27,20 @@ from tests.navigation.inertial_drives import (
     simulated,
     urban,
 )
+from tests.navigation.walks import WALKER, Walked, walked
 
 SEEDS = 50
+WALKS = 12
 RECORDINGS = Path(os.environ.get("ROADSCAN_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
 def figures(_: Path) -> Iterator[Figure]:
-    """Speed, outages of a real drive, odometer, consistency."""
+    """Speed, outages of a real drive, odometer, walks, consistency."""
     yield from speed()
     if RECORDINGS.is_dir():
         yield from real_drive()
         yield from odometer()
+    yield from walks()
     for grade in ("tactical", "mems"):
         yield from consistency(grade)
 
@@ -47,22 +53,25 @@ def speed() -> Iterator[Figure]:
         yield Figure(
             f"filter and smoother, {rate:.0f} Hz, GNSS 5 Hz, odometer (bar: 200)", epochs, "k epochs/s of a core"
         )
+        measuring = made.imu.epochs_gps_ns.size / _core_seconds(made, config, solve_adaptively) / 1e3
+        yield Figure(f"with its noise measured before, {rate:.0f} Hz", measuring, "k epochs/s of a core")
 
 
-def _core_seconds(made: Simulated, config: SmootherConfig) -> float:
+def _core_seconds(made: Simulated, config: SmootherConfig, call: Callable[..., object] = solve) -> float:
     """Least time of a core of four calls, after one that is not counted."""
     times = []
     for _ in range(5):
         started = time.process_time()
-        solve(made.imu, made.gnss, made.odometer, made.vehicle, config)
+        call(made.imu, made.gnss, made.odometer, made.vehicle, config)
         times.append(time.process_time() - started)
     return min(times[1:])
 
 
 def real_drive() -> Iterator[Figure]:
     drive = recorded(RECORDINGS)
-    for name, smooth, limits in (("smoother", True, (0.25, 0.45)), ("forward filter", False, (None, None))):
-        solution = solve(drive.imu, drive.masked, None, drive.vehicle, DRIVE_CONFIG, smooth=smooth)
+    measured = solve_adaptively(drive.imu, drive.masked, None, drive.vehicle, DRIVE_CONFIG).solution
+    forward = solve(drive.imu, drive.masked, None, drive.vehicle, DRIVE_CONFIG, smooth=False)
+    for name, solution, limits in (("smoother", measured, (0.25, 0.45)), ("forward filter", forward, (None, None))):
         for arm_name, arm in (
             ("rig's lever arm", drive.vehicle.antenna_lever_arm_body_m),
             ("estimated lever arm", solution.states["antenna_lever_arm_body_m"][0][-1]),
@@ -80,6 +89,9 @@ def real_drive() -> Iterator[Figure]:
             yield Figure(f"{which}: outside, vertical", _rms(error[outside, 2]), "m", 0.011, against)
             share = float((np.abs(error[~outside]) < 2.5 * sigma[~outside]).mean() * 100)
             yield Figure(f"{which}: within 2.5 σ in outages", share, "%", 95.0, "bar")
+            for axis, columns in (("horizontal", slice(0, 2)), ("vertical", slice(2, 3))):
+                ratio = _rms(error[~outside, columns]) / _rms(sigma[~outside, columns])
+                yield Figure(f"{which}: {axis} error over σ in outages", ratio, "", 1.0, "bar: 0.5 to 1.5")
 
 
 def _bar(limit: float | None) -> str:
@@ -88,6 +100,39 @@ def _bar(limit: float | None) -> str:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean()))
+
+
+def walks() -> Iterator[Figure]:
+    """A rig that a person carries, through four outages of 10 s, with the settings of a vehicle."""
+    for factor in (1.0, 3.0):
+        for name, call in (("noise measured", _adapted), ("noise as stated", _stated)):
+            found = np.array([call(walked(seed, sigma_factor=factor)) for seed in range(1, WALKS + 1)])
+            which = f"{WALKS} walks, GNSS errs by {factor:g} σ, {name}"
+            for column, axis in enumerate(("horizontal", "vertical")):
+                error, sigma = (np.sqrt((found[:, column + k] ** 2).mean()) for k in (0, 2))
+                yield Figure(f"{which}: {axis} RMS in outages", float(error), "m")
+                against = f"bar: 0.5 to 1.5; single walks {_span(found[:, column] / found[:, column + 2])}"
+                yield Figure(f"{which}: {axis} error over σ", float(error / sigma), "", 1.0, against)
+            yield Figure(f"{which}: outliers of GNSS", float(100 * found[:, 4].mean()), "%", 5.0, "bar")
+
+
+def _adapted(walk: Walked) -> tuple[float, ...]:
+    return _told(walk, solve_adaptively(walk.imu, walk.masked, None, walk.vehicle, WALKER).solution)
+
+
+def _stated(walk: Walked) -> tuple[float, ...]:
+    return _told(walk, solve(walk.imu, walk.masked, None, walk.vehicle, WALKER))
+
+
+def _told(walk: Walked, solution: Solution) -> tuple[float, ...]:
+    """RMS of errors and of σ in the outages, horizontal and vertical each, and the share of outliers of GNSS."""
+    horizontal, down, over, under = walk.ratios(solution)
+    share = next(one.outliers for one in figures_of(solution) if one.kind == "gnss")
+    return horizontal, down, horizontal / over, down / under, share
+
+
+def _span(values: np.ndarray) -> str:
+    return f"{values.min():.2f} to {values.max():.2f}"
 
 
 def odometer() -> Iterator[Figure]:

@@ -14,8 +14,10 @@ from benchmarks import skilled_user
 from benchmarks.course import CRS
 from benchmarks.pipeline import survey_with
 from benchmarks.surveys import BenchSurvey
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.model.survey import Survey
 from roadscan.tables.logs import LogRecord, read_log_records
 from roadscan.tables.store import Store
@@ -58,7 +60,7 @@ def ingested(bench: BenchSurvey, folder: Path) -> Store:
     """A store with the survey's tables."""
     survey = survey_with(bench.file, [])
     store = Store(str(folder), survey.config.id)
-    run_stages(Run(survey, store, Inline()), [s for s in STAGES if s.name == "ingest"])
+    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name == "ingest"])
     return store
 
 

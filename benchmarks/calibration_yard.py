@@ -19,12 +19,13 @@ from roadscan.navigation.calibration.stop_and_go import find_orientation
 from roadscan.navigation.calibration.surfaces.readings import Pieces, Readings
 from roadscan.navigation.calibration.unknowns import Prior, mounting_of
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.simulate import Scene, lidar, profiler, simulate
+from roadscan.simulate import Scene, simulate
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount
+from roadscan.simulate.sensors import lidar, profiler
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_of
 

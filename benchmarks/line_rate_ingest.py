@@ -19,9 +19,9 @@ import psutil
 import pyarrow as pa
 
 from benchmarks.timing import Figure
-from roadscan.jobs.compute import Compute
-from roadscan.jobs.compute_on import compute_on
-from roadscan.jobs.ingest import IngestResult, ingest
+from roadscan.jobs.engine.compute import Compute
+from roadscan.jobs.engine.compute_on import compute_on
+from roadscan.jobs.ingest.ingest import IngestResult, ingest
 from roadscan.model.survey import Survey
 from roadscan.tables.store import Store
 

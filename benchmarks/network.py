@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from benchmarks.course import CRS, START_GPS_NS
 from benchmarks.surveys import LINE_SPACING_M, LINE_SPEED_M_PER_S
-from roadscan.jobs.fingerprint import code_version, key_of
-from roadscan.jobs.footprints import FootprintRanges
-from roadscan.jobs.plan import SurveyPlan
+from roadscan.jobs.engine.fingerprint import code_version, key_of
+from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, ReadingSource, TrajectorySource
+from roadscan.jobs.tiles.footprints import FootprintRanges
 from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Mountings, Sensor
 from roadscan.model.survey import Survey

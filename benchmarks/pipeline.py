@@ -13,10 +13,12 @@ from pathlib import Path
 
 import psutil
 
-from roadscan.jobs.compute import Compute
-from roadscan.jobs.compute_on import compute_on
-from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
-from roadscan.jobs.tile_plan import TILE
+from roadscan.jobs.engine.compute import Compute
+from roadscan.jobs.engine.compute_on import compute_on
+from roadscan.jobs.run import close_run, run_stage
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, stages
+from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.strict import load_toml
 from roadscan.model.survey import Survey
 from roadscan.products.base import products
@@ -34,18 +36,18 @@ def main() -> None:
     survey = survey_with(Path(sys.argv[1]), sys.argv[4:] or list(WANTED))
     store = Store(sys.argv[2], survey.config.id)
     figures: dict[str, object] = {"products": survey.config.products.make}
-    stages: dict[str, dict[str, float]] = {}
+    timed: dict[str, dict[str, float]] = {}
     with compute_on(int(sys.argv[3])) as compute:
         started = time.perf_counter()
         for _ in compute.map(_imports, range(int(sys.argv[3]))):
             pass
         figures["start_s"] = time.perf_counter() - started
-        run = Run(survey, store, _Counted(compute))
+        run = Session(survey, store, _Counted(compute))
         with store.lock():
-            for stage in STAGES:
-                stages[stage.name] = _timed(run, stage)
-            close_run(run)
-    print(json.dumps(figures | {"stages": stages} | _stored(store)))
+            for stage in stages():
+                timed[stage.name] = _timed(run, stage)
+            close_run(run, stages())
+    print(json.dumps(figures | {"stages": timed} | _stored(store)))
 
 
 def survey_with(file: Path, wanted: list[str]) -> Survey:
@@ -74,10 +76,10 @@ class _Counted:
 
 def _imports(_: int) -> None:
     """What every worker does once, before its first task."""
-    importlib.import_module("roadscan.jobs.stages")
+    importlib.import_module("roadscan.jobs.run")
 
 
-def _timed(run: Run, stage: Stage) -> dict[str, float]:
+def _timed(run: Session, stage: Stage) -> dict[str, float]:
     """Wall and processor seconds of a stage, and its tasks."""
     counted = run.compute
     tasks, cpu, started = counted.tasks, _cpu_s(), time.perf_counter()  # type: ignore[attr-defined]

@@ -17,7 +17,7 @@ import psutil
 from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.on_dask import QUIET_CLIENT, QUIET_CLUSTER
+from roadscan.jobs.engine.on_dask import QUIET_CLIENT, QUIET_CLUSTER
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]

@@ -215,6 +215,7 @@ def tables(_: str) -> str:
 
 def _table_section(schema: TableSchema) -> str:
     partition = f"Partitioned by {schema.partition_s} s of GPS time. " if schema.partition_s else ""
+    partition += f"Lies in `{schema.location}`. " if schema.location else ""
     order = f"Sorted by {', '.join(f'`{name}`' for name in schema.sort)}."
     rows = [
         (
@@ -375,7 +376,21 @@ def _load(target: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
+def mistakes(_: str) -> str:
+    """Mistakes, what roadscan prints of each when it is made, and what to do."""
+    if (root := str(DOCS.parent)) not in sys.path:
+        sys.path.insert(0, root)  # where this runs as a script
+    from docs.mistakes import MISTAKES, heard
+
+    rows = [
+        (one.name, "<br>".join(f"`` {line.strip()} ``" for line in heard(one).text.splitlines()), one.remedy)
+        for one in MISTAKES
+    ]
+    return markdown_table(("mistake", "what roadscan prints", "what to do"), rows)
+
+
 DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
+    "mistakes": mistakes,
     "fields": fields,
     "model": model,
     "members": members,

@@ -13,9 +13,12 @@ from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed, Failed
 
-from roadscan.jobs.compute_on import compute_on
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, Stage, close_run, run_stage
+from roadscan.jobs.engine.compute_on import compute_on
+from roadscan.jobs.preflight import preflight
+from roadscan.jobs.run import close_run, run_stage
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, stages
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.survey import Survey
 from roadscan.progress import LineReporter
@@ -49,17 +52,19 @@ def conduct(
     try:
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
+        reporter = FlowReporter()
+        preflight(survey, store, selection=selection).begin(reporter.line)
         with store.lock(), compute_on(workers, scheduler) as compute:
-            run = Run(survey, store, compute, selection, FlowReporter())
-            for stage in STAGES:
+            run = Session(survey, store, compute, selection, reporter)
+            for stage in stages():
                 stage_task(stage, run)()
-            close_run(run)
+            close_run(run, stages())
     except RoadscanError as error:
         return failed(error)
     return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})
 
 
-def stage_task(stage: Stage, run: Run) -> Task[[], None]:
+def stage_task(stage: Stage, run: Session) -> Task[[], None]:
     """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
 
     def step() -> None:

@@ -9,7 +9,7 @@ from prefect import flow
 from prefect.client.schemas.objects import State
 
 from flows.conduct import conduct, failed, run_name
-from roadscan.jobs.selection import Selection
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.ids import TileId

@@ -1,3 +1,47 @@
-"""roadscan: raw logs of a road survey in, survey-grade pavement surfaces out."""
+"""roadscan: raw logs of a road survey in, survey-grade pavement surfaces out.
+
+Start with :func:`open_survey` (a survey file) or :func:`read_log` (one log, without a survey).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from roadscan.arrays import write_profiles, write_returns, write_trajectory
+    from roadscan.door import LogTables, MadeProduct, OpenSurvey, open_survey, read_log
+    from roadscan.model.errors import RoadscanError
+
+__all__ = [
+    "LogTables",
+    "MadeProduct",
+    "OpenSurvey",
+    "RoadscanError",
+    "__version__",
+    "open_survey",
+    "read_log",
+    "write_profiles",
+    "write_returns",
+    "write_trajectory",
+]
+
+_ELSEWHERE = {
+    "RoadscanError": "roadscan.model.errors",
+    **dict.fromkeys(("write_profiles", "write_returns", "write_trajectory"), "roadscan.arrays"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is asked for: `import roadscan` loads nothing heavy."""
+    if name not in __all__:
+        raise AttributeError(f"module 'roadscan' has no attribute '{name}'")
+    import importlib
+
+    return getattr(importlib.import_module(_ELSEWHERE.get(name, "roadscan.door")), name)
+
+
+def __dir__() -> list[str]:
+    """Names for completion."""
+    return sorted(__all__)

@@ -9,6 +9,8 @@ that store variants of one function at once, Numba's index keeps only one. A pro
 at most the locks of that function's callers in hand, and functions do not call one another in circles: nobody waits
 for ever. The system gives back the locks of a process that dies.
 
+What is compiled is code that a process runs: a cache that other users can write to is refused.
+
 Each compilation has a number of its own in the names of its machine code, whichever process it ran in. Numba counts
 from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
 name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
@@ -31,6 +33,8 @@ from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
+from roadscan.private_folder import check_private, make_private
+
 try:
     import fcntl
 except ImportError:  # no such locks on this system: each process compiles for itself
@@ -49,7 +53,8 @@ def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -
     folder : from :func:`cache_folder`.
     inlined : only ever into the compiled functions that call it; it gets no entry for Python, which would take longer
         to make than the function itself.
-    counted : references to arrays are counted; a function that makes no array needs none.
+    counted : references to arrays are counted; a function that makes no array needs none. It may not hand one back
+        either: its callers would give back a reference that was never counted. Compiling such a function fails.
     """
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder  # read when the function is decorated
@@ -61,21 +66,28 @@ def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -
     finally:
         numba.config.CACHE_DIR = before
     if not numba.config.DISABLE_JIT:
-        _compile_once(made, folder)
+        _compile_once(made, folder, counted=counted)
         if inlined:
             made.__class__ = _Part
     return cast("Function", made)
 
 
 def cache_folder(kind: str, sources: Iterable[Path]) -> str:
-    """Folder for what is compiled from these files; made where it is not there."""
+    """Folder for what is compiled from these files; made where it is not there.
+
+    Raises
+    ------
+    UnsafeFolderError
+        where another user could write to it, or did: what lies there is code.
+    """
     digest = hashlib.blake2b(digest_size=6)
-    for file in sorted({*sources, Path(__file__)}, key=lambda file: file.name):
+    for file in sorted({*sources, Path(__file__)}, key=str):
         digest.update(file.read_bytes())
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "roadscan" / f"{kind}-{digest.hexdigest()}"
     with contextlib.suppress(OSError):  # not writable: Numba says so, or looks for another place
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private(folder)
+    check_private(folder)
     return str(folder)
 
 
@@ -86,7 +98,7 @@ class _Part(CPUDispatcher):  # type: ignore[misc]
         raise TypeError(f"{self.py_func.__name__} is compiled into its callers only; Python calls a kernel")
 
 
-def _compile_once(dispatcher: Any, folder: str) -> None:
+def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
     """Let a function compile, or load what is compiled, with a lock of its own in the folder.
 
     A literal number counts as its type: Numba would compile a function, and all that it calls, once for a `0` that is
@@ -106,11 +118,23 @@ def _compile_once(dispatcher: Any, folder: str) -> None:
             with _locked(path):
                 inside = True
                 try:
-                    return compile_now(signature)
+                    entry = compile_now(signature)
                 finally:
                     inside = False
+        if not counted and _holds_array(dispatcher.overloads[signature].signature.return_type):
+            raise TypeError(
+                f"{function.__name__} counts no references and hands an array back: its callers would free it"
+            )
+        return entry
 
     dispatcher.compile = compile_alone
+
+
+def _holds_array(kind: Any) -> bool:
+    """Whether a value of a type is an array, or a tuple with one."""
+    if isinstance(kind, numba.types.BaseTuple):
+        return any(_holds_array(part) for part in kind)
+    return isinstance(kind, numba.types.Array)
 
 
 @contextlib.contextmanager

@@ -20,6 +20,12 @@ if os.environ.get("CI"):
     settings.load_profile("ci")
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out tests of the own codecs where libraries do their work."""
+    if item.get_closest_marker("own_codecs") and os.environ.get("ROADSCAN_CODECS") == "library":
+        pytest.skip("libraries alone: ROADSCAN_CODECS")
+
+
 def pytest_collection_finish() -> None:
     """Let Python's collector pass over what the imports left: looking through it takes a twentieth of the time."""
     gc.freeze()

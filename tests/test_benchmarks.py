@@ -15,10 +15,11 @@ from benchmarks.course import HOUR_UTC, START_GPS_NS
 from benchmarks.packets import PACKETS_PER_S, repeat_capture
 from benchmarks.roofline import Roofline
 from benchmarks.same_grid import difference_m, pdal_pipeline, with_numpy, with_roadscan, write_points
-from roadscan.jobs.cell_files import read_cells
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import Run, run_stages
-from roadscan.jobs.tile_plan import TILE
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.tiles.cell_files import read_cells
+from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.strict import load_toml
 from roadscan.model.survey import Survey
@@ -39,7 +40,7 @@ def store(pair: surveys.BenchSurvey) -> Store:
     make = {"products": {"make": ["las"], "options": {"las": {"scale_m": 1e-5, "compress": False}}}}
     survey = Survey.parse(load_toml(pair.file) | make, folder=pair.file.parent)
     store = Store(str(pair.file.parent / "store"), "bench")
-    run_stages(Run(survey, store, Inline()))
+    run_stages(Session(survey, store, Inline()))
     return store
 
 

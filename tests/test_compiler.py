@@ -6,14 +6,17 @@ Of two processes one meets the simulator first: both have to compile for the sam
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = """
 import sys
 import numpy as np
-from roadscan.kernels.poses import slope_weights
+from roadscan.kernels.georeferencing.poses import slope_weights
 print("ready", flush=True)
 sys.stdin.readline()
 times, weights = np.array([0.0, 1.0, 2.0]), np.zeros(3)
@@ -71,6 +74,34 @@ def test_a_written_number_makes_no_second_variant_and_a_part_is_not_called_from_
     assert said.startswith("4 1\none_more is compiled into its callers only")
 
 
+HANDED_BACK = """
+import numpy as np
+from roadscan.kernels.options import bare, kernel
+
+@bare
+def part(values):
+    return 1, values[1:]
+
+@kernel
+def total(values):
+    return part(values)[1].sum()
+
+try:
+    total(np.ones(3))
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+def test_a_kernel_that_counts_no_references_cannot_hand_an_array_back(tmp_path: Path) -> None:
+    """Its callers would give a reference back that was never counted, and free memory that is still in use."""
+    (tmp_path / "handed.py").write_text(HANDED_BACK, encoding="utf-8")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, str(tmp_path / "handed.py")]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=False).stdout
+    assert "part counts no references and hands an array back" in said
+
+
 VARIANTS = """
 import sys
 import numpy as np
@@ -115,3 +146,50 @@ def test_variants_of_one_name_that_two_processes_compile_have_names_of_their_own
     first, second = said("with_twice"), said("with_thrice")
     assert [first[0], second[0], said("with_twice", "with_thrice")[0]] == ["8.0", "12.0", "8.0 12.0"]
     assert first[1] and second[1] and first[1] != second[1]
+
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = """
+from pathlib import Path
+from roadscan.kernels.options import _folder_of_source
+kernels = Path("roadscan/kernels").resolve()
+for file in sorted(kernels.rglob("*.py")):
+    print(file.relative_to(kernels), _folder_of_source(str(file)))
+"""
+CHAIN = {
+    "rooms/first.py": "from roadscan.kernels.rooms import second\n",
+    "rooms/second.py": "from .deep.third import doubled\n",
+    "rooms/deep/third.py": "def f():\n    import roadscan.kernels.fourth\n",
+    "fourth.py": "from . import fifth as other\n",
+    "fifth.py": "FACTOR = 2\n",
+    "rooms/alone.py": "from roadscan.kernels.options import kernel\n",
+}
+
+
+@pytest.mark.parametrize("changed", CHAIN)
+def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Path, changed: str) -> None:
+    """Whatever the form of the import and the depth of the folder; no other kernel is compiled again."""
+    (tmp_path / "roadscan").mkdir()
+    for name in ("__init__.py", "compiler.py", "private_folder.py"):
+        shutil.copy(ROOT / "roadscan" / name, tmp_path / "roadscan" / name)
+    kernels = tmp_path / "roadscan/kernels"
+    for name in ("__init__.py", "options.py"):
+        (kernels / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / "roadscan/kernels" / name, kernels / name)
+    for name, text in CHAIN.items():
+        (kernels / name).parent.mkdir(parents=True, exist_ok=True)
+        (kernels / name).write_text(text, encoding="utf-8")
+        (kernels / name).with_name("__init__.py").touch()
+
+    def folders() -> dict[str, str]:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        command = [sys.executable, "-c", FOLDERS]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        return dict(line.split() for line in done.stdout.splitlines())
+
+    before = folders()
+    (kernels / changed).write_text(CHAIN[changed] + "# changed\n", encoding="utf-8")
+    after = folders()
+    chain = [name for name in CHAIN if name != "rooms/alone.py"]
+    stale = {changed} if changed == "rooms/alone.py" else set(chain[: chain.index(changed) + 1])
+    assert {name for name in before if before[name] != after[name]} == stale

@@ -5,17 +5,24 @@ from __future__ import annotations
 import datetime as dt
 import re
 import runpy
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import laspy
 import numpy as np
 import pandas as pd
+import pyogrio
 import pytest
 import rasterio
 from typer.testing import CliRunner
 
 from docs import generate
 from roadscan.cli import app
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import StoreError
 from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
@@ -23,9 +30,11 @@ from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
 from roadscan.sensors.base import LogSource, Reject, Rows, format_of, log_formats
-from roadscan.tables.schema import table_schema
+from roadscan.tables.schema import _schema_files, table_schema
+from roadscan.tables.sql import query
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -64,9 +73,14 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
+def links(page: Path) -> list[str]:
+    """Targets of a page's links, in order."""
+    return re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+    for target in links(page):
         if "://" in target:
             continue
         path, _, anchor = target.partition("#")
@@ -74,6 +88,83 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert there.exists(), target
         if anchor:
             assert anchor in anchors(there), target
+
+
+def test_every_page_is_linked_from_the_index() -> None:
+    index = ROOT / "docs" / "index.md"
+    linked = {(index.parent / target.partition("#")[0]).resolve() for target in links(index)}
+    pages = {page for page in PAGES if page.parent == index.parent and page != index}
+    assert sorted(page.name for page in pages - linked) == []
+
+
+def test_the_glossary_is_in_order_and_explains_the_terms_that_it_names() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text()
+    terms = re.findall(r"^\*\*(.+?)\.\*\*", text, flags=re.MULTILINE)
+    keys = [term.replace("σ (sigma)", "sigma").lower() for term in terms]
+    assert len(terms) >= 40
+    assert keys == sorted(keys)
+    explained = {term.lower() for term in terms} | {"body"}
+    named = {re.sub(r"\s+", " ", name).lower() for name in re.findall(r"(?<!\*)\*([^*]+)\*(?!\*)", text)} - {"italics"}
+    assert {name for name in named if name not in explained and name.removesuffix("s") not in explained} == set()
+
+
+def test_files_for_gis_open_as_the_page_says(
+    finished: Simulated,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    page = (ROOT / "docs" / "qgis.md").read_text()
+    store = finished.copy_with_store_to(tmp_path / "demo").survey_file.parent / "store" / "survey=demo"
+    kinds = {"GTiff": 0, "las": 0}
+    table = "\n".join(line for line in page.splitlines() if line.startswith("| "))
+    for name in re.findall(r"`((?:products|tiles)/[\w/]+\.(?:tif|laz))`", table):
+        files = sorted(store.glob(name.replace("COLUMN_ROW", "*")))
+        assert files, name
+        if name.endswith(".tif"):
+            with rasterio.open(files[0]) as raster:
+                kinds[raster.driver] += 1
+                assert raster.crs.to_epsg() == 32632
+                assert raster.tags()["ROADSCAN_HEIGHT"] == "ellipsoidal"
+                assert raster.count == (3 if "geotiff" in name else 1)
+        else:
+            with laspy.open(files[0]) as points:
+                kinds["las"] += 1
+                assert points.header.parse_crs().to_epsg() == 32632
+    assert kinds == {"GTiff": 4, "las": 1}
+    monkeypatch.chdir(store.parent.parent)
+    for example in re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL):
+        exec(compile(example, "docs/qgis.md", "exec"), {})
+    layer = pyogrio.read_info("tiles.gpkg", layer="tiles")
+    assert (layer["geometry_type"], layer["crs"]) == ("Polygon", "EPSG:32632")
+    assert "tile" in layer["fields"]
+
+
+def test_readme_lists_every_format_and_product() -> None:
+    tables = dict(re.findall(r"^\| (in|out) \|.*?\n((?:\|.*\n)+)", (ROOT / "README.md").read_text(), re.MULTILINE))
+    assert log_formats().keys() - set(re.findall(r"`(\w+)`", tables["in"])) == set()
+    assert products().keys() == set(re.findall(r"`(\w+)`", tables["out"]))
+
+
+def test_readme_questions_to_the_demo_have_answers(
+    finished: Simulated,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    finished.copy_with_store_to(tmp_path / "demo")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "README.md").read_text()
+    section = page[page.index("\n## Questions in SQL and Python") : page.index("\n## A survey with known truth")]
+    questions = re.findall(r"^roadscan (sql .*)$", section, flags=re.MULTILINE)
+    assert len(questions) == 3
+    for question in questions:
+        outcome = CliRunner().invoke(app, shlex.split(question))
+        assert outcome.exit_code == 0, outcome.output
+        assert len(outcome.stdout.splitlines()) > 2
+    names: dict[str, Any] = {}
+    for example in re.findall(r"^```python\n(.*?)^```", section, flags=re.MULTILINE | re.DOTALL):
+        exec(compile(example, "README.md", "exec"), names)
+    assert names["tiles"].points.sum() == names["cells"].points.sum() > 0
+    assert names["log"].format == "scans"
 
 
 # --- the worked examples ------------------------------------------------------------------------
@@ -111,30 +202,42 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 # --- the examples of CONTRIBUTING.md ------------------------------------------------------------
 
 
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+GROUPS = {"sensors": "roadscan.formats", "jobs/stages": "roadscan.stages"}
+
+
 @pytest.fixture(scope="module")
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The examples, installed as another package that adds them through entry points."""
     folder = tmp_path_factory.mktemp("plugin")
-    blocks = re.findall(
-        r"```python\n# roadscan/(\w+)/(\w+)\.py\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.DOTALL
-    )
+    blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}
     for group, module, code in blocks:
         (folder / f"contributed_{module}.py").write_text(code)
-        name = re.findall(r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct)\)", code, flags=re.MULTILINE)[0]
+        name = re.findall(r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|Stage)\)", code, flags=re.MULTILINE)[0]
         entry = f"{module} = contributed_{module}:{name}"
-        entries.setdefault({"sensors": "roadscan.formats"}.get(group, f"roadscan.{group}"), []).append(entry)
+        entries.setdefault(GROUPS.get(group, f"roadscan.{group}"), []).append(entry)
+    schemas = folder / "contributed_schemas"
+    schemas.mkdir()
+    (schemas / "__init__.py").touch()
+    for name, text in re.findall(r"```toml\n# schemas/(\w+)\.toml\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL):
+        (schemas / f"{name}.toml").write_text(text)
+    entries["roadscan.schemas"] = ["contributed = contributed_schemas"]
     info = folder / "contributed-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: contributed\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("\n".join(f"[{g}]\n" + "\n".join(e) for g, e in entries.items()))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
-        log_formats.cache_clear()
-        products.cache_clear()
+        _look_again()
         yield folder
-    log_formats.cache_clear()
-    products.cache_clear()
+    _look_again()
+
+
+def _look_again() -> None:
+    """Let what is installed be found anew."""
+    for found in (log_formats, products, stages, _schema_files, table_schema):
+        found.cache_clear()
 
 
 def test_the_contributed_format(plugin: Path, tmp_path: Path) -> None:
@@ -232,3 +335,28 @@ def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
     assert "boxlog" in log_formats()
     assert "boxlog" not in generate.formats("")
     assert "flatness" not in generate.product_list("")
+
+
+def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:  # noqa: F811
+    survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
+    assert [s.name for s in stages()][-3:] == ["levels", "surfaces", "products"]
+
+    def due() -> int:
+        return survey_status(Session.open(survey)).of("levels").stale
+
+    manifest = Session.open(survey).manifest
+    manifest.remove(manifest.of("levels").values())  # the fixture's run knew the stage, if it came after the plugin
+    held = len([r for r in Session.open(survey).manifest.of("tile").values() if r.path])
+    assert due() == held
+    assert "levels" in CliRunner().invoke(app, ["--help"]).output
+    outcome = CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"])
+    assert outcome.exit_code == 0, outcome.output
+    assert due() == 0
+    rows = query(Session.open(survey).store, "SELECT tile, level_m, height_mean_m FROM levels JOIN tiles USING (tile)")
+    assert rows.num_rows == held
+    told = CliRunner().invoke(app, ["sql", "--survey", str(survey), "--csv", "SELECT count(*) FROM levels"])
+    assert str(held) in told.output
+    (file,) = {r.path for r in Session.open(survey).manifest.of("levels").values() if r.unit == rows["tile"][0].as_py()}
+    Session.open(survey).store.write_bytes(file, b"damaged")
+    assert any(file in fault for fault in verify_store(Session.open(survey).store))
+    assert due() == 1

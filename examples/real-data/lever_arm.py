@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.spatial import KDTree
 
-from roadscan.jobs.ingest import survey_records
+from roadscan.jobs.ingest.ingest import survey_records
 from roadscan.jobs.readings import TrajectorySource, load_trajectory
 from roadscan.model.survey import Survey
 from roadscan.navigation.trajectory import Trajectory

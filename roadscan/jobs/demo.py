@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.cell_files import read_cells
-from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.tile_plan import TILE
+from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.tiles.cell_files import read_cells
+from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.tables.logs import read_log_records
@@ -35,24 +35,41 @@ class DemoSummary:
     products: Path
     """Folder with the products."""
 
+    def height_error(self) -> dict[str, float]:
+        """Median of the errors, 1.4826 times the median distance from it, and what 95 % stay below (m)."""
+        e = self.height_error_m
+        middle = float(np.median(e))
+        return {
+            "median": middle,
+            "robust_std": float(1.4826 * np.median(np.abs(e - middle))),
+            "percentile_95": float(np.percentile(np.abs(e), 95)),
+        }
+
     def lines(self) -> list[str]:
         """The summary as text."""
-        e = self.height_error_m * 1e3
-        middle = np.median(e)
+        error = self.height_error()
+        compared = f"cell against truth, {self.height_error_m.size:,} cells"
         return [
             f"readings      {self.readings:,}",
             f"tiles         {self.tiles:,}",
             f"area          {self.area_m2:,.1f} m² in {self.cells:,} cells",
-            f"height error  median {middle:+.2f} mm, 1.4826 MAD {1.4826 * np.median(np.abs(e - middle)):.2f} mm, "
-            f"95 % within {np.percentile(np.abs(e), 95):.2f} mm (cell against truth, {e.size:,} cells)",
+            f"height error  median {error['median'] * 1e3:+.2f} mm, 1.4826 MAD {error['robust_std'] * 1e3:.2f} mm, "
+            f"95 % within {error['percentile_95'] * 1e3:.2f} mm ({compared})",
             f"files         {self.products}",
         ]
 
 
 def prepare_demo(folder: Path, report: Callable[[str], None], scene: str = "demo") -> Path:
-    """Write the demo's raw logs, unless they are there; returns the survey file."""
+    """Write the demo's raw logs, unless they are there; returns the survey file.
+
+    Raises
+    ------
+    FormatError
+        where the folder holds a survey that was not simulated.
+    """
     survey_file = folder / "SURVEY.toml"
     if survey_file.exists():
+        truth.load(folder)
         report(f"raw logs are there: {folder}")
         return survey_file
     report(f"simulating the scene '{scene}' into {folder}")

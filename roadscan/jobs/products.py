@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from roadscan.jobs.bundles import run_bundles
-from roadscan.jobs.cell_files import read_cells, read_overview
-from roadscan.jobs.compute import Compute
-from roadscan.jobs.drives import Drives
-from roadscan.jobs.fingerprint import key_of, surface_version
-from roadscan.jobs.plan import SurveyPlan
-from roadscan.jobs.tile_files import WantedProduct, WantedSurface
-from roadscan.jobs.tile_plan import OVERVIEWS, TILE
-from roadscan.jobs.tiles import summary_of
+from roadscan.code_reach import code_digest, name_of
+from roadscan.jobs.engine.bundles import run_bundles
+from roadscan.jobs.engine.compute import Compute
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.plan.drives import Drives
+from roadscan.jobs.plan.plan import SurveyPlan
+from roadscan.jobs.tiles.cell_files import read_cells, read_overview
+from roadscan.jobs.tiles.tile_files import WantedProduct, WantedSurface
+from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE
+from roadscan.jobs.tiles.tiles import summary_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
@@ -31,7 +32,6 @@ from roadscan.products.base import (
     is_default,
     product_named,
     products,
-    source_digest,
 )
 from roadscan.products.lane_direction import LaneDirections
 from roadscan.surfaces.reconstruction import SurfaceGrid
@@ -43,6 +43,8 @@ from roadscan.tiles.pyramid import Level, pyramid_of
 _TILES_DRAWN = 2000
 """Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
 _NOWHERE = TileId(0, 0)
+_OF_SURVEY = ("roadscan.jobs.plan.drives:Drives", "roadscan.jobs.products:StoredTiles")
+"""Code by which survey products get what they draw."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,32 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
     read = (n for p in wanted if isinstance(p, SurveyProduct) for n in p.reads if n not in names)
     wanted += [product_named(n) for n in dict.fromkeys(read)]
     for product in wanted:
-        if isinstance(product, SurfaceProduct) and not with_surface:
-            raise ConfigError(
-                f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
-                change="add the section [surface] to the survey file, or leave the product out",
-            )
-    return [(p, _stated_options(p, config.options.get(p.name, {}))) for p in wanted]
+        _check_surface(survey, product)
+    stated = [(p, _stated_options(p, config.options.get(p.name, {}))) for p in wanted]
+    by_name = {p.name: options for p, options in stated}
+    for product, options in stated:
+        if isinstance(product, SurveyProduct):
+            product.check_reads(options, {name: by_name[name] for name in product.reads})
+    return stated
+
+
+def check_product(survey: Survey, name: str) -> None:
+    """Raise :class:`ConfigError` where a product that the survey file names does not exist, has other settings than
+    those stated, or needs a surface that is not made; reads nothing.
+    """
+    product, config = product_named(name), survey.config.products
+    if name in (config.make or ()):
+        _check_surface(survey, product)
+    _stated_options(product, config.options.get(name, {}))
+
+
+def _check_surface(survey: Survey, product: Product) -> None:
+    of_surface = isinstance(product, SurfaceProduct) or (isinstance(product, SurveyProduct) and product.reads)
+    if of_surface and survey.config.surface is None:
+        raise ConfigError(
+            f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
+            change="add the section [surface] to the survey file, or leave the product out",
+        )
 
 
 def _stated_options(product: Product, values: dict[str, Any]) -> Strict:
@@ -107,8 +129,9 @@ def _default_names(cell_m: float, with_surface: bool) -> list[str]:
 
 def product_context(plan: SurveyPlan) -> ProductContext:
     """What products know of the survey."""
-    config = plan.survey.config
-    return ProductContext(config.id, config.title, plan.ground.map, plan.ground.grid, plan.passes, plan.date)
+    config, grid = plan.survey.config, plan.ground.grid
+    cell_m = None if config.surface is None else SurfaceGrid(grid, config.surface).cell_m
+    return ProductContext(config.id, config.title, plan.ground.map, grid, plan.passes, plan.date, cell_m)
 
 
 def wanted_tile_products(survey: Survey, context: ProductContext) -> list[WantedProduct]:
@@ -175,12 +198,6 @@ def make_products(
     stale.sort(key=lambda t: (t.product.name, min(t.output.tiles, default=_NOWHERE)))  # what draws the same tiles
     failed = run_bundles(write_output, stale, lambda t: len(t.output.tiles), _TILES_DRAWN, manifest, compute, report)
     return [(f"{task.product.name}/{task.output.name}", reason) for task, reason in failed]
-
-
-def recorded_folders() -> list[str]:
-    """Folders of the store that hold nothing but files with a record in the manifest."""
-    of_survey = (f"products/{name}" for name, p in products().items() if isinstance(p, SurveyProduct))
-    return ["tables/footprints", "tables/regions", "tiles", *of_survey]
 
 
 def write_output(task: OutputTask) -> OutputRecord:
@@ -254,8 +271,8 @@ def _tasks(
     own_key = _product_key(product, options, context)
     driven = [] if drives is None else [drives.key()]
     bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # they have a surface, and no reading
-    for planned in product.outputs(list(summaries.values()), options, context) if summaries else []:
-        output = replace(planned, tiles=tuple(sorted({*planned.tiles, *bridged}))) if bridged else planned
+    known = [*summaries.values(), *map(TileSummary.without_readings, sorted(bridged))]
+    for output in product.outputs(known, options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
@@ -286,8 +303,8 @@ def _read(product: SurveyProduct, files: Sequence[OutputRecord], output: Output)
 
 def _product_key(product: Product, options: Strict, context: ProductContext) -> str:
     stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
-    joining = [surface_version()] if isinstance(product, SurveyProduct) and product.reads else []
+    around = _OF_SURVEY if isinstance(product, SurveyProduct) else ()
     return key_of(
-        product.name, product.version, options.model_dump(mode="json"), source_digest(product),
-        context.survey_id, context.title, context.map, context.grid, stated, *joining,
+        product.name, product.version, options.model_dump(mode="json"), code_digest(name_of(type(product)), *around),
+        context.survey_id, context.title, context.map, context.grid, stated,
     )  # fmt: skip

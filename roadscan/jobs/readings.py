@@ -70,7 +70,8 @@ class ReadingSource:
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: poses, corrections, mounting, clock, range limits, map, grid, code."""
+    """Hash of all that places the readings: poses, corrections, mounting, clock, range limits, map, grid. The
+    code that does it belongs to the keys of what it makes."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None

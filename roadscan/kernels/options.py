@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import ast
 import functools
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ def kernel(function: Kernel) -> Kernel:
 
 
 def bare(function: Kernel) -> Kernel:
-    """Compile a kernel that makes no array: it counts no references to those that it is given.
+    """Compile a kernel that makes no array and hands none back: it counts no references to those that it is given.
 
     To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     take as long for that as for the readings.
@@ -57,14 +57,37 @@ def _folder_of(function: Kernel) -> str:
 @functools.cache
 def _folder_of_source(source: str) -> str:
     """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
-    here = Path(__file__).parent
     unseen, seen = [Path(source), Path(__file__)], set[Path]()
     while unseen:
         file = unseen.pop()
         if file not in seen:
             seen.add(file)
-            unseen += [here / f"{name}.py" for name in _IMPORTED_KERNELS.findall(file.read_text(encoding="utf-8"))]
+            unseen += _imported_kernels(file)
     return cache_folder("kernels", seen)
 
 
-_IMPORTED_KERNELS = re.compile(r"^from roadscan\.kernels\.(\w+) import", re.MULTILINE)
+def _imported_kernels(file: Path) -> list[Path]:
+    """Files of this package that a file imports, anywhere in it, whatever form the import has."""
+    here = Path(__file__).parent
+    within = ("roadscan", "kernels", *file.parent.relative_to(here).parts) if file.is_relative_to(here) else ()
+    found = []
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        for name in _imported_names(node, within):
+            if name[:2] == ("roadscan", "kernels"):
+                module = here.joinpath(*name[2:])
+                found += [file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file()]
+    return found
+
+
+def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """What a statement may import, as parts of dotted names: modules, and what may be one inside them.
+
+    within : package that relative imports start from.
+    """
+    if isinstance(node, ast.Import):
+        return [tuple(alias.name.split(".")) for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    own = tuple(node.module.split(".")) if node.module else ()
+    package = (*within[: len(within) + 1 - node.level], *own) if node.level else own
+    return [package, *((*package, alias.name) for alias in node.names)]

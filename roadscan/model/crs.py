@@ -46,15 +46,15 @@ _CARTESIAN_AXES: Final = {
 }
 
 
-def crs_from_text(text: str) -> pyproj.CRS:
-    """CRS from ``"EPSG:25832"``, WKT or PROJJSON; a clear error otherwise."""
+def crs_from_text(text: str, key: str = "CRS") -> pyproj.CRS:
+    """CRS from ``"EPSG:25832"``, WKT or PROJJSON; a clear error, which names the `key` that holds it, otherwise."""
     try:
         return pyproj.CRS.from_user_input(text)
     except ProjCrsError as error:
         raise CrsError(
-            f"CRS '{text[:80]}' is not known to PROJ",
+            f"{key} '{text[:80]}' is not known to PROJ",
             expected="an authority code such as EPSG:25832, or WKT",
-            change=f"PROJ says: {error}",
+            change="check the code (epsg.org lists them)",
         ) from error
 
 
@@ -138,6 +138,10 @@ class Geoid:
             )
         return height
 
+    def check(self) -> None:
+        """Raise :class:`CrsError` unless the grid is there and can be read."""
+        self._transformer()
+
     def _transformer(self) -> pyproj.Transformer:
         try:
             return pyproj.Transformer.from_pipeline(f'+proj=vgridshift +grids="{_grid_file(self.grid)}" +multiplier=1')
@@ -207,8 +211,13 @@ class MapFrame:
                 expected="map.geoid, the file name of a grid",
                 change='add geoid = "us_noaa_g2018u0.tif" (your region\'s grid), or height = "ellipsoidal"',
             )
+        if self.vertical_crs is not None and not crs_from_text(self.vertical_crs, "map.vertical_crs").is_vertical:
+            raise CrsError(
+                f"map.vertical_crs '{self.vertical_crs}' ({crs_from_text(self.vertical_crs).name}) is not vertical",
+                expected='a CRS of heights, such as "EPSG:7837"',
+            )
         if self.crs is not None:
-            horizontal = crs_from_text(self.crs)
+            horizontal = crs_from_text(self.crs, "map.crs")
             if horizontal.is_compound:
                 raise CrsError(
                     f"map.crs '{self.crs}' is compound",
@@ -219,6 +228,7 @@ class MapFrame:
                 raise CrsError(
                     f"map.crs '{self.crs}' ({horizontal.name}) is not projected",
                     expected="a CRS in metres or feet, such as a UTM zone",
+                    change='state the projected CRS of your region, such as "EPSG:25832"',
                 )
 
     @property
@@ -261,6 +271,45 @@ class MapFrame:
     def world_from_map(self, world: str, enh_m: Float64) -> Float64:
         """World positions (n, 3) of map coordinates (n, 3) in metres: the inverse of `map_from_world`."""
         return self._inverse(world, np.asarray(enh_m, dtype=np.float64))
+
+    def check_world(self, world: str) -> None:
+        """Raise :class:`CrsError` where positions of a world frame cannot be brought into the map: no anchor, or a
+        change of datum that PROJ does not know well enough.
+        """
+        if world == LOCAL_WORLD:
+            if self.crs is not None:
+                self.check_world(self._anchor_for(world).world)
+        elif self.crs is None:
+            self._to_anchor_world(world)
+        else:
+            _projection(self.crs, world, self.geoid, self.max_datum_error_m)
+
+    def beyond_area_deg(self, lon_lat_deg: Float64) -> float:
+        """How far (degrees) a place, longitude and latitude (2,), lies outside the area that the map's CRS is made for;
+        0 inside it, in a local map, and where PROJ states no area.
+        """
+        area = None if self.crs is None else crs_from_text(self.crs).area_of_use
+        if area is None:
+            return 0.0
+        longitude, latitude = (float(v) for v in lon_lat_deg[:2])
+        width = (area.east - area.west) % 360.0 or 360.0
+        from_west = (longitude - area.west) % 360.0
+        across = 0.0 if from_west <= width else min(from_west - width, 360.0 - from_west)
+        return max(across, area.south - latitude, latitude - area.north, 0.0)
+
+    def length_scale(self, lon_lat_deg: Float64) -> float:
+        """Length on the map over length on the ellipsoid at a place, longitude and latitude (2,), in the direction
+        where the two differ most; 1 in a local map, and where PROJ has no factors for the CRS.
+        """
+        if self.crs is None:
+            return 1.0
+        longitude, latitude = (float(v) for v in lon_lat_deg[:2])
+        try:
+            factors = pyproj.Proj(crs_from_text(self.crs)).get_factors(longitude, latitude)
+        except (ProjError, ProjCrsError):
+            return 1.0
+        scales = [s for s in (factors.meridional_scale, factors.parallel_scale) if math.isfinite(s)]
+        return max(scales, key=lambda scale: abs(scale - 1.0), default=1.0)
 
     def _forward(self, world: str, xyz: Float64) -> Float64:
         if self.crs is None:
@@ -346,7 +395,7 @@ def _projection(crs: str, world: str, geoid: Geoid | None, limit_m: float) -> _S
     target = crs_from_text(crs).to_3d()
     units = np.array([axis.unit_conversion_factor for axis in target.axis_info[:3]])
     source = crs_from_text(world)
-    geographic = _geographic_of(world)
+    geographic = geographic_of(world)
     to_degrees = pyproj.Transformer.from_crs(source, geographic, always_xy=True) if geoid else None
     return _Step(_transformer(source, target, limit_m), units, geoid, to_degrees)
 
@@ -356,7 +405,8 @@ def _datum_step(world: str, target: str, limit_m: float) -> _Step:
     return _Step(_transformer(crs_from_text(world), crs_from_text(target), limit_m), np.ones(3))
 
 
-def _geographic_of(world: str) -> pyproj.CRS:
+def geographic_of(world: str) -> pyproj.CRS:
+    """Geographic CRS (degrees, ellipsoidal heights in metres) of the datum of a geocentric world frame."""
     source = crs_from_text(world)
     parts: dict[str, Any] = source.to_json_dict()
     axes = [
@@ -389,13 +439,13 @@ def _transformer(source: pyproj.CRS, target: pyproj.CRS, limit_m: float) -> pypr
 
 def geodetic_from_world(world: str, xyz_world_m: Float64) -> Float64:
     """Longitude (°), latitude (°), ellipsoidal height (m), (n, 3), of positions in a geocentric world frame."""
-    to_degrees = pyproj.Transformer.from_crs(crs_from_text(world), _geographic_of(world), always_xy=True)
+    to_degrees = pyproj.Transformer.from_crs(crs_from_text(world), geographic_of(world), always_xy=True)
     return np.stack(to_degrees.transform(*np.asarray(xyz_world_m, dtype=np.float64).T), axis=-1)
 
 
 def world_from_geodetic(world: str, lon_lat_height: Float64) -> Float64:
     """Positions (n, 3) in a geocentric world frame of longitude (°), latitude (°), ellipsoidal height (m)."""
-    from_degrees = pyproj.Transformer.from_crs(_geographic_of(world), crs_from_text(world), always_xy=True)
+    from_degrees = pyproj.Transformer.from_crs(geographic_of(world), crs_from_text(world), always_xy=True)
     return np.stack(from_degrees.transform(*np.asarray(lon_lat_height, dtype=np.float64).T), axis=-1)
 
 

@@ -8,7 +8,7 @@ from roadscan.model.strict import Strict
 
 
 class CrackDetection(Strict):
-    """Where a surface has cracks (``surfaces/valleys.py``, ``surfaces/cracks.py``)."""
+    """Where a surface has cracks (``valleys.py``, ``cracks.py``)."""
 
     max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
     """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""
@@ -38,7 +38,7 @@ class CrackDetection(Strict):
 
 
 class CrackJoining(Strict):
-    """What is a crack once its pieces are joined over all tiles, and of which type (``surfaces/crack_network.py``)."""
+    """What is a crack once its pieces are joined over all tiles, and of which type (``crack_network.py``)."""
 
     min_length_m: float = Field(default=0.15, ge=0.0)
     """Least length of a crack with all its branches, over all tiles (m)."""
@@ -57,7 +57,7 @@ class CrackJoining(Strict):
 
 
 class PotholeDetection(Strict):
-    """Where a surface may have potholes (``surfaces/potholes.py``)."""
+    """Where a surface may have potholes (``potholes.py``)."""
 
     block_m: float = Field(default=0.05, gt=0.0, le=0.5)
     """Edge of the blocks whose mean heights show the ground around (m)."""

@@ -7,6 +7,7 @@ Quaternions are scalar first (w, x, y, z).
 
 from __future__ import annotations
 
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -16,13 +17,20 @@ from roadscan.model.errors import ConfigError
 
 Float64 = npt.NDArray[np.float64]
 
-BODY_FROM_AXES: Final[dict[str, Float64]] = {
-    "frd": np.diag([1.0, 1.0, 1.0]),
-    "flu": np.diag([1.0, -1.0, -1.0]),
-    "rfu": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
-    "bru": np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
-}
-"""Body (forward-right-down) from the axes a maker uses; each letter names where x, y, z point."""
+DIRECTIONS: Final = {"f": "forward", "r": "right", "d": "down", "b": "back", "l": "left", "u": "up"}
+"""Words of the letters that axes are named by."""
+
+_UNIT: Final = {**dict(zip("frd", np.eye(3), strict=True)), **dict(zip("blu", -np.eye(3), strict=True))}
+
+
+def _right_handed() -> dict[str, Float64]:
+    """Matrices whose columns are three of the body's directions, by their letters, without those that mirror."""
+    every = {"".join(letters): np.column_stack([_UNIT[c] for c in letters]) for letters in permutations(_UNIT, 3)}
+    return {axes: matrix + 0.0 for axes, matrix in every.items() if np.linalg.det(matrix) > 0.5}  # no −0
+
+
+BODY_FROM_AXES: Final[dict[str, Float64]] = _right_handed()
+"""Body (forward-right-down) from the 24 ways to mount axes along the body's; a letter each says where x, y, z point."""
 
 ENU_FROM_NED: Final[Float64] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.errors import TimeSystemError
+from roadscan.model.errors import Missing, TimeSystemError
 
 Int64 = npt.NDArray[np.int64]
 
@@ -88,6 +88,11 @@ def gps_ns_from_utc(moment: dt.datetime) -> int:
     return (whole - GPS_EPOCH_UNIX_S + int(leap_seconds_at_unix(whole))) * NS_PER_S + delta.microseconds * 1_000
 
 
+def leap_second_steps() -> list[tuple[int, int]]:
+    """First GPS second with each number of leap seconds, and that number, ascending."""
+    return [(int(first), count) for count, first in enumerate(_LEAP_GPS_S, 1)]
+
+
 def utc_from_gps_ns(epoch_gps_ns: int) -> dt.datetime:
     """UTC datetime (microseconds) of a GPS epoch."""
     whole, rest = divmod(int(epoch_gps_ns), NS_PER_S)
@@ -155,6 +160,7 @@ class Clock:
             "stamps are seconds of the GPS week, and the week is not known",
             expected="the GPS week or the date of the log",
             change="add week = 2405 or date = 2026-02-11 to the log's clock",
+            missing=Missing("clock", {"system": "gps_week_seconds", "week": 2405}),
         )
 
     def to_epoch_gps_ns(self, stamps: npt.NDArray[np.generic]) -> Int64:
@@ -238,10 +244,12 @@ class Clock:
         # Which unit would have made sense of this stamp? Say so instead of guessing.
         fits = [unit for unit, scale in UNIT_NS.items() if unit != self.unit and self._plausible(stamp, scale)]
         hint = f"as '{fits[0]}' it would fit: set clock.unit = \"{fits[0]}\" if that is so" if fits else ""
+        clock = {"system": str(self.system), "unit": fits[0]} if fits else None
         raise TimeSystemError(
             f"stamp {shown} read as {self.unit} of '{self.system}' falls outside 1980–2080",
             expected="a stamp inside that span",
             change=hint or "check clock.system, clock.unit and clock.offset_s of this log",
+            missing=Missing("clock", clock),
         )
 
     def _plausible(self, stamp: float, scale_ns: int) -> bool:

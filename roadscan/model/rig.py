@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,9 @@ from roadscan.model.strict import Strict, load_toml
 Float64 = npt.NDArray[np.float64]
 
 SensorKind = Literal["profiler", "lidar", "camera", "gnss", "imu", "encoder"]
+
+
+_MOUNTING_KEYS: Final = ("axes", "boresight", "body_from_sensor", "lever_arm_body_m")
 
 
 @dataclass(frozen=True)
@@ -77,21 +80,26 @@ class Sensor(Strict):
     """One sensor of the rig."""
 
     kind: SensorKind
-    """What it is: profiler, lidar, camera, gnss, imu or encoder."""
+    """What it is: profiler, lidar, camera, gnss, imu or encoder. A log that it cannot have written is refused: scans
+    are of a profiler or lidar, returns of a lidar, images of a camera, clouds of any of these three."""
     model: str = ""
     """Maker's name, for the reader of the file only."""
     axes: str = "frd"
-    """Where the sensor's x, y, z point when it is mounted without misalignment: three letters
-    of f(orward) b(ack) r(ight) l(eft) u(p) d(own): frd, flu, rfu or bru. Ignored with `body_from_sensor`."""
+    """Where the sensor's x, y, z point when it is mounted without misalignment: three letters of f(orward) b(ack)
+    r(ight) l(eft) u(p) d(own), right-handed: one of 24 codes such as frd, flu or urf. Ignored with
+    `body_from_sensor`. Where it is left out, the log's own statement holds, if its format makes one."""
     lever_arm_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From the IMU reference point to the sensor's origin, body axes forward, right, down (m)."""
     boresight: Boresight = Boresight()
     """Misalignment: body_from_sensor = R(roll, pitch, heading) · body_from_axes."""
     body_from_sensor: tuple[tuple[float, float, float], ...] | None = None
     """The whole 3 × 3 rotation as rows, in place of `axes` and `boresight` (from a calibration sheet)."""
+    mounts_vehicle_frame: bool = False
+    """Confirms a lever arm or axes for readings that are in the vehicle's frame already, which are refused otherwise:
+    the maker's vehicle frame is then mounted in the body, because it is not the one that the trajectory holds."""
     range_min_m: float = Field(default=0.0, ge=0.0)
     """Returns and readings of profiles nearer than this are left out (own vehicle); points of clouds have no range."""
-    range_max_m: float = Field(default=float("inf"), gt=0.0)
+    range_max_m: float = Field(default=float("inf"), gt=0.0, allow_inf_nan=True)
     """Returns and readings of profiles farther than this are left out."""
     metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
@@ -110,7 +118,9 @@ class Sensor(Strict):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.axes not in BODY_FROM_AXES:
-            raise ValueError(f"axes '{self.axes}', expected one of {', '.join(BODY_FROM_AXES)}")
+            raise ValueError(
+                f"axes '{self.axes}' are no right-handed set of directions, expected one of {', '.join(BODY_FROM_AXES)}"
+            )
         if self.range_max_m <= self.range_min_m:
             raise ValueError(f"range_max_m {self.range_max_m:g} is not above range_min_m {self.range_min_m:g}")
         if any(len(polygon) < 3 for polygon in self.own_vehicle_px):
@@ -122,6 +132,22 @@ class Sensor(Strict):
             if np.linalg.det(matrix) < 0:
                 raise ValueError("body_from_sensor mirrors (determinant −1): an axis points the wrong way")
         return self
+
+    def stated_mounting(self) -> list[str]:
+        """Keys by which the rig file says how the sensor is mounted."""
+        return [key for key in _MOUNTING_KEYS if key in self.model_fields_set]
+
+    def mounted_as(self, known: Mapping[str, Any]) -> Self:
+        """The sensor with what its log says of its mounting, where the rig file states nothing.
+
+        Parameters
+        ----------
+        known : values by key, of those that :meth:`stated_mounting` may name.
+        """
+        stated = self.stated_mounting()
+        turned = {"axes", "boresight"} if "body_from_sensor" in stated else set()
+        added = {key: value for key, value in known.items() if key not in {*stated, *turned}}
+        return self.parse({**self.model_dump(exclude_unset=True), **added}) if added else self
 
     def imu_errors(self) -> ImuErrors | None:
         """Errors of an IMU, None where the rig file states none."""

@@ -6,8 +6,6 @@ out is parsed again and has to mean the old file with just these changes, or not
 
 from __future__ import annotations
 
-import datetime as dt
-import json
 import os
 import re
 import tempfile
@@ -20,6 +18,7 @@ from typing import Any, Final
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.rig import Rig
 from roadscan.model.strict import load_toml
+from roadscan.model.toml_text import toml, toml_key
 
 _KEY: Final = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
 _DOTTED: Final = rf"{_KEY}(?:[ \t]*\.[ \t]*{_KEY})*"
@@ -130,18 +129,18 @@ def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path |
     stated = [s for s in statements if s.table == own and s.key == (key,)]
     if stated:
         begin, end = stated[0].value
-        return text[:begin] + _toml(value) + text[end:]
+        return text[:begin] + toml(value) + text[end:]
     table = [s for s in statements if s.table == (*own, key)]
     if table:
         return _with_table(text, table, value, sensor, file)
     newline = "\r\n" if "\r\n" in text else "\n"
     if isinstance(value, dict):
         last = [s for s in statements if s.table[: len(own)] == own][-1]
-        name = ".".join(_toml_key(k) for k in (*own, key))
-        lines = [f"[{name}]", *(f"{_toml_key(k)} = {_toml(v)}" for k, v in value.items())]
+        name = ".".join(toml_key(k) for k in (*own, key))
+        lines = [f"[{name}]", *(f"{toml_key(k)} = {toml(v)}" for k, v in value.items())]
         return _inserted(text, last.end, ["", *lines], newline)
     last = [s for s in statements if s.table == own][-1]
-    return _inserted(text, last.end, [f"{_toml_key(key)} = {_toml(value)}"], newline)
+    return _inserted(text, last.end, [f"{toml_key(key)} = {toml(value)}"], newline)
 
 
 def _with_table(text: str, table: Sequence[_Statement], value: Any, sensor: str, file: str | Path | None) -> str:
@@ -150,13 +149,13 @@ def _with_table(text: str, table: Sequence[_Statement], value: Any, sensor: str,
         raise _unsafe(sensor, f"'{table[0].table[-1]}' is a table with dotted keys", file)
     stated = {s.key[0]: s for s in table if s.key}
     newline = "\r\n" if "\r\n" in text else "\n"
-    added = [f"{_toml_key(k)} = {_toml(v)}" for k, v in value.items() if k not in stated]
+    added = [f"{toml_key(k)} = {toml(v)}" for k, v in value.items() if k not in stated]
     if added:
         text = _inserted(text, table[-1].end, added, newline)
     for key, statement in sorted(stated.items(), key=lambda item: -item[1].begin):
         if key in value:
             begin, end = statement.value
-            text = text[:begin] + _toml(value[key]) + text[end:]
+            text = text[:begin] + toml(value[key]) + text[end:]
         else:
             text = text[: statement.begin] + text[statement.end :]
     return text
@@ -240,30 +239,10 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_toml_key(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, dt.date) and not isinstance(value, dt.datetime):
-        return value.isoformat()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    raise ConfigError(f"a value of type {type(value).__name__} in a rig file", expected="numbers, texts, dates, lists")
-
-
-def _toml_key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else json.dumps(key, ensure_ascii=False)
-
-
 def _unsafe(sensor: str, reason: str, file: str | Path | None) -> ConfigError:
     return ConfigError(
         f"the sensor '{sensor}' cannot be changed in this file: {reason}",
-        expected=f"a table [sensors.{_toml_key(sensor)}] with a key a line",
+        expected=f"a table [sensors.{toml_key(sensor)}] with a key a line",
         change="write it like that, or enter the values by hand",
         file=file,
     )

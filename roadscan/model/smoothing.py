@@ -87,6 +87,19 @@ class SmootherConfig(Strict):
     standing_deg_per_s: float = Field(default=0.02, gt=0.0)
     """1 σ of a standing vehicle's rotation (°/s)."""
 
+    measure_noise: bool = True
+    """Noise is measured on the run before it is used: the σ of constraints above, and factors of the σ of GNSS and of
+    the noise of the IMU. None is taken smaller than stated, but for the share of vibration."""
+    gnss_position_factor: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Multiplies the σ of positions of GNSS, beside `gnss_sigma_factor` and above the floor (1)."""
+    gnss_velocity_factor: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Multiplies the σ of velocities of GNSS in the same way (1)."""
+    imu_factor_horizontal: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Multiplies the noise (1 σ) of the gyroscopes, and of the accelerometers along the level axes of the body (1);
+    below 1 only what vibration adds to the data sheet's."""
+    imu_factor_vertical: float = Field(default=1.0, gt=0.0, le=100.0)
+    """Multiplies the noise (1 σ) of the accelerometers along the vertical axis of the body (1)."""
+
     outlier_probability: float = Field(default=0.001, gt=0.0, lt=0.5)
     """Updates whose innovation would be exceeded with less than this probability count less."""
     outlier_patience_s: float = Field(default=15.0, gt=0.0)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import datetime as dt
 import inspect
+import re
 import textwrap
 import tomllib
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
@@ -13,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_or
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.errors import ConfigError, in_words, nearest
 
 
 class Strict(BaseModel):
@@ -23,6 +26,7 @@ class Strict(BaseModel):
         extra="forbid",
         frozen=True,
         validate_default=True,
+        allow_inf_nan=False,
         ser_json_inf_nan="constants",
     )
 
@@ -32,10 +36,7 @@ class Strict(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            # A table where a path could stand too: only the table's own faults help.
-            found = [f for f in error.errors() if f["type"] != "path_type" or not isinstance(f["input"], dict)]
-            faults = [_describe(cls, fault) for fault in found]
-            raise ConfigError("; ".join(faults), file=file) from error
+            raise ConfigError("; ".join(faults_in_words(cls, values, error)), file=file) from error
 
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
@@ -75,6 +76,11 @@ def load_toml(path: str | Path) -> dict[str, Any]:
         values = tomllib.loads(text)
     except FileNotFoundError as error:
         raise ConfigError("the file does not exist", file=path) from error
+    except IsADirectoryError as error:
+        raise ConfigError("this is a folder", expected="a file (TOML)", file=path) from error
+    except OSError as error:
+        reason = in_words(error)
+        raise ConfigError(f"the file cannot be read: {reason.arrived}", change=reason.change, file=path) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"not valid TOML: {error}", file=path) from error
     _refuse_open_questions(text, path)
@@ -94,36 +100,160 @@ def _refuse_open_questions(text: str, path: str | Path) -> None:
         )
 
 
-def _describe(model: type[BaseModel], fault: Any) -> str:
-    where, current = _walk(model, fault["loc"])
-    if fault["type"] == "extra_forbidden":
-        known = list(current.model_fields) if current is not None else []
-        key = str(fault["loc"][-1])
-        return f"unknown key '{where}'{nearest(key, known)}, expected one of: {', '.join(sorted(known))}"
-    if fault["type"] == "missing":
-        return f"key '{where}' is missing"
-    if fault["type"] in {"union_tag_not_found", "union_tag_invalid"}:
-        return _untold(where, fault["ctx"])
-    message = str(fault["msg"]).removeprefix("Value error, ")
-    if not where:
-        return message
-    given = "" if isinstance(fault["input"], dict | list | BaseModel) else f" (got {fault['input']!r})"
-    return f"'{where}'{given}: {message}"
+def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError) -> list[str]:
+    """Every fault of a validation in words, one for each key: where, what stands there, what is expected."""
+    faults = error.errors(include_url=False)
+    told: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union has a fault for each
+    for fault in faults:
+        if _is_beside(fault, faults):
+            continue
+        place, holder = _walk(model, fault["loc"])
+        if fault["type"] in _OF_TAGS:
+            place.append(fault["ctx"]["discriminator"].strip("'"))
+        where = _place(place, values)
+        told.setdefault((where, _got(fault)), []).append(_expected(fault, holder, where))
+    return [_sentence(where, got, expected) for (where, got), expected in told.items()]
 
 
-def _untold(where: str, context: dict[str, str]) -> str:
-    """Which of several tables is meant is not said by its key, or by a word that is none of theirs."""
-    key = context["discriminator"].strip("'")
-    if "tag" not in context:
-        return f"key '{where}.{key}' is missing"
-    known = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
-    tag = context["tag"]
-    return f"'{where}.{key}' (got '{tag}'): unknown{nearest(tag, known)}, expected one of: {', '.join(known)}"
+def _is_beside(fault: Any, faults: Sequence[Any]) -> bool:
+    """A table where a text could stand too: only the table's own faults help."""
+    above = fault["loc"][:-1]
+    others = (f for f in faults if f is not fault and f["loc"][: len(above)] == above)
+    return isinstance(fault["input"], dict) and fault["type"] not in _OF_TABLES and any(others)
 
 
-def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
+def _got(fault: Any) -> str:
+    if fault["type"] == "union_tag_invalid":
+        return f" (got '{fault['ctx']['tag']}')"
+    if fault["type"] in _WITHOUT_VALUE or isinstance(fault["input"], dict | list | tuple | BaseModel):
+        return ""
+    return f" (got {_toml_value(fault['input'])})"
+
+
+def _toml_value(value: Any) -> str:
+    """A value as it stands in the file."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dt.date | dt.time):
+        return value.isoformat()
+    return repr(str(value)) if isinstance(value, str | Path) else str(value)
+
+
+def _sentence(where: str, got: str, expected: list[str]) -> str:
+    own = list(dict.fromkeys(expected))
+    choices = [one.removeprefix(_EXPECTED) for one in own if one.startswith(_EXPECTED)]
+    rest = [one for one in own if not one.startswith(_EXPECTED)]
+    said = "; ".join([*rest, *([_EXPECTED + " or ".join(choices)] if choices else [])])
+    if any(one.startswith(("unknown key ", "key ")) for one in rest) or not where:
+        return said
+    return f"{where}{got}: {said}"
+
+
+_EXPECTED: Final = "expected "
+_OF_TAGS: Final = frozenset({"union_tag_not_found", "union_tag_invalid"})
+_OF_TABLES: Final = _OF_TAGS | {"extra_forbidden", "missing"}
+_WITHOUT_VALUE: Final = _OF_TABLES | {"value_error"}
+
+_NUMBER, _WHOLE, _TABLE, _LIST = (
+    "a number",
+    "a whole number",
+    "a table, such as {{ key = value }}",
+    "a list, such as [ … ]",
+)
+_DATE, _INSTANT = "a date, such as 2026-05-04", "a date and time with its zone, such as 2026-05-04T09:30:00Z"
+
+_WORDS: Final[dict[str, str]] = {
+    "greater_than": "a number above {gt:g}", "greater_than_equal": "{ge:g} or more",
+    "less_than": "a number below {lt:g}", "less_than_equal": "{le:g} or less",
+    "multiple_of": "a multiple of {multiple_of:g}", "finite_number": "a finite number",
+    "float_type": _NUMBER, "float_parsing": _NUMBER,
+    "int_type": _WHOLE, "int_parsing": _WHOLE, "int_from_float": _WHOLE, "int_parsing_size": _WHOLE + " of usual size",
+    "bool_type": "true or false", "bool_parsing": "true or false",
+    "string_type": "a text in quotes", "string_unicode": "a text in UTF-8", "path_type": "a path in quotes",
+    "string_too_short": "a text of {min_length} letters or more",
+    "string_too_long": "a text of {max_length} letters or less",
+    "list_type": _LIST, "tuple_type": _LIST, "iterable_type": _LIST, "set_type": _LIST,
+    "too_short": "a list of at least {min_length} ({actual_length} given)",
+    "too_long": "a list of at most {max_length} ({actual_length} given)",
+    "dict_type": _TABLE, "mapping_type": _TABLE, "model_type": _TABLE, "model_attributes_type": _TABLE,
+    "invalid_key": "keys that are text",
+    "date_type": _DATE, "date_parsing": _DATE, "date_from_datetime_parsing": _DATE, "date_from_datetime_inexact": _DATE,
+    "datetime_type": _INSTANT, "datetime_parsing": _INSTANT, "datetime_object_invalid": _INSTANT,
+    "datetime_from_date_parsing": _INSTANT, "timezone_naive": _INSTANT, "timezone_aware": _INSTANT,
+    "none_required": "nothing: leave the key out",
+}  # fmt: skip
+"""What is expected, by the kind of a fault of pydantic."""
+
+NAME_PATTERN: Final = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
+"""What an id may be."""
+_PATTERNS: Final[dict[str, str]] = {
+    NAME_PATTERN: "1 to 64 letters (A–Z, a–z), digits, '_', '-' or '.', of which the first is a letter or a digit",
+}
+
+
+def pattern_in_words(pattern: str, words: str) -> str:
+    """The pattern; a text that does not follow it is told of in these words."""
+    _PATTERNS[pattern] = words
+    return pattern
+
+
+def _expected(fault: Any, holder: type[BaseModel] | None, where: str) -> str:
+    """What a fault says, as a part of a sentence."""
+    kind, context = str(fault["type"]), fault.get("ctx", {})
+    match kind:
+        case "extra_forbidden":
+            known = list(holder.model_fields) if holder is not None else []
+            return f"unknown key {where}{nearest(str(fault['loc'][-1]), known)}, expected one of: " + ", ".join(
+                sorted(known)
+            )
+        case "missing" | "union_tag_not_found":
+            return f"key {where} is missing"
+        case "union_tag_invalid":
+            tags = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+            return f"unknown{nearest(context['tag'], tags)}, expected one of: {', '.join(tags)}"
+        case "literal_error" | "enum":
+            choices = [one.strip("'") for one in re.findall(r"'[^']*'|-?\d+", str(context["expected"]))]
+            return f"{_EXPECTED}one of: {', '.join(choices)}{nearest(str(fault['input']), choices)}"
+        case "string_pattern_mismatch":
+            return _EXPECTED + _PATTERNS.get(context["pattern"], "a text of another form")
+        case "value_error" | "assertion_error":
+            return str(context["error"])
+    return _EXPECTED + _WORDS.get(kind, "another kind of value").format(**context)
+
+
+_ENTRIES: Final = {"logs": "log", "runs": "run", "passes": "pass", "control": "control log"}
+_LABELS: Final = ("path", "id", "sensor")
+
+
+def _place(location: Sequence[int | str], values: Any) -> str:
+    """Where in the file: a key, of the log (by its path), the run or the pass that it belongs to."""
+    label, rest, value = "", list(location), values
+    for depth, part in enumerate(location):
+        value = _inside(value, part)
+        entry = _ENTRIES.get(str(location[depth - 1])) if depth and isinstance(part, int) else None
+        if entry is not None:
+            label = _label(entry, value) or f"number {int(part) + 1} of {location[depth - 1]}"
+            rest = list(location[depth + 1 :])
+    if not label:
+        return f"'{'.'.join(map(str, location))}'" if location else ""
+    return f"'{'.'.join(map(str, rest))}' of {label}" if rest else label
+
+
+def _label(entry: str, value: Any) -> str:
+    """What a log, a run or a pass is called in the file, "" where it says nothing."""
+    name = next((value[key] for key in _LABELS if key in value), None) if isinstance(value, dict) else None
+    return f"{entry} '{name}'" if isinstance(name, str) else f"{entry} {name}" if isinstance(name, int) else ""
+
+
+def _inside(value: Any, part: int | str) -> Any:
+    if isinstance(value, dict):
+        return value.get(part)
+    return value[part] if isinstance(value, list) and isinstance(part, int) and part < len(value) else None
+
+
+def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
     """Keys of the file that lead to `location`, and the model that holds the last of them."""
-    names: list[str] = []
+    place: list[int | str] = []
     holder: type[BaseModel] | None = None
     annotation: Any = model
     for part in location:
@@ -131,7 +261,9 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str,
         if choices:  # pydantic names the member of a union, which the file does not
             annotation = next((c for c in choices if _is_called(c, part)), None)
             continue
-        names.append(str(part))
+        if part == "[key]":
+            continue
+        place.append(part)
         holder = annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
         if holder is not None:
             field = holder.model_fields.get(str(part))
@@ -140,7 +272,7 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str,
             arguments = get_args(annotation)
             position = 1 if get_origin(annotation) is dict else 0
             annotation = arguments[position] if len(arguments) > position else None
-    return ".".join(names), holder
+    return place, holder
 
 
 def _is_called(member: Any, name: int | str) -> bool:

@@ -17,10 +17,8 @@ from roadscan.model.ids import LanePass, PassId, RunId
 from roadscan.model.rig import Rig, Sensor
 from roadscan.model.segmentation import RoadSegmentation
 from roadscan.model.smoothing import SmootherConfig, SplineConfig
-from roadscan.model.strict import Strict, load_toml
+from roadscan.model.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.model.surface import SurfaceConfig
-
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 
 
 class AnchorConfig(Strict):
@@ -98,7 +96,7 @@ class ClockConfig(Strict):
     """GPS week of the log's first stamp, in full: a receiver that counts modulo 1024 shows too small a one."""
     date: dt.date | None = None
     """UTC date of the log's first stamp; stands for the week, and resolves the hour of `utc_hour`."""
-    offset_s: float = 0.0
+    offset_s: float = Field(default=0.0, ge=-4e9, le=4e9)
     """Measured correction added to every stamp (s)."""
     drift_ppm: float = 0.0
     """Measured rate error (parts per million) from `reference_s` on."""
@@ -127,6 +125,58 @@ class ClockConfig(Strict):
         return Clock(**self.model_dump(exclude={"pairs"}))
 
 
+class ClockDefaults(Strict):
+    """Time system of logs that state none, and the week or date of those that state neither."""
+
+    system: TimeSystem | None = None
+    """Time system of a log that states no clock and whose format asks for one; a log that knows its own time keeps
+    it. Not `free`: such a clock is one sensor's own. Left out, only `week` or `date` is a default."""
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Unit of the stamps of such a log."""
+    week: int | None = Field(default=None, ge=0, le=5000)
+    """GPS week, in full, of logs whose clock is `gps_week_seconds` and states neither week nor date."""
+    date: dt.date | None = None
+    """UTC date of logs whose clock is `gps_week_seconds` or `utc_hour` and states neither week nor date, and of NMEA
+    logs without one."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.week is not None and self.date is not None:
+            raise ValueError("give week or date, not both")
+        if self.week is not None:
+            check_week(self.week)
+        if self.system is TimeSystem.FREE:
+            raise ValueError("a free-running clock is one sensor's own: state it with its log")
+        return self
+
+    def clock(self) -> Clock | None:
+        """The clock of a log that states none; None where there is no default."""
+        return None if self.system is None else Clock(self.system, self.unit, self.week, self.date)
+
+    def dated(self, clock: ClockConfig) -> ClockConfig:
+        """A stated clock with the week or date that it lacks."""
+        lacks = clock.week is None and clock.date is None
+        if lacks and clock.system is TimeSystem.GPS_WEEK:
+            return clock.model_copy(update={"week": self.week, "date": self.date})
+        if lacks and clock.system is TimeSystem.UTC_HOUR:
+            return clock.model_copy(update={"date": self.date})
+        return clock
+
+
+class LogDefaults(Strict):
+    """What holds for all logs of the runs that do not state it themselves; ground control states its own."""
+
+    crs: str | None = None
+    """CRS of positions of a log that states none, and whose file names none."""
+    height: Literal["ellipsoidal", "orthometric"] | None = None
+    """Kind of heights of a log that does not state `height`. A log whose file says that its heights are of another
+    kind is refused until it states its own."""
+    geoid: str | None = None
+    """Geoid grid of logs with orthometric heights that name none."""
+    clock: ClockDefaults | None = None
+    """Time system, and week or date."""
+
+
 class LogConfig(Strict):
     """One raw log."""
 
@@ -147,11 +197,23 @@ class LogConfig(Strict):
     options: dict[str, Any] = {}
     """Settings of the format (`roadscan formats NAME`)."""
 
+    def completed(self, defaults: LogDefaults) -> LogConfig:
+        """The log with the kind of heights, geoid, week and date of the defaults where it states none.
+
+        Default CRS and time system are not put in: only the log's reader knows whether its file says its own.
+        """
+        height = self.height if defaults.height is None or "height" in self.model_fields_set else defaults.height
+        geoid = defaults.geoid if self.geoid is None and height == "orthometric" else self.geoid
+        clock = self.clock
+        if clock is not None and defaults.clock is not None:
+            clock = defaults.clock.dated(clock)
+        return self.model_copy(update={"height": height, "geoid": geoid, "clock": clock})
+
 
 class RunConfig(Strict):
     """One recorded drive."""
 
-    id: str = Field(pattern=_NAME)
+    id: str = Field(pattern=NAME_PATTERN)
     """Name of the run."""
     logs: list[LogConfig] = Field(min_length=1)
     """Logs of this run."""
@@ -254,10 +316,12 @@ CellColumns = Literal["full", "surface"]
 class TileConfig(Strict):
     """The grid."""
 
-    size_m: float = Field(default=10.0, gt=0)
+    size_m: float = Field(default=10.0, gt=0, allow_inf_nan=False)
     """Edge of a tile (m)."""
-    cell_m: float = Field(default=0.05, gt=0)
-    """Edge of a cell (m); divides the tile's edge."""
+    cell_m: float = Field(default=0.05, gt=0, allow_inf_nan=False)
+    """Edge of a cell (m); divides the tile's edge. A cell should hold four readings or more, so that its height is a
+    median: `run` and `status` name the edge that would where cells hold one (or, where this is left out, fewer than
+    four) in the fullest tiles, those with half of all readings."""
     cell_table: CellColumns = "full"
     """What is stored of a cell: `full`, all columns of the table `cells`; `surface`, its place, count, robust height
     (rounded to 2⁻²⁰ m) and mean intensity (rounded to 1/64), which takes a third of the time and a sixth
@@ -290,10 +354,18 @@ class ProductConfig(Strict):
     """Settings by product name, for example { las = { spacing_m = 0.1 } }."""
 
 
+class ChecksConfig(Strict):
+    """When a run warns of what it lost; a log that gives nothing at all always fails."""
+
+    lost_share: float = Field(default=0.1, ge=0, le=1)
+    """Share of a log's records that are rejected, or of the readings that have no pose, above which `roadscan run` and
+    `roadscan status` say so."""
+
+
 class SurveyConfig(Strict):
     """Everything a run needs to know."""
 
-    id: str = Field(pattern=_NAME)
+    id: str = Field(pattern=NAME_PATTERN)
     """Name of the survey; part of the store's path."""
     title: str = ""
     """One line about it."""
@@ -305,6 +377,8 @@ class SurveyConfig(Strict):
     """Map frame and heights."""
     runs: list[RunConfig] = Field(min_length=1)
     """Recorded drives."""
+    defaults: LogDefaults | None = None
+    """What holds for all logs that do not state it themselves: CRS, kind of heights, geoid, clock."""
     passes: list[PassConfig] = []
     """Traverses of lanes."""
     control: list[ControlConfig] = []
@@ -317,6 +391,8 @@ class SurveyConfig(Strict):
     """Poses."""
     filters: FilterConfig = FilterConfig()
     """Filters of points."""
+    checks: ChecksConfig = ChecksConfig()
+    """When a run warns."""
     segmentation: RoadSegmentation | None = None
     """Left out, all readings of profiles count; with it, even as an empty table, only those that hit the road."""
     tiles: TileConfig = TileConfig()
@@ -339,6 +415,15 @@ class SurveyConfig(Strict):
         return self
 
 
+def _with_defaults(config: SurveyConfig) -> SurveyConfig:
+    """The survey file with what its defaults say of each log (:meth:`LogConfig.completed`)."""
+    defaults = config.defaults
+    if defaults is None:
+        return config
+    runs = [run.model_copy(update={"logs": [log.completed(defaults) for log in run.logs]}) for run in config.runs]
+    return config.model_copy(update={"runs": runs})
+
+
 class Survey:
     """A loaded survey file: configuration with its rig and folder."""
 
@@ -356,7 +441,7 @@ class Survey:
     @classmethod
     def parse(cls, values: dict[str, Any], *, folder: Path, file: str | Path | None = None) -> Self:
         """Check `values` as a survey file in `folder`."""
-        config = SurveyConfig.parse(values, file=file)
+        config = _with_defaults(SurveyConfig.parse(values, file=file))
         rig = config.rig if isinstance(config.rig, Rig) else Rig.load(folder / config.rig)
         for run in config.runs:
             for log in run.logs:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.poses import COEFFICIENTS, interpolate, interval_coefficients
+from roadscan.kernels.georeferencing.poses import COEFFICIENTS, PoseIntervals, interpolate, interval_coefficients
 from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
@@ -61,7 +61,7 @@ class Poses:
 class Trajectory:
     """Recorded poses of one run in one world frame.
 
-    Poses between knots are cubic on position and on the rotation group, see ``kernels/poses.py``.
+    Poses between knots are cubic on position and on the rotation group, see ``kernels/georeferencing/poses.py``.
     """
 
     world: str
@@ -123,15 +123,6 @@ class Trajectory:
             self.sigma_ned_m,
         )
 
-    def position_sigma_m(self, epochs_gps_ns: Int64) -> Float64:
-        """1 σ (n, 3) of positions at epochs (n,), north, east, down: linear between knots, NaN where not known."""
-        if self.sigma_ned_m is None or self.epochs_gps_ns.size == 0:
-            return np.full((epochs_gps_ns.size, 3), np.nan)
-        knots = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
-        since = (epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
-        columns = [np.interp(since, knots, self.sigma_ned_m[:, a], left=np.nan, right=np.nan) for a in range(3)]
-        return np.stack(columns, axis=-1)
-
     def interval_sigmas_m(self) -> Float64:
         """Largest 1 σ (n − 1, 2) of the poses of each interval between knots, horizontal and down; inf where not known.
 
@@ -160,15 +151,14 @@ class Trajectory:
         n = epochs_gps_ns.size
         position, rotation = np.full((n, 3), np.nan), np.full((n, 9), np.nan)
         found = np.zeros(n, dtype=bool)
-        coefficients, valid = self.intervals
-        interpolate(epochs_gps_ns, self.epochs_gps_ns, coefficients, valid, position, rotation, found)
+        interpolate(epochs_gps_ns, self.intervals, position, rotation, found)
         if strict and not found.all():
             self._refuse(int(epochs_gps_ns[np.flatnonzero(~found)[0]]), int((~found).sum()))
         return Poses(epochs_gps_ns, position, rotation.reshape(n, 3, 3), found)
 
     @cached_property
-    def intervals(self) -> tuple[Float64, npt.NDArray[np.bool_]]:
-        """Coefficients and validity of the intervals between knots, for the kernels."""
+    def intervals(self) -> PoseIntervals:
+        """Intervals between the knots, as the kernels take them."""
         size = max(self.epochs_gps_ns.size - 1, 0)
         coefficients = np.zeros((size, COEFFICIENTS))
         valid = np.zeros(size, dtype=bool)
@@ -181,7 +171,7 @@ class Trajectory:
                 coefficients,
                 valid,
             )
-        return coefficients, valid
+        return PoseIntervals(self.epochs_gps_ns, coefficients, valid)
 
     @property
     def _max_gap_ns(self) -> int:

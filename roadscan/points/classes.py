@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.kernels.carriageway import CLASS_OFF_ROAD, CLASS_SCATTERED
-from roadscan.kernels.georeference import (
+from roadscan.kernels.georeferencing.readings import (
     CLASS_KEPT,
     CLASS_NO_POSE,
     CLASS_NO_RETURN,
@@ -20,7 +19,8 @@ from roadscan.kernels.georeference import (
     CLASS_TOO_LOW,
     CLASS_TOO_NEAR,
 )
-from roadscan.kernels.segmentation import CLASS_ABOVE, CLASS_GRAZING
+from roadscan.kernels.road.carriageway import CLASS_OFF_ROAD, CLASS_SCATTERED
+from roadscan.kernels.road.segmentation import CLASS_ABOVE, CLASS_GRAZING
 
 KEPT: Final = CLASS_KEPT
 TOO_LOW: Final = CLASS_TOO_LOW

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.curved_grid import accumulate_curved
+from roadscan.kernels.road.curved_grid import accumulate_curved
 from roadscan.points.cloud import QUANTUM_M
 from roadscan.points.reference_line import ReferenceLine
 

@@ -1,14 +1,13 @@
-"""Profiles that are measured at once and lie near the sensor: what ``kernels.flat_profiles`` needs of them."""
+"""Profiles that are measured at once and lie near the sensor: what kernels need of their geometry."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.kernels.georeferencing.flat_profiles import FlatProfiles
 from roadscan.points.readings import ScanGeometry
 
 REACH_M: Final = 8.0
@@ -17,20 +16,6 @@ s²/2R = 5 µm (R the Earth's radius), and a 32-bit float resolves 0.6 µm."""
 
 EVERY_RAW_RANGE: Final = (np.uint16(1), np.uint16(65_535))
 """All raw ranges that are returns."""
-
-
-@dataclass(frozen=True)
-class FlatProfiles:
-    """Rays of a profile about its middle, in the numbers that the kernels take."""
-
-    rays: npt.NDArray[np.float32]
-    """(4, m): y and z of the rays' origins from the middle (m), y and z of their directions."""
-    middle: tuple[float, float]
-    """y and z in the sensor's frame (m)."""
-    scale: tuple[np.float32, np.float32]
-    """range_offset_m, range_step_m."""
-    raw_limits: tuple[np.uint16, np.uint16]
-    """Lowest and highest raw range that is kept."""
 
 
 @functools.lru_cache(maxsize=64)

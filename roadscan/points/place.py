@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.kernels.flat_profiles import georeference_flat_profiles
-from roadscan.kernels.georeference import FATES
+from roadscan.kernels.georeferencing import readings as kernels
+from roadscan.kernels.georeferencing.flat_profiles import georeference_flat_profiles
+from roadscan.kernels.georeferencing.readings import FATES, Georeference, Limits, MirrorProfiles, Points, Returns
+from roadscan.kernels.georeferencing.timed_points import georeference_mirror, georeference_returns
 from roadscan.kernels.options import read_only
-from roadscan.kernels.placed_points import georeference_mirror, georeference_returns
 from roadscan.model.crs import Geoid, MapFrame, world_frame_of
 from roadscan.model.errors import CrsError
 from roadscan.model.ids import LanePass
@@ -24,6 +25,7 @@ from roadscan.points.charts import Charts
 from roadscan.points.classes import KEPT, NOT_ROAD, READING_CLASSES, TOO_HIGH, TOO_LOW
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.points.flat_profiles import EVERY_RAW_RANGE, flat_profiles
+from roadscan.points.georeference import georeference_of
 from roadscan.points.readings import ScanGeometry
 from roadscan.points.road_profiles import RoadFinder, RoadProfiles
 
@@ -82,8 +84,8 @@ class Window:
     end_row: int
 
 
-_NO_LIMITS: Final = (0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)
-_NO_MARKS: Final = np.empty(0, np.uint8)
+_NO_LIMITS: Final = Limits(0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)
+_NO_CLASSES: Final = np.empty(0, np.uint8)
 EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
 
 
@@ -132,20 +134,15 @@ class Placement:
     road: RoadFinder | None = None
     """Readings of profiles that did not hit the road are left out; None where all count."""
 
-    def poses(self, mounting: Mounting) -> tuple[Any, ...]:
-        """What the kernels need to place readings of a mounting: it, the trajectory, the charts of the map."""
-        rotation, lever = mounting.arrays()
-        coefficients, valid = self.trajectory.intervals
-        return (
-            (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
-            tuple(self.charts.lattice.tolist()), self.charts.table, self.charts.centres, self.charts.coefficients,
-        )  # fmt: skip
+    def georeference(self, mounting: Mounting, *, limited: bool = True) -> Georeference:
+        """What the kernels need to place readings of a mounting; not `limited`: whatever their ranges and heights."""
+        return georeference_of(mounting, self.trajectory, self.charts, self.limits if limited else _NO_LIMITS)
 
     @property
-    def limits(self) -> tuple[float, ...]:
-        """Limits of ranges and heights, in the order of ``kernels.georeference.LIMITS``."""
+    def limits(self) -> Limits:
+        """Limits of ranges and heights."""
         h = self.heights
-        return (
+        return Limits(
             float(self.range_min_m), float(self.range_max_m), *h.absolute(),
             float(h.above_body_min_m), float(h.above_body_max_m),
         )  # fmt: skip
@@ -227,7 +224,7 @@ class Placement:
             return self._filtered(batch, geometry, window)
         classes = np.zeros(_readings(batch, geometry), np.uint8)
         limited = self._filtered(batch, geometry, window, classes)
-        every = self._place(batch, geometry, window, _NO_LIMITS)
+        every = self._place(batch, geometry, window, limited=False)
         return replace(every, fates=limited.fates, classes=classes)
 
     def _filtered(
@@ -235,9 +232,9 @@ class Placement:
     ) -> _Work:
         """Place the readings that no filter leaves out, and write the classes of all where they are asked for."""
         if self.road is None or geometry is None:
-            return self._place(batch, geometry, window, self.limits, classes)
+            return self._place(batch, geometry, window, classes)
         road = self.road.profiles(_numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), geometry)
-        work = self._place(batch, geometry, window, self.limits, classes, road)
+        work = self._place(batch, geometry, window, classes, road)
         road.tell(work.fates)
         if classes is not None:
             road.mark(classes)
@@ -248,46 +245,41 @@ class Placement:
         batch: pa.RecordBatch,
         geometry: ScanGeometry | None,
         window: Window,
-        limits: tuple[float, ...],
         classes: UInt8 | None = None,
         road: RoadProfiles | None = None,
+        *,
+        limited: bool = True,
     ) -> _Work:
         work = _Work.of(_readings(batch, geometry))
         epochs = _numpy(batch, "pose_epoch_gps_ns" if geometry is None else "epoch_gps_ns")
+        wanted = kernels.Window(self.tile_quanta, astuple(window))
         made = 0
         for rows, mounting in self.mountings.pieces(epochs):
-            poses = self.poses(mounting)
-            common = (*poses, limits, float(QUANTA_PER_M), self.tile_quanta, astuple(window))
-            own = work.after(made)
+            georeference = self.georeference(mounting, limited=limited)
             piece = batch.slice(rows.start, rows.stop - rows.start)
             if geometry is None:
+                out = work.points(made, classes, rows)
                 x, y, z = (_numpy(piece, f"{a}_sensor_m") for a in "xyz")
-                count = georeference_returns(
-                    epochs[rows], x, y, z, *common, own.rows, own.tiles, own.quanta, work.fates,
-                    _NO_MARKS if classes is None else classes[rows],
-                )  # fmt: skip
+                count = georeference_returns(Returns(epochs[rows], x, y, z), georeference, wanted, out)
             else:
-                readings = slice(rows.start * geometry.readings, rows.stop * geometry.readings)
+                out = work.points(made, classes, slice(rows.start * geometry.readings, rows.stop * geometry.readings))
                 ranges = _lists(piece, "range", geometry.readings) if road is None else read_only(road.ranges[rows])
-                out = (
-                    own.rows, own.readings, own.tiles, own.quanta, work.fates,
-                    _NO_MARKS if classes is None else classes[readings],
-                )  # fmt: skip
                 flat = flat_profiles(geometry, self.range_min_m, self.range_max_m)
                 if flat is None:
-                    count = georeference_mirror(
-                        epochs[rows], ranges, *geometry.rays(), (geometry.range_offset_m, geometry.range_step_m),
-                        geometry.reading_period_ns, *common, *out,
-                    )  # fmt: skip
+                    profiles = mirror_profiles(geometry, epochs[rows], ranges)
+                    count = georeference_mirror(profiles, georeference, wanted, out)
                 else:
-                    count = georeference_flat_profiles(
-                        epochs[rows], ranges, flat.rays, flat.middle, flat.scale, poses,
-                        flat.raw_limits if limits is not _NO_LIMITS else EVERY_RAW_RANGE,
-                        *common[8:], *out,
-                    )  # fmt: skip
-            own.rows[:count] += rows.start
+                    flat = flat if limited else flat._replace(raw_limits=EVERY_RAW_RANGE)
+                    count = georeference_flat_profiles(epochs[rows], ranges, flat, georeference, wanted, out)
+            out.rows[:count] += rows.start
             made += count
         return work.first(made)
+
+
+def mirror_profiles(geometry: ScanGeometry, epochs_gps_ns: Int64, ranges: npt.NDArray[np.uint16]) -> MirrorProfiles:
+    """Profiles (n,) of a turning mirror as the kernels take them; ranges : (n, m) raw."""
+    scale = geometry.range_offset_m, geometry.range_step_m
+    return MirrorProfiles(epochs_gps_ns, ranges, *geometry.rays(), scale, geometry.reading_period_ns)
 
 
 @dataclass(frozen=True)
@@ -309,8 +301,12 @@ class _Work:
             np.zeros(COUNTED_FATES, np.int64),
         )  # fmt: skip
 
-    def after(self, n: int) -> _Work:
-        return _Work(self.rows[n:], self.readings[n:], self.tiles[n:], self.quanta[n:], self.fates)
+    def points(self, made: int, classes: UInt8 | None, readings: slice) -> Points:
+        """Where the kernels write points behind the `made` ones, and the classes of some readings where asked for."""
+        own = _NO_CLASSES if classes is None else classes[readings]
+        return Points(
+            self.rows[made:], self.readings[made:], self.tiles[made:], self.quanta[made:], self.fates, own
+        )  # fmt: skip
 
     def first(self, n: int) -> _Work:
         return _Work(self.rows[:n], self.readings[:n], self.tiles[:n], self.quanta[:n], self.fates)

@@ -9,13 +9,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.block_ranges import block_ranges
+from roadscan.kernels.georeferencing.block_ranges import block_ranges
+from roadscan.kernels.georeferencing.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
+from roadscan.kernels.georeferencing.readings import Georeference, Limits
 from roadscan.kernels.options import read_only
-from roadscan.kernels.reach import reach_of_profiles, reach_of_returns
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
 from roadscan.points.cloud import QUANTA_PER_M
+from roadscan.points.georeference import georeference_of
 from roadscan.points.readings import ScanGeometry
 
 Float64 = npt.NDArray[np.float64]
@@ -113,16 +115,16 @@ class Reach:
             epochs, low, high = epochs[order], low[order], high[order]
         low, high = read_only(low), read_only(high)
         scale = (float(geometry.range_offset_m), float(geometry.range_step_m))
-        limits = (float(self.range_min_m), float(self.range_max_m))
-        pieces = self._pieces(spans, geometry)
-
+        period_ns, pieces = float(geometry.reading_period_ns), self._pieces(spans, geometry)
+        profiles = SpannedProfiles(read_only(epochs), low, high, starts, pieces, scale, period_ns)
         parts = [
             reach_of_profiles(
-                read_only(epochs), low, high, np.clip(starts, rows.start, rows.stop), pieces, scale, limits,
-                float(geometry.reading_period_ns), *self._common(mounting),
+                profiles._replace(starts=np.clip(starts, rows.start, rows.stop)),
+                self._georeference(mounting),
+                self._tile_m,
             )
             for rows, mounting in self.mountings.pieces(epochs)
-        ]  # fmt: skip
+        ]
         return _under_each(parts, starts.size - 1)
 
     def returns(self, spans_gps_ns: Int64, boxes_m: Float64, readings: Int64) -> Touched:
@@ -139,20 +141,19 @@ class Reach:
         parts = [
             reach_of_returns(
                 np.column_stack([np.maximum(spans_gps_ns[:, 0], since), np.minimum(spans_gps_ns[:, 1], until)]),
-                boxes_m, readings, float(self.range_max_m), *self._common(mounting),
+                boxes_m, readings, self._georeference(mounting), self._tile_m,
             )
             for since, until, mounting in zip(starts, ends, self.mountings.mountings, strict=True)
         ]  # fmt: skip
         return _under_each(parts, readings.size)
 
-    def _common(self, mounting: Mounting) -> tuple[Any, ...]:
-        rotation, lever = mounting.arrays()
-        coefficients, valid = self.trajectory.intervals
-        return (
-            (*rotation.ravel().tolist(), *lever.tolist()), self.trajectory.epochs_gps_ns, coefficients, valid,
-            tuple(self.charts.lattice.tolist()), self.charts.table, self.charts.centres, self.charts.coefficients,
-            self.tile_quanta / QUANTA_PER_M,
-        )  # fmt: skip
+    def _georeference(self, mounting: Mounting) -> Georeference:
+        limits = Limits(float(self.range_min_m), float(self.range_max_m), -np.inf, np.inf, -np.inf, np.inf)
+        return georeference_of(mounting, self.trajectory, self.charts, limits)
+
+    @property
+    def _tile_m(self) -> float:
+        return self.tile_quanta / QUANTA_PER_M
 
     def _pieces(self, spans: RangeSpans, geometry: ScanGeometry) -> Float64:
         farthest = geometry.range_offset_m + geometry.range_step_m * float(spans.high.max(initial=0))
@@ -164,7 +165,7 @@ class Reach:
 def profile_pieces(geometry: ScanGeometry, size: int, block: int) -> Float64:
     """Pieces (p, 9) of a profile, of `size` readings at most, each in one block of `block` readings.
 
-    Columns as ``kernels.reach.reach_of_profiles`` wants them.
+    Columns as ``kernels.georeferencing.reach.SpannedProfiles`` states them.
     """
     edges = range(0, geometry.readings, block)
     first = np.concatenate([np.arange(a, min(a + block, geometry.readings), size) for a in edges])

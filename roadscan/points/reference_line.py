@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.kernels.curved_grid import thin_path
+from roadscan.kernels.road.curved_grid import thin_path
 from roadscan.model.errors import NavigationError
 
 Float64 = npt.NDArray[np.float64]

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.georeference import NO_RETURN
-from roadscan.kernels.road_ranges import keep_road
+from roadscan.kernels.georeferencing.readings import NO_RETURN
+from roadscan.kernels.road.road_ranges import keep_road
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.segmentation import RangeFilter, RoadSegmentation
 from roadscan.navigation.trajectory import Trajectory

@@ -52,7 +52,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.options import read_only
-from roadscan.kernels.segmentation import segment_profiles
+from roadscan.kernels.road.segmentation import segment_profiles
 from roadscan.model.segmentation import SegmentationConfig
 from roadscan.points.readings import ScanGeometry
 
@@ -97,7 +97,7 @@ def road_only(ranges: npt.NDArray[np.uint16], classes: UInt8) -> npt.NDArray[Any
 
 
 def _numbers(s: SegmentationConfig) -> tuple[float, ...]:
-    """Settings in the order of ``kernels.carriageway.SETTINGS``."""
+    """Settings in the order of ``kernels.road.carriageway.SETTINGS``."""
     return (
         s.bin_m, s.share, s.gate_m, s.scatter_factor, float(s.scatter_readings), math.radians(s.grazing_deg),
         s.chord_m, s.step_m, s.noise_factor, s.slope, s.window_m, float(s.window_readings), s.bridge_m,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.picture_colours import HEIGHT, WIDTH, sample, take_better
+from roadscan.kernels.surface.picture_colours import HEIGHT, WIDTH, sample, take_better
 from roadscan.model.camera import Interior
 
 Float64 = npt.NDArray[np.float64]

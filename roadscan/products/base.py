@@ -9,21 +9,18 @@ from __future__ import annotations
 
 import datetime as dt
 import functools
-import hashlib
-import importlib
-import inspect
-import pkgutil
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import ClassVar, Final, Literal, Protocol, TypeAlias
+from typing import ClassVar, Final, Literal, Protocol, Self, TypeAlias
 
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import LanePass, TileId
 from roadscan.model.strict import Strict
+from roadscan.plugins import found_kinds
 from roadscan.points.cloud import TilePoints
 from roadscan.points.views import PictureRule
 from roadscan.products.lane_direction import LaneDirections
@@ -57,6 +54,8 @@ class ProductContext:
     passes: tuple[LanePass, ...]
     date: dt.date
     """UTC date of the survey's first epoch; stands where files want a creation date."""
+    surface_cell_m: tuple[float, float] | None = None
+    """Edges (m), east and north, of a cell of the reconstructed surface; None for a survey without one."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +91,12 @@ class TileSummary:
     last_epoch_gps_ns: int
     sigma_horizontal_m: float | None = None
     sigma_down_m: float | None = None
+
+    @classmethod
+    def without_readings(cls, tile: TileId) -> Self:
+        """A tile that has a surface and no reading of its own."""
+        nan = math.nan
+        return cls(tile, 0, 0, nan, nan, nan, nan, nan, (), 0, 0)
 
 
 @dataclass(frozen=True)
@@ -218,8 +223,14 @@ class SurveyProduct(ABC):
     default_cells: ClassVar[Cells] = "any"
     reads: ClassVar[tuple[str, ...]] = ()
     """Surface products whose files of the tiles it is made from; they are made wherever this product is."""
+    table: ClassVar[str] = ""
+    """Table of ``schemas/`` that its file holds, where it holds one."""
     needs_lanes: ClassVar[bool] = False
     """True for a product that asks which way the lanes run."""
+
+    def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
+        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit its own."""
+        return
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
@@ -257,25 +268,9 @@ def is_default(product: Product, cell_m: float) -> bool:
 
 @functools.cache
 def products() -> dict[str, Product]:
-    """All products by name: the files of this folder and installed entry points."""
-    found: dict[str, Product] = {}
-    package = importlib.import_module("roadscan.products")
-    for module_info in pkgutil.iter_modules(package.__path__):
-        module = importlib.import_module(f"roadscan.products.{module_info.name}")
-        for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, Product) and value.__module__ == module.__name__:
-                _add(found, value)
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        _add(found, entry.load())
-    return dict(sorted(found.items()))
-
-
-def _add(found: dict[str, Product], kind: type[Product]) -> None:
-    if kind.__abstractmethods__:
-        return
-    if kind.name in found:
-        raise ConfigError(f"two products are called '{kind.name}'", expected="unique names")
-    found[kind.name] = kind()
+    """All products by name: those of this folder, and installed entry points."""
+    kinds = (TileProduct, SurfaceProduct, SurveyProduct)
+    return {name: kind() for name, kind in found_kinds("roadscan.products", kinds, ENTRY_POINT_GROUP).items()}
 
 
 def product_named(name: str) -> Product:
@@ -284,13 +279,3 @@ def product_named(name: str) -> Product:
     if name not in known:
         raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
     return known[name]
-
-
-@functools.cache
-def source_digest(product: Product) -> str:
-    """Hash of the code that writes a product: its own module and the modules of this folder."""
-    files = {Path(inspect.getfile(type(product))), *Path(__file__).parent.glob("*.py")}
-    digest = hashlib.blake2b(digest_size=8)
-    for file in sorted(files, key=lambda f: f.name):
-        digest.update(file.name.encode() + file.read_bytes())
-    return digest.hexdigest()

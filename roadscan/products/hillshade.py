@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,24 +11,17 @@ from typing import Any, ClassVar, Final, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
 from pydantic import Field
-from rasterio.shutil import copy as translate
 from rasterio.windows import Window
 
-from roadscan.model.errors import StoreError
+from roadscan.codecs.cog import Band
+from roadscan.codecs.gdal import raster_settings
+from roadscan.codecs.grey_picture import check_picture
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
-from roadscan.products.raster import (
-    Band,
-    CellBox,
-    SparseRaster,
-    cell_image,
-    paste_tile,
-    raster_settings,
-    without_place_warning,
-)
+from roadscan.products.raster import CellBox, SparseRaster, cell_image, paste_tile
+from roadscan.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture
 from roadscan.products.sheets import (
     Sheet,
     cells_of,
@@ -51,7 +42,6 @@ _PICTURE: Final = "hillshade.png"
 _EMPTY: Final = 0
 _STRIP_ROWS: Final = 128
 SHADE_BAND: Final = Band("hillshade", "")
-_PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 
 
 class HillshadeOptions(Strict):
@@ -81,6 +71,7 @@ class Hillshade(SurveyProduct):
 
     name: ClassVar[str] = "hillshade"
     title: ClassVar[str] = "shaded relief of the surface, as a GeoTIFF and as a picture for pages and reports"
+    version: ClassVar[int] = 2
     options: ClassVar[type[Strict]] = HillshadeOptions
     default_cells: ClassVar[Cells] = "coarse"
 
@@ -121,10 +112,10 @@ class Hillshade(SurveyProduct):
         """Decode all of a sheet or picture; of an index, check its geometry."""
         with path.open("rb") as stream:
             start = stream.read(1)
-        if start == _PNG_SIGNATURE[:1]:
-            _check_picture(path)
+        if start == PNG_SIGNATURE[:1]:
+            check_picture(path, "LA")
         else:
-            check_sheet(path, "uint8")
+            check_sheet(path)
 
 
 @dataclass(frozen=True)
@@ -215,6 +206,23 @@ def shade(
     return np.where(np.isnan(grey), _EMPTY, grey).astype(np.uint8)
 
 
+def with_empty_rim(heights_m: Float64) -> Float64:
+    """(rows + 2, columns + 2) heights with unknown ones around them."""
+    return np.pad(heights_m, 1, constant_values=np.nan)
+
+
+def shade_in_strips(
+    around_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
+) -> npt.NDArray[np.uint8]:
+    """As :func:`shade`, few rows at a time to save memory."""
+    rows = around_m.shape[0] - 2
+    strips = [
+        shade(around_m[top : top + _STRIP_ROWS + 2], cell_m, options, cell_north_m)
+        for top in range(0, rows, _STRIP_ROWS)
+    ]
+    return np.concatenate(strips)
+
+
 def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
     """Tiles of a sheet and those of the survey that touch one of them, in order."""
     around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
@@ -253,72 +261,17 @@ def _write_picture(
 ) -> None:
     box = CellBox.around(tiles, context.grid)
     step = -(-max(box.width, box.height) // options.picture_px)
-    heights_m = _trimmed(_mean_heights(tiles, load_cells, box, step))
-    grey = _shade_in_strips(heights_m, step * context.grid.cell_m, options)
-    opaque = np.where(grey == _EMPTY, 0, 255).astype(np.uint8)
-    with raster_settings(), without_place_warning(), _picture_in_memory(grey, opaque) as picture:
-        translate(picture, str(path), driver="PNG", zlevel=6)
+    heights_m = _mean_heights(tiles, load_cells, box, step).trimmed()
+    cell_m = step * context.grid.cell_m
+    write_picture(path, shade_in_strips(with_empty_rim(heights_m), cell_m, options))
 
 
-def _shade_in_strips(heights_m: Float64, cell_m: float, options: HillshadeOptions) -> npt.NDArray[np.uint8]:
-    """Shade of (rows, columns) heights, few rows at a time to save memory."""
-    around = np.pad(heights_m, 1, constant_values=np.nan)
-    rows = heights_m.shape[0]
-    strips = [shade(around[top : top + _STRIP_ROWS + 2], cell_m, options) for top in range(0, rows, _STRIP_ROWS)]
-    return np.concatenate(strips)
-
-
-@contextmanager
-def _picture_in_memory(*bands: npt.NDArray[np.uint8]) -> Iterator[Any]:
-    rows, columns = bands[0].shape
-    with rasterio.open(
-        "picture", "w+", driver="MEM", width=columns, height=rows, count=len(bands), dtype="uint8"
-    ) as raster:
-        for number, band in enumerate(bands, start=1):
-            raster.write(band, number)
-        yield raster
-
-
-def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> Float64:
-    """(rows, columns) mean of the heights in pixels of `step` squared cells, north up, NaN where empty."""
-    rows, columns = -(-box.height // step), -(-box.width // step)
-    total, count = np.zeros(rows * columns), np.zeros(rows * columns)
+def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> MeanPixels:
+    """Means of the heights in pixels of `step` squared cells, north up."""
+    pixels = MeanPixels.over(box.height, box.width, (step, step))
     for tile in tiles:
         cells = cells_of(tile, load_cells)
         edge = cells.cells_per_edge
-        column = (tile.column * edge - box.west + cells.column.astype(np.int64)) // step
-        row = (box.north - 1 - tile.row * edge - cells.row.astype(np.int64)) // step
-        pixel, inverse = np.unique(row * columns + column, return_inverse=True)
-        total[pixel] += np.bincount(inverse, weights=cells.height_robust_m)
-        count[pixel] += np.bincount(inverse)
-    with np.errstate(invalid="ignore"):
-        return (total / count).reshape(rows, columns)
-
-
-def _trimmed(heights_m: Float64) -> Float64:
-    """The raster without empty rows and columns at its edges."""
-    known = ~np.isnan(heights_m)
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    return heights_m[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-
-
-def _check_picture(path: Path) -> None:
-    """Read a PNG chunk by chunk (W3C, *Portable Network Graphics*, 5): GDAL shows damaged ones without a word."""
-    content, at = path.read_bytes(), len(_PNG_SIGNATURE)
-    if not content.startswith(_PNG_SIGNATURE):
-        raise StoreError("the picture is no PNG", change="make it again", file=path)
-    parts: dict[bytes, bytes] = {}
-    try:
-        while at < len(content):
-            (length,) = struct.unpack_from(">I", content, at)
-            body = content[at + 4 : at + 8 + length]
-            if struct.unpack_from(">I", content, at + 8 + length) != (zlib.crc32(body),):
-                raise StoreError("a part of the picture is damaged", change="make it again", file=path, record=at)
-            parts[body[:4]] = parts.get(body[:4], b"") + body[4:]
-            at += 12 + length
-        columns, rows, bits, colours = struct.unpack_from(">IIBB", parts[b"IHDR"])
-        pixels = zlib.decompress(parts[b"IDAT"])
-    except (struct.error, KeyError, zlib.error) as error:
-        raise StoreError("the picture is cut short", change="make it again", file=path, record=at) from error
-    if b"IEND" not in parts or (bits, colours) != (8, 4) or len(pixels) != rows * (1 + 2 * columns):
-        raise StoreError("the picture is not whole", expected="8 bits of grey and of opacity", file=path)
+        column = tile.column * edge - box.west + cells.column.astype(np.int64)
+        pixels.add(box.north - 1 - tile.row * edge - cells.row.astype(np.int64), column, cells.height_robust_m)
+    return pixels

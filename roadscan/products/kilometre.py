@@ -11,16 +11,17 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.codecs.cog import Band, write_sparse_cog
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
 from roadscan.products.quantities import band_of
-from roadscan.products.raster import Band, CellBox
+from roadscan.products.raster import CellBox, about
 from roadscan.products.sheets import (
     Sheet,
-    check_index,
+    check_sheet,
     cut_sheets,
     dated,
     index_name,
@@ -29,8 +30,6 @@ from roadscan.products.sheets import (
     unknown_output,
     write_index,
 )
-from roadscan.products.sparse_cog import SparseCog
-from roadscan.products.tiff import check_tiff
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.pyramid import Level, overview_factors
 
@@ -71,6 +70,7 @@ class Kilometre(SurveyProduct):
 
     name: ClassVar[str] = "kilometre"
     title: ClassVar[str] = "sheets of a kilometre in large pixels (height, intensity, relief), for whole networks"
+    version: ClassVar[int] = 2
     options: ClassVar[type[Strict]] = KilometreOptions
     default_cells: ClassVar[Cells] = "fine"
 
@@ -117,12 +117,7 @@ class Kilometre(SurveyProduct):
 
     def check(self, path: Path) -> None:
         """Compare every byte of a sheet with its stored digest; of an index, check its geometry."""
-        with path.open("rb") as stream:
-            is_index = stream.read(1) == b"<"
-        if is_index:
-            check_index(path)
-        else:
-            check_tiff(path)
+        check_sheet(path)
 
 
 @dataclass(frozen=True)
@@ -206,8 +201,11 @@ class _Overviews:
 def _write_sheet(raster: _Raster, sheet: Sheet, overviews: _Overviews, light: Light, path: Path) -> None:
     edge, box = raster.context.grid.cells_per_edge, CellBox.around(sheet.tiles, raster.context.grid)
     corners = {t: (t.column * edge - box.west, box.north - (t.row + 1) * edge) for t in sheet.tiles}
-    SparseCog(box, raster.band, _TYPES[raster.view], raster.context).write(
+    write_sparse_cog(
         path,
+        (box.width, box.height),
+        _TYPES[raster.view],
         ((*corners[tile], overviews.image(tile, light)) for tile in sheet.tiles),
-        [(*corner, edge) for corner in corners.values()],
+        [(*corner, edge, edge) for corner in corners.values()],
+        about(box.transform(raster.context), [raster.band], raster.context),
     )

@@ -11,21 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.model.errors import ConfigError, StoreError
 from roadscan.model.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import TilePoints
 from roadscan.products.base import Cells, ProductContext, Tile, TileProduct
-from roadscan.products.las_file import (
-    ONE_OF_ONE,
-    Axes,
-    Layout,
-    axis,
-    check_points,
-    rounding_errors,
-    set_coordinates,
-    write_points,
-)
+from roadscan.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 from roadscan.tiles.grid import TileGrid
 
 Float64 = npt.NDArray[np.float64]
@@ -79,7 +71,7 @@ class Las(TileProduct):
     name: ClassVar[str] = "las"
     title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
     suffix: ClassVar[str] = ".laz"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     options: ClassVar[type[Strict]] = LasOptions
     default_cells: ClassVar[Cells] = "coarse"
     needs_points: ClassVar[bool] = True
@@ -102,7 +94,7 @@ class Las(TileProduct):
         layout = _layout(points, axes, context)
         records = _record(points, axes, layout.header).array
         facts = _facts(points, tile, axes, settings, context)
-        write_points(path, layout, axes, records, facts, context.date, settings.compress)
+        write_points(path, layout, [one.offset for one in axes], records, facts, context.date, settings.compress)
 
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""

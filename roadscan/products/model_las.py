@@ -9,19 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.products.base import Cells, ProductContext, Tile, TileProduct
-from roadscan.products.las_file import (
-    ONE_OF_ONE,
-    Axes,
-    Layout,
-    axis,
-    check_points,
-    rounding_errors,
-    set_coordinates,
-    write_points,
-)
+from roadscan.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 from roadscan.tiles.decimate import Squares, cells_per_square, decimate
 
 _UNCLASSIFIED = 1
@@ -71,7 +63,7 @@ class ModelLas(TileProduct):
     name: ClassVar[str] = "model_las"
     title: ClassVar[str] = "pavement surface every 100 mm, without stones and cracks (LAS 1.4 or LAZ), for CAD"
     suffix: ClassVar[str] = ".laz"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     options: ClassVar[type[Strict]] = ModelLasOptions
     default_cells: ClassVar[Cells] = "fine"
 
@@ -99,7 +91,7 @@ class ModelLas(TileProduct):
             "min_cover": settings.min_cover,
             "rounding_error_max_m": rounding_errors(axes),
         }
-        write_points(path, layout, axes, records, facts, context.date, settings.compress)
+        write_points(path, layout, [one.offset for one in axes], records, facts, context.date, settings.compress)
 
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""

@@ -9,10 +9,11 @@ from typing import ClassVar, cast
 import numpy as np
 from pydantic import Field
 
+from roadscan.codecs.gdal import raster_settings
 from roadscan.model.strict import Strict
 from roadscan.products.base import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.quantities import QUANTITIES, Quantity, band_of, values_of
-from roadscan.products.raster import CellBox, SparseRaster, cell_image, paste_tile, raster_settings
+from roadscan.products.raster import CellBox, SparseRaster, cell_image, paste_tile
 from roadscan.products.sheets import (
     Sheet,
     cells_of,
@@ -46,6 +47,7 @@ class Mosaic(SurveyProduct):
 
     name: ClassVar[str] = "mosaic"
     title: ClassVar[str] = "cells of the whole survey as GeoTIFFs (height, intensity, count, standard deviation)"
+    version: ClassVar[int] = 2
     options: ClassVar[type[Strict]] = MosaicOptions
     default_cells: ClassVar[Cells] = "coarse"
 
@@ -83,7 +85,7 @@ class Mosaic(SurveyProduct):
 
     def check(self, path: Path) -> None:
         """Decode every block and compare with the stored digest; of an index, check its geometry."""
-        check_sheet(path, "float32")
+        check_sheet(path)
 
 
 def _write_sheet(quantity: Quantity, sheet: Sheet, load_cells: LoadCells, context: ProductContext, path: Path) -> None:

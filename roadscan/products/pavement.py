@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from roadscan.kernels.pictures import grey_intensity, shade_cells
+from roadscan.codecs import SOFTWARE
+from roadscan.codecs.grey_picture import check_picture, check_world_file, world_file, write_bmp, write_png
+from roadscan.kernels.cells.grey_pictures import grey_intensity, shade_cells
 from roadscan.model.strict import Strict
 from roadscan.products.base import ProductContext, Tile, TileProduct
-from roadscan.products.grey_picture import check_picture, check_world_file, world_file, write_bmp, write_png
-from roadscan.products.raster import SOFTWARE, CellBox
+from roadscan.products.raster import CellBox
 from roadscan.tiles.cells import TileCells
 
 _WORLD_FILES: Final = {"png": ".pgw", "bmp": ".bpw"}
@@ -59,7 +60,7 @@ class _Picture(TileProduct):
     """A picture of the part of a tile that holds cells, with a world file beside it."""
 
     suffix: ClassVar[str] = ".png"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     default: ClassVar[bool] = False
     smooth: ClassVar[bool]
     """True where lines of pixels resemble the line above them."""

@@ -6,8 +6,9 @@ from typing import Any, Final, Literal, get_args
 
 import numpy.typing as npt
 
+from roadscan.codecs.cog import Band
 from roadscan.products.base import ProductContext
-from roadscan.products.raster import Band, height_unit
+from roadscan.products.raster import height_unit
 from roadscan.tiles.cells import TileCells
 
 Quantity = Literal["height", "intensity", "count", "height_std"]

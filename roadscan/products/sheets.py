@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from roadscan.codecs.cog import Band, overview_factors
+from roadscan.codecs.tiff import check_cog
 from roadscan.model.crs import MapFrame, crs_from_text
 from roadscan.model.errors import StoreError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.products.base import LoadCells, Output, ProductContext, TileSummary
-from roadscan.products.raster import Band, CellBox, check_cog, overview_factors
+from roadscan.products.raster import CellBox
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
 
@@ -102,8 +104,8 @@ def unknown_output(output: Output) -> StoreError:
 def dated(context: ProductContext, tiles: Iterable[TileSummary], drawn: Iterable[TileId]) -> ProductContext:
     """The context with the UTC date of the first epoch of the tiles `drawn`, so that a file depends on them alone."""
     members = set(drawn)
-    first_gps_ns = min(one.first_epoch_gps_ns for one in tiles if one.tile in members)
-    return replace(context, date=utc_from_gps_ns(first_gps_ns).date())
+    first_gps_ns = min((one.first_epoch_gps_ns for one in tiles if one.tile in members), default=None)
+    return context if first_gps_ns is None else replace(context, date=utc_from_gps_ns(first_gps_ns).date())
 
 
 def cells_of(tile: TileId, load_cells: LoadCells) -> TileCells:
@@ -114,10 +116,21 @@ def cells_of(tile: TileId, load_cells: LoadCells) -> TileCells:
     return cells
 
 
-def write_index(path: Path, sheets: Sequence[Sheet], band: Band, dtype: str, context: ProductContext) -> None:
-    """Write a GDAL virtual raster (VRT) over one-band `sheets` of `dtype`, which lie in the same folder."""
+def write_index(
+    path: Path,
+    sheets: Sequence[Sheet],
+    band: Band,
+    dtype: str,
+    context: ProductContext,
+    box_of: Callable[[Iterable[TileId]], CellBox] | None = None,
+) -> None:
+    """Write a GDAL virtual raster (VRT) over one-band `sheets` of `dtype`, which lie in the same folder.
+
+    `box_of` gives the pixels over tiles, where these are not the survey's cells.
+    """
     type_name, nodata = _VRT_TYPES[dtype]
-    box = CellBox.around((tile for sheet in sheets for tile in sheet.tiles), context.grid)
+    over = box_of or (lambda tiles: CellBox.around(tiles, context.grid))
+    box = over(tile for sheet in sheets for tile in sheet.tiles)
     root = ET.Element("VRTDataset", rasterXSize=str(box.width), rasterYSize=str(box.height))
     frame = context.map
     ET.SubElement(root, "SRS", dataAxisToSRSAxisMapping=_axis_mapping(frame)).text = frame.wkt()
@@ -129,7 +142,7 @@ def write_index(path: Path, sheets: Sequence[Sheet], band: Band, dtype: str, con
         if text:
             ET.SubElement(raster_band, tag).text = text
     for sheet in sheets:
-        _add_source(raster_band, sheet, box, nodata, context.grid)
+        _add_source(raster_band, sheet.name, over(sheet.tiles), box, nodata)
     factors = overview_factors(box.width, box.height)
     if factors:
         ET.SubElement(root, "OverviewList", resampling="average").text = " ".join(str(f) for f in factors)
@@ -137,14 +150,14 @@ def write_index(path: Path, sheets: Sequence[Sheet], band: Band, dtype: str, con
     path.write_bytes(ET.tostring(root, encoding="utf-8") + b"\n")
 
 
-def check_sheet(path: Path, dtype: str) -> None:
+def check_sheet(path: Path) -> None:
     """Raise :class:`StoreError` unless `path` is a whole sheet, or an index whose sheets lie inside it."""
     with path.open("rb") as stream:
         is_index = stream.read(1) == b"<"
     if is_index:
         check_index(path)
     else:
-        check_cog(path, bands=1, dtype=dtype)
+        check_cog(path)
 
 
 def check_index(path: Path) -> None:
@@ -163,10 +176,9 @@ def check_index(path: Path) -> None:
             raise StoreError("a sheet lies outside the index", change="make it again", file=path)
 
 
-def _add_source(band: ET.Element, sheet: Sheet, box: CellBox, nodata: str, grid: TileGrid) -> None:
-    own = CellBox.around(sheet.tiles, grid)
+def _add_source(band: ET.Element, name: str, own: CellBox, box: CellBox, nodata: str) -> None:
     source = ET.SubElement(band, "ComplexSource")
-    ET.SubElement(source, "SourceFilename", relativeToVRT="1").text = sheet.name
+    ET.SubElement(source, "SourceFilename", relativeToVRT="1").text = name
     ET.SubElement(source, "SourceBand").text = "1"
     for tag, x, y in (("SrcRect", 0, 0), ("DstRect", own.west - box.west, box.north - own.north)):
         ET.SubElement(source, tag, xOff=str(x), yOff=str(y), xSize=str(own.width), ySize=str(own.height))

@@ -49,6 +49,7 @@ class TileTable(SurveyProduct):
     """
 
     name: ClassVar[str] = "tile_table"
+    table: ClassVar[str] = "tiles"
     title: ClassVar[str] = "table of the tiles with their outlines (GeoParquet), for DuckDB, pandas and GIS"
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:

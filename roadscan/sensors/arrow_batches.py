@@ -20,15 +20,20 @@ _MESSAGES = 16
 class MappedBatches:
     """Record batches of a file as views of its mapped pages: nothing is copied, whatever the size of a batch.
 
+    Parameters
+    ----------
+    fields : numbers of the columns that are wanted; all where left out.
+
     Raises
     ------
     pa.ArrowException, OSError, ValueError
         where the file is no whole Arrow IPC file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fields: list[int] | None = None) -> None:
         self._pages = _mapped(path)
-        self.reader = pa.ipc.open_file(pa.BufferReader(pa.py_buffer(self._pages)))
+        chosen = pa.ipc.IpcReadOptions(included_fields=fields)
+        self.reader = pa.ipc.open_file(pa.BufferReader(pa.py_buffer(self._pages)), options=chosen)
 
     def release(self) -> None:
         """Give the pages read so far back; views stay good, a page that is asked for again is mapped again."""

@@ -8,22 +8,23 @@ subclass of :class:`LogFormat`. It streams :class:`Rows` and :class:`Reject`; ev
 from __future__ import annotations
 
 import functools
-import importlib
-import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import pyarrow as pa
 
-from roadscan.model.crs import Geoid, MapFrame
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
+from roadscan.model.crs import LOCAL_WORLD, Geoid, MapFrame
+from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.model.gpstime import Clock
 from roadscan.model.rig import Sensor, SensorKind
 from roadscan.model.strict import Strict
+from roadscan.plugins import found_kinds
+from roadscan.sensors.columns import Quantity
+
+NO_LEVER_ARM: Final = [0.0, 0.0, 0.0]
 
 ENTRY_POINT_GROUP: Final = "roadscan.formats"
 """Entry-point group through which a third party's package adds a format."""
@@ -31,6 +32,21 @@ ENTRY_POINT_GROUP: Final = "roadscan.formats"
 
 class NoOptions(Strict):
     """Settings of a format without settings."""
+
+
+_CARTESIAN: Final = 'crs = "local", or a geocentric one such as "EPSG:4978"'
+
+
+@dataclass(frozen=True)
+class SourceDefaults:
+    """What the survey file says of all logs that do not say it themselves."""
+
+    clock: Clock | None = None
+    """Time system of stamps that neither the log nor its entry in the survey file explains."""
+    week: Clock | None = None
+    """Clock of seconds of the GPS week, where the survey file gives a week or date for all logs."""
+    crs: str | None = None
+    """CRS of positions that neither the log nor its entry in the survey file explains."""
 
 
 @dataclass(frozen=True)
@@ -55,28 +71,43 @@ class LogSource:
     """The survey's map, for control points and for formats that need it (`LogFormat.needs_map`)."""
     trajectory_span_gps_ns: tuple[int, int] | None = None
     """Span of the run's trajectory, where it is already ingested."""
+    defaults: SourceDefaults = SourceDefaults()
+    """What the survey file says of all logs; a reader takes it where the log says nothing, and never against it."""
 
-    def need_clock(self, example: str) -> Clock:
-        """The stated clock, or an error that asks for one: time is never guessed."""
-        if self.clock is None:
+    @property
+    def any_clock(self) -> Clock | None:
+        """The stated clock, or the survey's default: for stamps whose time system the log does not say."""
+        return self.defaults.clock if self.clock is None else self.clock
+
+    def need_clock(self, system: str, **more: object) -> Clock:
+        """The stated clock or the survey's default, or an error that asks for one: time is never guessed.
+
+        Parameters
+        ----------
+        system, more : a clock that such logs often have, as the survey file states it.
+        """
+        clock = self.any_clock
+        if clock is None:
             raise TimeSystemError(
                 "the log's time system is not stated",
                 expected="clock.system: gps, gps_week_seconds, gps_adjusted, unix_gps, unix_utc, unix_tai, "
                 "utc_hour or free",
-                change=f"add clock = {example} to this log",
                 file=self.path,
+                missing=Missing("clock", {"system": system, **more}, is_example=True),
             )
-        return self.clock
+        return clock
 
     def need_crs(self, example: str = "EPSG:4979") -> str:
-        """The stated CRS, or an error that asks for one: a datum is never guessed."""
-        if self.crs is None:
+        """The stated CRS or the survey's default, or an error that asks for one: a datum is never guessed."""
+        crs = self.defaults.crs if self.crs is None else self.crs
+        if crs is None:
             raise ConfigError(
                 "the CRS of the log's positions is not stated",
-                expected=f'crs, such as "{example}", or "local"',
+                expected=f'crs, such as "{example}", or "local"' if example != LOCAL_WORLD else _CARTESIAN,
                 file=self.path,
+                missing=Missing("crs"),
             )
-        return self.crs
+        return crs
 
     def need_file(self) -> None:
         """Refuse a log that is no file, or one that cannot be opened, for formats of single files."""
@@ -96,6 +127,7 @@ class LogSource:
                 expected=f"a sensor of the rig, of kind {wanted}",
                 change='add sensor = "…" to this log',
                 file=self.path,
+                missing=Missing("sensor"),
             )
         if self.sensor.kind not in kinds:
             raise ConfigError(
@@ -151,6 +183,8 @@ class LogHeader:
     ``world_frame`` (trajectory): world frame of the poses.
     ``scan_geometry`` (scans): fields of :class:`roadscan.points.readings.ScanGeometry`.
     ``frame`` (returns): ``"sensor"``, or ``"body"`` where the maker already applied the mounting.
+    ``mounting`` (scans, returns): what the log says of its sensor's mounting, by keys of
+    :class:`roadscan.model.rig.Sensor` (`axes`, `lever_arm_body_m`, `boresight`); it holds where the rig states none.
     ``crs``, ``height``, ``geoid`` (cloud): what the coordinates are; the unit is metres.
     Further entries are kept for the reader of the log record.
     """
@@ -195,6 +229,19 @@ class LogFormat(ABC):
     """Model of the format's settings; the docstrings of its fields are the manual."""
     needs_map: ClassVar[bool] = False
     """Its rows are in the survey's map, as those of control points are: `LogSource.map` is given."""
+    axes_on_sensor: ClassVar[str] = ""
+    """Where x, y, z of its readings point on the sensor itself, in words, for whoever has to state `axes`."""
+    usual_axes: ClassVar[Mapping[str, str]] = {}
+    """`axes` of usual mountings, each with the words "if …"; `roadscan init` proposes the first."""
+    vehicle_axes: ClassVar[str] = ""
+    """Axes of the vehicle's frame, where its readings are in that frame already: the sensor then has no lever arm
+    and no axes of its own, and a rig file that states some is refused."""
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    """Endings of file names, lower case, by which such logs are known: for saying what is wrong, never for reading."""
+    column_sets: ClassVar[tuple[tuple[Quantity, ...], ...]] = ()
+    """Columns of a text of this format, one of these sets whole: for saying what one lacks that comes near."""
+    accompanies: ClassVar[Mapping[str, str]] = {}
+    """Formats whose logs name one of this format, each with the setting that does; `roadscan init` pairs them."""
     provisional: ClassVar[tuple[Provisional, ...]] = ()
     """Readings that `roadscan inspect` tries first where statements are missing. Needed only where the usual
     clocks, frames and settings, which it then tries one after another, do not open the log."""
@@ -236,25 +283,9 @@ class LogFormat(ABC):
 
 @functools.cache
 def log_formats() -> dict[str, LogFormat]:
-    """All formats by name: the files of this folder and installed entry points."""
-    found: dict[str, LogFormat] = {}
-    package = importlib.import_module("roadscan.sensors")
-    for module_info in pkgutil.iter_modules(package.__path__):
-        module = importlib.import_module(f"roadscan.sensors.{module_info.name}")
-        for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, LogFormat) and value.__module__ == module.__name__:
-                _add(found, value, module.__name__)
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        _add(found, entry.load(), f"entry point {entry.value}")
-    return dict(sorted(found.items()))
-
-
-def _add(found: dict[str, LogFormat], kind: type[LogFormat], origin: str) -> None:
-    if kind.__abstractmethods__:
-        return
-    if kind.name in found:
-        raise ConfigError(f"two formats are called '{kind.name}'", expected="unique names", change=f"see {origin}")
-    found[kind.name] = kind()
+    """All formats by name: those of this folder, and installed entry points."""
+    found = found_kinds("roadscan.sensors", LogFormat, ENTRY_POINT_GROUP)
+    return {name: kind() for name, kind in found.items()}
 
 
 def format_named(name: str) -> LogFormat:
@@ -275,8 +306,7 @@ def format_of(path: Path) -> LogFormat:
     if not fitting:
         raise FormatError(
             "the content is of no known format",
-            expected="one of: " + ", ".join(log_formats()),
-            change='state format = "…" for this log',
+            change='state format = "…" for this log; `roadscan formats` lists them',
             file=path,
         )
     raise FormatError(

@@ -7,18 +7,22 @@ has to be mapped, with its unit, in the log's options. Nothing is guessed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError, nearest
+from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.model.gpstime import UNIT_NS, Clock
 from roadscan.model.strict import Strict
 
 Dimension: TypeAlias = Literal[
     "angle", "length", "time", "rate", "acceleration", "speed", "temperature", "count", "text"
 ]
+
+_BRACKETS: Final = re.compile(r"[(\[<{].*")
+"""What many programs put a unit into: `Latitude (deg)`."""
 
 STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
 """Size of the unit g (CGPM 1901)."""
@@ -77,6 +81,54 @@ class Quantity:
     also: tuple[str, ...] = ()
     """Other names it is known by."""
     optional: bool = False
+
+    @property
+    def usual_unit(self) -> str:
+        """The first of its units, "" where it has none."""
+        return next(iter(UNITS[self.dimension]))
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How near the columns of a text come to those of a format."""
+
+    found: int
+    """Columns whose names carry their units."""
+    unitless: dict[str, tuple[Quantity, str]]
+    """Columns by name that lack nothing but the unit, with a usual one."""
+    absent: tuple[Quantity, ...]
+    """Quantities without a column."""
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Order of nearness, the greater the nearer."""
+        return self.found + len(self.unitless), -len(self.absent)
+
+    @property
+    def is_near(self) -> bool:
+        """True if at least two columns, and half of all, are there."""
+        there = self.found + len(self.unitless)
+        return there >= max(2, len(self.absent))
+
+
+def likeness(quantities: Iterable[Quantity], names: Sequence[str]) -> Likeness:
+    """How near columns of these `names` come to the `quantities`; time may be without unit, the clock has it."""
+    plain = {_BRACKETS.sub("", name.lower()).strip(" _"): name for name in names}
+    bracketed = {name: bracket[0].strip("()[]<>{} ") for name in names if (bracket := _BRACKETS.search(name.lower()))}
+    found, unitless, absent = 0, {}, []
+    for quantity in quantities:
+        named = next((plain[stem] for stem in (quantity.name, *quantity.also) if stem in plain), None)
+        if any(name.lower() in _spellings(quantity) for name in plain.values()):
+            found += 1
+        elif named is None:
+            absent.append(quantity)
+        elif quantity.dimension == "time":
+            found += 1
+        else:
+            units = UNITS[quantity.dimension]
+            unit = bracketed.get(named, "")
+            unitless[named] = (quantity, unit if unit in units else quantity.usual_unit)
+    return Likeness(found, unitless, tuple(absent))
 
 
 @dataclass(frozen=True)
@@ -147,6 +199,7 @@ def need_stamp_unit(column: Found, clock: Clock, file: Path) -> None:
             expected="one unit",
             change=f'set clock.unit = "{column.unit}", or map the column under another name',
             file=file,
+            missing=Missing("clock", {"system": str(clock.system), "unit": column.unit}),
         )
 
 
@@ -217,6 +270,7 @@ def _missing(quantity: Quantity, names: tuple[str, ...], file: Path) -> FormatEr
         expected="a column called " + " or ".join(f"'{s}'" for s in list(_spellings(quantity))[:4]),
         change=f'or state it: columns = {{ {quantity.name} = {{ name = "{example}", unit = "{unit}" }} }}',
         file=file,
+        missing=Missing(f"options.columns.{quantity.name}"),
     )
 
 

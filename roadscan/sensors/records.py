@@ -237,13 +237,7 @@ class EpochReader:
     def _give_up(self, error: RoadscanError, sieve: Sieve, records: Int64) -> None:
         """All stamps of the block are refused: a fault of the log, unless earlier blocks were sound."""
         if self._last_epoch is None:
-            raise TimeSystemError(
-                error.arrived,
-                expected=error.expected,
-                change=error.change,
-                file=self._file,
-                record=int(records[np.flatnonzero(sieve.good)[0]]),
-            )
+            raise error.at(self._file, int(records[np.flatnonzero(sieve.good)[0]]))
         sieve.drop(sieve.good.copy(), error.arrived)
 
     def _drop_leaps(self, epochs: Int64, sieve: Sieve) -> None:
@@ -287,7 +281,7 @@ class UnorderedStamps:
         try:
             epoch = int(clock.to_epoch_gps_ns(anchor)[0])
         except TimeSystemError as error:
-            raise TimeSystemError(error.arrived, expected=error.expected, change=error.change, file=file) from error
+            raise error.at(file) from error
         return cls(clock, float(anchor[0]), epoch)
 
     def epochs(self, stamps: Float64, sieve: Sieve, name: str = "gps_time") -> Int64:

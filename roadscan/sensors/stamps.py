@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from roadscan.model.errors import TimeSystemError
+from roadscan.model.errors import Missing, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
@@ -51,14 +51,16 @@ class StampColumn:
         TimeSystemError
             if the clock is not stated, or fits neither the column's unit nor the way times are written.
         """
-        kind = stamp_kind(file, layout, found.column, "s" if source.clock is None else source.clock.unit)
+        clock = source.any_clock
+        kind = stamp_kind(file, layout, found.column, "s" if clock is None else clock.unit)
         if kind != "text":
-            clock = source.need_clock('{ system = "gps", unit = "s" }')
+            clock = source.need_clock("gps", unit="s")
             need_stamp_unit(found, clock, file)
             return cls(found.column, kind, clock, zoned=False)
         word = _first_word(file, layout, found.column)
         zoned = parse_calendar([word], zoned=True) is not None
-        return cls(found.column, kind, calendar_clock(source.clock, word, file, zoned=zoned), zoned)
+        stated = source.clock if zoned else clock
+        return cls(found.column, kind, calendar_clock(stated, word, file, zoned=zoned), zoned)
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> npt.NDArray[np.generic]:
         """Stamps (n,) of a block, float64 or int64, in the unit of `clock`; faulty ones are dropped from `sieve`."""
@@ -88,6 +90,7 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool) -
                 f"time '{word}' has a zone, so it is UTC, the clock says {clock.system}",
                 expected='clock.system = "unix_utc", or no clock',
                 file=file,
+                missing=Missing("clock", {"system": "unix_utc"}),
             )
         return replace(clock or Clock(TimeSystem.UNIX_UTC), unit="ns")
     if parse_calendar([word], zoned=False) is None:
@@ -102,6 +105,7 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool) -
             expected="clock.system = unix_utc, unix_gps or unix_tai: the scale it is written in",
             change='add clock = { system = "unix_utc" } if it is UTC',
             file=file,
+            missing=Missing("clock", {"system": "unix_utc"}),
         )
     return replace(clock, unit="ns")
 

@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.imu import ImuErrors, ImuGrade
-from roadscan.simulate import sick
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.imu import AT_BODY, head_imus
-from roadscan.simulate.lens import Lens
-from roadscan.simulate.lidar import RANGE_MIN_M
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
-from roadscan.simulate.profiler import Head, heads
 from roadscan.simulate.scene import Camera, Mount, MountError, Scene
+from roadscan.simulate.sensors import sick
+from roadscan.simulate.sensors.imu import AT_BODY, head_imus
+from roadscan.simulate.sensors.lens import Lens
+from roadscan.simulate.sensors.lidar import RANGE_MIN_M
+from roadscan.simulate.sensors.profiler import Head, heads
 from roadscan.simulate.surface import Surface
 
 SURVEY_FILE: Final = "SURVEY.toml"

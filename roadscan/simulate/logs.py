@@ -11,13 +11,14 @@ import numpy as np
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
-from roadscan.simulate import encoder, gnss, imu, lidar, sick, trajectory
-from roadscan.simulate.camera import write_camera
+from roadscan.simulate import trajectory
 from roadscan.simulate.caster import World
-from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.profiler import Head, heads, write_profiles
 from roadscan.simulate.scene import ClockError, Scene
+from roadscan.simulate.sensors import encoder, gnss, imu, lidar, sick
+from roadscan.simulate.sensors.camera import write_camera
+from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.profiler import Head, heads, write_profiles
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object
 

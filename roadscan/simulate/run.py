@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from roadscan.model.errors import ConfigError
-from roadscan.simulate import files, truth
+from roadscan.simulate import files, own_files, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
@@ -48,6 +48,7 @@ def simulate(
     *,
     write_hits: bool = False,
     progress: Callable[[str], None] | None = None,
+    overwrite: bool = False,
 ) -> SimulatedSurvey:
     """Write the survey of a scene as raw logs. Same scene, same bytes; memory does not grow with its length.
 
@@ -60,14 +61,15 @@ def simulate(
         profilers one row a profile, NaN where the beam missed; for the line scanner one row a turn of its mirror; for
         the lidar one row a recorded return).
     progress : called with the name of each log before it is written.
+    overwrite : write survey file, rig file and control points anew also where they were edited.
 
     Raises
     ------
     ConfigError
-        where the folder holds something else, or the map's CRS cannot be used.
+        where the folder holds something else, one of these files was edited, or the map's CRS cannot be used.
     """
     target = Path(folder)
-    _prepare(scene, target)
+    _prepare(scene, target, overwrite)
     earth = Earth(scene.map.crs)
     surface, ride = Surface(scene), Surface(scene, ride=True)
     drives = drives_of(scene, earth, ride)
@@ -80,11 +82,12 @@ def simulate(
     counts: Counter[str] = Counter()
     for drive, listed in zip(drives, logs, strict=True):
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
-    files.write_rig(scene, target / files.RIG_FILE)
     files.write_rig(scene, known.rig_file, nominal=False)
     files.write_clocks(scene, known.clocks_file)
-    files.write_control(scene, surface, target / files.CONTROL_FILE)
-    files.write_survey(scene, earth, logs, target / files.SURVEY_FILE)
+    with own_files.written_for_the_user(target) as new:
+        files.write_rig(scene, new / files.RIG_FILE)
+        files.write_control(scene, surface, new / files.CONTROL_FILE)
+        files.write_survey(scene, earth, logs, new / files.SURVEY_FILE)
     return SimulatedSurvey(
         folder=target,
         survey_file=target / files.SURVEY_FILE,
@@ -131,8 +134,8 @@ def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) ->
     return counts
 
 
-def _prepare(scene: Scene, folder: Path) -> None:
-    """Make the folder, and refuse one that holds anything but this scene's survey."""
+def _prepare(scene: Scene, folder: Path, overwrite: bool) -> None:
+    """Make the folder, and refuse one that holds anything but this scene's survey, or files that were edited."""
     if folder.exists() and not folder.is_dir():
         raise ConfigError("this is a file", expected="a folder to write the survey into", file=folder)
     if folder.is_dir() and any(folder.iterdir()):
@@ -150,4 +153,6 @@ def _prepare(scene: Scene, folder: Path) -> None:
                 change="name another folder, or remove this one first",
                 file=folder,
             )
+        if not overwrite:
+            own_files.refuse_edited(folder)
     truth.save(scene, folder)

@@ -39,8 +39,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.clough_tocher import POINTS, control_points, cross_slopes
-from roadscan.kernels.patch_grid import evaluate
+from roadscan.kernels.simd.patch_heights import POINTS
+from roadscan.kernels.surface.clough_tocher import control_points, cross_slopes
+from roadscan.kernels.surface.patch_grid import evaluate
 from roadscan.surfaces.sites import Sites, from_steps, steps
 from roadscan.surfaces.triangulation import Triangulation
 from roadscan.surfaces.window import GridWindow
@@ -55,7 +56,7 @@ class CubicSurface:
     sites: Sites
     mesh: Triangulation
     patches: npt.NDArray[np.float64]
-    """(n, 19) heights of control points (m); their order stands in ``kernels.clough_tocher``."""
+    """(n, 19) heights of control points (m); their order stands in ``kernels.surface.clough_tocher``."""
 
     def heights(self, window: GridWindow) -> npt.NDArray[np.float64]:
         """(rows, columns) heights (m) at the nodes of a window, south row first, NaN where no triangle lies.

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from roadscan.kernels import coarse as kernels
+from roadscan.kernels.surface import coarse as kernels
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
 from roadscan.points.cloud import QUANTA_PER_M
@@ -154,11 +154,16 @@ class CoarseModel:
         sums, counts = np.zeros((edge, edge), np.int64), np.zeros((edge, edge), np.int32)
         origin = np.zeros((edge, edge), np.uint8)
         links = np.append(np.hypot(*np.diff(self.zero_m[rows], axis=0).T) <= self.settings.link_m, False)
+        east, north, right_east, right_north = (
+            np.ascontiguousarray(column) for column in (*self.zero_m[rows].T, *self.right[rows].T)
+        )
+        profiles = kernels.Profiles(
+            east, north, right_east, right_north, self.first_node, self.settings.spacing_m, self.height_m[rows],
+            self.origin[rows], links,
+        )  # fmt: skip
         kernels.rasterise(
-            *(np.ascontiguousarray(column) for column in (*self.zero_m[rows].T, *self.right[rows].T)),
-            self.first_node, self.settings.spacing_m, self.height_m[rows], self.origin[rows], links,
-            (box.easting_min_m, box.northing_min_m), grid.size_m / edge, 1.5 * edge / grid.size_m,
-            float(QUANTA_PER_M), sums, counts, origin,
+            profiles, (box.easting_min_m, box.northing_min_m), grid.size_m / edge, 1.5 * edge / grid.size_m,
+            float(QUANTA_PER_M), kernels.CellSums(sums, counts, origin),
         )  # fmt: skip
         with np.errstate(invalid="ignore", divide="ignore"):
             height: Float64 = np.where(counts > 0, sums / counts / QUANTA_PER_M, np.nan)

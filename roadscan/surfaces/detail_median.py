@@ -17,8 +17,8 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    `outlier_sigmas`, so that an outlier has no say.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
    on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
-   (outliers replaced by the line's median), and of all that of least risk (``kernels/supports.py``).
-6. *Strips*: a crack too shallow for lines of seven may stand out over 21 cells (``surfaces/long_lines.py``). Its cells
+   (outliers replaced by the line's median), and of all that of least risk (``kernels/cracks/supports.py``).
+6. *Strips*: a crack too shallow for lines of seven may show over 21 cells (``faint_cracks.py``). Its cells
    are detail as well, and the strip is a sixth support.
 7. *Level ground*: the median of seven in a row, of seven such in a column, side by side; of these the mean of 7 × 7,
    every second one (a median of medians smooths no more: it keeps whatever rises or falls steadily). Cells with
@@ -35,7 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.line_medians import (
+from roadscan.kernels.cracks.line_medians import (
     CELLS,
     judge_lines,
     keep_better,
@@ -44,10 +44,10 @@ from roadscan.kernels.line_medians import (
     mirrored_line_medians,
     window_sums,
 )
-from roadscan.kernels.supports import SUPPORTS, heights_by_support, least_risk
+from roadscan.kernels.cracks.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
 from roadscan.model.surface_smoothing import SurfaceSmoothing
-from roadscan.surfaces.long_lines import REACH as STRIP_REACH
-from roadscan.surfaces.long_lines import Chains, no_strips
+from roadscan.surfaces.distress.faint_cracks import REACH as STRIP_REACH
+from roadscan.surfaces.distress.faint_cracks import Chains, no_strips
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -178,10 +178,9 @@ class _Lines:
             outlier = np.abs(heights - self.median_m) > self.config.outlier_sigmas * sigma_m
         clean = _padded(np.where(outlier & self.measured, self.median_m, heights), _FIT_REACH)
         off, own = np.empty((row.size, SUPPORTS), np.float32), np.empty((row.size, SUPPORTS), np.float32)
-        heights_by_support(
-            clean, _FIT_REACH, row, column, middle, self.own[detail], _CHOICE, self.direction[detail],
-            lines_onward(), detail_pairs(), _ABSENT, off, own,
-        )  # fmt: skip
+        cells = CrackCells(row, column, middle, self.own[detail], self.direction[detail])
+        shapes = Shapes(lines_onward(), detail_pairs())
+        heights_by_support(clean, _FIT_REACH, cells, _CHOICE, shapes, _ABSENT, off, own)
         drawn = self.strips.gain[detail] > 0.0
         off[:, -1] = np.where(drawn, self.strips.height_m[detail] - middle, 0.0)
         own[:, -1] = np.where(drawn, self.strips.own[detail] - _FAVOUR, own[:, 0])

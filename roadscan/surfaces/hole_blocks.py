@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.ground import depths, grounds, slopes
+from roadscan.kernels.surface.ground import depths, grounds, slopes
 from roadscan.model.distress import PotholeDetection
 from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
 

@@ -43,10 +43,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.spline_gradients import WORK, spline_gradients
-from roadscan.kernels.vertex_gradients import FITTED, LEVEL, vertex_gradients
-from roadscan.kernels.vertex_neighbourhoods import MOST, neighbourhoods
-from roadscan.kernels.vertex_rings import MOST_RINGS
+from roadscan.kernels.surface.spline_gradients import WORK, spline_gradients
+from roadscan.kernels.surface.vertex_gradients import FITTED, LEVEL, vertex_gradients
+from roadscan.kernels.surface.vertex_neighbourhoods import MOST, neighbourhoods
+from roadscan.kernels.surface.vertex_rings import MOST_RINGS
 from roadscan.model.surface import SlopeKind
 from roadscan.surfaces.sites import Sites
 from roadscan.surfaces.triangulation import Triangulation
@@ -64,7 +64,7 @@ class Slopes:
     slopes: npt.NDArray[np.float64]
     """(m, 2) along easting and northing (m/m)."""
     sources: npt.NDArray[np.uint8]
-    """(m,) FITTED, PLANE or LEVEL of ``kernels.vertex_gradients``."""
+    """(m,) FITTED, PLANE or LEVEL of ``kernels.surface.vertex_gradients``."""
 
 
 def slopes_at(sites: Sites, mesh: Triangulation, kind: SlopeKind) -> Slopes:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import shapely
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 
-from roadscan.kernels.coarse import PATCH_SUMS, sum_patches
+from roadscan.kernels.surface.coarse import PATCH_SUMS, sum_patches
 from roadscan.model.surface_regions import RegionSettings
 from roadscan.surfaces.coarse import CoarseModel
 

@@ -54,9 +54,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.directional_filters import choose_filters
-from roadscan.kernels.smoothing import REACH as STEP_REACH
-from roadscan.kernels.smoothing import descend
+from roadscan.kernels.surface.directional_filters import choose_filters
+from roadscan.kernels.surface.smoothing import REACH as STEP_REACH
+from roadscan.kernels.surface.smoothing import descend
 from roadscan.model.errors import RoadscanError
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH as MEDIAN_REACH

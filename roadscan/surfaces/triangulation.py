@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import Delaunay, QhullError
 
-from roadscan.kernels.delaunay import flip_edges
+from roadscan.kernels.surface.delaunay import flip_edges
 from roadscan.surfaces.sites import Sites
 
 NUDGE_M: Final = 2.0**-24

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
-from roadscan.kernels.profile_bounds import range_bounds
+from roadscan.kernels.georeferencing.profile_bounds import range_bounds
 from roadscan.tables.schema import TableSchema
 
 

@@ -10,9 +10,10 @@ from typing import ClassVar, Final, Generic, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.codecs.choice import LIBRARY
+from roadscan.codecs.parquet.page_file import DamageError, PageFile, read_footer
 from roadscan.model.errors import StoreError
 from roadscan.tables.byte_source import opened
-from roadscan.tables.page_file import DamageError, PageFile, read_footer
 from roadscan.tables.store import Store
 
 Rows = TypeVar("Rows")
@@ -42,7 +43,7 @@ class GroupReader(ABC, Generic[Rows, Pages]):
             self._source = opened(store, store.path(file))
             self._metadata, ours = read_footer(self._source.stream)
             suits = self._suits(self._metadata.schema.to_arrow_schema())
-            if ours and suits:
+            if ours and suits and not LIBRARY:
                 self._packed = self._pages()
         except _DAMAGE as error:
             raise self._error(error) from error

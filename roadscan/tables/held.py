@@ -1,6 +1,8 @@
 """Small tables that are held whole, a file each: what was estimated of clocks, mountings and trajectories.
 
-No record of the manifest names them, and no run makes all of them. So each says by itself what mends it.
+No record of the manifest names them, and no run makes all of them. So each says by itself what mends it. A list of
+their digests (``manifest/held.json``) tells damage that the checksums of their pages do not cover; a table that someone
+put there, and roadscan did not write, is not in it.
 """
 
 from __future__ import annotations
@@ -11,9 +13,12 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.model.errors import DamagedError
+from roadscan.model.errors import DamagedError, StoreError
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
+from roadscan.tables.sealed import seal, unseal
+from roadscan.tables.store import Store, bytes_digest
+
+_DIGESTS: Final = "manifest/held.json"
 
 WAY_OUT: Final = {
     "clocks": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
@@ -62,4 +67,33 @@ def write_held(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> No
     table = pa.Table.from_pylist(full, schema.arrow()).sort_by([(c, "ascending") for c in schema.sort])
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, row_group_size=schema.row_group_rows, compression="zstd", write_page_checksum=True)
-    store.write_bytes(held_path(name), sink.getvalue().to_pybytes())
+    content = sink.getvalue().to_pybytes()
+    known = _known(store)
+    both = {"bytes": len(content), "digest": bytes_digest(content)}
+    store.write_bytes(_DIGESTS, seal({**known, name: {**both, "before": known.get(name, {}).get("digest")}}))
+    store.write_bytes(held_path(name), content)
+
+
+def held_records(store: Store) -> dict[str, tuple[int, str]]:
+    """Bytes and digest of the small tables that roadscan wrote, by their paths.
+
+    One whose writing was cut short is the one before it.
+    """
+    found: dict[str, tuple[int, str]] = {}
+    for name, of in _known(store).items():
+        path = held_path(name)
+        if store.exists(path) and bytes_digest(content := store.read_bytes(path)) == of.get("before"):
+            found[path] = (len(content), str(of["before"]))
+        else:
+            found[path] = (int(of["bytes"]), str(of["digest"]))
+    return found
+
+
+def _known(store: Store) -> dict[str, Any]:
+    """Digests that were kept; none where their list is damaged, which costs nothing but this check."""
+    if not store.exists(_DIGESTS):
+        return {}
+    try:
+        return {name: of for name, of in unseal(store.read_bytes(_DIGESTS)).items() if name in WAY_OUT and dict(of)}
+    except (StoreError, ValueError, TypeError):
+        return {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -14,6 +14,9 @@ from roadscan.tables.store import Store
 
 _FOLDER: Final = "manifest/logs"
 _COPIES: Final = "manifest/log_copies"
+
+NAVIGATION: Final = "navigation"
+"""Sensor of the records of computed trajectories."""
 
 
 @dataclass(frozen=True)
@@ -145,23 +148,17 @@ def retire_log(store: Store, record: LogRecord) -> None:
             store.fs.mv(store.path(record.folder(table)), target, recursive=True)
 
 
+def data_file(raw: Mapping[str, Any]) -> DataFile:
+    """What a record holds of a data file, from JSON."""
+    spans = tuple((s[0], s[1]) for s in raw["group_spans"])
+    return DataFile(**{**raw, "group_rows": tuple(raw["group_rows"]), "group_spans": spans})
+
+
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """The record of the log `key`, from the content of the file `path`."""
     try:
         raw = unseal(content)
-        raw["tables"] = {
-            name: tuple(
-                DataFile(
-                    **{
-                        **f,
-                        "group_rows": tuple(f["group_rows"]),
-                        "group_spans": tuple((s[0], s[1]) for s in f["group_spans"]),
-                    }
-                )
-                for f in files
-            )
-            for name, files in raw["tables"].items()
-        }
+        raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
         record = LogRecord(**raw)
         if record.key != key:
             raise ValueError(f"it is the record of the log {record.key}")

@@ -1,6 +1,6 @@
 """Profiles of a line scanner out of the store, into arrays that are used again.
 
-Files as `list_table` writes them are decoded here; those of other writers, and of older stores, by Arrow.
+Files of roadscan's own pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.codecs.parquet.list_file import ListTableFile
+from roadscan.codecs.parquet.page_file import DamageError
 from roadscan.tables.group_reader import GroupReader
-from roadscan.tables.list_table_reader import ListTableFile
-from roadscan.tables.page_file import DamageError
 from roadscan.tables.store import Store
 
 _COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
@@ -111,4 +111,5 @@ def _readings(lists: pa.ChunkedArray, kind: pa.DataType) -> npt.NDArray[Any]:
     flat = pa.compute.list_flatten(lists)
     if flat.null_count:
         raise DamageError("readings are missing")
-    return np.ascontiguousarray(flat.cast(kind).to_numpy()).reshape(len(lists), -1 if len(lists) else 0)
+    none = lists.type.list_size if pa.types.is_fixed_size_list(lists.type) else 0
+    return np.ascontiguousarray(flat.cast(kind).to_numpy()).reshape(len(lists), -1 if len(lists) else none)

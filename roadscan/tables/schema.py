@@ -6,6 +6,7 @@ import functools
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +27,10 @@ _TYPES: Final[dict[str, pa.DataType]] = {
     "float64": pa.float64(),
     "string": pa.string(),
 }
+
+
+ENTRY_POINT_GROUP: Final = "roadscan.schemas"
+"""Entry points of packages that add tables: each names a package whose folder holds the schema files."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,8 @@ class TableSchema:
     """Length of a partition of GPS time (s); None for tables that are not partitioned."""
     compression: str = "zstd"
     """Parquet codec of all columns."""
+    location: str | None = None
+    """Folder of its Parquet files, relative to the survey's root; None for rows of logs, whose records name them."""
 
     def arrow(self, list_size: int | None = None) -> pa.Schema:
         """Arrow schema, with unit, frame and meaning as field metadata."""
@@ -173,14 +180,27 @@ def schema_folder() -> Path:
 
 def schema_names() -> list[str]:
     """Names of all tables."""
-    return sorted(p.stem for p in schema_folder().glob("*.toml"))
+    return sorted(_schema_files())
+
+
+@functools.cache
+def _schema_files() -> dict[str, Path]:
+    """Schema files by name of their table: roadscan's own, and those of packages that add tables."""
+    added = (Path(str(resources.files(entry.value))) for entry in entry_points(group=ENTRY_POINT_GROUP))
+    folders = [schema_folder(), *added]
+    found: dict[str, Path] = {}
+    for file in (file for folder in folders for file in sorted(folder.glob("*.toml"))):
+        if file.stem in found:
+            raise SchemaError(f"table '{file.stem}' is there twice: {found[file.stem]} and {file}")
+        found[file.stem] = file
+    return found
 
 
 @functools.cache
 def table_schema(name: str) -> TableSchema:
     """Schema of a table by name."""
-    file = schema_folder() / f"{name}.toml"
-    if not file.is_file():
+    file = _schema_files().get(name)
+    if file is None:
         raise SchemaError(f"there is no table '{name}'{nearest(name, schema_names())}")
     with file.open("rb") as stream:
         raw = tomllib.load(stream)
@@ -193,4 +213,5 @@ def table_schema(name: str) -> TableSchema:
         row_group_rows=raw["row_group_rows"],
         partition_s=raw.get("partition_s"),
         compression=raw.get("compression", "zstd"),
+        location=raw.get("location"),
     )

@@ -15,6 +15,7 @@ the disk before its name is seen: a power loss leaves it whole or absent. Files 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
@@ -30,7 +31,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from blake3 import blake3
 
-from roadscan.model.errors import DamagedError, StoreError
+from roadscan.model.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 
 try:
     import fcntl
@@ -40,6 +41,14 @@ except ImportError:  # no such locks on this system
 _STAGING: Final = ".staging"
 _CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
 _ALGORITHM: Final = "blake3:"
+
+_NO_ROOM_BYTES: Final = 8 << 20
+"""A writer that fails with less free room than that, and does not say why, failed for that: GDAL and others write
+blocks of some megabytes.
+"""
+_MAKE_ROOM: Final = (
+    "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
+)
 
 MADE_AGAIN: Final = "`roadscan verify` finds all such files, and the next run makes them again"
 """What mends a damaged product."""
@@ -197,7 +206,8 @@ class Store:
         else:
             folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
         try:
-            yield folder
+            with told_if_full(folder):
+                yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -247,8 +257,11 @@ class Store:
         _made(doomed.parent, lambda: path.rename(doomed))
         shutil.rmtree(doomed, ignore_errors=True)
 
-    def set_aside(self, relative: str) -> str:
-        """Move a damaged file below ``damaged/``, for whoever wants to look at it; returns its name there."""
+    def set_aside(self, relative: str, *, keep: bool = False) -> str:
+        """Move a damaged file below ``damaged/``, for whoever wants to look at it; returns its name there.
+
+        With `keep` it stays under its old name too, until another takes its place at once.
+        """
         aside, number = f"damaged/{relative}", 1
         while self.exists(aside):
             number += 1
@@ -256,7 +269,9 @@ class Store:
         with _in_words(self.path(aside)):
             if self.is_folder:
                 Path(self.path(aside)).parent.mkdir(parents=True, exist_ok=True)
-                Path(self.path(relative)).rename(self.path(aside))
+                _move_aside(Path(self.path(relative)), Path(self.path(aside)), keep)
+            elif keep:
+                self.fs.copy(self.path(relative), self.path(aside))
             else:
                 self.fs.mv(self.path(relative), self.path(aside))
         return aside
@@ -305,6 +320,14 @@ class Store:
             if not (maker.isdigit() and _alive(int(maker))):
                 shutil.rmtree(left, ignore_errors=True)
                 left.unlink(missing_ok=True) if left.is_file() else None
+
+
+def _move_aside(file: Path, aside: Path, keep: bool) -> None:
+    if keep:
+        with contextlib.suppress(OSError):  # a file system without links
+            aside.hardlink_to(file)
+            return
+    file.rename(aside)
 
 
 def _made(folder: Path, write: Callable[[], _T], lasting: bool = False) -> _T:
@@ -360,11 +383,64 @@ def _opened(url: str) -> tuple[Any, str]:
 
 
 @contextlib.contextmanager
+def told_if_full(folder: Path) -> Iterator[None]:
+    """Say what is full where a writer fails in a folder for want of room, whatever words its library has for that.
+
+    Raises
+    ------
+    FullDiskError
+        in place of what the writer raised.
+    """
+    try:
+        yield
+    except RoadscanError:
+        raise
+    except Exception as error:
+        if not (_names_want_of_room(error) or _has_no_room(folder)):
+            raise
+        raise full_disk(folder, error) from error
+
+
+def full_disk(folder: Path, error: Exception) -> FullDiskError:
+    """What to tell of a writer that failed in a folder for want of room."""
+    there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
+    if _STAGING in folder.parts:  # say the store's name, not that of a folder that is gone in a moment
+        folder = Path(*folder.parts[: folder.parts.index(_STAGING)])
+    with contextlib.suppress(OSError):
+        room = shutil.disk_usage(there)
+        arrived = f"the disk is full: {room.free / 1e6:,.1f} MB are free of {room.total / 1e6:,.0f} MB ({error})"
+        return FullDiskError(arrived, change=_MAKE_ROOM, file=folder)
+    return FullDiskError(f"the disk is full ({error})", change=_MAKE_ROOM, file=folder)
+
+
+def _names_want_of_room(error: BaseException) -> bool:
+    """True if an error, or one that led to it, is that of a full disk or of a quota that is used up."""
+    found: BaseException | None = error
+    while found is not None:
+        if isinstance(found, OSError) and found.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if any(os.strerror(code) in str(found) for code in (errno.ENOSPC, errno.EDQUOT)):
+            return True
+        found = found.__cause__ or found.__context__
+    return False
+
+
+def _has_no_room(folder: Path) -> bool:
+    """True if next to nothing is free where a writer failed that does not say why, as GDAL."""
+    try:
+        return shutil.disk_usage(folder).free < _NO_ROOM_BYTES
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
 def _in_words(file: str) -> Iterator[None]:
     """A disk that is full or must not be written is no fault of the program."""
     try:
         yield
     except OSError as error:
+        if _names_want_of_room(error):
+            raise full_disk(Path(file).parent, error) from error
         raise StoreError(
             f"the store cannot be written: {error.strerror or error}",
             change="see to room, rights and the disk itself, and run again: what is finished stays",

@@ -14,12 +14,12 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.codecs.parquet.list_table import is_list_table, write_list_table
+from roadscan.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.tables.derived import with_derived
-from roadscan.tables.list_table import is_list_table, write_list_table
 from roadscan.tables.logs import DataFile, log_folder
 from roadscan.tables.merge import merged
-from roadscan.tables.number_table import is_number_table, write_number_table
 from roadscan.tables.schema import TableSchema, table_schema
 from roadscan.tables.store import Store, file_digest
 
@@ -86,15 +86,19 @@ class LogWriter:
 
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
         """Move the finished tables into the store, each at once."""
-        out: dict[str, tuple[DataFile, ...]] = {}
+        out = self.files(run, sensor, key)
+        for table in out:
+            store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+        return {table: tuple(files.values()) for table, files in out.items()}
+
+    def files(self, run: str, sensor: str, key: str) -> dict[str, dict[Path, DataFile]]:
+        """Finished files by table and by where they lie now, as :meth:`publish` would record them."""
+        out: dict[str, dict[Path, DataFile]] = {}
         for table in sorted({t for t, _ in self._bins}):
             local = self._folder / table
             target = log_folder(table, run, sensor, key)
-            out[table] = tuple(
-                _describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in sorted(local.rglob("*.parquet"))
-            )
-        for table in out:
-            store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+            found = sorted(local.rglob("*.parquet"))
+            out[table] = {p: describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in found}
         return out
 
     def _flush(self, key: tuple[str, int]) -> None:
@@ -208,7 +212,8 @@ def _overlap(parts: list[tuple[Path, int, int]]) -> bool:
     return any(later[1] < earlier[2] for earlier, later in itertools.pairwise(parts))
 
 
-def _describe(path: Path, relative: str) -> DataFile:
+def describe(path: Path, relative: str) -> DataFile:
+    """What a record says of a finished local file that will lie at `relative`."""
     metadata = pq.read_metadata(path)
     groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
     spans: list[tuple[int, int]] = []

@@ -9,19 +9,22 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels import cells as finishing
-from roadscan.kernels.accumulate import LANES, LINE, PIECE, SLOTS, accumulate_cells, work_arrays
-from roadscan.kernels.cells import AHEAD, find_groups, finish_cells
-from roadscan.kernels.georeference import FATES
-from roadscan.kernels.line_access import VECTOR
-from roadscan.kernels.pile_cells import MOST, finish_piles, row_arrays
-from roadscan.kernels.row_piles import sizes_of_rows, take_piles
+from roadscan.kernels.cells import cell_statistics as finishing
+from roadscan.kernels.cells import pool as kernels
+from roadscan.kernels.cells.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
+from roadscan.kernels.cells.active_tiles import ActiveTiles
+from roadscan.kernels.cells.bucket_statistics import MOST, finish_buckets, row_arrays
+from roadscan.kernels.cells.cell_columns import CellColumns
+from roadscan.kernels.cells.cell_statistics import AHEAD, find_groups, finish_cells
+from roadscan.kernels.cells.row_buckets import Buckets, sizes_of_rows, take_readings
+from roadscan.kernels.georeferencing.readings import FATES
+from roadscan.kernels.simd.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE, VECTOR
 from roadscan.model.errors import RoadscanError
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import QUANTUM_M
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
-from roadscan.tiles.piles import Piles
+from roadscan.tiles.row_buckets import RowBuckets
 
 ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""
@@ -29,14 +32,14 @@ ROBUST_FLOOR_QUANTA: Final = 100.0
 MOST_BYTES: Final = 800 << 20
 """Memory that the cells of begun tiles may take."""
 
-_PILES: Final = 1 / 3
+_BUCKETS: Final = 1 / 3
 """Share of that which readings may take that are not counted yet."""
 
 _FIRST_ELEMENTS: Final = 4096
 _COLUMNS: Final = (
     np.uint16, np.uint16, np.uint32, np.float64, np.float64, np.float64, np.float64, np.float32, np.float32,
 )  # fmt: skip
-"""column, row, count, mean, robust, lowest, highest height, their deviation, intensity."""
+"""Of the columns of ``CellColumns`` but the last two."""
 _NEVER: Final = np.array([2**62, -(2**62)])
 
 
@@ -52,12 +55,12 @@ class TileEvidence:
 
 
 class Pool:
-    """Elements that hold the heights of cells (``kernels.accumulate``); it grows, and is never given back."""
+    """Elements that hold the heights of cells (``kernels.cells.accumulate``); it grows, and is never given back."""
 
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
         self._columns: list[npt.NDArray[Any]] = []
-        self.piles = Piles()
+        self.buckets = RowBuckets()
         self._make(_FIRST_ELEMENTS)
 
     @property
@@ -68,13 +71,13 @@ class Pool:
     @property
     def bytes(self) -> int:
         """Memory of the elements."""
-        return sum(a.nbytes for a in self.arrays) - self.lines.nbytes  # the headers are the lines
+        return sum(a.nbytes for a in self.arrays) - self.slots.nbytes  # the headers are in the slots
 
     @property
-    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """lines, heads, bases, chain, free, spare, held, as the kernels take them."""
-        heads = self.lines.view(np.uint64)
-        return self.lines, heads, self.bases, self.chain, self.free, self.spare, self.held
+    def arrays(self) -> kernels.Pool:
+        """The elements, as the kernels take them."""
+        headers = self.slots.view(np.uint64)
+        return kernels.Pool(self.slots, headers, self.bases, self.chain, self.free, self.spare, self.held)
 
     def make_room(self, elements: int, most_bytes: int) -> bool:
         """Grow until so many elements are free; False where that would take more than `most_bytes`."""
@@ -87,14 +90,14 @@ class Pool:
             size = most_bytes // each
         if size < needed:
             return False
-        kept = (self.lines, self.bases, self.chain, self.free, self.spare)
+        kept = (self.slots, self.bases, self.chain, self.free, self.spare)
         self._make(size)
-        for new, old in zip((self.lines, self.bases, self.chain, self.free, self.spare), kept, strict=True):
+        for new, old in zip((self.slots, self.bases, self.chain, self.free, self.spare), kept, strict=True):
             new[: old.size] = old
         return True
 
-    def columns(self, cells: int, passes: int) -> tuple[npt.NDArray[Any], ...]:
-        """Arrays for the statistics of so many cells, as `finish_cells` takes them: the same ones every time."""
+    def columns(self, cells: int, passes: int) -> CellColumns:
+        """Arrays for the statistics of so many cells: the same ones every time."""
         sizes = [cells] * len(_COLUMNS) + [cells + 1, cells * passes]
         kinds = (*_COLUMNS, np.int32, np.uint16)
         for k, (size, kind) in enumerate(zip(sizes, kinds, strict=True)):
@@ -102,16 +105,16 @@ class Pool:
                 self._columns.append(np.empty(0, kind))
             if self._columns[k].size < size:
                 self._columns[k] = np.empty(size * 5 // 4, kind)
-        return tuple(array[:size] for array, size in zip(self._columns, sizes, strict=True))
+        return CellColumns(*(array[:size] for array, size in zip(self._columns, sizes, strict=True)))
 
     def clear(self) -> None:
         """Take all elements back."""
         self.held[:] = 0
         self.free[:] = np.arange(self.size, dtype=np.int32)
-        self.piles.clear()
+        self.buckets.clear()
 
     def _make(self, size: int) -> None:
-        self.lines = _aligned(size * LANES * LINE, np.int16)
+        self.slots = _aligned(size * LANES * SLOT_SIZE, np.int16)
         self.bases, self.chain, self.spare = (np.empty(size * LANES, np.int32) for _ in range(3))
         self.free = np.arange(size, dtype=np.int32)
 
@@ -184,36 +187,44 @@ class Accumulator:
             self.tile_rows[tile.row - self._south, tile.column - self._west] = row
             self.spans[row], self.sigmas[row] = _NEVER, -1.0
 
-    def run(self, kernel: Callable[..., int], items: int, elements: int) -> None:
-        """Call `kernel` with the pool and the item to begin with until it has done all items.
+    @property
+    def active(self) -> ActiveTiles:
+        """The active tiles, as the kernels take them."""
+        return ActiveTiles(
+            self.tile_rows, self.corner_quanta, self.grid.cell_quanta, self.grid.cells_per_edge, self._groups,
+            self._ends, self.spans, self.sigmas,
+        )  # fmt: skip
+
+    def run(
+        self, kernel: Callable[[ActiveTiles, kernels.Pool, CountingWork, int], int], items: int, elements: int
+    ) -> None:
+        """Call `kernel` with the active tiles, the pool, work and the item to begin with until it has done all items.
 
         The kernel stops before an item for which the pool is short of `elements`; the pool is then made larger.
         """
         done = 0
         while True:
-            done = kernel(
-                self.tile_rows, self._groups, self._pool.arrays, self._work, self.spans, self.sigmas, done
-            )  # fmt: skip
+            done = kernel(self.active, self._pool.arrays, self._work, done)
             if done >= items:
                 return
             if not self._pool.make_room(elements, self._most_bytes):
                 raise PoolExhaustedError(f"the cells of the tiles in work take more than {self._most_bytes >> 20} MB")
 
-    def pile(self, kernel: Callable[..., int], items: int, blocks: int) -> None:
-        """Call `kernel` with the piles and the item to begin with until it has done all items.
+    def fill(self, kernel: Callable[[ActiveTiles, Buckets, int], int], items: int, blocks: int) -> None:
+        """Call `kernel` with the active tiles, the buckets and the item to begin with until it has done all items.
 
-        The kernel stops before an item for which there may be too few free `blocks`. Then the piles get more memory;
-        where they have their share, what lies on them is counted.
+        The kernel stops before an item for which there may be too few free `blocks`. Then the buckets get more memory;
+        where they have their share, what lies in them is counted.
         """
-        piles, done = self._pool.piles, 0
+        buckets, done = self._pool.buckets, 0
         while True:
-            done = kernel(self._ends, piles.arrays, done)
+            done = kernel(self.active, buckets.arrays, done)
             if done >= items:
                 return
-            if not piles.make_room(blocks, int(_PILES * self._most_bytes)):
+            if not buckets.make_room(blocks, int(_BUCKETS * self._most_bytes)):
                 for along, across in np.argwhere(self.tile_rows >= 0).tolist():
-                    self._count_piles(along, across)
-                piles.make_room(blocks, int(_PILES * self._most_bytes))
+                    self._count_buckets(along, across)
+                buckets.make_room(blocks, int(_BUCKETS * self._most_bytes))
 
     def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
         """Cells of a tile, which becomes inactive; None where no reading fell into it.
@@ -221,17 +232,17 @@ class Accumulator:
         The next tile that is finished overwrites them: fresh memory would cost as much as the statistics.
         """
         row, along, across = self._row(tile), tile.row - self._south, tile.column - self._west
-        taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
-        piled, most_piled = self._sizes(row)
-        if (taken and piled) or most_piled >= MOST:
-            self._count_piles(along, across)
-            taken, most_lines = find_groups(self._groups[row], self._pool.chain, self._found)
+        taken, most_slots = find_groups(self._groups[row], self._pool.chain, self._found)
+        left, most_left = self._sizes(row)
+        if (taken and left) or most_left >= MOST:
+            self._count_buckets(along, across)
+            taken, most_slots = find_groups(self._groups[row], self._pool.chain, self._found)
         self.tile_rows[along, across] = -1
         self._unused.append(row)
         if taken:
-            cells = self._cells(tile, self._groups[row], taken, most_lines * SLOTS)
-        elif piled:
-            cells = self._piled_cells(tile, row, piled, most_piled)
+            cells = self._cells(tile, self._groups[row], taken, most_slots * SLOT_HEIGHTS)
+        elif left:
+            cells = self._bucketed_cells(tile, row, left, most_left)
         else:
             return None
         (first, last), (horizontal, down) = self.spans[row].tolist(), self.sigmas[row].tolist()
@@ -246,25 +257,23 @@ class Accumulator:
         self._pool.clear()
 
     def _sizes(self, row: int) -> tuple[int, int]:
-        """Readings on the piles of a tile, and on its largest one."""
-        piles = self._pool.piles
-        total, most = sizes_of_rows(self._ends[row], piles.before, piles.sizes)
+        """Readings in the buckets of a tile, and in its fullest one."""
+        buckets = self._pool.buckets
+        total, most = sizes_of_rows(self._ends[row], buckets.before, buckets.sizes)
         return int(total), int(most)
 
-    def _count_piles(self, along: int, across: int) -> None:
-        """Count what lies on the piles of a tile, by its place in the box, into its cells."""
+    def _count_buckets(self, along: int, across: int) -> None:
+        """Count what lies in the buckets of a tile, by its place in the box, into its cells."""
         row, edge = int(self.tile_rows[along, across]), self.grid.cells_per_edge
         n, _ = self._sizes(row)
         column, rows, passes = (np.empty(n, np.int32) for _ in range(3))
-        heights, intensity = np.zeros(n + VECTOR, np.int32), np.empty(n, np.uint16)
-        west, south = across * edge, along * edge
-        take_piles(self._ends[row], self._pool.piles.arrays, west, south, column, rows, heights, passes, intensity)
-        told = np.zeros(FATES, np.int64)  # they were told when they were piled up
+        readings, intensity = Heights(column, rows, np.zeros(n + VECTOR, np.int32)), np.empty(n, np.uint16)
+        buckets = self._pool.buckets.arrays
+        take_readings(self._ends[row], buckets, across * edge, along * edge, readings, passes, intensity)
+        told = np.zeros(FATES, np.int64)  # they were told when they were put into buckets
 
-        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
-            done: int = accumulate_cells(
-                column, rows, heights, passes, intensity, edge, tile_rows, groups, pool, work, told, first
-            )
+        def count(active: ActiveTiles, pool: kernels.Pool, work: CountingWork, first: int) -> int:
+            done: int = accumulate_cells(readings, passes, intensity, active, pool, work, told, first)
             return done
 
         self.run(count, n, 2 * PIECE)
@@ -285,37 +294,26 @@ class Accumulator:
         columns = self._pool.columns(taken * LANES, self.passes.size)
         cells, written = finish_cells(
             groups, self._found, taken, self.grid.cells_per_edge, self._pool.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M,
-            self.passes, finishing.work_arrays(most), *columns,
+            self.passes, finishing.work_arrays(most), columns,
         )  # fmt: skip
         return self._of_columns(tile, columns, cells, written)
 
-    def _piled_cells(self, tile: TileId, row: int, readings: int, most: int) -> TileCells:
+    def _bucketed_cells(self, tile: TileId, row: int, readings: int, most: int) -> TileCells:
         edge = self.grid.cells_per_edge
         columns = self._pool.columns(min(readings, edge * edge), self.passes.size)
-        cells, written = finish_piles(
-            self._ends[row], self._pool.piles.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M, self.passes,
-            row_arrays(edge, self.passes.size, most), *columns,
+        cells, written = finish_buckets(
+            self._ends[row], self._pool.buckets.arrays, ROBUST_FLOOR_QUANTA, QUANTUM_M, self.passes,
+            row_arrays(edge, self.passes.size, most), columns,
         )  # fmt: skip
         return self._of_columns(tile, columns, cells, written)
 
-    def _of_columns(self, tile: TileId, columns: tuple[npt.NDArray[Any], ...], cells: int, written: int) -> TileCells:
-        column, row, count, mean, robust, low, high, deviation, bright, offsets, ids = columns
-        offsets = offsets[: cells + 1]
+    def _of_columns(self, tile: TileId, columns: CellColumns, cells: int, written: int) -> TileCells:
+        own = {name: array[:cells] for name, array in columns._asdict().items()}
+        offsets = columns.pass_offsets[: cells + 1]
+        own["count"] = own.pop("readings")
+        own |= {"pass_offsets": offsets, "pass_ids": columns.pass_ids[:written]}
         return TileCells(
-            tile=tile,
-            cells_per_edge=self.grid.cells_per_edge,
-            column=column[:cells],
-            row=row[:cells],
-            count=count[:cells],
-            height_mean_m=mean[:cells],
-            height_robust_m=robust[:cells],
-            height_min_m=low[:cells],
-            height_max_m=high[:cells],
-            height_std_m=deviation[:cells],
-            intensity_mean=bright[:cells],
-            pass_count=np.diff(offsets).astype(np.uint16),
-            pass_offsets=offsets,
-            pass_ids=ids[:written],
+            tile=tile, cells_per_edge=self.grid.cells_per_edge, pass_count=np.diff(offsets).astype(np.uint16), **own
         )
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.ids import TileId
-from roadscan.tiles.grid import TileGrid
 
 
 @dataclass(frozen=True)
@@ -45,11 +44,6 @@ class Block:
 
 def _unpacked(packed: npt.NDArray[np.int32], halo_tiles: int) -> Block:
     return Block(tuple(map(TileId._make, packed.tolist())), halo_tiles)
-
-
-def halo_tiles_for(halo_m: float, grid: TileGrid) -> int:
-    """Rings of tiles that cover a halo of `halo_m` metres."""
-    return -int(-halo_m // grid.size_m)
 
 
 def cut_blocks(readings: Mapping[TileId, int], edge_tiles: int, max_readings: int, halo_tiles: int = 0) -> list[Block]:

@@ -8,12 +8,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.flat_profiles import accumulate_profiles
-from roadscan.kernels.piled_readings import pile_mirror, pile_returns
-from roadscan.kernels.placing import CHUNK
-from roadscan.points.cloud import QUANTA_PER_M
-from roadscan.points.flat_profiles import FlatProfiles, flat_profiles
-from roadscan.points.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement
+from roadscan.kernels.cells.accumulate import CountingWork
+from roadscan.kernels.cells.active_tiles import ActiveTiles, Measured
+from roadscan.kernels.cells.bucket_readings import bucket_mirror, bucket_returns
+from roadscan.kernels.cells.pool import Pool
+from roadscan.kernels.cells.profile_counting import accumulate_profiles
+from roadscan.kernels.cells.row_buckets import Buckets
+from roadscan.kernels.georeferencing.flat_profiles import FlatProfiles
+from roadscan.kernels.georeferencing.readings import Georeference, MirrorProfiles, Returns
+from roadscan.kernels.georeferencing.timed_readings import CHUNK
+from roadscan.points.flat_profiles import flat_profiles
+from roadscan.points.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
 from roadscan.points.readings import ScanGeometry
 from roadscan.tiles.accumulator import Accumulator
 
@@ -60,13 +65,15 @@ class Counting:
             road.tell(self.fates)
             ranges = road.ranges
         for rows, mounting in self.placement.mountings.pieces(epochs_gps_ns):
-            poses = self.placement.poses(mounting)
+            georeference = self.placement.georeference(mounting)
             epochs, raw, shine = epochs_gps_ns[rows], ranges[rows], bright[rows]
             if flat is None:
                 m = geometry.readings
-                self._mirror(geometry, poses, epochs, raw, shine, passes[rows.start * m : rows.stop * m])
+                own = passes[rows.start * m : rows.stop * m]
+                measured = self._measured(geometry.all_epochs(epochs), own, shine.reshape(-1), _EIGHT_BITS)
+                self._mirror(mirror_profiles(geometry, epochs, raw), measured, georeference)
             else:
-                self._flat(flat, poses, epochs, raw, shine, passes[rows])
+                self._flat(raw, self._measured(epochs, passes[rows], shine, _EIGHT_BITS), flat, georeference)
 
     def returns(
         self,
@@ -78,57 +85,34 @@ class Counting:
     ) -> None:
         """Count n returns; all arrays are (n,), `passes` as in :meth:`profiles`."""
         for rows, mounting in self.placement.mountings.pieces(pose_epochs_gps_ns):
-            arrays: tuple[npt.NDArray[Any], ...] = (
-                epochs_gps_ns[rows],
-                pose_epochs_gps_ns[rows],
-                *(axis[rows] for axis in xyz_sensor_m),
-            )
-            self._returns(self.placement.poses(mounting), arrays, intensity[rows], passes[rows])
+            returns = Returns(pose_epochs_gps_ns[rows], *(axis[rows] for axis in xyz_sensor_m))
+            measured = self._measured(epochs_gps_ns[rows], passes[rows], intensity[rows], _SIXTEEN_BITS)
+            self._returns(returns, measured, self.placement.georeference(mounting))
 
-    @property
-    def _cells(self) -> tuple[tuple[int, int], int, int]:
-        grid = self.accumulator.grid
-        return self.accumulator.corner_quanta, grid.cell_quanta, grid.cells_per_edge
+    def _measured(self, epochs: Int64, passes: Int32, intensity: npt.NDArray[Any], gain: np.uint32) -> Measured:
+        return Measured(epochs, passes, intensity, gain, self.placement.interval_sigmas_m)
 
-    @property
-    def _place(self) -> tuple[Any, ...]:
-        """Limits and cells, active tiles and what is noted of them."""
-        held = self.accumulator
-        return (
-            self.placement.limits, float(QUANTA_PER_M), held.corner_quanta, held.grid.cell_quanta, held.tile_rows,
-            held.spans, held.sigmas, self.placement.interval_sigmas_m,
-        )  # fmt: skip
-
-    def _flat(self, flat: FlatProfiles, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
-        def count(tile_rows: Any, groups: Any, pool: Any, work: Any, spans: Any, sigmas: Any, first: int) -> int:
+    def _flat(
+        self, ranges: npt.NDArray[np.uint16], measured: Measured, flat: FlatProfiles, georeference: Georeference
+    ) -> None:
+        def count(active: ActiveTiles, pool: Pool, work: CountingWork, first: int) -> int:
             done: int = accumulate_profiles(
-                epochs, raw, bright, _EIGHT_BITS, passes, flat.rays, flat.middle, flat.scale, poses, flat.raw_limits,
-                self.placement.limits, float(QUANTA_PER_M), *self._cells, tile_rows, groups, pool, work,
-                spans, sigmas, self.placement.interval_sigmas_m, self.fates, first,
+                ranges, measured, flat, georeference, active, pool, work, self.fates, first
             )  # fmt: skip
             return done
 
-        self.accumulator.run(count, epochs.size, 2 * raw.shape[1])
+        self.accumulator.run(count, len(ranges), 2 * ranges.shape[1])
 
-    def _returns(self, poses: Any, arrays: tuple[npt.NDArray[Any], ...], intensity: Any, passes: Int32) -> None:
-        def pile(ends: Any, piles: Any, first: int) -> int:
-            done: int = pile_returns(
-                *arrays, intensity, _SIXTEEN_BITS, passes, poses, *self._place, ends, piles, self.fates, first
-            )
+    def _returns(self, returns: Returns, measured: Measured, georeference: Georeference) -> None:
+        def fill(active: ActiveTiles, buckets: Buckets, first: int) -> int:
+            done: int = bucket_returns(returns, measured, georeference, active, buckets, self.fates, first)
             return done
 
-        self.accumulator.pile(pile, passes.size, CHUNK)
+        self.accumulator.fill(fill, returns.epochs.size, CHUNK)
 
-    def _mirror(self, geometry: ScanGeometry, poses: Any, epochs: Int64, raw: Any, bright: Any, passes: Int32) -> None:
-        m = geometry.readings
-        own_epochs = geometry.all_epochs(epochs)
-        scale = geometry.range_offset_m, geometry.range_step_m
-
-        def pile(ends: Any, piles: Any, first: int) -> int:
-            done: int = pile_mirror(
-                epochs, own_epochs, raw, *geometry.rays(), scale, geometry.reading_period_ns, bright.reshape(-1),
-                _EIGHT_BITS, passes, poses, *self._place, ends, piles, self.fates, first,
-            )  # fmt: skip
+    def _mirror(self, profiles: MirrorProfiles, measured: Measured, georeference: Georeference) -> None:
+        def fill(active: ActiveTiles, buckets: Buckets, first: int) -> int:
+            done: int = bucket_mirror(profiles, measured, georeference, active, buckets, self.fates, first)
             return done
 
-        self.accumulator.pile(pile, epochs.size, max(CHUNK, m))
+        self.accumulator.fill(fill, profiles.epochs.size, max(CHUNK, profiles.ranges.shape[1]))

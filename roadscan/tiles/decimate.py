@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.decimate import decimate_cells
-from roadscan.kernels.decimate_fours import AT_ONCE, SCRATCH_ROWS, SUMS, decimate_fours
-from roadscan.kernels.lanes import LANES
+from roadscan.kernels.cells import decimate as kernels
+from roadscan.kernels.cells.decimate_2x2 import decimate_2x2
 from roadscan.kernels.options import read_only
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
@@ -86,32 +84,22 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     edge = cells.cells_per_edge
     patch = patch_cells(side, edge, cell_m)
     room = min(len(cells), (edge // side) ** 2)
-    out: list[npt.NDArray[Any]] = [
-        *(np.empty(room, np.uint16) for _ in range(2)), np.empty(room, np.float64), np.empty(room, np.float32),
-        *(np.empty(room, np.uint32) for _ in range(2)), np.empty(room, np.bool_),
-    ]  # fmt: skip
+    out = kernels.Squares(
+        column=np.empty(room, np.uint16), row=np.empty(room, np.uint16), height_m=np.empty(room, np.float64),
+        intensity=np.empty(room, np.float32), cells=np.empty(room, np.uint32), points=np.empty(room, np.uint32),
+        sloped=np.empty(room, np.bool_),
+    )  # fmt: skip
     some = cells.height_robust_m[:: max(len(cells) // _SAMPLE, 1)]
     base = float(np.floor(np.median(some))) if len(cells) else 0.0
-    written = _fours(cells, base, out) if patch == side == 2 else _squares(cells, base, patch, side, out)
-    return Squares(*(values[:written] for values in out))
-
-
-def _fours(cells: TileCells, base: float, out: Sequence[npt.NDArray[Any]]) -> int:
-    """Squares of two by two cells, each a patch; returns how many."""
-    starts = np.searchsorted(cells.row, np.arange(cells.cells_per_edge + 1))
-    found, sums = np.empty((SCRATCH_ROWS, AT_ONCE), np.int32), np.empty((SUMS, AT_ONCE), np.int64)
-    values = read_only(cells.height_robust_m), cells.intensity_mean, cells.count
-    return int(decimate_fours(cells.column, starts, *values, base, FLOOR_UM, found, sums, *out))
-
-
-def _squares(cells: TileCells, base: float, patch: int, side: int, out: Sequence[npt.NDArray[Any]]) -> int:
-    """Squares of any size; returns how many."""
-    edge = cells.cells_per_edge
-    heights, lights, counts = np.empty((3, patch * edge), np.int32)
-    scratch = np.empty((2, -(-patch * patch // LANES) * LANES), np.int32)
-    values = read_only(cells.height_robust_m), cells.intensity_mean, cells.count
-    strips = heights, lights, counts, scratch
-    return int(decimate_cells(cells.column, cells.row, *values, base, edge, patch, side, FLOOR_UM, *strips, *out))
+    own = kernels.Cells(
+        cells.column, cells.row, read_only(cells.height_robust_m), cells.intensity_mean, cells.count
+    )  # fmt: skip
+    if patch == side == 2:
+        starts = np.searchsorted(cells.row, np.arange(edge + 1))
+        written = int(decimate_2x2(own, starts, base, FLOOR_UM, out))
+    else:
+        written = int(kernels.decimate_cells(own, base, edge, patch, side, FLOOR_UM, out))
+    return Squares(**{name: values[:written] for name, values in out._asdict().items()})
 
 
 def patch_cells(side: int, edge: int, cell_m: float) -> int:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import QUANTA_PER_M
+
+ENOUGH: Final = 4
+"""Readings that a cell should hold: fewer have no median that leaves an outlier out."""
+LARGEST_M: Final = 1.0
+"""Larger cells are not proposed."""
 
 
 @dataclass(frozen=True)

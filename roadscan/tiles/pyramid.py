@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.kernels.cells.decimate import Cells
+from roadscan.kernels.cells.pyramid import Levels, Pixels, reduce_cells
 from roadscan.kernels.options import read_only
-from roadscan.kernels.pyramid import reduce_cells
 from roadscan.model.errors import ConfigError
 from roadscan.tiles.cells import TileCells
 
@@ -90,11 +91,11 @@ def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
     height, intensity = np.empty(total, np.float64), np.empty(total, np.float32)
     written = np.zeros(len(factors), np.int64)
     base = float(np.rint(cells.height_robust_m[0])) if len(cells) else 0.0
-    reduce_cells(
-        cells.column, cells.row, cells.count, read_only(cells.height_robust_m), cells.intensity_mean, base,
-        steps, edges, starts, np.zeros((len(factors), 4, edges[0])),
-        column, row, count, covered, height, intensity, written,
+    held = Cells(
+        cells.column, cells.row, read_only(cells.height_robust_m), cells.intensity_mean, cells.count
     )  # fmt: skip
+    pixels = Pixels(column, row, count, covered, height, intensity)
+    reduce_cells(held, base, Levels(steps, edges, starts, written), np.zeros((len(factors), 4, edges[0])), pixels)
     levels: list[Level] = []
     for factor, start, size in zip(factors, starts.tolist(), written.tolist(), strict=True):
         own = slice(start, start + size)

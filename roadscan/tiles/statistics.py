@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.accumulate import PIECE, accumulate_points
-from roadscan.kernels.piled_readings import pile_points
-from roadscan.kernels.placing import CHUNK
+from roadscan.kernels.cells.accumulate import PIECE, CountingWork, accumulate_points
+from roadscan.kernels.cells.active_tiles import ActiveTiles
+from roadscan.kernels.cells.bucket_readings import bucket_points
+from roadscan.kernels.cells.pool import Pool
+from roadscan.kernels.cells.row_buckets import Buckets
+from roadscan.kernels.georeferencing.timed_readings import CHUNK
 from roadscan.points.cloud import TilePoints
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
@@ -18,7 +21,7 @@ from roadscan.tiles.grid import TileGrid
 _SAMPLE: Final = 1 << 16
 """Points that are looked at for the order they come in."""
 _MOST_CHANGES: Final = 256
-"""Changes of the pass among a tile's points with which they are put on piles: each one closes the piles of all rows."""
+"""Changes of the pass among a tile's points with which they are put into buckets: each closes those of all rows."""
 
 
 def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
@@ -27,7 +30,7 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
     Sums are made of whole 10 µm, so they are exact. The squared deviations of one cell stay below 2⁶³ for
     up to 250,000 points spread over 60 m of height, and for more where the spread is less.
 
-    Points that come cell by cell, as along a profile, are counted as they come; others by way of piles.
+    Points that come cell by cell, as along a profile, are counted as they come; others by way of buckets.
 
     Parameters
     ----------
@@ -42,23 +45,20 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
     x, y, height = (np.ascontiguousarray(a) for a in (points.x_quanta, points.y_quanta, points.height_quanta))
     intensity = np.ascontiguousarray(points.intensity)
 
-    def count(tile_rows: Any, groups: Any, pool: Any, work: Any, _spans: Any, _sigmas: Any, first: int) -> int:
-        done: int = accumulate_points(
-            x, y, height, passes, intensity, grid.cell_quanta, grid.cells_per_edge,
-            tile_rows, groups, pool, work, first,
-        )  # fmt: skip
+    def count(active: ActiveTiles, pool: Pool, work: CountingWork, first: int) -> int:
+        done: int = accumulate_points(x, y, height, passes, intensity, active, pool, work, first)
         return done
 
-    def pile(ends: Any, piles: Any, first: int) -> int:
-        own = ends[accumulator.tile_rows[0, 0]]
-        done: int = pile_points(x, y, height, passes, intensity, grid.cell_quanta, own, piles, first)
+    def fill(active: ActiveTiles, buckets: Buckets, first: int) -> int:
+        own = active.ends[active.rows[0, 0]]
+        done: int = bucket_points(x, y, height, passes, intensity, grid.cell_quanta, own, buckets, first)
         return done
 
     mixed = not one and np.count_nonzero(np.diff(passes)) > _MOST_CHANGES
     if mixed or _cell_by_cell(x, y, grid.cell_quanta):
         accumulator.run(count, n, 2 * PIECE)
     else:
-        accumulator.pile(pile, n, CHUNK)
+        accumulator.fill(fill, n, CHUNK)
     finished = accumulator.finish(tile)
     if finished is None:
         raise ValueError(f"tile {tile} holds no point")

@@ -26,6 +26,36 @@ def pose_parquet() -> bytes:
     return bytes(sink.getvalue())
 
 
+def level_table() -> pa.Table:
+    zero = np.zeros(6)
+    columns = {"latitude_deg": zero + 50, "longitude_deg": zero + 10, "height_m": 100 + zero, "sigma_down_m": zero}
+    columns |= {"roll_deg": zero, "pitch_deg": zero, "heading_rad": zero + 1}
+    epochs = np.arange(6) * 10**9 + 1_400_000_000_000_000_000
+    table = pa.table({"epoch_gps_ns": epochs, **columns})
+    return table.replace_schema_metadata({"roadscan.trajectory": '{"crs": "EPSG:4937", "height": "ellipsoidal"}'})
+
+
+def level_parquet() -> bytes:
+    sink = pa.BufferOutputStream()
+    pa.parquet.write_table(level_table(), sink, write_page_checksum=True)
+    return bytes(sink.getvalue())
+
+
+def level_feather() -> bytes:
+    sink = pa.BufferOutputStream()
+    pa.feather.write_feather(level_table(), sink, compression="uncompressed")
+    return bytes(sink.getvalue())
+
+
+def returns_parquet() -> bytes:
+    epochs = np.arange(12) * 10**6 + 1_400_000_000_000_000_000
+    axes = {f"{axis}_sensor_m": np.linspace(1, 2, 12, dtype=np.float32) for axis in "xyz"}
+    whole = {"intensity": np.arange(12, dtype=np.uint16), "laser": np.arange(12, dtype=np.uint8)}
+    sink = pa.BufferOutputStream()
+    pa.parquet.write_table(pa.table({"epoch_gps_ns": epochs, **axes, **whole}), sink, write_page_checksum=True)
+    return bytes(sink.getvalue())
+
+
 def control_csv() -> bytes:
     names = "name,code,role,easting,northing,height_m"
     return "\n".join([names, *(f'"P{i}",X,gcp,571600.{i},5539000.5,300' for i in range(6)), ""]).encode()

@@ -27,12 +27,19 @@ import pyarrow.parquet as pq
 
 from roadscan.model.crs import MapFrame
 from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.e57_file import page_checksums
-from roadscan.sensors.nmea_writer import Fix, sentences
-from roadscan.sensors.sick_telegrams import encode_scans, encode_telegram, write_telegrams
+from roadscan.sensors.clouds.e57_file import page_checksums
+from roadscan.sensors.motion.nmea_writer import Fix, sentences
+from roadscan.sensors.scanners.sick_telegrams import encode_scans, encode_telegram, write_telegrams
 from roadscan.sensors.text_table import LINE_BYTES_MAX
 from tests.fuzz.mutations import Change, Inside
-from tests.fuzz.pose_samples import control_csv, pose_feather, pose_parquet
+from tests.fuzz.pose_samples import (
+    control_csv,
+    level_feather,
+    level_parquet,
+    pose_feather,
+    pose_parquet,
+    returns_parquet,
+)
 from tests.sensors import (
     test_argoverse,
     test_carmen,
@@ -499,6 +506,8 @@ def _poses() -> Iterator[Sample]:
     yield Sample("pose_quaternions", "lines", file("a.txt", pose_lines), axes, _POSES, text=True, spans=lines_from(0))
     yield Sample("pose_quaternions", "feather", file("a.feather", pose_feather), axes, _POSES)
     yield Sample("pose_quaternions", "parquet", file("a.parquet", pose_parquet), axes, _POSES)
+    yield Sample("trajectory_table", "parquet", file("a.parquet", level_parquet))
+    yield Sample("trajectory_table", "feather", file("a.feather", level_feather))
     ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832"}
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
@@ -580,6 +589,7 @@ def _lidar() -> Iterator[Sample]:
     unix = {"clock": test_argoverse.CLOCK}
     yield Sample("argoverse", "folder", argoverse, {}, unix, ("**/*.feather",))
     yield Sample("argoverse", "plain", argoverse_plain, {}, unix)
+    yield Sample("returns_table", "parquet", file("a.parquet", returns_parquet))
     yield Sample("scans", "parquet", scans(test_scans.write_parquet))
     yield Sample("scans", "plain", scans(plain_parquet))
     yield Sample("scans", "arrow", scans(test_scans.write_arrow))

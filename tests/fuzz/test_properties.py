@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import MapFrame
 from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.sick_telegrams import encode_scans
+from roadscan.sensors.scanners.sick_telegrams import encode_scans
 from roadscan.sensors.text_table import Reject, TextOptions, text_blocks, text_layout
 from tests.sensors import test_scans as scan_files
 from tests.sensors import test_sick_lms as telegrams

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.compute import Compute, Inline
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Reporter, Run, run_stages
+from roadscan.jobs.engine.compute import Compute, Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Reporter, Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate
 from roadscan.tables.store import Store
@@ -42,11 +44,11 @@ class Simulated:
         compute: Compute | None = None,
         selection: Selection | None = None,
         **changes: object,
-    ) -> Run:
+    ) -> Session:
         """Run all stages into the store `name`, with dotted settings changed (``tiles__block_tiles=1``)."""
         survey = changed(Survey.load(self.survey_file), changes)
-        run = Run(survey, self.store(name), compute or Inline(), selection, Lines())
-        run_stages(run, STAGES)
+        run = Session(survey, self.store(name), compute or Inline(), selection, Lines())
+        run_stages(run, stages())
         return run
 
     def copy_to(self, folder: Path) -> Simulated:

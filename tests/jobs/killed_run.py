@@ -15,7 +15,7 @@ import time
 import psutil
 
 from roadscan.cli import main
-from roadscan.jobs import stages
+from roadscan.jobs.stage import stages
 from roadscan.products.base import products
 from roadscan.sensors.base import log_formats
 
@@ -36,6 +36,7 @@ def run_for(seconds: float) -> str:
 
 def _run() -> None:
     status = 1
+    sys.stdout = sys.stderr  # how it ended is all that whoever reads standard output expects
     try:
         main()
     except SystemExit as end:
@@ -53,7 +54,7 @@ def _status_of(child: int, options: int) -> str | None:
 
 
 if __name__ == "__main__":
-    assert stages.STAGES and log_formats() and products()
+    assert stages() and log_formats() and products()
     for line in sys.stdin:
         sys.stdout.write(f"{run_for(float(line))}\n")
         sys.stdout.flush()

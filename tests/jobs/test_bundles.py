@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.jobs import footprints, products
-from roadscan.jobs.bundles import cut_bundles, run_bundles
-from roadscan.jobs.compute import Done, Inline
-from roadscan.jobs.footprints import PRODUCT, index_footprints
-from roadscan.jobs.plan import plan_survey
+from roadscan.jobs import products
+from roadscan.jobs.engine.bundles import cut_bundles, run_bundles
+from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.products import make_products, plan_outputs
+from roadscan.jobs.tiles import footprints
+from roadscan.jobs.tiles.footprints import PRODUCT, index_footprints
 from roadscan.model.errors import StoreError
 from roadscan.model.survey import Survey
 from roadscan.tables.manifest import Manifest, OutputRecord

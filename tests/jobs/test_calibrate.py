@@ -11,11 +11,14 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey, outdated_calibrations
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.calibrate.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey, outdated_calibrations
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.readings import load_mountings
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey
@@ -54,7 +57,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     made = simulate(scene, tmp_path_factory.mktemp("yard") / "survey")
     survey = Survey.load(made.survey_file)
-    run_stages(Run(survey, store_of(survey), Inline()), [s for s in STAGES if s.name == "ingest"])
+    run_stages(Session(survey, store_of(survey), Inline()), [s for s in stages() if s.name == "ingest"])
     return made.survey_file
 
 
@@ -105,6 +108,23 @@ def test_what_it_wrote_is_what_readings_are_placed_by(calibrated: tuple[Survey, 
     assert "vertical lever arm" in row["not_determined"]
 
 
+def test_a_report_that_is_gone_or_damaged_is_seen_and_written_again(calibrated: tuple[Survey, Calibrated]) -> None:
+    """From its record: a run calibrates nothing."""
+    survey, _ = calibrated
+    store = store_of(survey)
+    before = {path: store.read_bytes(path) for path in (PICTURE, TEXT)}
+    store.remove(PICTURE)
+    store.write_bytes(TEXT, before[TEXT][::-1])
+    faults = verify_store(store)
+    assert [any(path in fault for fault in faults) for path in (PICTURE, TEXT)] == [True, True]
+    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name == "navigate"])
+    assert {path: store.read_bytes(path) for path in (PICTURE, TEXT)} == before
+    assert verify_store(store) == []
+    lines = survey_status(Session(survey, store)).of("navigate").lines
+    (line,) = [one for one in lines if one.startswith("mounting of profiler_left ")]
+    assert ", not determined: " in line and "vertical lever arm" in line and line.endswith(PICTURE)
+
+
 def test_a_later_calibration_stands_beside_the_first(yard: Path, calibrated: tuple[Survey, Calibrated]) -> None:
     entries = [stop_and_go("profiler_left")]
     later = {"calibration": entries, "navigation__calibration": {"valid_from": "2026-03-02T12:03:00Z"}}
@@ -150,7 +170,7 @@ def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
     }  # fmt: skip
     survey = changed(Survey.load(made.survey_file), {"calibration": [reference]})
     store = store_of(survey)
-    run_stages(Run(survey, store, Inline()), [s for s in STAGES if s.name == "ingest"])
+    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name == "ingest"])
     found = calibrate_survey(survey, store).calibration.sensors["lidar"]
     truth = Rig.load(made.survey_file.parent / "truth" / "RIG.toml").sensors["lidar"].mounting()
     (rotation, lever), (true, arm) = found.mounting.arrays(), truth.arrays()

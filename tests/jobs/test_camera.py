@@ -14,8 +14,8 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.camera import calibrate_interior, resect_camera
-from roadscan.jobs.ingest import ingest
+from roadscan.jobs.calibrate.camera import calibrate_interior, resect_camera
+from roadscan.jobs.ingest.ingest import ingest
 from roadscan.model.errors import ConfigError, FormatError, RunError
 from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.cell_files import read_cells, read_overview, write_cells, write_overviews
-from roadscan.jobs.inspect import inspect
+from roadscan.inspect.inspect import inspect
+from roadscan.jobs.tiles.cell_files import read_cells, read_overview, write_cells, write_overviews
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import TilePoints

@@ -7,8 +7,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-import roadscan.jobs.tile_cells as tile_cells
-from roadscan.jobs.compute_on import compute_on
+import roadscan.jobs.tiles.tile_cells as tile_cells
+from roadscan.jobs.engine.compute_on import compute_on
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status
 from roadscan.model.errors import RunError
 from roadscan.model.survey import Survey
@@ -43,7 +44,7 @@ def test_cells_without_points_are_those_of_points(finished: Simulated, counted: 
 
 def test_fates_are_those_of_points(finished: Simulated, counted: Store) -> None:
     survey = Survey.load(finished.survey_file)
-    by_points = survey_status(survey, finished.store()).readings
+    by_points = survey_status(Session(survey, finished.store())).readings
     assert by_points
     assert sum(by_points.values()) == sum(
         pq.read_metadata(finished.store().path(file.path)).num_rows * (200 if "/scans/" in f"/{file.path}" else 1)
@@ -51,7 +52,7 @@ def test_fates_are_those_of_points(finished: Simulated, counted: Store) -> None:
         for table in ("scans", "returns")
         for file in record.tables.get(table, ())
     )
-    assert survey_status(survey, counted).readings == by_points
+    assert survey_status(Session(survey, counted)).readings == by_points
 
 
 def test_neither_blocks_nor_workers_change_a_byte(finished: Simulated, counted: Store) -> None:

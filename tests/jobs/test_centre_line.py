@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.jobs.centre_line import CentreLines, load_buffer
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.plan.centre_line import CentreLines, load_buffer
+from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.model.errors import ConfigError, CrsError
 from roadscan.model.survey import Survey
 from roadscan.points.centre_line import CentreLineBuffer
@@ -62,7 +64,7 @@ def survey_of(folder: Path, **filters: Any) -> Survey:
 def kept(survey: Survey) -> tuple[float, float]:
     """Lowest and highest northing that stays."""
     store = Store(survey.store_url, "cut")
-    run_stages(Run(survey, store, Inline()), STAGES)
+    run_stages(Session(survey, store, Inline()), stages())
     north = np.concatenate([np.array(laspy.read(store.path(p)).y) for p in store.files("tiles/las")])
     return float(north.min()), float(north.max())
 

@@ -17,9 +17,11 @@ import shapely
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.classes import write_classes
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.export.classes import write_classes
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
 from roadscan.points.classes import LAS_CLASSES, READING_CLASSES
@@ -93,7 +95,7 @@ def survey_of(folder: Path, store: str = "store", **filters: Any) -> Survey:
 
 def run(survey: Survey) -> Store:
     store = Store(survey.store_url, "classes")
-    run_stages(Run(survey, store, Inline()), STAGES)
+    run_stages(Session(survey, store, Inline()), stages())
     return store
 
 

@@ -16,9 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.jobs.clock_pairs import log_pairs
-from roadscan.jobs.clocks import estimate_clocks, load_clocks
-from roadscan.jobs.ingest import ingest, survey_records
+from roadscan.jobs.ingest.clock_pairs import log_pairs
+from roadscan.jobs.ingest.ingest import ingest, survey_records
+from roadscan.jobs.navigate.clocks import estimate_clocks, load_clocks
+from roadscan.jobs.session import Session
+from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.clock_evidence import MotionEvidence
 from roadscan.model.errors import ConfigError, FormatError, RoadscanError, RunError
 from roadscan.model.gpstime import gps_ns_from_utc
@@ -120,6 +122,26 @@ def test_the_tables_in_sql_and_the_picture(driven: tuple[Survey, Store]) -> None
     image = cv2.imdecode(np.frombuffer(store.read_bytes(pictures[0]), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape[1] == 1200
     assert (image != 255).any(axis=2).mean() > 0.02
+
+
+def test_a_picture_that_is_gone_or_damaged_is_seen_and_drawn_again(driven: tuple[Survey, Store]) -> None:
+    """From the table: no clock is estimated for it."""
+    survey, store = driven
+    estimate_clocks(survey, store)
+    paths = store.files("products/clocks", ".png")
+    before = {path: store.read_bytes(path) for path in paths}
+    store.remove(paths[0])
+    store.write_bytes(paths[1], before[paths[1]][::-1])
+    faults = verify_store(store)
+    assert [any(path in fault for fault in faults) for path in paths] == [True, True, False]
+    said: list[str] = []
+    estimate_clocks(survey, store, said.append)
+    assert all(line.startswith("known: ") for line in said)
+    assert {path: store.read_bytes(path) for path in store.files("products/clocks", ".png")} == before
+    assert verify_store(store) == []
+    lines = survey_status(Session(survey, store)).of("navigate").lines
+    assert sum(line.startswith("clock of run-1/") for line in lines) == 5
+    assert any(line.startswith("clock of run-1/encoder: ") and line.endswith("run-1_encoder.png") for line in lines)
 
 
 def test_nothing_is_done_twice(driven: tuple[Survey, Store]) -> None:

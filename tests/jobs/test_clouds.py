@@ -8,8 +8,11 @@ import laspy
 import numpy as np
 import pytest
 
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.model.errors import RunError
 from roadscan.model.survey import Survey
 from roadscan.tables.store import Store
 
@@ -38,7 +41,7 @@ def run(folder: Path, logs: list[str], edge: int) -> Store:
     }
     survey = Survey.parse(values, folder=folder)
     store = Store(survey.store_url, "cloud")
-    run_stages(Run(survey, store, Inline()), STAGES)
+    run_stages(Session(survey, store, Inline()), stages())
     return store
 
 
@@ -58,6 +61,8 @@ def test_what_else_is_in_a_block_changes_no_tile(tmp_path: Path) -> None:
 def test_a_height_that_is_none_is_counted_and_left_out(tmp_path: Path, height: float) -> None:
     write_cloud(tmp_path / "good.las", 6, np.array([1.0, 2.0]), 200_000_000.0)
     write_cloud(tmp_path / "bad.las", 6, np.array([3.0]), 200_000_001.0, height)
-    store = run(tmp_path, ["good.las", "bad.las"], 8)
+    with pytest.raises(RunError, match=r"1 units failed: footprints bad\.las: not one of the 1 readings.*heights"):
+        run(tmp_path, ["good.las", "bad.las"], 8)
+    store = Store(str(tmp_path / "store-8"), "cloud")
     (path,) = store.files("tiles/las")
     assert np.array(laspy.read(store.path(path)).z).tolist() == [50.0, 50.0]

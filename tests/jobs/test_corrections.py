@@ -11,9 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.model.errors import DamagedError
 from roadscan.model.frames import quaternion_from_rotation
 from roadscan.model.survey import Survey
@@ -64,7 +66,7 @@ def test_an_estimated_clock_puts_readings_where_a_right_one_does(right: Simulate
     write_held(wrong.store(), "clocks", table)
     # The stage `navigate` would take the rows away: the survey file names no evidence for them.
     survey = changed(Survey.load(wrong.survey_file), PRODUCTS)
-    run_stages(Run(survey, wrong.store(), Inline()), [s for s in STAGES if s.name != "navigate"])
+    run_stages(Session(survey, wrong.store(), Inline()), [s for s in stages() if s.name != "navigate"])
     totals = [
         query(one.store(), "SELECT sum(points) AS n, avg(height_mean_m) AS h, min(first_epoch_gps_ns) AS a FROM tiles")
         for one in (wrong, right)

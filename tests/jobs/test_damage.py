@@ -9,10 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.jobs.status import survey_status, verify_store
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -62,17 +64,17 @@ def test_damaged_records_are_told_in_one_go_and_mended(finished: Simulated, tmp_
         store.write_bytes(path, store.read_bytes(path)[:-50])
     faults = verify_store(store)
     assert len(faults) == 3 and all(any(path in fault for fault in faults) for path in broken[:3])
-    status = survey_status(survey, store)
+    status = survey_status(Session(survey, store))
     assert len(status.damaged) == 3 and not status.is_complete
     assert sorted(log["state"] for log in status.logs) == ["damaged"] * 2 + ["ingested"] * 7
     code, words = say("sql", "--survey", copy.survey_file, "SELECT count(*) FROM trajectory")
-    assert code == 0 and words.count("not shown: ") == 3
+    assert code == 1 and words.count("not shown: ") == 3
     said = copy.run().reporter.lines
     notes = [line for line in said if line.startswith("note: ")]
     assert len(notes) == 3 and sum("its copy put in its place" in note for note in notes) == 1
     assert outputs(store) == outputs(finished.store())
     assert verify_store(store) == []
-    assert survey_status(survey, store).is_complete
+    assert survey_status(Session(survey, store)).is_complete
     assert len(store.files("damaged")) == 3
 
 
@@ -124,16 +126,16 @@ def test_damaged_files_are_found_and_made_again(made: tuple[Simulated, dict[str,
     store, survey = copy.store(), changed(Survey.load(copy.survey_file), MAKE)
     spoilt = spoil(store, damage)
     cells, overviews = spoilt[:2]
-    assert survey_status(survey, store).is_complete is False  # by their sizes, and footprints are read
+    assert survey_status(Session(survey, store)).is_complete is False  # by their sizes, and footprints are read
     for table in ("cells", "overviews", "footprints", "tiles"):
         try:
             query(store, f"SELECT * FROM {table}")
         except RoadscanError as error:
             assert "`roadscan verify`" in str(error) or (damage == "removed" and "SHOW TABLES" in str(error))
 
-    other = Run(changed(survey, {"title": "drawn anew"}), store, Inline())  # of the same tiles
+    other = Session(changed(survey, {"title": "drawn anew"}), store, Inline())  # of the same tiles
     with pytest.raises(RunError) as raised:
-        run_stages(other, [stage for stage in STAGES if stage.name == "products"])
+        run_stages(other, [stage for stage in stages() if stage.name == "products"])
     for product, path in (("mosaic/height", cells), ("kilometre/height", overviews)):
         assert any(unit.startswith(product) and path in reason for _, unit, reason in other.failures)
     assert "`roadscan verify` finds all such files, and the next run makes them again" in str(raised.value)

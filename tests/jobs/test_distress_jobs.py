@@ -8,12 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from roadscan.code_reach import name_of, reached_code
 from roadscan.jobs import products
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.drives import Drives
-from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.plan.drives import Drives
+from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.products import StoredTiles, wanted_products
-from roadscan.jobs.stages import Run, run_stages
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.ids import TileId
@@ -50,7 +52,7 @@ def test_wrong_products_are_told_before_a_log_is_read(simulated, tmp_path, value
     survey = changed(Survey.load(simulated.survey_file), {"products": values})
     store = Store(str(tmp_path), survey.config.id)
     with pytest.raises(RoadscanError, match=told):
-        run_stages(Run(survey, store, Inline()))
+        run_stages(Session(survey, store, Inline()))
     assert not store.files("tables") + store.files("logs")
 
 
@@ -66,16 +68,14 @@ def test_files_of_tiles_are_read_from_the_store(simulated):
     assert tiles.file("pothole_pieces", TileId(3, 4)) is None
 
 
-def test_other_code_that_joins_pieces_makes_tables_stale(monkeypatch):
-    context = ProductContext("s", "", MapFrame(None, "yard"), TileGrid(), (), DAY)
-
-    def keys():
-        named = (product_named(name) for name in ("cracks", "potholes", "tile_table"))
-        return [products._product_key(p, p.options(), context) for p in named]
-
-    before = keys()
-    monkeypatch.setattr(products, "surface_version", lambda: "another")
-    assert [a == b for a, b in zip(before, keys(), strict=True)] == [False, False, True]
+def test_the_code_that_joins_pieces_belongs_to_the_keys_of_their_tables():
+    for name, joiner in (
+        ("cracks", "roadscan.surfaces.distress.crack_network"),
+        ("potholes", "roadscan.surfaces.distress.potholes"),
+    ):
+        reached = {place.partition(":")[0] for place in reached_code([name_of(type(product_named(name)))])}
+        assert joiner in reached
+    assert not [m for m in reached_code([name_of(type(product_named("tile_table")))]) if "surfaces" in m]
 
 
 def test_pieces_of_tiles_without_a_reading_are_joined_as_well():

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.footprints import Footprints, load_footprints, load_ranges
-from roadscan.jobs.plan import SurveyPlan, plan_survey
-from roadscan.jobs.reach import opened, touched_tiles
+from roadscan.jobs.plan.plan import SurveyPlan, plan_survey
 from roadscan.jobs.readings import Placer
+from roadscan.jobs.tiles.footprints import FootprintRanges, load_ranges
+from roadscan.jobs.tiles.reach import opened, touched_tiles
 from roadscan.model.errors import StoreError
 from roadscan.model.survey import Survey
 from roadscan.points.place import Window
@@ -26,15 +26,20 @@ def indexed(finished: Simulated) -> tuple[SurveyPlan, Manifest]:
     return plan_survey(Survey.load(finished.survey_file), store), Manifest(store)
 
 
-def rows_of(f: Footprints) -> np.ndarray:
-    return np.column_stack([f.slice_index, f.row_group, f.tile_column, f.tile_row])
+def pairs_of(f: FootprintRanges) -> np.ndarray:
+    """(n, 4) slice, row group, column and row of the tile, for each pair of row group and tile."""
+    counts = f.last_group - f.first_group + 1
+    rows = np.repeat(np.arange(counts.size), counts)
+    group = f.first_group[rows] + np.arange(rows.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.column_stack([f.slice_index[rows], group, f.tile_column[rows], f.tile_row[rows]])
 
 
 def test_footprints_hold_every_reading(indexed) -> None:
     plan, manifest = indexed
-    found = load_footprints(plan, manifest)
-    known = set(map(tuple, rows_of(found).tolist()))
-    assert len(known) == found.readings.size
+    found = load_ranges(plan, manifest)
+    pairs = pairs_of(found)
+    known = set(map(tuple, pairs.tolist()))
+    assert len(known) == len(pairs) > found.readings.size
     placed = set()
     for number, one in enumerate(found.slices):
         placer = Placer(plan.store, plan.ground, [one])
@@ -46,36 +51,36 @@ def test_footprints_hold_every_reading(indexed) -> None:
     assert len(known) < 1.6 * len(placed)
 
 
-def test_ranges_say_the_same_in_fewer_rows(indexed) -> None:
+def test_ranges_span_the_epochs_of_their_groups(indexed) -> None:
     plan, manifest = indexed
-    ranges, found = load_ranges(plan, manifest), load_footprints(plan, manifest)
-    assert ranges.readings.size < found.readings.size
-    assert ranges.readings.sum() == found.readings.sum()
+    found = load_ranges(plan, manifest)
     assert found.readings.min() >= 1
     for number, one in enumerate(found.slices):
         rows = found.slice_index == number
         file = pq.ParquetFile(plan.store.path(one.file))
         epochs = [file.read_row_group(k, ["epoch_gps_ns"]).column(0).to_numpy() for k in range(file.num_row_groups)]
-        spans = np.array(one.source.spans([(e.min(), e.max()) for e in epochs]))[found.row_group[rows]]
-        assert (spans[:, 0] == found.first_epoch_gps_ns[rows]).all()
-        assert (spans[:, 1] == found.last_epoch_gps_ns[rows]).all()
+        spans = np.array(one.source.spans([(e.min(), e.max()) for e in epochs]))
+        assert (spans[found.first_group[rows], 0] == found.first_epoch_gps_ns[rows]).all()
+        assert (spans[found.last_group[rows], 1] == found.last_epoch_gps_ns[rows]).all()
 
 
 def test_only_some_files_or_tiles_are_loaded(indexed, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, manifest = indexed
-    whole = load_footprints(plan, manifest)
+    whole = load_ranges(plan, manifest)
     column, row = int(np.median(whole.tile_column)), int(np.median(whole.tile_row))
-    near = load_footprints(plan, manifest, window=Window(column, row, column + 2, row + 1))
+    near = load_ranges(plan, manifest, window=Window(column, row, column + 2, row + 1))
     inside = (whole.tile_column >= column) & (whole.tile_column < column + 2) & (whole.tile_row == row)
     assert inside.any()
-    assert set(map(tuple, rows_of(near).tolist())) == set(map(tuple, rows_of(whole)[inside].tolist()))
+    assert set(map(tuple, pairs_of(near).tolist())) == {
+        p for p in map(tuple, pairs_of(whole).tolist()) if column <= p[2] < column + 2 and p[3] == row
+    }
     file = whole.slices[-1].file
-    own = load_footprints(plan, manifest, files={file})
+    own = load_ranges(plan, manifest, files={file})
     assert (own.slice_index == len(whole.slices) - 1).all()
     assert own.readings.sum() == whole.readings[whole.slice_index == len(whole.slices) - 1].sum()
     opened: list[str] = []
     monkeypatch.setattr(Store, "read_bytes", lambda _, path: opened.append(path))
-    assert load_footprints(plan, manifest, window=Window(0, 0, 1, 1)).readings.size == 0
+    assert load_ranges(plan, manifest, window=Window(0, 0, 1, 1)).readings.size == 0
     assert not opened
 
 
@@ -108,4 +113,4 @@ def first_group_rows(plan: SurveyPlan, path: str) -> int:
 def test_a_survey_without_footprints_says_so(indexed, tmp_path: Path) -> None:
     plan, _ = indexed
     with pytest.raises(StoreError, match="no footprints"):
-        load_footprints(plan, Manifest(Store(str(tmp_path), "new")))
+        load_ranges(plan, Manifest(Store(str(tmp_path), "new")))

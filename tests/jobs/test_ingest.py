@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 from blake3 import blake3
 
-from roadscan.jobs.compute import Compute, Done, Inline, R, T
-from roadscan.jobs.ingest import ingest
+from roadscan.jobs.engine.compute import Compute, Done, Inline, R, T
+from roadscan.jobs.ingest.ingest import ingest
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.errors import RunError, StoreError
 from roadscan.model.survey import Survey
@@ -39,7 +40,7 @@ class Backwards(Inline):
 
 @pytest.fixture(autouse=True)
 def all_logs_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.jobs.ingest._SMALL_BYTES", 0)
+    monkeypatch.setattr("roadscan.jobs.ingest.ingest._SMALL_BYTES", 0)
 
 
 def write_log(path: Path, seed: int) -> None:
@@ -90,7 +91,7 @@ def test_little_memory_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.M
     survey = survey_of(tmp_path, 1)
     whole, _ = ingested(survey, "whole", None)
     monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 2000)
-    monkeypatch.setattr("roadscan.sensors.scans._CHUNK_BYTES", 2000)
+    monkeypatch.setattr("roadscan.sensors.scanners.scans._CHUNK_BYTES", 2000)
     pieces, _ = ingested(survey, "pieces", None)
     assert len(whole.files("tables")) == 3 < len(pieces.files("tables"))
     one, other = (
@@ -187,7 +188,7 @@ def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatc
             raise OSError(5, "Input/output error")
         return file_digest(path)
 
-    monkeypatch.setattr("roadscan.jobs.sources.file_digest", broken)
+    monkeypatch.setattr("roadscan.jobs.ingest.sources.file_digest", broken)
     store = Store(str(tmp_path / "store"), "s")
     with pytest.raises(RunError, match=r"1 of 2 logs .*0\.arrow: the log cannot be read: Input/output error"):
         ingest(survey_of(tmp_path, 2), store)
@@ -230,7 +231,7 @@ def test_a_damaged_list_of_logs_or_failures_costs_itself(tmp_path: Path, damage:
     whole = json.loads(store.read_bytes("manifest/sources.json"))
     for name in ("sources", "failures"):
         store.write_bytes(f"manifest/{name}.json", damage)
-    assert [log["state"] for log in survey_status(survey, store).logs] == ["ingested", "ingested"]
+    assert [log["state"] for log in survey_status(Session(survey, store)).logs] == ["ingested", "ingested"]
     assert json.loads(store.read_bytes("manifest/sources.json")) == whole
     store.write_bytes("manifest/sources.json", damage)
     (tmp_path / "1.arrow").rename(tmp_path / "away")
@@ -259,7 +260,7 @@ def test_who_may_only_read_the_store_can_ask_it(tmp_path: Path, monkeypatch: pyt
     with monkeypatch.context() as patch:
         for name in ("replace", "mkdir", "unlink"):
             patch.setattr(Path, name, refused)
-        assert [log["state"] for log in survey_status(survey, store).logs] == ["ingested", "ingested"]
+        assert [log["state"] for log in survey_status(Session(survey, store)).logs] == ["ingested", "ingested"]
         with pytest.raises(StoreError, match=r"manifest/lock: the store cannot be written: Read-only file system; see"):
             verify_store(store)
     assert tables_of(store) == before

@@ -9,19 +9,24 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from scipy.spatial import KDTree
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.first_survey import FoundFolder, find_logs
-from roadscan.jobs.first_survey_text import FirstSurvey, write_first_survey
+from roadscan.inspect.first_survey import FoundFolder, find_logs
+from roadscan.inspect.first_survey_text import FirstSurvey, write_first_survey
 from roadscan.model.errors import ConfigError
 from roadscan.model.strict import OPEN_QUESTION
 from roadscan.model.survey import Survey
-from roadscan.sensors.sick_telegrams import encode_scans, write_telegrams
+from roadscan.sensors.scanners.sick_telegrams import encode_scans, write_telegrams
+from roadscan.simulate import simulate, truth
+from tests.answers import answer_questions, first_survey, roadscan, spared
 
-from .conftest import Simulated, outputs
+from .conftest import Simulated, outputs, small_scene
 from .test_inspect import sbet, written
 
 
@@ -73,9 +78,6 @@ def answers_of(original: Survey, first: FirstSurvey) -> dict[str, dict[str, str]
             keys = ("axes", "lever_arm_body_m", "boresight", "range_min_m", "range_max_m")
             mounted = sensor.model_dump(include=set(keys))
             said[f"sensors.{names[log['path']]}"] = {key: toml(mounted[key]) for key in keys}
-        if log.get("options", {}).get("accuracy"):  # found as a log of its own too, in the trajectory's clock
-            beside = Path(log["path"]).with_name(log["options"]["accuracy"])
-            said[f"logs/{beside}"] = {"clock": toml(log["clock"])}
     return said
 
 
@@ -180,7 +182,42 @@ def test_logs_join_the_drive_whose_time_they_share(tmp_path: Path) -> None:
     sigma = np.column_stack([103_600 + np.arange(20) / 2, np.full((20, 9), 0.01)])
     (tmp_path / "a_accuracy.smrmsg").write_bytes(sigma.astype("<f8").tobytes())
     found = find_logs(tmp_path)
-    assert runs_of(found) == {"a": ["a.sbet"], "b": ["a_accuracy.smrmsg", "b.sbet"]}
+    assert runs_of(found) == {"a": ["a.sbet"], "b": ["b.sbet"]}
+    assert [(log.path.name, one.path.name, setting) for log, one, setting in found.pairs] == [
+        ("b.sbet", "a_accuracy.smrmsg", "accuracy")
+    ]
+
+
+def smrmsg(path: Path, first_s: float, records: int = 20) -> None:
+    sigma = np.column_stack([first_s + np.arange(records) / 2, np.full((records, 9), 0.01)])
+    path.write_bytes(sigma.astype("<f8").tobytes())
+
+
+def test_pairs_in_one_folder_are_told_by_time_then_by_name(tmp_path: Path) -> None:
+    """Two missions one after another, and two at the same time of the week; one accuracy file is of none of them."""
+    for name, first_s in (("A", 100_000.0), ("B", 100_009.0), ("C", 200_000.0), ("D", 200_000.0)):
+        written(tmp_path / f"sbet_{name}.out", sbet(first_s + np.arange(2_000) / 200))
+        smrmsg(tmp_path / f"smrmsg_{name}.out", first_s)
+    smrmsg(tmp_path / "smrmsg_lost.out", 400_000.0)
+    found = find_logs(tmp_path)
+    named = {log.path.name: one.path.name for log, one, _ in found.pairs}
+    assert named == {f"sbet_{name}.out": f"smrmsg_{name}.out" for name in "ABCD"}
+    text = write_first_survey(found, tmp_path / "SURVEY.toml").survey_file.read_text()
+    values = tomllib.loads(text)
+    logs = {log["path"]: log for run in values["runs"] for log in run["logs"]}
+    assert logs["sbet_C.out"]["options"] == {"accuracy": "smrmsg_C.out"}
+    assert [path for path in logs if "smrmsg" in path] == ["smrmsg_lost.out"]
+    assert "# no log of sbet was found that this one belongs to by its time" in text
+
+
+def test_folders_pair_what_names_do_not(tmp_path: Path) -> None:
+    for folder in ("monday", "tuesday"):
+        (tmp_path / folder).mkdir()
+        written(tmp_path / folder / "sbet.out", sbet(100_000 + np.arange(2_000) / 200))
+        smrmsg(tmp_path / folder / "smrmsg.out", 100_000.0)
+    pairs = [(log.path, one.path) for log, one, _ in find_logs(tmp_path).pairs]
+    assert len(pairs) == 2
+    assert all(one.parent == log.parent for log, one in pairs)
 
 
 def test_logs_without_a_trajectory_are_grouped_by_folder(tmp_path: Path) -> None:
@@ -212,7 +249,6 @@ def test_a_damaged_log_is_listed_with_its_reason(tmp_path: Path) -> None:
 
 
 def test_a_log_whose_file_states_its_crs_fills_the_map_in(tmp_path: Path) -> None:
-    import laspy
     import pyproj
 
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -278,3 +314,47 @@ def test_the_folder_of_recordings_is_sorted(recordings: Path, tmp_path: Path) ->
     assert next(log.path for log in av2.logs if log.format.name == "argoverse") == av2.folder
     made = write_first_survey(av2, tmp_path / "SURVEY.toml")
     assert tomllib.loads(made.survey_file.read_text())["runs"]
+
+
+# --- by its questions alone ----------------------------------------------------------------------------
+
+
+def test_two_missions_in_one_folder_become_a_map_with_its_sigma(tmp_path: Path) -> None:
+    """SBET, SMRMSG and PCAP of two passes side by side: every return where the simulator's beam hit."""
+    scene = small_scene(length_m=6.0, profilers={"on": False}, lidar={"range_max_m": 6.0}).noiseless()
+    made = simulate(scene, tmp_path / "simulated", write_hits=True)
+    original = Survey.load(made.survey_file)
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for number, run in enumerate(original.config.runs, 1):
+        raw = made.survey_file.parent / run.logs[0].path.parent
+        for kind, name in (("sbet", "trajectory.sbet"), ("smrmsg", "trajectory.smrmsg"), ("lidar", "lidar.pcap")):
+            ending = "pcap" if kind == "lidar" else "out"
+            shutil.copy(raw / name, logs / f"{kind}_mission{number}.{ending}")
+    survey_file, said = first_survey(logs)
+    assert "paired: smrmsg_mission2.out with sbet_mission2.out, as its options.accuracy" in said
+    (lidar,) = [s for s in original.rig.sensors.values() if s.kind == "lidar"]
+    stated = lidar.model_dump(include={"axes", "lever_arm_body_m", "boresight"})
+    rig_answers = {key: f"{key} = {toml(value)}" for key, value in stated.items()}
+    answers = {
+        "map.crs": 'crs = "EPSG:32632"',
+        "clock": 'clock = { system = "gps_week_seconds", week = 2417 }',
+        "crs": f"crs = {toml(original.config.runs[0].logs[0].crs)}",
+    }
+    assert answer_questions(survey_file, answers) == 5
+    rig_file = survey_file.with_name("RIG.toml")
+    names = re.findall(r"^\[sensors\.(\S+)\]", rig_file.read_text(), re.MULTILINE)
+    assert answer_questions(rig_file, {f"sensors.{n}.{k}": v for n in names for k, v in rig_answers.items()}) == 3
+    spared(survey_file)
+    done = roadscan("run", survey_file, "--workers", "0")
+    assert done.exit_code == 0, done.output
+    tiles = [laspy.read(file) for file in (tmp_path / "store/survey=logs/tiles/las").glob("*.laz")]
+    found = np.concatenate([np.column_stack([tile.x, tile.y, tile.z]) for tile in tiles])
+    files = [truth.load(made.survey_file.parent).hits_file(run.id, "lidar") for run in original.config.runs]
+    hits = [pq.read_table(file, columns=["easting_m", "northing_m", "height_m"]).to_pandas() for file in files]
+    expected = np.concatenate([one.dropna().to_numpy() for one in hits])
+    assert len(found) == len(expected) > 10_000
+    for one, other in ((found, expected), (expected, found)):
+        assert KDTree(other).query(one)[0].max() < 2e-3  # packets hold 2 mm and 0.01°
+    asked = roadscan("sql", "--survey", survey_file, "SELECT count(*) AS n FROM trajectory WHERE sigma_north_m IS NULL")
+    assert asked.stdout.split()[-1] == "0", asked.output

@@ -23,11 +23,12 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs import inspect as inspect_module
-from roadscan.jobs.inspect import Inspection, inspect
-from roadscan.jobs.inspect_text import print_inspection
-from roadscan.jobs.log_figures import Fault
-from roadscan.jobs.provisional import Stated, open_log, parse_clock, parse_option
+from roadscan.inspect import diagnosis as diagnosis_module
+from roadscan.inspect import inspect as inspect_module
+from roadscan.inspect.inspect import Inspection, inspect
+from roadscan.inspect.inspect_text import print_inspection
+from roadscan.inspect.log_figures import Fault
+from roadscan.inspect.provisional import Stated, open_log, parse_clock, parse_option
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
@@ -342,7 +343,7 @@ def test_compressed_files_are_looked_into(tmp_path: Path) -> None:
     damaged = inspect(cut, WEEK_CLOCK)
     assert damaged.wrappers == ("gzip",)
     assert damaged.log is None or 0 < damaged.log.figures.rows < 400
-    assert any("the gzip file is damaged after" in f.what for f in damaged.faults)
+    assert any("the gzip file is cut off after" in f.what for f in damaged.faults)
 
 
 def test_unpacking_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,7 +492,7 @@ class _Liar(LogFormat):
 def test_a_reader_that_breaks_its_promise_ends_in_a_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, said: str
 ) -> None:
-    monkeypatch.setattr(inspect_module, "log_formats", lambda: {"liar": _Liar(where)})
+    monkeypatch.setattr(diagnosis_module, "log_formats", lambda: {"liar": _Liar(where)})
     path = tmp_path / "a.bin"
     path.write_bytes(b"\1\2\3")
     found = inspect(path)
@@ -538,7 +539,7 @@ class _Particular(_Liar):
     provisional = (Provisional(clock=Clock(TimeSystem.UNIX_TAI, unit="ms"), crs="EPSG:4937"),)
 
     def header(self, source: LogSource) -> LogHeader:
-        if source.need_clock("{ … }").unit != "ms" or source.need_crs() != "EPSG:4937":
+        if source.need_clock("unix_tai").unit != "ms" or source.need_crs() != "EPSG:4937":
             raise ConfigError("something else was stated")
         return LogHeader({"world_frame": "local"})
 

@@ -10,14 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.computed_trajectory import NAVIGATION
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status
 from roadscan.model.errors import RoadscanError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.survey import Survey
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.logs import read_log_records
+from roadscan.tables.logs import NAVIGATION, read_log_records
 from roadscan.tables.sql import query
 
 from .conftest import Simulated, changed, outputs
@@ -178,13 +178,13 @@ def test_a_short_gap_of_a_trajectory_log_is_filled_where_that_is_wanted(navigate
     records[(records[:, 0] < begin) | (records[:, 0] > begin + 1.5)].tofile(log)
 
     def fates(store: str) -> dict[str, int]:
-        return survey_status(Survey.load(copy.survey_file), copy.store(store)).readings
+        return survey_status(Session(Survey.load(copy.survey_file), copy.store(store))).readings
 
     copy.run("gap", **FEW)
     run = copy.run("filled", **with_spline(fill_gap_s=3.0))
     assert fates("gap").get("no_pose", 0) > 100
     survey = changed(Survey.load(copy.survey_file), with_spline(fill_gap_s=3.0))
-    assert survey_status(survey, copy.store("filled")).readings.get("no_pose", 0) == 0
+    assert survey_status(Session(survey, copy.store("filled"))).readings.get("no_pose", 0) == 0
     assert any("gap (" in line and "filled in" in line for line in run.reporter.lines)
     error, _ = errors_of(copy, computed(copy, "filled"))
     assert np.linalg.norm(error, axis=1).max() < 0.15

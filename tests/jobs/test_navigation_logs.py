@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.ingest import ingest
-from roadscan.jobs.planned_logs import plan_logs
+from roadscan.jobs.ingest.ingest import ingest
+from roadscan.jobs.ingest.planned_logs import plan_logs
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status, verify_store
 from roadscan.model.survey import Survey
-from roadscan.sensors.nmea_writer import Fix, write_nmea
+from roadscan.sensors.motion.nmea_writer import Fix, write_nmea
 from roadscan.simulate import Scene
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.sql import query
@@ -44,7 +45,7 @@ def gnss_survey(folder: Path, *logs: dict[str, Any]) -> Survey:
 def test_gnss_logs_leave_a_run_as_it_is(finished: Simulated, tmp_path: Path) -> None:
     survey = Survey.load(finished.survey_file)
     runs = survey.config.model_dump()["runs"]
-    path = write_pos(tmp_path / "rover.pos", range(10))
+    path = write_pos(tmp_path / "rover.pos", range(17, 27))  # the drive lasts from 17 s to 19 s
     runs[0]["logs"].append({"path": path, "crs": "EPSG:4979"})
     run = finished.run("store-gnss", runs=runs)
     store = finished.store("store-gnss")
@@ -53,7 +54,7 @@ def test_gnss_logs_leave_a_run_as_it_is(finished: Simulated, tmp_path: Path) -> 
     assert [p for p in before if before[p] != after[p]] == []
     rows = query(store, "SELECT quality, count(*) AS n FROM gnss GROUP BY quality ORDER BY quality").to_pylist()
     assert rows == [{"quality": "fixed", "n": 5}, {"quality": "float", "n": 5}]
-    status = survey_status(run.survey, store)
+    status = survey_status(Session(run.survey, store))
     assert status.is_complete
     (log,) = [log for log in status.logs if log["format"] == "rtklib_pos"]
     assert (log["sensor"], log["rows"], log["rejected"], log["state"]) == ("gnss", 10, 1, "ingested")
@@ -80,9 +81,10 @@ def test_a_survey_of_gnss_alone(tmp_path: Path) -> None:
     assert all(not r.fresh for r in ingest(survey, store))
     spans = query(store, "SELECT count(*) AS n FROM gnss_between(0, 9000000000000000000)").to_pylist()
     assert spans == [{"n": 15}]
-    status = survey_status(survey, store)
+    status = survey_status(Session(survey, store))
     assert {log["state"] for log in status.logs} == {"ingested"}
-    assert "no readings" in status.note
+    assert "nothing to place" in status.places_nothing
+    assert status.is_complete
 
 
 def test_a_log_without_a_row(tmp_path: Path) -> None:
@@ -98,7 +100,7 @@ def test_a_log_without_a_row(tmp_path: Path) -> None:
     (result,) = ingest(survey, store)
     assert (result.record.rows, result.record.rejected) == (0, 0)
     assert len(read_log_records(store)) == 1
-    assert survey_status(survey, store).logs[0]["state"] == "ingested"
+    assert survey_status(Session(survey, store)).logs[0]["state"] == "ingested"
 
 
 def test_a_changed_accuracy_file_makes_the_trajectory_new(tmp_path: Path) -> None:

@@ -10,10 +10,12 @@ import fsspec
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.jobs.status import survey_status, verify_store
+from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -53,9 +55,9 @@ def objects() -> Iterator[str]:
     Remembering.store.clear()
 
 
-def run(survey: Survey, store: Store, *chosen: TileId) -> Run:
-    run = Run(survey, store, Inline(), Selection(named=chosen) if chosen else None, Lines())
-    run_stages(run, STAGES)
+def run(survey: Survey, store: Store, *chosen: TileId) -> Session:
+    run = Session(survey, store, Inline(), Selection(named=chosen) if chosen else None, Lines())
+    run_stages(run, stages())
     return run
 
 
@@ -66,7 +68,7 @@ def test_a_whole_run(finished: Simulated, objects: str) -> None:
     assert run(survey, store).raw_bytes_read > 0
     assert outputs(store) == outputs(folder)
     assert run(survey, store).raw_bytes_read == 0
-    assert survey_status(survey, store).is_complete
+    assert survey_status(Session(survey, store)).is_complete
     tile, damaged = [r for r in Manifest(store).of("tile").values() if r.path][:2]
     assert run(survey, store, TileId.parse(tile.unit)).raw_bytes_read > 0
     for table in ("scans", "returns", "trajectory", "cells", "tiles", "footprints", "outputs", "rejects"):

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from roadscan.jobs import on_dask
-from roadscan.jobs.on_dask import OnDask, embedded
+from roadscan.jobs.engine import on_dask
+from roadscan.jobs.engine.on_dask import OnDask, embedded
 from roadscan.model.errors import RoadscanError
 
 DEADLY = 7

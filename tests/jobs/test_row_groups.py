@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.footprints import FootprintRanges
-from roadscan.jobs.row_groups import GroupsByTile
-from roadscan.jobs.stages import Run, plan_tile_work
-from roadscan.jobs.tiles import TaskResult
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.session import Session
+from roadscan.jobs.tile_work import plan_tile_work
+from roadscan.jobs.tiles.footprints import FootprintRanges
+from roadscan.jobs.tiles.row_groups import GroupsByTile
+from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.survey import Survey
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import OutputRecord
 from tests.jobs.conftest import Simulated
 
 TILES = 12
@@ -73,8 +74,8 @@ def test_what_a_task_needs_and_tells(seed: int) -> None:
 
 
 def test_a_task_arrives_as_it_was_sent_and_carries_no_epochs_of_row_groups(finished: Simulated) -> None:
-    run = Run(Survey.load(finished.survey_file), finished.store(), Inline())
-    planned = plan_tile_work(run, Manifest(finished.store())).planned
+    run = Session(Survey.load(finished.survey_file), finished.store(), Inline())
+    planned = plan_tile_work(run).planned
     tiles = list(planned.tiles)
     for task in [*planned.tasks(tiles), *planned.singly(tiles[:2])]:
         arrived = pickle.loads(pickle.dumps(task))

@@ -18,13 +18,14 @@ import rasterio
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.compute_on import compute_on
-from roadscan.jobs.ingest import ingest
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import Run, plan_tile_work
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.engine.compute_on import compute_on
+from roadscan.jobs.ingest.ingest import ingest
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status, verify_store
-from roadscan.jobs.tile_points import load_points
+from roadscan.jobs.tile_work import plan_tile_work
+from roadscan.jobs.tiles.selection import Selection
+from roadscan.jobs.tiles.tile_points import load_points
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -134,7 +135,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
     stages = ("ingest:", "navigate:", "footprints:", "tiles:", "surfaces:", "products:")
     assert all(line.startswith(("known:", *stages)) for line in _lines(run))
     assert {p: store.fs.modified(store.path(p)) for p in outputs(store)} == before
-    assert survey_status(Survey.load(finished.survey_file), store).is_complete
+    assert survey_status(Session(Survey.load(finished.survey_file), store)).is_complete
 
 
 @pytest.mark.parametrize(
@@ -177,9 +178,9 @@ def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path:
     with pytest.raises(RunError, match=r"units failed: tiles \d+_\d+: .*profiler_left.*cannot be read") as caught:
         copy.run()
     assert "the next run does only these" in str(caught.value)
-    status = survey_status(Survey.load(copy.survey_file), store)
-    assert 0 < status.tiles_stale < status.tiles_current + status.tiles_stale
-    assert len(status.failures) == status.tiles_stale
+    status = survey_status(Session(Survey.load(copy.survey_file), store))
+    assert 0 < status.of("tiles").stale < status.of("tiles").current + status.of("tiles").stale
+    assert len(status.failures) == status.of("tiles").stale
     path.write_bytes(whole)
     copy.run()
     assert_same_files(finished.store(), store)
@@ -240,7 +241,7 @@ def test_files_open_with_other_programs(finished: Simulated) -> None:
 
 def test_a_halo_adds_neighbours_and_changes_no_core_tile(finished: Simulated) -> None:
     manifest = Manifest(finished.store())
-    work = plan_tile_work(Run(Survey.load(finished.survey_file), finished.store(), Inline()), manifest)
+    work = plan_tile_work(Session(Survey.load(finished.survey_file), finished.store(), Inline()))
     tiles = [TileId.parse(u) for u, r in manifest.of("tile").items() if r.path]  # those with points
     inner = next(t for t in tiles if TileId(t.column + 1, t.row) in tiles)
     (alone,) = work.planned.singly([inner])
@@ -319,7 +320,7 @@ def test_one_missing_log_does_not_keep_the_others_out(finished: Simulated, tmp_p
     ):
         copy.run()
     assert len(read_log_records(copy.store())) == 8
-    assert not survey_status(Survey.load(copy.survey_file), copy.store()).is_complete
+    assert not survey_status(Session(Survey.load(copy.survey_file), copy.store())).is_complete
     (tmp_path / "elsewhere.pcap").rename(lidar)
     copy.run()
     assert_same_files(finished.store(), copy.store())
@@ -330,7 +331,7 @@ def test_raw_logs_may_be_archived_once_they_are_ingested(finished: Simulated, tm
     copy.run()  # logs are known by their place
     (copy.survey_file.parent / "raw").rename(tmp_path / "archive")
     assert copy.run(products__make=["las", "tile_table"]).failures == []
-    assert survey_status(Survey.load(copy.survey_file), copy.store()).failures == []
+    assert survey_status(Session(Survey.load(copy.survey_file), copy.store())).failures == []
 
 
 def test_a_tile_that_could_not_be_made_again_counts_as_stale(
@@ -344,10 +345,10 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("roadscan.jobs.tiles.cells_of", broken)
+        patch.setattr("roadscan.jobs.tiles.tiles.cells_of", broken)
         with pytest.raises(RunError, match=rf"tiles {unit}: OSError: disk full"):
             copy.run(selection=Selection(named=(TileId.parse(unit),)))
-    assert survey_status(Survey.load(copy.survey_file), store).tiles_stale == 1
+    assert survey_status(Session(Survey.load(copy.survey_file), store)).of("tiles").stale == 1
     copy.run()
     assert_same_files(finished.store(), store)
 
@@ -400,10 +401,10 @@ def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_
     before = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
     both = changed(Survey.load(copy.survey_file), {"runs": runs, "passes": []})
     ingest(both, copy.store())
-    told = survey_status(both, copy.store())
-    assert (told.footprints_stale, told.is_complete) == (sum(len(run["logs"]) - 1 for run in runs[1:]), False)
+    told = survey_status(Session(both, copy.store()))
+    assert (told.of("footprints").stale, told.is_complete) == (sum(len(run["logs"]) - 1 for run in runs[1:]), False)
     copy.run(runs=runs, passes=[])
-    assert survey_status(both, copy.store()).is_complete
+    assert survey_status(Session(both, copy.store())).is_complete
     after = {u: r.key for u, r in Manifest(copy.store()).of("tile").items()}
     assert any(after[u] == key for u, key in before.items())
     swapped = copy.run("store-b", runs=runs[::-1], passes=[])
@@ -439,9 +440,9 @@ def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_pat
     path.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
     assert [f for f in verify_store(store) if path.name in f and "the next run makes it again" in f]
     store.remove("products/mosaic")
-    assert not survey_status(survey, store).is_complete
+    assert not survey_status(Session(survey, store)).is_complete
     copy.run()
-    assert survey_status(survey, store).is_complete
+    assert survey_status(Session(survey, store)).is_complete
     assert verify_store(store) == []
     assert_same_files(finished.store(), store)
 

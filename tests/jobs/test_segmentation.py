@@ -11,10 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.classes import write_classes
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.plan import plan_survey
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.export.classes import write_classes
+from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.jobs.status import survey_status
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
@@ -112,7 +114,7 @@ def test_road_is_kept_and_others_are_rejected(street: Simulated) -> None:
 
 
 def test_every_reading_is_told_by_its_fate(street: Simulated) -> None:
-    status = survey_status(changed(Survey.load(street.survey_file), ON | CELLS), street.store("cells"))
+    status = survey_status(Session(changed(Survey.load(street.survey_file), ON | CELLS), street.store("cells")))
     counts: dict[str, int] = dict.fromkeys(NAMES, 0)
     readings = 0
     for sensor in SENSORS:
@@ -158,8 +160,8 @@ def test_marked_points_are_those_beside_the_road(street: Simulated) -> None:
 def test_only_settings_of_the_segmentation_make_tiles_stale(street: Simulated) -> None:
     def keys(**settings: Any) -> tuple[int, int]:
         survey = changed(Survey.load(street.survey_file), CELLS | settings)
-        status = survey_status(survey, street.store("cells"))
-        return status.tiles_stale, status.tiles_current
+        status = survey_status(Session(survey, street.store("cells")))
+        return status.of("tiles").stale, status.of("tiles").current
 
     assert keys(**ON)[0] == 0
     assert keys(**ON, tiles__block_tiles=3)[0] == 0
@@ -225,7 +227,7 @@ def test_what_overlaps_in_a_turn_is_left_out_in_any_blocks(tmp_path: Path) -> No
 
     def run(name: str, **settings: Any) -> Store:
         store = Store(str(tmp_path / name), "turn")
-        run_stages(Run(changed(survey, settings), store, Inline()), STAGES)
+        run_stages(Session(changed(survey, settings), store, Inline()), stages())
         return store
 
     store = run("a")

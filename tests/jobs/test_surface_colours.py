@@ -17,10 +17,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.compute import Compute, Inline
-from roadscan.jobs.pictures import Pictures
-from roadscan.jobs.stages import STAGES, Run, Stage, run_stages
-from roadscan.jobs.surface_plan import SURFACE, plan_surface_work
+from roadscan.jobs.engine.compute import Compute, Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, stages
+from roadscan.jobs.surface_work import plan_surface_work
+from roadscan.jobs.surfaces.pictures import Pictures
+from roadscan.jobs.surfaces.surface_plan import SURFACE
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
 from roadscan.simulate import simulate, truth
@@ -38,7 +41,7 @@ INTERIOR = {
 }  # fmt: skip
 SQUARE_M = 0.8
 CAMERA = "rig__sensors__camera"
-INGEST = tuple(s for s in STAGES if s.name == "ingest")
+INGEST = tuple(s for s in stages() if s.name == "ingest")
 COLOURED: dict[str, object] = {"colours": "camera", "spacing_m": 0.05, "format": "ply", "camera_reach_m": 6.0}
 
 
@@ -90,7 +93,7 @@ class Drive:
     ) -> dict[str, bytes]:
         manifest = Manifest(self.store)
         manifest.forget(SURFACE, list(manifest.of(SURFACE)))
-        run = Run(survey, self.store, compute or Inline(), None, Lines())
+        run = Session(survey, self.store, compute or Inline(), None, Lines())
         run_stages(run, stages)
         self.lines = run.reporter.lines  # type: ignore[attr-defined]
         return {p: data for p, data in outputs(self.store).items() if p.startswith("tiles/surface")}
@@ -188,9 +191,9 @@ def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: 
     first = np.empty((count.size, 3), np.uint8)
     first[which] = colour  # any of those at one place
     assert np.array_equal(first[which], colour)
-    monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
-    monkeypatch.setattr("roadscan.jobs.picture_colours._KEPT_BYTES", 0)
-    monkeypatch.setattr("roadscan.jobs.picture_colours._POINTS_AT_ONCE", 777)
+    monkeypatch.setattr("roadscan.jobs.surfaces.surface_plan._BLOCK_TILES", 1)
+    monkeypatch.setattr("roadscan.jobs.surfaces.picture_colours._KEPT_BYTES", 0)
+    monkeypatch.setattr("roadscan.jobs.surfaces.picture_colours._POINTS_AT_ONCE", 777)
     assert drive.run(drive.survey(), TwoThreads()) == files
     monkeypatch.setattr(Pictures, "near", lambda self, *_: self)  # all pictures: none that counts was left out
     assert drive.run(drive.survey()) == files
@@ -242,7 +245,7 @@ def test_the_own_vehicle_colours_nothing(drive: Drive) -> None:
 
 def test_tiles_that_a_picture_may_show_depend_on_it(drive: Drive) -> None:
     def keys(options: dict[str, object] = COLOURED, **changes: object) -> dict[str, str]:
-        planned = plan_surface_work(drive.survey(options, **changes), drive.store, None, Manifest(drive.store)).planned
+        planned = plan_surface_work(Session(drive.survey(options, **changes), drive.store)).planned
         assert planned is not None
         return {str(t): key for t, key in planned.keys.items()}
 
@@ -267,7 +270,7 @@ def test_what_cannot_be_coloured(
     survey = drive.survey(COLOURED | options, **changes)
     stage = "tiles" if "pixels" in message else "ingest"
     with pytest.raises(ConfigError, match=message):
-        run_stages(Run(survey, drive.store, Inline(), None, Lines()), [s for s in STAGES if s.name == stage])
+        run_stages(Session(survey, drive.store, Inline(), None, Lines()), [s for s in stages() if s.name == stage])
 
 
 def test_pictures_that_are_gone(drive: Drive) -> None:

@@ -20,13 +20,16 @@ import pytest
 import rasterio
 import shapely
 
-from roadscan.jobs.compute import Compute, Done, Inline
-from roadscan.jobs.selection import Selection
-from roadscan.jobs.stages import STAGES, Run, run_stages
+from roadscan.jobs.engine.compute import Compute, Done, Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
 from roadscan.jobs.status import verify_store
-from roadscan.jobs.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles, plan_surface_work
-from roadscan.jobs.surfaces import _Cells, source_of
-from roadscan.jobs.tile_plan import TILE
+from roadscan.jobs.surface_work import plan_surface_work
+from roadscan.jobs.surfaces.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles
+from roadscan.jobs.surfaces.surfaces import _Cells, source_of
+from roadscan.jobs.tiles.selection import Selection
+from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
@@ -40,7 +43,7 @@ from roadscan.tables.store import Store
 
 from .conftest import Lines, Simulated, changed, outputs, small_scene
 
-SURFACES = tuple(s for s in STAGES if s.name == "surfaces")
+SURFACES = tuple(s for s in stages() if s.name == "surfaces")
 CELLS: dict[str, object] = {"method": "cells", "sigma_m": 0.004}
 POINTS: dict[str, object] = {"method": "points", "sigma_m": 0.006, "cell_m": (0.03, 0.04)}
 POTHOLE = {"station_m": 3.9, "offset_m": 2.5, "radius_m": 0.3, "depth_m": 0.05}
@@ -75,7 +78,7 @@ class Reconstructed:
     ) -> tuple[list[str], dict[str, bytes]]:
         """Tiles whose surface was made, and all files of surfaces."""
         before = Manifest(self.store).of(SURFACE)
-        run = Run(survey, self.store, compute or Inline(), selection, Lines())
+        run = Session(survey, self.store, compute or Inline(), selection, Lines())
         run_stages(run, SURFACES)
         after = Manifest(self.store).of(SURFACE)
         files = {p: data for p, data in outputs(self.store).items() if p.startswith("tiles/surface")}
@@ -86,7 +89,7 @@ class Reconstructed:
         manifest.forget(SURFACE, list(manifest.of(SURFACE)))
 
     def plan(self, survey: Survey) -> SurfacePlan:
-        planned = plan_surface_work(survey, self.store, None, Manifest(self.store)).planned
+        planned = plan_surface_work(Session(survey, self.store)).planned
         assert planned is not None
         return planned
 
@@ -208,8 +211,8 @@ def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: py
     assert record.path == "" and figures["cells"] == sum(figures[k] for k in ("measured", "interpolated", "filled")) > 0
     assert figures["lowest_known"] == figures["measured"]
     cells.forget()
-    monkeypatch.setattr("roadscan.jobs.surface_plan._BLOCK_TILES", 1)
-    monkeypatch.setattr("roadscan.jobs.surfaces._CELLS_KEPT", 0)
+    monkeypatch.setattr("roadscan.jobs.surfaces.surface_plan._BLOCK_TILES", 1)
+    monkeypatch.setattr("roadscan.jobs.surfaces.surfaces._CELLS_KEPT", 0)
     assert cells.run(survey, TwoThreads())[1] == files
     assert verify_store(cells.store) == []
 
@@ -252,7 +255,7 @@ def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructe
     assert tile in lost and all(
         abs(int(u.split("_")[0]) - column) < 2 and abs(int(u.split("_")[1]) - row) < 2 for u in lost
     )
-    work = plan_surface_work(survey, cells.store, None, Manifest(cells.store))
+    work = plan_surface_work(Session(survey, cells.store))
     assert "run `roadscan tiles`" in work.note and not lost & set(map(str, work.chosen))
     path.write_bytes(content)
     Manifest(cells.store).add([record])  # as the tiles stage makes it again
@@ -263,7 +266,7 @@ def test_surfaces_wait_for_cells_of_the_survey_as_it_is(cells: Reconstructed) ->
     survey = cells.survey(CELLS)
     _, files = cells.run(survey)
     coarser = changed(survey, {"tiles__cell_m": 2 * survey.config.tiles.cell_m})
-    work = plan_surface_work(coarser, cells.store, None, Manifest(cells.store))
+    work = plan_surface_work(Session(coarser, cells.store))
     assert "run `roadscan tiles`" in work.note and work.planned is not None
     assert set(map(str, work.planned.waiting)) >= set(Manifest(cells.store).of(SURFACE))
     assert cells.run(coarser) == ([], files)  # cells of the other grid are not taken for those of this one
@@ -347,7 +350,7 @@ FOUND: dict[str, object] = {**UNSMOOTHED, "regions": "found"}
 
 
 def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.jobs.found_regions._LONGEST_S", 1)  # several pieces of the drive
+    monkeypatch.setattr("roadscan.jobs.surfaces.found_regions._LONGEST_S", 1)  # several pieces of the drive
     survey = points.survey(FOUND, {"make": ["surface"], "options": {}})
     before = points.plan(survey)
     assert before.waiting and not before.keys  # nobody looked for regions yet
@@ -375,7 +378,7 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     assert len(pieces) > 3
     manifest.forget("regions", pieces)
     points.forget()
-    monkeypatch.setattr("roadscan.jobs.found_regions._CHUNK_ROWS", 7)
+    monkeypatch.setattr("roadscan.jobs.surfaces.found_regions._CHUNK_ROWS", 7)
     assert points.run(survey, TwoThreads())[1] == files  # neither workers nor chunks matter
     assert {p: points.store.read_bytes(p) for p in points.store.files("tables/regions")} == tables
     assert points.run(survey) == ([], files)
@@ -395,14 +398,14 @@ def test_workers_change_no_byte_of_a_pothole_on_the_border_of_tiles(points: Reco
     finely = {**UNSMOOTHED, "cell_m": [0.007, 0.007], "regions": "polygons", "polygons": str(layer)}
     options = {"crack_pieces": {"max_width_m": 0.018, "spur_m": 0.0}}
     survey = points.survey(finely, {"make": ["cracks", "potholes"], "options": options})
-    stages = [s for s in STAGES if s.name in ("surfaces", "products")]
+    chosen = [s for s in stages() if s.name in ("surfaces", "products")]
     made = []
     for compute in (Inline(), TwoThreads()):
         points.forget()
         manifest = Manifest(points.store)
         for name in ("cracks", "potholes"):
             manifest.forget(name, list(manifest.of(name)))
-        run_stages(Run(survey, points.store, compute, None, Lines()), stages)
+        run_stages(Session(survey, points.store, compute, None, Lines()), chosen)
         made.append({p: b for p, b in outputs(points.store).items() if "pieces" in p or p.startswith("products/")})
     assert made[0] == made[1] and len(made[0]) > 4
     (hole,) = query(points.store, "SELECT * FROM potholes").to_pylist()
@@ -455,16 +458,16 @@ def test_bridged_tiles_lie_between_two_sides() -> None:
 def test_settings_that_do_not_fit_the_tiles_stop_a_run_before_them(
     cells: Reconstructed, settings: dict[str, object], message: str
 ) -> None:
-    run = Run(cells.survey(settings), cells.store, Inline(), None, Lines())
+    run = Session(cells.survey(settings), cells.store, Inline(), None, Lines())
     with pytest.raises(ConfigError, match=message):
-        run_stages(run, [s for s in STAGES if s.name == "tiles"])
+        run_stages(run, [s for s in stages() if s.name == "tiles"])
 
 
 def test_cells_too_coarse_for_cracks_stop_a_run_before_them(cells: Reconstructed) -> None:
     survey = cells.survey(CELLS, {"make": ["surface", "cracks"], "options": {}})
-    run = Run(survey, cells.store, Inline(), None, Lines())
+    run = Session(survey, cells.store, Inline(), None, Lines())
     with pytest.raises(ConfigError, match=r"'crack_pieces' got cells of 0\.05 × 0\.05 m"):
-        run_stages(run, [s for s in STAGES if s.name == "tiles"])
+        run_stages(run, [s for s in stages() if s.name == "tiles"])
 
 
 @pytest.mark.parametrize(
@@ -486,6 +489,6 @@ def test_settings_that_do_not_fit(cells: Reconstructed, settings: dict[str, obje
 
 
 def test_a_product_of_the_surface_needs_one(cells: Reconstructed) -> None:
-    run = Run(cells.survey(None, {"make": ["surface_mesh"], "options": {}}), cells.store, Inline(), None, Lines())
+    run = Session(cells.survey(None, {"make": ["surface_mesh"], "options": {}}), cells.store, Inline(), None, Lines())
     with pytest.raises(ConfigError, match=r"add the section \[surface\]"):
-        run_stages(run, [s for s in STAGES if s.name == "tiles"])
+        run_stages(run, [s for s in stages() if s.name == "tiles"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from roadscan.jobs.tile_files import WantedProduct, tile_file_names, write_product
+from roadscan.jobs.tiles.tile_files import WantedProduct, tile_file_names, write_product
 from roadscan.model.strict import Strict
 from roadscan.products.base import Tile, TileProduct
 from roadscan.products.pavement import IntensityOptions, PavementIntensity

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.jobs.tile_plan import PlannedTiles
+from roadscan.jobs.tiles.tile_plan import PlannedTiles
 from roadscan.model.ids import TileId
 
 

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.jobs.demo import summarise
-from roadscan.jobs.ingest import ingest
-from roadscan.jobs.plan import plan_survey
+from roadscan.jobs.ingest.ingest import ingest
+from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.readings import Placer
 from roadscan.model.survey import Survey
 from roadscan.points.place import EVERYWHERE

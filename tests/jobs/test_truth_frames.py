@@ -17,8 +17,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from roadscan.jobs.ingest import ingest
-from roadscan.jobs.plan import SurveyPlan, plan_survey
+from roadscan.jobs.ingest.ingest import ingest
+from roadscan.jobs.plan.plan import SurveyPlan, plan_survey
 from roadscan.jobs.readings import Placer
 from roadscan.model.survey import Survey
 from roadscan.points.place import EVERYWHERE

@@ -9,36 +9,48 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.georeference import CLASS_KEPT, CLASS_NO_POSE, CLASS_NO_RETURN, CLASS_TOO_FAR, FATES
+from roadscan.kernels.georeferencing.readings import (
+    CLASS_KEPT,
+    CLASS_NO_POSE,
+    CLASS_NO_RETURN,
+    CLASS_TOO_FAR,
+    FATES,
+    Georeference,
+    Limits,
+    MirrorProfiles,
+    Placed,
+    Returns,
+)
+from roadscan.kernels.georeferencing.timed_readings import STEP_NS, place_mirror, place_returns
 from roadscan.kernels.options import read_only
-from roadscan.kernels.placing import STEP_NS, place_mirror, place_returns
 from roadscan.model.crs import LOCAL_WORLD, Anchor, MapFrame
+from roadscan.model.rig import Mounting
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import charts_along
+from roadscan.points.georeference import georeference_of
 
 START = 10**18
 WIDE = (0.0, 1e4, -1e5, 1e5, -1e5, 1e5)
 LEVER, BORESIGHT = np.array([-1.7, 0.6, -2.1]), Rotation.from_euler("ZYX", [30.0, -12.0, 4.0], degrees=True)
-MOUNTING = (*BORESIGHT.as_matrix().ravel().tolist(), *LEVER.tolist())
+MOUNTING = Mounting(tuple(LEVER.tolist()), tuple(map(tuple, BORESIGHT.as_matrix().tolist())))
 PER_M = 1e9
 YARD = MapFrame(crs=None, local_name="yard", anchor=Anchor(48.0, 11.0, 500.0, 0.0))
 
 
-def common(path: Trajectory, frame: MapFrame, limits=WIDE) -> tuple:
+def common(path: Trajectory, frame: MapFrame, limits=WIDE, per_m=PER_M) -> Georeference:
     charts = charts_along(frame, path.world, path.position_world_m)
-    lattice = tuple(charts.lattice.tolist())
-    navigation = (path.epochs_gps_ns, *path.intervals)
-    return MOUNTING, *navigation, lattice, charts.table, charts.centres, charts.coefficients, limits, PER_M
+    made = georeference_of(MOUNTING, path, charts, Limits(*limits))
+    return made._replace(quanta_per_m=per_m)
 
 
 def outputs(n: int) -> tuple[np.ndarray, ...]:
     return np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32), np.zeros(FATES, int)
 
 
-def placed(start: int, end: int, epochs: np.ndarray, xyz: np.ndarray, how: tuple) -> tuple[np.ndarray, ...]:
+def placed(start: int, end: int, epochs: np.ndarray, xyz: np.ndarray, how: Georeference) -> tuple[np.ndarray, ...]:
     out = outputs(end - start)
     columns = (read_only(np.ascontiguousarray(xyz[:, a])) for a in range(3))
-    place_returns(start, end, read_only(epochs), *columns, *how, *out)
+    place_returns(start, end, Returns(read_only(epochs), *columns), how, Placed(*out[:5]), out[5])
     return out
 
 
@@ -85,15 +97,16 @@ def mirror(path: Trajectory, limits=WIDE) -> tuple:
     ranges = rng.integers(1, 65_000, (40, 181)).astype(np.uint16)
     ranges[3, 50] = 0
     epochs = START + 13_333_333 * np.arange(40)
-    return read_only(epochs), read_only(ranges), *rays, (0.5, 0.0015), 37_037.04, *common(path, YARD, limits)
+    profiles = MirrorProfiles(read_only(epochs), read_only(ranges), *rays, (0.5, 0.0015), 37_037.04)
+    return profiles, common(path, YARD, limits)
 
 
 def test_readings_of_a_mirror_lie_where_exact_poses_put_them() -> None:
     path = wild_drive(5_000_000)
     how = mirror(path)
     out = outputs(40 * 181)
-    place_mirror(0, 40, *how, *out)
-    epochs, ranges, _, directions = how[:4]
+    place_mirror(0, 40, *how, Placed(*out[:5]), out[5])
+    epochs, ranges, _, directions, *_ = how[0]
     when = (epochs[:, None] + np.floor(np.arange(181) * 37_037.04 + 0.5).astype(np.int64)).ravel()
     xyz = ((0.5 + 0.0015 * ranges)[:, :, None] * directions).reshape(-1, 3)
     seen = ranges.ravel() > 0
@@ -131,9 +144,9 @@ def test_no_bit_depends_on_how_returns_are_divided_or_ordered() -> None:
 def test_no_bit_depends_on_how_profiles_of_a_mirror_are_divided() -> None:
     how = mirror(wild_drive(5_000_000), (5.0, 80.0, -1e5, 40.0, -1e5, 1e5))
     whole, one = outputs(40 * 181), outputs(181)
-    place_mirror(0, 40, *how, *whole)
+    place_mirror(0, 40, *how, Placed(*whole[:5]), whole[5])
     for p in range(40):
-        place_mirror(p, p + 1, *how, *one)
+        place_mirror(p, p + 1, *how, Placed(*one[:5]), one[5])
         kept = one[3] == CLASS_KEPT
         for column in range(5):
             mine = kept if column < 3 else slice(None)
@@ -170,7 +183,7 @@ def test_points_meet_across_the_borders_of_charts() -> None:
     to_map = Transformer.from_crs(world, Transformer.from_crs("EPSG:32632", world).source_crs.to_3d(), always_xy=True)
     epochs = START + np.linspace(0, 2_000_000_000, 3000).astype(np.int64)
     xyz = np.random.default_rng(5).uniform(-60, 60, (3000, 3)).astype(np.float32)
-    how = (*common(path, frame)[:-1], 1e6)
+    how = common(path, frame, per_m=1e6)
     out = placed(0, 3000, epochs, xyz, how)
     expected = np.column_stack(to_map.transform(*exact(path, epochs, xyz.astype(float)).T))
     assert np.unique(np.floor(path.position_world_m / 200.0), axis=0).shape[0] > 4

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import pickle
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -38,3 +40,29 @@ def test_parts_that_are_missing_leave_no_trace() -> None:
 )
 def test_nearest_word(word: str, answer: str) -> None:
     assert errors.nearest(word, ["axes", "lever_arm_body_m", "kind"]) == answer
+
+
+def test_the_words_follow_from_what_is_missing() -> None:
+    hour = errors.Missing("options.hour", 9)
+    clock = errors.Missing("clock", {"system": "utc_hour", "date": dt.date(2026, 5, 4)})
+    together = errors.TimeSystemError("the hour is not known", missing=[[clock, hour]])
+    assert str(together) == (
+        'the hour is not known; expected clock = { system = "utc_hour", date = 2026-05-04 } with options.hour = 9; '
+        'add clock = { system = "utc_hour", date = 2026-05-04 } and options.hour = 9 to this log'
+    )
+    lines = [part.partition(" = ")[2] for part in together.advice.removeprefix("add ").split(" and ")]
+    assert tomllib.loads(f"x = {lines[0]}")["x"]["date"] == dt.date(2026, 5, 4)
+    chosen = errors.ConfigError("no unit", missing=errors.Missing("options.unit", choices=("m", "ft")))
+    assert str(chosen) == 'no unit; expected options.unit = "m" or "ft"'
+    either = errors.ConfigError("no time", missing=[errors.Missing("options.stamps"), (clock, hour)])
+    assert either.expected.startswith("one of options.stamps, clock = {")
+    assert either.change == ""
+
+
+def test_what_is_missing_survives_pickling_and_a_new_place() -> None:
+    error = errors.ConfigError("no layer", missing=errors.Missing("options.layer", choices=("a", "b")))
+    for other in (pickle.loads(pickle.dumps(error)), error.at("b.gpkg", 3)):
+        assert (type(other), other.missing) == (errors.ConfigError, error.missing)
+        assert [one.choices for one in other.asks_for("options.")] == [("a", "b")]
+        assert list(other.asks_for("clock")) == []
+    assert str(error.at("b.gpkg", 3)).startswith("b.gpkg, record 3: no layer;")

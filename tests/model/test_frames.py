@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import ConfigError
 from roadscan.model.frames import (
+    BODY_FROM_AXES,
     ENU_FROM_NED,
     body_from_axes,
     ecef_from_ned,
@@ -117,5 +118,22 @@ def test_axes_letters_name_where_each_axis_points(axes: str) -> None:
 
 
 def test_unknown_axes() -> None:
-    with pytest.raises(ConfigError, match="axes 'xyz'; expected one of frd, flu"):
+    with pytest.raises(ConfigError, match="axes 'xyz'; expected one of frd, "):
         body_from_axes("xyz")
+
+
+def test_axes_are_the_24_rotations_of_a_cube() -> None:
+    """SciPy's octahedral group, found by another way, holds the same matrices."""
+    cube = {tuple(np.rint(turn.as_matrix()).astype(int).ravel()) for turn in Rotation.create_group("O")}
+    assert len(BODY_FROM_AXES) == len(cube) == 24
+    assert {tuple(matrix.astype(int).ravel()) for matrix in BODY_FROM_AXES.values()} == cube
+    assert all(np.linalg.det(matrix) == pytest.approx(1.0) for matrix in BODY_FROM_AXES.values())
+
+
+def test_each_letter_says_where_its_axis_points() -> None:
+    towards = {"f": (1, 0, 0), "b": (-1, 0, 0), "r": (0, 1, 0), "l": (0, -1, 0), "d": (0, 0, 1), "u": (0, 0, -1)}
+    for axes, body_from_sensor in BODY_FROM_AXES.items():
+        for letter, axis in zip(axes, np.eye(3), strict=True):
+            np.testing.assert_array_equal(body_from_sensor @ axis, towards[letter])
+    # As docs/real-data.md states a robot's upright scanner: x up, y right, z ahead.
+    np.testing.assert_array_equal(body_from_axes("urf"), [[0, 0, 1], [0, 1, 0], [-1, 0, 0]])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Rig, Sensor
+from roadscan.model.rig import Boresight, Rig, Sensor
 
 RIG = """
 name = "van"
@@ -79,9 +79,9 @@ def test_boresight_directions_as_the_manual_words_them(
 @pytest.mark.parametrize(
     ("sensor", "words"),
     [
-        ({"kind": "lidr"}, "'kind' .got 'lidr'.*'profiler', 'lidar'"),
+        ({"kind": "lidr"}, "'kind' .got 'lidr'.*expected one of: profiler, lidar.*did you mean 'lidar'"),
         ({}, "key 'kind' is missing"),
-        ({"kind": "lidar", "axes": "fru"}, "axes 'fru', expected one of frd, flu, rfu, bru"),
+        ({"kind": "lidar", "axes": "fru"}, "axes 'fru' are no right-handed set of directions, expected one of frd, "),
         ({"kind": "lidar", "range_min_m": 5, "range_max_m": 5}, "range_max_m 5 is not above range_min_m 5"),
         ({"kind": "lidar", "body_from_sensor": [[1, 0, 0], [0, 1, 0]]}, "not a 3 × 3 rotation"),
         ({"kind": "lidar", "body_from_sensor": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "orthonormal"),
@@ -95,3 +95,15 @@ def test_boresight_directions_as_the_manual_words_them(
 def test_sensors_that_make_no_sense(sensor: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         Sensor.parse(sensor)
+
+
+def test_what_a_log_knows_holds_where_the_rig_states_nothing() -> None:
+    known = {"axes": "urf", "lever_arm_body_m": [0.3, 0.0, 0.0], "boresight": {"heading_deg": 180.0}}
+    bare = Sensor(kind="profiler", range_max_m=30.0).mounted_as(known)
+    assert (bare.axes, bare.lever_arm_body_m, bare.boresight.heading_deg) == ("urf", (0.3, 0.0, 0.0), 180.0)
+    assert bare.range_max_m == 30.0
+    own = Sensor(kind="profiler", axes="frd", lever_arm_body_m=(1.0, 0.0, 0.0), boresight=Boresight())
+    assert own.mounted_as(known) is own
+    turned = Sensor(kind="profiler", body_from_sensor=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    assert turned.mounted_as(known).mounting().body_from_sensor == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    assert turned.mounted_as(known).lever_arm_body_m == (0.3, 0.0, 0.0)

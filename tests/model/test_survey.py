@@ -95,24 +95,27 @@ LOG = ("runs", 0, "logs", 0)
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (changed("runs", to=[]), "'runs': List should have at least 1 item"),
+        (changed("runs", to=[]), "'runs': expected a list of at least 1 .0 given."),
         (changed("id", to="a b"), "'id' .got 'a b'"),
         (changed("map", to={}), "'map': say where the map is"),
         (changed("map", "heigth", to="orthometric"), r"unknown key 'map\.heigth' \(did you mean 'height'\?\)"),
-        (changed(*LOG, "clok", to={}), r"unknown key 'runs\.0\.logs\.0\.clok' \(did you mean 'clock'\?\)"),
+        (changed(*LOG, "clok", to={}), r"unknown key 'clok' of log 'raw/poses\.csv' \(did you mean 'clock'\?\)"),
         (changed(*LOG, "clock", to={"system": "gps_week_seconds", "week": 2400, "date": "2026-01-01"}), "week or date"),
         (changed(*LOG, "clock", to={"system": "free"}), "needs offset_s"),
-        (changed(*LOG, "clock", to={"unit": "s"}), r"'runs\.0\.logs\.0\.clock\.system' is missing"),
+        (changed(*LOG, "clock", to={"unit": "s"}), r"key 'clock\.system' of log 'raw/poses\.csv' is missing"),
         (changed("runs", to=MINIMAL["runs"] * 2), "two runs have the same id"),
         (changed("passes", to=[{"id": 1, "run": "mondy"}]), r"unknown run 'mondy' \(did you mean 'monday'\?\)"),
         (changed("passes", to=[{"id": 1, "run": "monday"}] * 2), "two passes have the same id"),
-        (changed("passes", to=[{"id": 65_536, "run": "monday"}]), "less than or equal to 65535"),
+        (
+            changed("passes", to=[{"id": 65_536, "run": "monday"}]),
+            "'id' of pass 65536 .got 65536.: expected 65535 or less",
+        ),
         (changed("tiles", "cell_m", to=0.03), "cell_m 0.03 does not divide size_m 10"),
         (changed("tiles", "cell_m", to=10 / 3), "even number of cells"),
         (changed("tiles", "cell_m", to=0.0001), "make cell_m larger"),
         (
             changed("control", to=[{"path": "gcp.csv"}]),
-            r"'control\.0\.crs' is missing; key 'control\.0\.height' is missing",
+            r"key 'crs' of control log 'gcp\.csv' is missing; key 'height' of control log",
         ),
         (changed(*LOG, "sensor", to="top"), "names the unknown sensor 'top'.*it has none"),
         (

@@ -15,13 +15,13 @@ from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.simulate import Scene
-from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.encoder import write_encoder
-from roadscan.simulate.imu import head_imus, write_imu
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import ClockError
+from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.encoder import write_encoder
+from roadscan.simulate.sensors.imu import head_imus, write_imu
 from roadscan.simulate.surface import Surface
 
 WORLD = "EPSG:4978"

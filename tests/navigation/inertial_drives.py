@@ -27,12 +27,12 @@ from roadscan.navigation.inertial.readings import (
     VehicleSensors,
 )
 from roadscan.simulate import Scene
-from roadscan.simulate import gnss as simulated_gnss
-from roadscan.simulate import imu as simulated_imu
 from roadscan.simulate.drive import Drive, Poses, drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.encoder import WheelEncoder
 from roadscan.simulate.noise import stream
+from roadscan.simulate.sensors import gnss as simulated_gnss
+from roadscan.simulate.sensors import imu as simulated_imu
+from roadscan.simulate.sensors.encoder import WheelEncoder
 from roadscan.simulate.surface import Surface
 
 Gaps = tuple[tuple[float, float], ...]

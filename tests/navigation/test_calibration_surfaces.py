@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.bench_surfaces import overlap_mm, solved
 from benchmarks.calibration_yard import mounting_error, profiler_yard
-from roadscan.kernels.calibration_surfaces import MOMENTS, UNKNOWNS, match_patches
+from roadscan.kernels.calibration.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches
 from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.estimator import calibrate
@@ -37,7 +37,8 @@ def matched(first: np.ndarray, second: np.ndarray, size: int = 48):
     n = len(corner)
     shift, crossed, mean = np.zeros((n, 3)), np.zeros((n, UNKNOWNS, UNKNOWNS)), np.zeros((n, UNKNOWNS, UNKNOWNS))
     spread, count, felt = np.zeros(n), np.zeros(n, np.int32), np.zeros((n, MOMENTS))
-    match_patches(first, second, CELL_M, corner, size, 1, 20, 100, shift, crossed, mean, spread, count, felt)
+    found = Matches(shift, crossed, mean, spread, count, felt)
+    match_patches(first, second, CELL_M, corner, size, 1, 20, 100, found)
     return shift, crossed, mean, spread, count
 
 

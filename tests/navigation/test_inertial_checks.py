@@ -24,11 +24,11 @@ from roadscan.navigation.inertial.smoother import solve
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.encoder import WheelEncoder
-from roadscan.simulate.gnss import FIXED
-from roadscan.simulate.gnss import solve as solutions_of
-from roadscan.simulate.imu import _SensorErrors, felt, first_gps_ns, imu_of
 from roadscan.simulate.noise import stream
+from roadscan.simulate.sensors.encoder import WheelEncoder
+from roadscan.simulate.sensors.gnss import FIXED
+from roadscan.simulate.sensors.gnss import solve as solutions_of
+from roadscan.simulate.sensors.imu import _SensorErrors, felt, first_gps_ns, imu_of
 from roadscan.simulate.surface import Surface
 from tests.navigation.recorded_drive import recorded_drive
 

@@ -11,7 +11,7 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.inertial import increments, strapdown
+from roadscan.kernels.inertial.strapdown import increments, strapdown
 from roadscan.model.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
 from roadscan.navigation.inertial.earth import ecef_from_level, gravity_ecef
 from tests.navigation.inertial_drives import NO_GAPS, simulated, urban

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from roadscan.kernels.kalman_smoother import smooth_backwards
-from roadscan.kernels.kalman_states import NAVIGATION, WITHOUT_SCALES
+from roadscan.kernels.inertial.kalman_smoother import smooth_backwards
+from roadscan.kernels.inertial.kalman_states import NAVIGATION, WITHOUT_SCALES
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.imu import IMU_GRADES, ImuGrade

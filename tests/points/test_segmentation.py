@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.kernels.segmentation import height_threshold
+from roadscan.kernels.road.segmentation import height_threshold
 from roadscan.model.segmentation import SegmentationConfig
 from roadscan.points.classes import LAS_CLASSES, READING_CLASSES
 from roadscan.points.readings import ScanGeometry

@@ -15,11 +15,11 @@ from roadscan.model.distress import CrackDetection, CrackJoining, PotholeDetecti
 from roadscan.model.errors import ConfigError, StoreError
 from roadscan.model.ids import TileId
 from roadscan.products.base import product_named
-from roadscan.products.crack_pieces import CrackPieces
-from roadscan.products.cracks import Cracks
+from roadscan.products.distress.crack_pieces import CrackPieces
+from roadscan.products.distress.cracks import Cracks
+from roadscan.products.distress.pothole_pieces import PotholePieces
+from roadscan.products.distress.potholes import Potholes
 from roadscan.products.lane_direction import LaneDirections
-from roadscan.products.pothole_pieces import PotholePieces
-from roadscan.products.potholes import Potholes
 from roadscan.surfaces.tile import MEASURED, SurfaceTile
 from roadscan.surfaces.window import GridWindow
 from roadscan.tables.schema import table_schema

@@ -15,12 +15,14 @@ import pytest
 import rasterio
 from rasterio.enums import Resampling
 
+from roadscan.codecs import tiff as tiff_module
+from roadscan.codecs.cog import overview_factors
+from roadscan.codecs.gdal import raster_crs
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
-from roadscan.products import tiff as tiff_module
 from roadscan.products.base import Tile, product_named
 from roadscan.products.geotiff import GeoTiff, GeoTiffOptions
-from roadscan.products.raster import CellBox, overview_factors, raster_crs
+from roadscan.products.raster import CellBox
 
 
 @pytest.fixture

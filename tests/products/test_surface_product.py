@@ -15,10 +15,11 @@ import trimesh
 from PIL import Image
 from rasterio.enums import Resampling
 
+from roadscan.codecs.mesh import write_glb
 from roadscan.model.errors import ConfigError, StoreError
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, product_named
-from roadscan.products.mesh import mesh_of, write_glb
+from roadscan.products.mesh import mesh_of
 from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surfaces.window import GridWindow
 from roadscan.tiles.grid import TileGrid

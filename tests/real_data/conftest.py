@@ -15,8 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.compute import Inline
-from roadscan.jobs.stages import STAGES, Reporter, Run, run_stages
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Reporter, Session
+from roadscan.jobs.stage import stages
 from roadscan.model.survey import Survey
 from roadscan.tables.logs import LogRecord, read_log_records
 from roadscan.tables.store import Store
@@ -59,12 +61,12 @@ class Place:
         path.write_text(text)
         return path
 
-    def run(self, survey_file: Path, *stages: str) -> list[str]:
+    def run(self, survey_file: Path, *names: str) -> list[str]:
         """Run a survey in this process, all stages or those named; what it said."""
         survey = Survey.load(survey_file)
-        chosen = [s for s in STAGES if not stages or s.name in stages]
+        chosen = [s for s in stages() if not names or s.name in names]
         reporter = Lines()
-        run_stages(Run(survey, self.store(survey_file), Inline(), None, reporter), chosen)
+        run_stages(Session(survey, self.store(survey_file), Inline(), None, reporter), chosen)
         return reporter.lines
 
     def store(self, survey_file: Path) -> Store:

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import scan_matching
 
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status
 from roadscan.model.survey import Survey
 
@@ -30,8 +31,13 @@ def aces(place: Place) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(place: Place) -> np.ndarray:
+    """What :func:`recorded_scans` reads."""
+    return recorded_scans(place.recordings)
+
+
+def recorded_scans(recordings: Path) -> np.ndarray:
     """(7374, 184) stamp, x, y, θ and 180 ranges of each scan, by plain Python."""
-    text = bz2.decompress((place.recordings / "lms" / "aces.clf.bz2").read_bytes()).decode()
+    text = bz2.decompress((recordings / "lms" / "aces.clf.bz2").read_bytes()).decode()
     lines = [line.split() for line in text.splitlines() if line.startswith("FLASER ")]
     return np.array([[float(w) for w in (line[188], *line[182:185], *line[2:182])] for line in lines])
 
@@ -44,12 +50,12 @@ def points(place: Place, aces: Path) -> pd.DataFrame:
     return pd.concat([pd.DataFrame({n: np.asarray(tile[of]) for n, of in names.items()}) for tile in tiles])
 
 
-def expected_points(recorded: np.ndarray, turning: int = 1) -> pd.DataFrame:
+def expected_points(recorded: np.ndarray, turning: int = 1, farthest_m: float = 30.0) -> pd.DataFrame:
     """Where the beams end: beam k looks k − 90° from ahead, counter-clockwise seen from above."""
     x, y, theta = recorded[:, 1:4].T
     ranges = recorded[:, 4:]
     angle = theta[:, None] + turning * np.radians(np.arange(180) - 90.0)
-    kept = ranges <= 30.0
+    kept = ranges <= farthest_m
     return pd.DataFrame(
         {
             "stamp": np.repeat(recorded[:, 0], 180)[kept.ravel()],
@@ -67,7 +73,7 @@ def cells(points: pd.DataFrame) -> int:
 
 def test_every_reading_is_accounted_for(place: Place, aces: Path, recorded: np.ndarray) -> None:
     assert recorded.shape == (7_374, 184)
-    status = survey_status(Survey.load(aces), place.store(aces))
+    status = survey_status(Session(Survey.load(aces), place.store(aces)))
     assert status.is_complete
     ranges = recorded[:, 4:]
     assert sum(status.readings.values()) == ranges.size == 7_374 * 180

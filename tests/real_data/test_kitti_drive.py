@@ -13,6 +13,7 @@ import rasterio
 import road_cells
 from las_points import read_points
 
+from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status
 from roadscan.model.survey import Survey
 
@@ -35,7 +36,7 @@ def test_every_return_is_accounted_for(place: Place, kitti: Path, points: pd.Dat
     (lidar,) = (r for r in place.records(kitti) if r.sensor == "velodyne")
     assert lidar.rows + lidar.rejected == recorded == 6_317_433
     assert lidar.reject_reasons == {"0, 0, 0 is no return": 52}
-    status = survey_status(Survey.load(kitti), place.store(kitti))
+    status = survey_status(Session(Survey.load(kitti), place.store(kitti)))
     assert status.is_complete
     assert sum(status.readings.values()) == lidar.rows
     assert status.readings["kept"] == len(points)

@@ -11,10 +11,10 @@ import pyarrow.feather
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.model.errors import FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.rig import Sensor
-from roadscan.sensors.base import format_named, format_of
+from roadscan.sensors.base import LogSource, NoOptions, format_named, format_of
 from tests.sensors.readings import read
 
 CLOCK = Clock(TimeSystem.UNIX_GPS, unit="ns")
@@ -95,11 +95,13 @@ def test_stamps_need_a_clock_in_nanoseconds(tmp_path: Path) -> None:
         read("argoverse", path, clock=Clock(TimeSystem.UNIX_GPS))
 
 
-def test_the_ego_frame_has_its_axes(tmp_path: Path) -> None:
-    path = write_sweep(tmp_path)
-    assert len(read("argoverse", path, clock=CLOCK, sensor=Sensor(kind="lidar", axes="flu"))) == 4
-    with pytest.raises(ConfigError, match='axes = "flu"'):
-        read("argoverse", path, clock=CLOCK, sensor=Sensor(kind="lidar"))
+def test_the_log_says_that_it_is_in_the_vehicles_frame(tmp_path: Path) -> None:
+    log_format = format_named("argoverse")
+    header = log_format.header(LogSource(write_sweep(tmp_path), NoOptions(), clock=CLOCK))
+    assert header.attributes["frame"] == "body"
+    mounting = Sensor(kind="lidar").mounted_as(header.attributes["mounting"]).mounting()
+    np.testing.assert_array_equal(mounting.arrays()[0], np.diag([1, -1, -1]))  # x forward, y left, z up
+    assert mounting.lever_arm_body_m == (0.0, 0.0, 0.0)
 
 
 def test_damage_costs_its_return_or_its_sweep(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.model.rig import Sensor
 from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import LogSource, Reject, Rows, format_named, format_of
 from roadscan.tables.schema import table_schema
@@ -182,6 +183,26 @@ def test_a_robot_message(tmp_path: Path, more: list[str]) -> None:
         assert found == {"forward_m": pytest.approx(0.3), "left_m": pytest.approx(0, abs=1e-6), "turned_rad": 0.0}
 
 
+def test_both_poses_with_the_mounting_they_imply_place_a_beam_alike(tmp_path: Path) -> None:
+    """A scanner 0.3 m behind and 0.2 m left of a robot, looking back: seen from either pose, one place."""
+    robot = np.array([1.0, 2.0, 0.7])
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    laser = [*(robot[:2] + turn @ [-0.3, 0.2]), 0.7 + np.pi]
+    poses = [f"{value:.9f}" for value in (*laser, *robot)]
+    path = write(tmp_path / "a.log", raw("ROBOTLASER1", 0, "1 2 3 4 5", "", *poses, "0", "0", "0", "0"))
+    ahead_m = {}
+    for pose in ("laser", "robot"):
+        log = read_carmen(path, {"pose": pose})
+        mounting = Sensor(kind="profiler").mounted_as(log.attributes["mounting"]).mounting()
+        body_from_sensor, lever_arm = mounting.arrays()
+        forward, right, down = body_from_sensor @ [0.0, 0.0, 5.0] + lever_arm  # 5 m along the middle reading
+        x, y, heading = laser if pose == "laser" else robot
+        ahead_m[pose] = (x + forward * np.cos(heading) + right * np.sin(heading),
+                         y + forward * np.sin(heading) - right * np.cos(heading), down)  # fmt: skip
+    assert ahead_m["laser"] == pytest.approx(ahead_m["robot"], abs=1e-5)
+    assert ahead_m["laser"][:2] == pytest.approx(robot[:2] + turn @ [-5.3, 0.2], abs=1e-5)
+
+
 def test_two_scanners_in_one_log(tmp_path: Path) -> None:
     rear = plain(0, laser="1 2 3.6", name="RLASER").replace("RLASER 181 1.00", "RLASER 181 7.77")
     path = write(tmp_path / "a.clf", plain(0), rear, plain(1))
@@ -189,7 +210,7 @@ def test_two_scanners_in_one_log(tmp_path: Path) -> None:
         read_carmen(path)
     assert len(read_carmen(path, {"message": "FLASER"}).ranges) == 2
     assert read_carmen(path, {"message": "RLASER", "pose": "none"}).ranges[:, 0].tolist() == [777]
-    with pytest.raises(ConfigError, match="pattern"):
+    with pytest.raises(ConfigError, match="expected a message with ranges"):
         read_carmen(path, {"message": "ODOM"})
 
 

@@ -164,7 +164,13 @@ def test_damage(tmp_path: Path) -> None:
             "no column holds the lon",
         ),
         ("name,easting,northing,height_m", {"role": "gcp"}, {"crs": "EPSG:9518"}, CrsError, "heights are stated apart"),
-        ("name,easting,northing,height_m", {"role": "gpc"}, {"crs": "EPSG:25832"}, ConfigError, "'gcp' or 'check'"),
+        (
+            "name,easting,northing,height_m",
+            {"role": "gpc"},
+            {"crs": "EPSG:25832"},
+            ConfigError,
+            "expected one of: gcp, check",
+        ),
     ],
 )
 def test_nothing_is_guessed(tmp_path: Path, names: str, options: dict, stated: dict, error: type, says: str) -> None:

@@ -118,7 +118,7 @@ def test_layers_and_roles(tmp_path: Path) -> None:
     path = write(tmp_path / "a.gpkg", layer(), "first")
     write(path, layer(name=["X", "Y", "Z"]), "second")
     stated: dict[str, Any] = {"crs": "EPSG:25832", "map": UTM32}
-    with pytest.raises(ConfigError, match=r"has 2 layers; expected options\.layer, one of: first, second"):
+    with pytest.raises(ConfigError, match=r'has 2 layers; expected options\.layer = "first" or "second"'):
         read_log("control_vector", path, **stated)
     with pytest.raises(ConfigError, match="did you mean 'second'"):
         read_log("control_vector", path, {"layer": "secnd"}, **stated)

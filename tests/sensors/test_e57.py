@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_of
-from roadscan.sensors.e57_file import page_checksums, unpacked
+from roadscan.sensors.clouds.e57_file import page_checksums, unpacked
 from tests.sensors.e57_files import (
     PAGE,
     Column,

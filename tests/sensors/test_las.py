@@ -16,7 +16,7 @@ import pytest
 from roadscan.model.crs import Geoid
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
+from roadscan.sensors.base import SourceDefaults, format_named, format_of
 from tests.sensors.readings import read
 
 ADJUSTED = Clock(TimeSystem.GPS_ADJUSTED)
@@ -167,6 +167,15 @@ def test_week_seconds_under_the_adjusted_bit_are_refused(tmp_path: Path) -> None
         read("las", path)
     log = read("las", path, clock=Clock(TimeSystem.GPS_WEEK, week=2400))
     assert log.epochs[0] == (2400 * 604_800 + 100_000) * 10**9
+
+
+def test_the_week_of_all_logs_completes_seconds_of_the_week_alone(tmp_path: Path) -> None:
+    week = Clock(TimeSystem.GPS_WEEK, week=2400)
+    defaults = SourceDefaults(clock=Clock(TimeSystem.GPS), week=week)
+    weekly = cloud(tmp_path / "a.las", adjusted=False, times=np.linspace(100_000.0, 100_100.0, N))
+    assert read("las", weekly, defaults=defaults).epochs[0] == (2400 * 604_800 + 100_000) * 10**9
+    adjusted = cloud(tmp_path / "b.las")
+    assert np.array_equal(read("las", adjusted, defaults=defaults).epochs, read("las", adjusted).epochs)
 
 
 def test_week_seconds_need_the_week(tmp_path: Path) -> None:

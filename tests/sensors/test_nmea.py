@@ -22,8 +22,8 @@ from roadscan.model.crs import Geoid
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.sensors import text_table
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.nmea_writer import Fix, NmeaForm, sentences, write_nmea
+from roadscan.sensors.base import SourceDefaults, format_named, format_of
+from roadscan.sensors.motion.nmea_writer import Fix, NmeaForm, sentences, write_nmea
 from tests.sensors.log_reading import Log, read_log, source_of
 from tests.sensors.test_rtklib_pos import ecef, flat_geoid
 
@@ -272,6 +272,14 @@ def test_what_is_stated_wrongly(tmp_path: Path, options: dict, stated: dict, err
 
 
 # --- dates -------------------------------------------------------------------------------------------
+
+
+def test_the_date_of_all_logs_is_for_a_log_without_one(tmp_path: Path) -> None:
+    defaults = SourceDefaults(week=Clock(TimeSystem.GPS_WEEK, date=dt.date(2026, 5, 3)))
+    undated = write(tmp_path / "a.nmea", gga("093000.00"))
+    dated = write(tmp_path / "b.nmea", gga("093000.00"), rmc("093000.00", "040526"))
+    epochs = [read_log("nmea", file, **STATED, defaults=defaults).epochs[0] for file in (undated, dated)]
+    assert epochs == [gps_ns_from_utc(dt.datetime(2026, 5, day, 9, 30, tzinfo=dt.UTC)) for day in (3, 4)]
 
 
 def test_a_log_without_a_date_asks_for_it(tmp_path: Path) -> None:
@@ -570,7 +578,7 @@ def test_a_truncated_packed_log(tmp_path: Path) -> None:
 def test_a_clock_that_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sentences are not held for ever."""
     monkeypatch.setattr(text_table, "BLOCK_BYTES", 5000)
-    monkeypatch.setattr("roadscan.sensors.nmea.HELD_MAX", 100)
+    monkeypatch.setattr("roadscan.sensors.motion.nmea.HELD_MAX", 100)
     path = write(tmp_path / "a.nmea", rmc("093000.00", "040526"), *[gga("093000.00")] * 1000)
     log = read_log("nmea", path, **STATED)
     assert log.table.num_rows + sum(r.records for r in log.rejects) >= 1000

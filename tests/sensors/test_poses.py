@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.model.crs import Geoid
 from roadscan.model.errors import ConfigError, CrsError
 from roadscan.sensors.base import LogSource, NoOptions
-from roadscan.sensors.poses import (
+from roadscan.sensors.trajectories.poses import (
     GeodeticPlacement,
     WorldPlacement,
     body_quaternion,

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.psi import Psi, PsiStatement, statement_text
-from roadscan.sensors.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
+from roadscan.sensors.scanners.psi import Psi, PsiStatement, statement_text
+from roadscan.sensors.scanners.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
 from tests.sensors.readings import read
 
 ROWS, COLUMNS = 6, 10

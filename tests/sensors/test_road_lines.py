@@ -16,7 +16,7 @@ import shapely
 from roadscan.model.crs import Anchor, MapFrame
 from roadscan.model.errors import ConfigError, CrsError, FormatError
 from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.road_lines import TIGER_ROADS
+from roadscan.sensors.vectors.road_lines import TIGER_ROADS
 from tests.sensors.log_reading import Log, read_log
 
 UTM17 = MapFrame(crs="EPSG:26917")
@@ -190,7 +190,7 @@ def test_points_and_lines_are_told_apart(tmp_path: Path, recordings: Path) -> No
     with zipfile.ZipFile(empty, "w") as archive:
         archive.writestr("readme.txt", "nothing")
     assert not sniff(empty)
-    assert [p for p in recordings.rglob("*") if sniff(p)] == []
+    assert [p.name for p in recordings.rglob("*") if sniff(p)] == ["sidewalk_segments.gpkg"]  # the one layer of lines
 
 
 def test_the_files_of_a_shapefile_belong_together(tmp_path: Path) -> None:

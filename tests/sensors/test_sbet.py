@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import WEEK_S, Clock, TimeSystem
-from roadscan.sensors import sbet
 from roadscan.sensors.base import format_named, format_of
+from roadscan.sensors.trajectories import sbet
 from tests.sensors.log_reading import read_log, source_of
 
 WEEK = 2405

@@ -122,7 +122,7 @@ def test_short_batches_are_joined_and_a_damaged_one_costs_itself(tmp_path: Path)
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux states what a process holds")
 def test_a_long_log_is_passed_without_holding_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.sensors.scans._CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr("roadscan.sensors.scanners.scans._CHUNK_BYTES", 1 << 20)
     wide = np.arange(2000 * 4000, dtype=np.uint64).reshape(2000, 4000).astype(np.uint16)
     geometry = GEOMETRY | {"readings": 4000}
     write_arrow(

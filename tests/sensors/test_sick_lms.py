@@ -14,7 +14,7 @@ from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.sick_telegrams import (
+from roadscan.sensors.scanners.sick_telegrams import (
     Checksums,
     checksum,
     encode_scans,
@@ -439,7 +439,7 @@ def test_pieces_find_what_one_look_finds(tmp_path: Path, monkeypatch: pytest.Mon
     starts, ends, _ = find_telegrams(np.fromfile(path, dtype=np.uint8), is_end=True)
     assert starts.size >= 60
     for size in (7, 100, 1000):
-        monkeypatch.setattr("roadscan.sensors.sick_telegrams._PIECE_BYTES", size)
+        monkeypatch.setattr("roadscan.sensors.scanners.sick_telegrams._PIECE_BYTES", size)
         pieces = list(read_pieces(path))
         assert np.array_equal(np.concatenate([p.offset + p.starts for p in pieces]), starts)
         assert np.array_equal(np.concatenate([p.offset + p.ends for p in pieces]), ends)

@@ -208,7 +208,7 @@ def test_many_blocks_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     times = np.sort(rng.uniform(990, 1110, 2000))
     poses = sbet(tmp_path / "a.sbet", times.tolist())
     monkeypatch.setattr(text_table, "BLOCK_BYTES", 800)
-    monkeypatch.setattr("roadscan.sensors.sbet.CHUNK_RECORDS", 64)
+    monkeypatch.setattr("roadscan.sensors.trajectories.sbet.CHUNK_RECORDS", 64)
     log = sbet_with(poses, "acc.out")
     expected = np.interp(times, known, sigma, left=np.nan, right=np.nan)
     np.testing.assert_allclose(log.table.column("sigma_east_m").to_numpy(), expected, rtol=1e-5)

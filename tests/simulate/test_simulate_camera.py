@@ -19,8 +19,8 @@ from roadscan.model.errors import ConfigError
 from roadscan.model.rig import Rig, Sensor
 from roadscan.model.survey import ClockConfig
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.lens import Lens
 from roadscan.simulate.scene import Camera
+from roadscan.simulate.sensors.lens import Lens
 from tests.sensors.log_reading import read_log
 
 BARREL = (-0.22, 0.05, 0.002, -0.0015, 0.004)

@@ -18,8 +18,8 @@ from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.lidar import hdl32e_beams, measure
 from roadscan.simulate.run import SimulatedSurvey
+from roadscan.simulate.sensors.lidar import hdl32e_beams, measure
 from roadscan.simulate.surface import Surface
 from tests.simulate.chain import WEEK_NS, Chain
 

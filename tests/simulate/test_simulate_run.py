@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from roadscan.model.errors import ConfigError, FormatError
-from roadscan.simulate import Scene, profiler, simulate, trajectory, truth
+from roadscan.simulate import Scene, simulate, trajectory, truth
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.sensors import profiler
 from roadscan.simulate.surface import Surface
 
 TINY = Scene.load("demo").changed(
@@ -33,7 +34,7 @@ def test_same_seed_same_bytes(tmp_path: Path):
     simulate(scene, tmp_path / "a", write_hits=True)
     simulate(scene, tmp_path / "b", write_hits=True)
     first = hashes(tmp_path / "a")
-    assert len(first) == 7 + 2 * (5 + 1 + 3)
+    assert len(first) == 8 + 2 * (5 + 1 + 3)
     assert first == hashes(tmp_path / "b")
     # Again into the same folder: the same files.
     simulate(scene, tmp_path / "a", write_hits=True)

@@ -14,18 +14,18 @@ import pynmea2
 import pytest
 from pyins import strapdown
 
-from roadscan.jobs.ingest import ingest
+from roadscan.jobs.ingest.ingest import ingest
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, gps_ns_from_utc
 from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.clock import SensorClock
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.gnss import FIXED, FLOAT, solve
-from roadscan.simulate.imu import AT_BODY, felt, imu_of
 from roadscan.simulate.scene import ClockError
+from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.gnss import FIXED, FLOAT, solve
+from roadscan.simulate.sensors.imu import AT_BODY, felt, imu_of
 from roadscan.simulate.surface import Surface
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.store import Store
@@ -92,7 +92,7 @@ def test_imu_at_rest_feels_gravity_and_the_earths_rotation():
 
 def test_imu_grades_have_their_errors():
     scene = Scene.load("demo").changed(length_m=60.0, **BARE)
-    from roadscan.simulate.imu import _SensorErrors
+    from roadscan.simulate.sensors.imu import _SensorErrors
 
     for grade, noise in (("tactical", 50.0), ("mems", 150.0)):
         one = imu_of(scene.changed(imu={"on": True, "grade": grade}))

@@ -17,7 +17,7 @@ from roadscan.points.readings import ScanGeometry
 from roadscan.sensors.base import Reject, format_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.run import SimulatedSurvey
-from roadscan.simulate.sick import telegrams
+from roadscan.simulate.sensors.sick import telegrams
 from tests.sensors.log_reading import Log, source_of
 from tests.simulate.chain import WEEK_NS, Chain
 

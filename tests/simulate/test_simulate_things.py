@@ -13,8 +13,8 @@ import pytest
 from roadscan.simulate.caster import SLOT_NS, Hits, Pattern, World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.lidar import BODY_FROM_AXES, hdl32e_beams, measure
 from roadscan.simulate.scene import Mount, Scene
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, hdl32e_beams, measure
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_of, objects_table
 from tests.simulate import solids
@@ -415,7 +415,7 @@ def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch):
         return tuple(np.concatenate(column)[:600] for column in zip(*blocks, strict=True))
 
     first = whole()
-    monkeypatch.setattr("roadscan.simulate.lidar.BLOCK_PACKETS", 40)
+    monkeypatch.setattr("roadscan.simulate.sensors.lidar.BLOCK_PACKETS", 40)
     for a, b in zip(first, whole(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert first[1].max() > len(world.objects)  # the moving car was seen

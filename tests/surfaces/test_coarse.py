@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import generic_filter
 
-from roadscan.kernels.coarse import median_filter, natural_spline
+from roadscan.kernels.surface.coarse import median_filter, natural_spline
 from roadscan.surfaces.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING, CoarseSettings, Stretch, coarse_model
 from roadscan.surfaces.regions import FOUND, STATED, RegionSettings, find_regions, stated_regions
 from roadscan.tiles.grid import TileGrid

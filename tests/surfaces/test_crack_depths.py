@@ -11,16 +11,16 @@ import pytest
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
-from roadscan.kernels.quantiles_along import quantiles_along
+from roadscan.kernels.cracks.quantiles_along import quantiles_along
 from roadscan.model.distress import CrackDetection, CrackJoining
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surfaces.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
-from roadscan.surfaces.crack_network import join_cracks
-from roadscan.surfaces.cracks import crack_pieces
+from roadscan.surfaces.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
+from roadscan.surfaces.distress.crack_network import join_cracks
+from roadscan.surfaces.distress.cracks import crack_pieces
+from roadscan.surfaces.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.surfaces.heights import HeightWindow
 from roadscan.surfaces.lowest import LowestReadings
-from roadscan.surfaces.valley_lines import LINE_HALF, flank_cells
 
 Float64 = npt.NDArray[np.float64]
 

@@ -99,7 +99,7 @@ def test_one_triangle_alone_keeps_a_quadratic() -> None:
 
 
 def bezier(patch: np.ndarray, k: int, corners: np.ndarray, place: np.ndarray) -> tuple[float, np.ndarray]:
-    """Height and gradient of the cubic of edge k by de Casteljau, from the table in ``kernels.clough_tocher``."""
+    """Height and gradient of the cubic of edge k by de Casteljau; table: ``kernels/surface/clough_tocher``."""
     i, j, c = (k + 1) % 3, (k + 2) % 3, corners.mean(axis=0)
     net = {
         (3, 0, 0): patch[i], (0, 3, 0): patch[j], (0, 0, 3): patch[18],

@@ -10,8 +10,8 @@ from roadscan.model.distress import PotholeDetection, PotholeJoining
 from roadscan.model.errors import ConfigError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
+from roadscan.surfaces.distress.potholes import around_cells, join_potholes, pothole_pieces
 from roadscan.surfaces.heights import HeightWindow
-from roadscan.surfaces.potholes import around_cells, join_potholes, pothole_pieces
 
 CONFIG, JOINING = PotholeDetection(), PotholeJoining()
 CELL_M = 0.01

@@ -7,8 +7,8 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import eigsh, spsolve
 
-from roadscan.kernels.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
-from roadscan.kernels.supports import heights_by_support, least_risk
+from roadscan.kernels.cracks.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
+from roadscan.kernels.cracks.supports import CrackCells, Shapes, heights_by_support, least_risk
 from roadscan.model.errors import RoadscanError
 from roadscan.model.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH, detail_median, detail_pairs, lines_onward
@@ -268,9 +268,8 @@ def test_heights_by_support_like_least_squares(share):
     pairs, onward = detail_pairs(), lines_onward()
     off, own = np.empty((5, 6), np.float32), np.empty((5, 6), np.float32)
     middle, direction = np.linspace(-1, 1, 5), np.arange(5, dtype=np.uint8)
-    heights_by_support(
-        values, 6, row, column, middle, np.full(5, 0.5), 0.25, direction, onward, pairs, np.inf, off, own
-    )
+    cells = CrackCells(row, column, middle, np.full(5, 0.5), direction)
+    heights_by_support(values, 6, cells, 0.25, Shapes(onward, pairs), np.inf, off, own)
     for t in range(5):
         i, j = row[t] + 6, column[t] + 6
 

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from roadscan.codecs.parquet.list_table import is_list_table
 from roadscan.model.errors import StoreError
-from roadscan.tables.list_table import is_list_table
 from roadscan.tables.profiles import ProfileReader, Profiles
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -130,6 +130,7 @@ def test_reader_gives_back_what_was_written(name: str, store: Store) -> None:
     assert reader.read([]).range.shape[0] == 0
 
 
+@pytest.mark.own_codecs
 def test_row_groups_come_in_the_order_asked_for_into_one_buffer(folder: Store) -> None:
     rows = TABLES["random"]
     put(folder, rows)
@@ -198,6 +199,7 @@ def test_what_holds_no_scans_is_refused(store: Store) -> None:
             ProfileReader(store, FILE)
 
 
+@pytest.mark.own_codecs
 def test_any_damaged_byte_is_told_or_changes_nothing(folder: Store) -> None:
     """Each byte of the pages, and some of the footer; the mark that begins a Parquet file is not looked at."""
     rows = table(random(np.uint16, 12, 9, 900), random(np.uint8, 12, 9, 9), encoder_ticks=np.arange(12))
@@ -232,6 +234,7 @@ def test_a_file_cut_short_is_refused(kept: int, folder: Store) -> None:
         ProfileReader(folder, FILE)
 
 
+@pytest.mark.own_codecs
 def test_damage_names_file_and_row_groups(folder: Store) -> None:
     put(folder, TABLES["random"])
     path = Path(folder.path(FILE))

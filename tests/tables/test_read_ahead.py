@@ -90,6 +90,7 @@ def same(reader: ProfileReader, groups: list[int], rows: pa.Table) -> bool:
     )
 
 
+@pytest.mark.own_codecs
 def test_requests_go_out_before_their_groups_are_read(store: Store, rows: pa.Table) -> None:
     reader = ProfileReader(store, FILE)
     for groups in ([0, 1], [2, 3], [2, 3], [5]):
@@ -100,6 +101,7 @@ def test_requests_go_out_before_their_groups_are_read(store: Store, rows: pa.Tab
     assert len(SlowStore.requests) == 3  # a run of groups is one request, and none is made twice
 
 
+@pytest.mark.own_codecs
 def test_a_failed_request_is_told_where_its_groups_are_read(store: Store, rows: pa.Table) -> None:
     SlowStore.gate.set()
     SlowStore.broken.add(2)

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from roadscan.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.model.errors import StoreError
-from roadscan.tables.number_table import is_number_table, write_number_table
 from roadscan.tables.returns import Returns, ReturnsReader
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -116,6 +116,7 @@ def test_what_holds_no_returns_is_refused(tmp_path: Path) -> None:
         ReturnsReader(store, "tables/returns/missing.parquet")
 
 
+@pytest.mark.own_codecs
 def test_every_damaged_byte_that_is_read_is_told(tmp_path: Path) -> None:
     rows = TABLES["epochs of sweeps"]
     store = put(tmp_path, rows)

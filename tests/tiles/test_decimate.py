@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from roadscan.kernels.cells.decimate import Cells, Squares, decimate_cells
+from roadscan.kernels.cells.decimate_2x2 import decimate_2x2
+from roadscan.kernels.options import read_only
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.decimate import _fours, _squares, cells_per_square, decimate, patch_cells
+from roadscan.tiles.decimate import FLOOR_UM, cells_per_square, decimate, patch_cells
 from roadscan.tiles.grid import TileGrid
 
 EDGE = 40  # cells of 5 mm: a tile of 20 cm
@@ -147,8 +150,11 @@ def test_squares_of_four_cells_are_to_the_bit_those_of_any_size():
         cells = cells_of(height, rng.random((EDGE, EDGE)) < cover, 5)
         room = len(cells)
         kinds = np.uint16, np.uint16, np.float64, np.float32, np.uint32, np.uint32, np.bool_
-        fours, squares = ([np.empty(room, kind) for kind in kinds] for _ in range(2))
-        written = _fours(cells, 412.0, fours)
-        assert written == _squares(cells, 412.0, 2, 2, squares) > 0
+        fours, squares = (Squares(*(np.empty(room, kind) for kind in kinds)) for _ in range(2))
+        height_m = read_only(cells.height_robust_m)
+        own = Cells(cells.column, cells.row, height_m, cells.intensity_mean, cells.count)
+        starts = np.searchsorted(cells.row, np.arange(EDGE + 1))
+        written = decimate_2x2(own, starts, 412.0, FLOOR_UM, fours)
+        assert written == decimate_cells(own, 412.0, EDGE, 2, 2, FLOOR_UM, squares) > 0
         for one, other in zip(fours, squares, strict=True):
             assert np.array_equal(one[:written], other[:written])

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from roadscan.model.ids import TileId
-from roadscan.tiles.blocks import Block, cut_blocks, halo_tiles_for
+from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.grid import Bounds, TileGrid
 
 GRID = TileGrid(10.0, 0.05)
@@ -46,7 +46,6 @@ def test_blocks_hold_every_tile_once(readings: dict[TileId, int], edge: int, lim
 
 
 def test_halo_surrounds_each_tile() -> None:
-    block = Block((TileId(5, 5), TileId(6, 5)), halo_tiles_for(12.0, GRID))
-    assert block.halo_tiles == 2
+    block = Block((TileId(5, 5), TileId(6, 5)), 2)
     assert block.box() == (3, 3, 9, 8)
     assert len(block.with_halo()) == 6 * 5

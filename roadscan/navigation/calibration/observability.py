@@ -94,13 +94,6 @@ class Observability:
         """Those of them that a sensor has part in."""
         return tuple(d.words for d in self.directions if not d.determined and any(p.sensor == sensor for p in d.parts))
 
-    def determined_share(self, unknowns: Unknowns, sensor: str) -> Float64:
-        """(7,) how much of each unknown's prior variance lies in determined directions; NaN where it is held fixed."""
-        place = unknowns.mounting_slice(sensor)
-        share = (self.free[place] ** 2).sum(axis=1)
-        share[np.diag(unknowns.root)[place] == 0.0] = np.nan
-        return np.asarray(share)
-
     def updated(self, information: Float64, unknowns: Unknowns) -> Observability:
         """The same split with the covariance of information at another place.
 

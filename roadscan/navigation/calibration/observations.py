@@ -20,7 +20,7 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.calibration import tie_residuals, tie_rows
+from roadscan.kernels.calibration.ties import tie_residuals, tie_rows
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.evidence import Directions, Evidence, Known, Orientation, Seen, Ties
 from roadscan.navigation.calibration.orientations import OrientationObservations

@@ -17,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.inertial import increments, turned_frame
+from roadscan.kernels.inertial.strapdown import increments, turned_frame
 from roadscan.model.errors import NavigationError
-from roadscan.model.frames import quaternion_from_rotation
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 from roadscan.navigation.inertial.timeline import merged
@@ -283,8 +282,3 @@ def _aligned(
         sigma_velocity_m_per_s=1.0 + 2.0 * early,
         ready_gps_ns=ready,
     )
-
-
-def quaternion_of(alignment: Alignment) -> Float64:
-    """(4,) ECEF from IMU."""
-    return quaternion_from_rotation(alignment.ecef_from_imu)

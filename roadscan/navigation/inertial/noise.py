@@ -19,10 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
-from roadscan.kernels.kalman_states import Fixes
-from roadscan.model.imu import ImuErrors
+from roadscan.kernels.inertial.kalman_states import Fixes
 from roadscan.model.smoothing import SmootherConfig
-from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings
+from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 
 Float64 = npt.NDArray[np.float64]
 
@@ -57,11 +56,12 @@ def usable(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
 
 def fixes_of(gnss: GnssSolutions, config: SmootherConfig) -> Fixes:
     """Solutions with their noise as the filter takes it; all of them :func:`usable`."""
-    covariance = _covariance(gnss, config)
+    covariance = _covariance(gnss, config) * config.gnss_position_factor**2
     slow = np.where(gnss.quality == "fixed", config.gnss_correlated_share, _SLOW_SHARE)
     default = np.array([QUALITIES[str(q)].velocity_m_per_s for q in gnss.quality])
     sigma = gnss.sigma_velocity_ned_m_per_s * config.gnss_sigma_factor
     sigma = np.maximum(np.where(np.isfinite(sigma), sigma, default[:, None]), config.gnss_floor_velocity_m_per_s)
+    sigma *= config.gnss_velocity_factor
     return Fixes(
         position=np.ascontiguousarray(gnss.position_world_m),
         white=covariance * (1.0 - slow)[:, None, None],
@@ -99,18 +99,23 @@ _TREMBLING_S: Final = 1.0
 
 
 def imu_noise(
-    imu: ImuReadings, errors: ImuErrors, config: SmootherConfig, epochs: npt.NDArray[np.int64]
+    imu: ImuReadings, vehicle: VehicleSensors, config: SmootherConfig, epochs: npt.NDArray[np.int64]
 ) -> tuple[Float64, Float64]:
     """Noise of gyroscopes (rad²/s) and accelerometers (m²/s³), (k, 3) in the IMU's axes, about epochs (k,)."""
+    errors = vehicle.imu_errors
     gyro = max(float(np.radians(errors.gyro_noise_deg_per_sqrt_h)) / 60.0, _LEAST_DENSITY)
     accel = max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY)
     at = np.clip(np.searchsorted(imu.epochs_gps_ns, epochs), 0, imu.epochs_gps_ns.size - 1)
     step = float(np.median(np.diff(imu.epochs_gps_ns))) * 1e-9
     share = config.vibration_share**2 * step
     size = round(_TREMBLING_S / step)
+    level, down = config.imu_factor_horizontal**2, config.imu_factor_vertical**2
+    along_down = vehicle.body_from_imu[2] ** 2
+    factor = level * (1.0 - along_down) + down * along_down
+    # Vibration may be found to fold back less than it is taken to; a data sheet is no upper limit.
     return (
-        gyro**2 + share * _trembling(imu.angular_rate_rad_per_s, size)[at],
-        accel**2 + share * _trembling(imu.specific_force_m_per_s2, size)[at],
+        gyro**2 * max(level, 1.0) + share * _trembling(imu.angular_rate_rad_per_s, size)[at] * level,
+        accel**2 * np.maximum(factor, 1.0) + share * _trembling(imu.specific_force_m_per_s2, size)[at] * factor,
     )
 
 

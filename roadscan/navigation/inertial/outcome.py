@@ -30,6 +30,9 @@ FAR_SHARE: Final = 0.05
 CONTRADICTED: Final = 1 / 3
 """Greatest share of another kind of measurement that may be outliers where positions disagree."""
 _DOUBTFUL: Final = 0.1
+"""Share of outliers above which a kind of measurement doubts the trajectory."""
+_LARGE: Final = 3.0
+"""RMS of innovations over their σ above which it does."""
 _LEAST: Final = 20
 _CAUSE: Final = (
     "check axes, signs and units of the IMU (its horizontal axes above all), its errors in the rig file, clocks, the "
@@ -109,6 +112,56 @@ def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSenso
         change=_CAUSE,
         record=record,
     )
+
+
+@dataclass(frozen=True)
+class KindFigures:
+    """What became of the updates of a kind."""
+
+    kind: str
+    updates: int
+    outliers: float
+    """Share that counts less than stated."""
+    innovation: float
+    """RMS of the innovations over their predicted σ."""
+
+
+def figures_of(solution: Solution) -> list[KindFigures]:
+    """Figures of the updates by kind, those of GNSS also together as 'gnss'."""
+    found = solution.innovations
+    if found is None:
+        return []
+    rows = {str(kind): found.kind == kind for kind in np.unique(found.kind)}
+    rows = {"gnss": np.char.startswith(found.kind.astype(str), "gnss"), **rows}
+    return [
+        KindFigures(
+            kind,
+            int(own.sum()),
+            float((found.weight[own] < 1.0).mean()),
+            float(np.sqrt(found.normalised[own].mean())),
+        )
+        for kind, own in rows.items()
+        if own.any()
+    ]
+
+
+def warnings_of(solution: Solution) -> list[str]:
+    """In words, the kinds of measurement of which many are outliers, or whose innovations are large.
+
+    A receiver that errs often does that as well as a trajectory that is wrong: :func:`check_outcome` tells which.
+    """
+    said = []
+    for one in figures_of(solution):
+        if one.updates < _LEAST or one.kind.startswith(("gnss ", "zero")):
+            continue
+        found = []
+        if one.outliers > _DOUBTFUL:
+            found.append(f"{one.outliers:.0%} of {one.updates:,} updates are outliers (at most {_DOUBTFUL:.0%})")
+        if one.innovation > _LARGE:
+            found.append(f"innovations are {one.innovation:.1f} σ (RMS; at most {_LARGE:g})")
+        if found:
+            said.append(f"'{one.kind}': {' and '.join(found)}")
+    return [f"measurements disagree with the trajectory: {'; '.join(said)}: {_CAUSE}"] if said else []
 
 
 def _doubted(solution: Solution) -> dict[str, float]:

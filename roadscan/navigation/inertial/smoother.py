@@ -1,9 +1,10 @@
 """The smoother: a trajectory from IMU, GNSS and odometer.
 
-A loosely coupled error-state Kalman filter (:mod:`roadscan.kernels.kalman`) runs forwards over a run, a smoother
-(:mod:`roadscan.kernels.kalman_smoother`) back. The order of things is :mod:`~roadscan.navigation.inertial.timeline`,
-the first attitude :mod:`~roadscan.navigation.inertial.alignment`, standstill
-:mod:`~roadscan.navigation.inertial.standing`, the trust in readings :mod:`~roadscan.navigation.inertial.noise`.
+A loosely coupled error-state Kalman filter (:mod:`roadscan.kernels.inertial.kalman`) runs forwards over a run, a
+smoother (:mod:`roadscan.kernels.inertial.kalman_smoother`) back. The order of things is
+:mod:`~roadscan.navigation.inertial.timeline`, the first attitude :mod:`~roadscan.navigation.inertial.alignment`,
+standstill :mod:`~roadscan.navigation.inertial.standing`, the trust in readings
+:mod:`~roadscan.navigation.inertial.noise`.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.kernels.kalman import filter_forwards
-from roadscan.kernels.kalman_smoother import Poses, smooth_backwards, spread
-from roadscan.kernels.kalman_states import NAVIGATION, Layout, Model, Nodes, Record, Start, Track, Updates
+from roadscan.kernels.inertial.kalman import filter_forwards
+from roadscan.kernels.inertial.kalman_smoother import Poses, smooth_backwards, spread
+from roadscan.kernels.inertial.kalman_states import NAVIGATION, Layout, Model, Nodes, Record, Start, Track, Updates
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import quaternion_from_rotation
@@ -142,7 +143,7 @@ def _solve_piece(
     layout = _layout(odometer, vehicle, config)
     model = _model(vehicle, config)
     start = _start(alignment, vehicle, config, layout, odometer)
-    whole = timeline(imu, gnss, odometer, still, vehicle.imu_errors, config)
+    whole = timeline(imu, gnss, odometer, still, vehicle, config)
     start = _refined(start, alignment, whole, model, layout, vehicle)
     return _Run.of(whole, model, layout, start, smooth=smooth).solution(gnss.world, vehicle, config, smooth=smooth)
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.inertial import increments
-from roadscan.kernels.kalman_states import Fixes, Nodes, Steps
-from roadscan.model.imu import ImuErrors
+from roadscan.kernels.inertial.kalman_states import Fixes, Nodes, Steps
+from roadscan.kernels.inertial.strapdown import increments
 from roadscan.model.smoothing import SmootherConfig
 from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise
-from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
+from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.standing import odometer_distance
 
 Float64 = npt.NDArray[np.float64]
@@ -65,7 +64,7 @@ def timeline(
     gnss: GnssSolutions,
     odometer: OdometerReadings | None,
     still: Bool,
-    errors: ImuErrors,
+    vehicle: VehicleSensors,
     config: SmootherConfig,
 ) -> Timeline:
     """Lay out the piece between the first and the last IMU sample.
@@ -73,7 +72,7 @@ def timeline(
     Parameters
     ----------
     imu : unbroken but for gaps up to `max_imu_gap_s`; gnss : usable solutions; still : (n,) standing samples.
-    errors : of the IMU.
+    vehicle : how the IMU sits on it, and how good it is.
     """
     epochs = imu.epochs_gps_ns
     gnss = _within(gnss, int(epochs[0]), int(epochs[-1]))
@@ -83,7 +82,7 @@ def timeline(
     return Timeline(
         bounds,
         _steps(imu, bounds, config),
-        _nodes(imu, gnss, odometer, still, errors, config, node_epochs, bound),
+        _nodes(imu, gnss, odometer, still, vehicle, config, node_epochs, bound),
         fixes_of(gnss, config),
         np.searchsorted(bounds, epochs),
     )
@@ -151,7 +150,7 @@ def _nodes(
     gnss: GnssSolutions,
     odometer: OdometerReadings | None,
     still: Bool,
-    errors: ImuErrors,
+    vehicle: VehicleSensors,
     config: SmootherConfig,
     epochs: Int64,
     bound: Int64,
@@ -166,7 +165,7 @@ def _nodes(
     long_enough = np.append(False, np.diff(epochs) >= _SHORTEST_NS)
     stands = _whole(imu.epochs_gps_ns, still, epochs) & long_enough & config.land_vehicle
     travel = np.where(long_enough, _travel(odometer, epochs), np.nan)
-    rate_noise, force_noise = imu_noise(imu, errors, config, epochs)
+    rate_noise, force_noise = imu_noise(imu, vehicle, config, epochs)
     return Nodes(
         bound=bound,
         colour_keep=keep,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.navigation.calibration.estimator import Calibrated, Calibration, Figures
 from roadscan.navigation.calibration.rotations import logarithm
@@ -22,7 +24,46 @@ _HELD: Final = 0.9
 """σ above this share of the prior's: not determined."""
 
 
-def draw_calibration(path: Path, calibration: Calibration, title: str) -> None:
+@dataclass(frozen=True)
+class SensorChange:
+    """How the mounting of a sensor changed: six numbers each, lever arm (m), then boresight (rad)."""
+
+    change: npt.NDArray[np.float64]
+    sigma: npt.NDArray[np.float64]
+    prior_sigma: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CalibrationPicture:
+    """What is drawn: it can be kept as JSON and drawn again."""
+
+    title: str
+    undetermined: tuple[str, ...]
+    """Directions that the evidence does not determine, in words."""
+    sensors: dict[str, SensorChange]
+    figures: tuple[Figures, ...]
+
+    @classmethod
+    def of(cls, calibration: Calibration, title: str) -> CalibrationPicture:
+        """What is drawn of a calibration."""
+        sensors = {n: SensorChange(_change(one), one.sigma, one.prior_sigma) for n, one in calibration.sensors.items()}
+        return cls(title, tuple(calibration.observability.undetermined), sensors, calibration.figures)
+
+    def as_values(self) -> dict[str, Any]:
+        """Numbers, texts and lists of them."""
+        sensors = {n: {k: v.tolist() for k, v in vars(one).items()} for n, one in self.sensors.items()}
+        figures = [asdict(one) for one in self.figures]
+        return {"title": self.title, "undetermined": self.undetermined, "sensors": sensors, "figures": figures}
+
+    @classmethod
+    def of_values(cls, values: dict[str, Any]) -> CalibrationPicture:
+        """The inverse of :meth:`as_values`."""
+        sensors = {n: SensorChange(**{k: np.array(v) for k, v in s.items()}) for n, s in values["sensors"].items()}
+        figures = tuple(Figures(**one) for one in values["figures"])
+        return cls(values["title"], tuple(values["undetermined"]), sensors, figures)
+
+
+def draw_calibration(path: Path, calibration: CalibrationPicture) -> None:
     """Write one PNG; the same calibration gives the same bytes.
 
     Above, the change of each lever arm and boresight with 1 σ, and the prior 1 σ as a grey band: hollow where the
@@ -30,9 +71,9 @@ def draw_calibration(path: Path, calibration: Calibration, title: str) -> None:
     """
     figure = empty_figure(13.0, 9.0, 110)
     grid = figure.add_gridspec(2, 2, height_ratios=[1.2, 1.0])
-    held = calibration.observability.undetermined
+    held = calibration.undetermined
     words = "all mountings determined" if not held else "not determined: " + "; ".join(held[:4])
-    figure.suptitle(f"{title}, calibration\n{words}", fontsize=10, x=0.01, ha="left")
+    figure.suptitle(f"{calibration.title}, calibration\n{words}", fontsize=10, x=0.01, ha="left")
     _draw_changes(figure.add_subplot(grid[0, 0]), calibration, slice(0, 3), 1e3, "mm", _LEVER)
     _draw_changes(figure.add_subplot(grid[0, 1]), calibration, slice(3, 6), 180.0 / np.pi, "°", _ANGLES)
     _draw_residuals(figure.add_subplot(grid[1, :]), calibration)
@@ -45,13 +86,13 @@ def draw_calibration(path: Path, calibration: Calibration, title: str) -> None:
 
 
 def _draw_changes(
-    axes: Axes, calibration: Calibration, part: slice, scale: float, unit: str, names: tuple[str, ...]
+    axes: Axes, calibration: CalibrationPicture, part: slice, scale: float, unit: str, names: tuple[str, ...]
 ) -> None:
     count = max(len(calibration.sensors), 1)
     for number, (sensor, one) in enumerate(calibration.sensors.items()):
         x = np.arange(3) + (number - (count - 1) / 2) * 0.7 / count
         colour = _COLOURS[number % len(_COLOURS)]
-        change, sigma, prior = (scale * v[part] for v in (_change(one), one.sigma, one.prior_sigma))
+        change, sigma, prior = (scale * v[part] for v in (one.change, one.sigma, one.prior_sigma))
         axes.bar(x, 2 * prior, bottom=-prior, width=0.6 / count, color="#dddddd", zorder=0)
         for k in range(3):
             is_held = sigma[k] > _HELD * prior[k]
@@ -71,7 +112,7 @@ def _draw_changes(
     axes.legend(fontsize=8)
 
 
-def _draw_residuals(axes: Axes, calibration: Calibration) -> None:
+def _draw_residuals(axes: Axes, calibration: CalibrationPicture) -> None:
     shown = [f for f in calibration.figures if f.count]
     y = np.arange(len(shown))[::-1]
     before = np.array([max(f.rms_before, 1e-3) for f in shown])

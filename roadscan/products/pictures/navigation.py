@@ -46,7 +46,7 @@ class NavigationPicture:
     """Run, and what else names it."""
     solution: Solution
     gnss: GnssSolutions
-    """As the smoother took them."""
+    """Of the run, on GPS time."""
     antenna_lever_arm_body_m: Float64
     """(3,) from the IMU reference point, forward, right, down."""
 

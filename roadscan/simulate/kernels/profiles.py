@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -78,43 +79,74 @@ def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
         beam[axis, 2] = planes[p, axis, 5]
 
 
+class Planes(NamedTuple):
+    """Planes of p profiles as polynomials of a reading's y and of its range from their middle range."""
+
+    in_road: Float64
+    """(p, 3, 9) station, offset, height, see :func:`road_beam`."""
+    in_map: Float64
+    """(p, 3, 6) easting, northing, height, see :func:`map_beam`."""
+    is_bent: Flags
+    """(p,) whether the road bends so much here that `in_road` is only a first approximation."""
+    middle_m: float
+    """Middle range."""
+
+
+class Bodies(NamedTuple):
+    """Things that may stand in the beams' way."""
+
+    standing: Float64
+    """(b, 18) see :mod:`roadscan.simulate.kernels.things`; the last m rows are overwritten by what moves."""
+    moving: Float64
+    """(p, m, 18) what moves, as it is at each profile."""
+
+
+class Head(NamedTuple):
+    """A head's readings, and the errors that it makes."""
+
+    y_sensor_m: Float64
+    """(n,) transverse positions of the readings."""
+    range_offset_m: float
+    """Range of raw 0."""
+    range_step_m: float
+    lost_share: float
+    """Of readings without a return."""
+    range_noise_m: float
+    """1 σ."""
+    intensity_noise: float
+    """1 σ."""
+    wrong_share: float
+    """Of wrong readings."""
+    wrong_within_m: float
+    """How far these lie off."""
+    normal: Float32
+    """(65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind."""
+    random_from: np.uint64
+    """Where the random numbers of the first reading begin; reading i of profile p has its own."""
+
+
+class Measured(NamedTuple):
+    """What is measured; written by :func:`scan_profiles`."""
+
+    ranges: UInt16
+    """(p, n) raw."""
+    intensity: UInt8
+    """(p, n)"""
+    true_range_m: Float64
+    """(p, n); NaN where the beam misses. (0, 0): not wanted."""
+    body_hit: Int32
+    """(p, n) row of the body that the beam meets, −1: none. (0, 0): not wanted."""
+
+
 @compiled
 def scan_profiles(
-    road: RoadArrays,
-    road_planes: Float64,
-    map_planes: Float64,
-    is_bent: Flags,
-    y_sensor_m: Float64,
-    scale: Float64,
-    bodies: Float64,
-    movers: Float64,
-    normal: Float32,
-    random_from: np.uint64,
-    beam: Float64,
-    ranges: UInt16,
-    intensity: UInt8,
-    true_range_m: Float64,
-    body_hit: Int32,
+    road: RoadArrays, planes: Planes, obstacles: Bodies, head: Head, beam: Float64, out: Measured
 ) -> None:
-    """Measure profiles of a triangulation head.
-
-    Parameters
-    ----------
-    road_planes, map_planes : (p, 3, 9), see :func:`road_beam`, and (p, 3, 6), see :func:`map_beam`.
-    is_bent : (p,) whether the road bends so much here that `road_planes` are only a first approximation.
-    y_sensor_m : (n,) transverse positions of the readings.
-    scale : (8,) middle range of the planes (m), range of raw 0 (m), range step (m), share of lost readings, range
-        noise (m), intensity noise, share of wrong readings and how far they lie off (m).
-    bodies : (b, 18) things that may stand in the beams' way, see :mod:`roadscan.simulate.kernels.things`; the last m
-        rows are overwritten by what moves.
-    movers : (p, m, 18) what moves, as it is at each profile.
-    normal : (65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind.
-    random_from : where the random numbers of the first reading begin; reading i of profile p has its own.
-    beam : (3, 3) scratch.
-    ranges, intensity : (p, n), out.
-    true_range_m : (p, n), out; NaN where the beam misses. (0, 0): not wanted.
-    body_hit : (p, n), out; row of the body that the beam meets, −1: none. (0, 0): not wanted.
-    """
+    """Measure profiles of a triangulation head; beam : (3, 3) scratch."""
+    road_planes, map_planes, is_bent, middle_m = planes
+    bodies, movers = obstacles
+    y_sensor_m, normal, random_from = head.y_sensor_m, head.normal, head.random_from
+    ranges, intensity, true_range_m, body_hit = out
     for p in range(road_planes.shape[0]):
         place_movers(bodies, movers, p)
         before = 0.0
@@ -130,7 +162,7 @@ def scan_profiles(
                 map_beam(map_planes, p, y, beam)
                 r, k, u, offset = polished_range(road, beam, r, fall, k)
                 road_beam(road_planes, p, y, beam)
-            found = scale[0] + r
+            found = middle_m + r
             depth = 0.0
             if road.nodes[k, DEFECTS] < road.nodes[k, DEFECTS_END]:
                 depth, _ = defect_depth(road, k, u, offset)
@@ -142,7 +174,7 @@ def scan_profiles(
                     road_beam(road_planes, p, y, beam)
             stone = 0.0
             if road.texture.size:
-                stone = over_texture(road, beam, found - scale[0], road.nodes[k, STATION] + u, offset, r)
+                stone = over_texture(road, beam, found - middle_m, road.nodes[k, STATION] + u, offset, r)
                 found -= stone / fall
             seen = on_surface(road, k, u, offset)
             value = brightness(road, k, u, offset, depth, stone)
@@ -150,9 +182,9 @@ def scan_profiles(
             body = -1
             if bodies.shape[0]:
                 map_beam(map_planes, p, y, beam)
-                body, found = in_the_way(bodies, beam, scale[0], found, bits)
+                body, found = in_the_way(bodies, beam, middle_m, found, bits)
                 if body >= 0:
-                    r_body = found - scale[0]
+                    r_body = found - middle_m
                     value = shade(
                         bodies,
                         body,
@@ -165,12 +197,14 @@ def scan_profiles(
                 true_range_m[p, i] = found if seen else np.nan
                 body_hit[p, i] = body
             if normal.size:
-                found += scale[4] * normal[bits & np.uint64(0xFFFF)]
-                value += scale[5] * normal[(bits >> np.uint64(16)) & np.uint64(0xFFFF)]
-                seen = seen and float((bits >> np.uint64(32)) & np.uint64(0xFFFF)) >= scale[3] * 65536.0
-                if float(bits >> np.uint64(48)) < scale[6] * 65536.0:
-                    found += scale[7] * (2.0 * float(mixed(bits) >> np.uint64(11)) / 9007199254740992.0 - 1.0)
-            raw = math.floor((found - scale[1]) / scale[2] + 0.5)
+                found += head.range_noise_m * normal[bits & np.uint64(0xFFFF)]
+                value += head.intensity_noise * normal[(bits >> np.uint64(16)) & np.uint64(0xFFFF)]
+                seen = seen and float((bits >> np.uint64(32)) & np.uint64(0xFFFF)) >= head.lost_share * 65536.0
+                if float(bits >> np.uint64(48)) < head.wrong_share * 65536.0:
+                    found += head.wrong_within_m * (
+                        2.0 * float(mixed(bits) >> np.uint64(11)) / 9007199254740992.0 - 1.0
+                    )
+            raw = math.floor((found - head.range_offset_m) / head.range_step_m + 0.5)
             seen = seen and 1.0 <= raw <= 65535.0
             ranges[p, i] = int(raw) if seen else 0
             intensity[p, i] = int(min(max(value + 0.5, 0.0), 255.0)) if seen else 0

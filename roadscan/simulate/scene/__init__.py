@@ -15,7 +15,7 @@ from typing import Any, Self
 from pydantic import BaseModel, Field, model_validator
 
 from roadscan.model.errors import ConfigError, nearest
-from roadscan.model.strict import Strict, load_toml
+from roadscan.model.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.scene.rig import (
     Camera,
     ClockError,
@@ -61,7 +61,6 @@ __all__ = [
 ]
 
 _EARLIEST, _LATEST = dt.datetime(1981, 1, 1, tzinfo=dt.UTC), dt.datetime(2080, 1, 1, tzinfo=dt.UTC)
-_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 
 
 class MapScene(Strict):
@@ -83,7 +82,7 @@ class MapScene(Strict):
 class Scene(Strict):
     """A simulated survey, whole. Every field has a default; ``Scene()`` is a straight road without defects."""
 
-    id: str = Field(default="simulated", pattern=_NAME)
+    id: str = Field(default="simulated", pattern=NAME_PATTERN)
     """Name of the survey."""
     title: str = "Simulated survey"
     """One line about it."""

@@ -172,9 +172,9 @@ class Joints(Strict):
     """Width at the surface (m)."""
     depth_m: float = Field(default=0.012, gt=0.0, le=0.1)
     """Depth below the surface (m)."""
-    start_m: float = float("-inf")
+    start_m: float = Field(default=float("-inf"), allow_inf_nan=True)
     """First station (m)."""
-    end_m: float = float("inf")
+    end_m: float = Field(default=float("inf"), allow_inf_nan=True)
     """Last station (m)."""
 
 
@@ -260,9 +260,9 @@ class Marking(Strict):
     """Length of a dash (m); 0: a solid line."""
     gap_m: float = Field(default=0.0, ge=0.0)
     """Length of the gap between dashes (m)."""
-    start_m: float = float("-inf")
+    start_m: float = Field(default=float("-inf"), allow_inf_nan=True)
     """First station (m)."""
-    end_m: float = float("inf")
+    end_m: float = Field(default=float("inf"), allow_inf_nan=True)
     """Last station (m)."""
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pydantic import Field
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from roadscan.kernels.calibration_surfaces import MOMENTS, UNKNOWNS, match_patches, splat
+from roadscan.kernels.calibration.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches, splat
 from roadscan.model.errors import NavigationError
 from roadscan.model.strict import Strict
 from roadscan.navigation.calibration.evidence import Seen, Ties, Traverse
@@ -58,7 +58,7 @@ class HeightLevel(Strict):
     """From patch to patch (m)."""
     reach_m: float = Field(gt=0.0)
     """Patches that would have to move farther are left out (m)."""
-    steepest: float = Field(default=float("inf"), gt=0.0)
+    steepest: float = Field(default=float("inf"), gt=0.0, allow_inf_nan=True)
     """Cells on steeper slopes (m/m) are left out: edges lie between two readings, and no interpolation finds them."""
 
 
@@ -318,7 +318,7 @@ def match(first: Image, second: Image, at: HeightLevel, settings: HeightSettings
     least = int(settings.covered * (size / step) ** 2)
     match_patches(
         first.height_m, second.height_m, at.cell_m, corner, size, step, settings.iterations, least,
-        shift, crossed, mean, spread, used, felt,
+        Matches(shift, crossed, mean, spread, used, felt),
     )  # fmt: skip
     centre = first.corner_m + at.cell_m * (corner[:, ::-1] + 0.5 * (size - 1))
     # A pose that is off is so for all patches across the drive: together they know no more than one.

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.calibration_surfaces import place
+from roadscan.kernels.calibration.surface_patches import place
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.calibration.evidence import Seen, Traverse

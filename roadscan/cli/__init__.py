@@ -1,0 +1,76 @@
+"""The command line. Heavy imports happen inside the commands: `roadscan --help` must be quick.
+
+Each module holds the commands of one group as plain functions; they become commands here, in the order of the help.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from typing import Annotated
+
+import typer
+
+from roadscan import __version__
+from roadscan.cli import cameras, estimates, exports, logs, queries, runs, simulations, state
+from roadscan.cli.added_stages import Commands
+from roadscan.cli.ending import ending_well
+
+app = typer.Typer(
+    name="roadscan",
+    cls=Commands,
+    help="Raw logs of a road survey in; pavement surfaces, point clouds and tables out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"roadscan {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def roadscan(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Raw logs of a road survey in; pavement surfaces, point clouds and tables out."""
+
+
+app.command("run")(runs.run)
+app.command("ingest")(runs.ingest)
+app.command("navigate")(runs.navigate)
+app.command("clocks")(estimates.clocks)
+app.command("calibrate")(estimates.calibrate)
+app.command("footprints")(runs.footprints)
+app.command("tile")(runs.tile)
+app.command("surfaces")(runs.surfaces)
+app.command("products")(runs.make_products)
+app.command("reprocess")(runs.reprocess)
+app.command("status")(state.status)
+app.command("verify")(state.verify)
+app.command("sql")(queries.sql)
+app.command("export")(exports.export)
+app.command("classes")(exports.classes)
+app.command("formats")(logs.list_formats)
+app.command("inspect")(logs.inspect_files)
+app.command("init")(logs.first_survey)
+app.command("simulate")(simulations.simulate)
+app.command("scenes")(simulations.list_scenes)
+app.command("demo")(simulations.demo)
+
+camera = typer.Typer(help="Interior orientation and mounting of cameras.", no_args_is_help=True)
+camera.command("interior")(cameras.camera_interior)
+camera.command("resect")(cameras.camera_resect)
+app.add_typer(camera, name="camera")
+
+
+def main() -> None:
+    """Run the command line; an error the user can mend is printed without a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that knows no "─" or "σ" stops nothing
+    ending_well(app)

@@ -1,0 +1,67 @@
+"""Commands that write readings as files of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadscan.cli.arguments import SurveyFile
+from roadscan.cli.terminal import new_reporter, print_table
+
+
+def export(
+    survey_file: SurveyFile,
+    format_: Annotated[str, typer.Option("--format", help="psi (a run's profiles) or opencrg (a pass's heights).")],
+    run_id: Annotated[str, typer.Option("--run", help="Run.")],
+    sensor: Annotated[str, typer.Option(help="Sensor of the rig.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to; new or empty.")],
+    length: Annotated[float, typer.Option(help="psi: road a file (m).")] = 5.0,
+    pass_id: Annotated[int | None, typer.Option("--pass", help="opencrg: pass, where the run has several.")] = None,
+    u_step: Annotated[float, typer.Option(help="opencrg: distance from row to row (m).")] = 0.05,
+    v_step: Annotated[float, typer.Option(help="opencrg: distance from column to column (m).")] = 0.05,
+    left: Annotated[float, typer.Option(help="opencrg: reach to the left of the driven path (m).")] = 2.0,
+    right: Annotated[float, typer.Option(help="opencrg: reach to the right of the driven path (m).")] = 2.0,
+    smoothing: Annotated[float, typer.Option(help="opencrg: length over which the path is smoothed (m).")] = 10.0,
+    hole: Annotated[float, typer.Option(help="opencrg: longest hole closed by straight lines (m).")] = 0.25,
+    encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI",
+) -> None:
+    """Ingested readings as files of other programs: PSI containers or an OpenCRG grid."""
+    from roadscan.jobs.export.export_opencrg import CrgSettings, export_opencrg
+    from roadscan.jobs.export.export_psi import PsiSettings, export_psi
+    from roadscan.model.errors import ConfigError
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    store = Store(loaded.store_url, loaded.config.id)
+    if format_ == "psi":
+        written = export_psi(loaded, store, run_id, sensor, out, PsiSettings(length))
+    elif format_ == "opencrg":
+        settings = CrgSettings(pass_id, u_step, v_step, left, right, smoothing, hole, encoding)
+        written = export_opencrg(loaded, store, run_id, sensor, out, settings)
+    else:
+        raise ConfigError(f"--format {format_}", expected="psi or opencrg")
+    for note in written.notes:
+        typer.echo(note)
+    typer.echo(f"{len(written.files):,} files in {out}")
+
+
+def classes(
+    survey_file: SurveyFile,
+    run: Annotated[str, typer.Option(help="Run of the survey file.")],
+    sensor: Annotated[str, typer.Option(help="Sensor whose readings are classed.")],
+    out: Annotated[Path, typer.Option(help="Parquet file to write.")],
+) -> None:
+    """What became of every reading of a sensor, and which filter left it out: one row a reading."""
+    from roadscan.jobs.export.classes import write_classes
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    reporter = new_reporter()
+    store = Store(loaded.store_url, loaded.config.id)
+    counts = write_classes(loaded, store, run, sensor, out, lambda d, t: reporter.progress("classes", d, t))
+    reporter.close()
+    print_table(("class", "readings"), [(name, f"{count:,}") for name, count in counts.items()])

@@ -1,0 +1,111 @@
+"""Commands before a survey: the formats there are, what a file is, and a first survey file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadscan.cli.arguments import formats_for
+from roadscan.cli.terminal import looking, print_table
+
+
+def list_formats(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Show the settings of one format.", show_default=False, autocompletion=formats_for),
+    ] = None,
+) -> None:
+    """Raw formats that can be read, and what they yield."""
+    from roadscan.model.strict import meanings
+    from roadscan.sensors.base import format_named, log_formats
+
+    if name is None:
+        rows = [(n, ", ".join(f.yields), f.title) for n, f in log_formats().items()]
+        print_table(("format", "yields", "what"), rows)
+        return
+    found = format_named(name)
+    typer.echo(f"{found.name}: {found.title}\nyields: {', '.join(found.yields)}\ntime: {found.time}")
+    for field, meaning in meanings(found.options).items():
+        info = found.options.model_fields[field]
+        default = "required" if info.is_required() else f"default {info.default!r}"
+        typer.echo(f"  options.{field} ({default}): {meaning}")
+
+
+def inspect_files(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE…", help="Files or folder logs.", show_default=False, readable=False),
+    ],
+    clock: Annotated[
+        str | None, typer.Option(help="Time system, such as gps_week_seconds,week=2405 or unix_utc,unit=us.")
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help='CRS of positions, such as EPSG:4979 or "local".')] = None,
+    option: Annotated[
+        list[str] | None, typer.Option("--option", help="Setting of the format, key=value; may be repeated.")
+    ] = None,
+    format_name: Annotated[
+        str | None, typer.Option("--format", help="Read as this format.", autocompletion=formats_for)
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Read only the beginning.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: a list, one entry a file.")] = False,
+) -> None:
+    """Say of any file what it is, what it holds, its time span and extent, and what is wrong with it.
+
+    Ends with 0 if all files can be read (faults of single records do not count), with 2 if one cannot.
+    """
+    from roadscan.inspect.inspect import inspect
+    from roadscan.inspect.provisional import Stated, parse_clock, parse_option
+
+    stated = Stated(
+        clock=None if clock is None else parse_clock(clock),
+        crs=crs,
+        options=dict(parse_option(one) for one in option or ()),
+    )
+    found = []
+    for file in files:
+        with looking(file) as progress:
+            found.append(inspect(file, stated, format_name, quick=quick, progress=progress))
+        if not as_json:
+            from roadscan.inspect.inspect_text import print_inspection
+
+            print_inspection(found[-1])
+    if as_json:
+        import json
+
+        typer.echo(json.dumps([one.as_json() for one in found], indent=2, ensure_ascii=False))
+    raise typer.Exit(0 if all(one.readable for one in found) else 2)
+
+
+def first_survey(
+    folder: Annotated[Path, typer.Argument(help="Folder of raw logs, looked through recursively.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Survey file to write; RIG.toml is written beside it.")] = Path(
+        "SURVEY.toml"
+    ),
+) -> None:
+    """Look through a folder of logs and write a first survey file for you to complete."""
+    from roadscan.inspect.first_survey import find_logs
+    from roadscan.inspect.first_survey_text import refuse_to_overwrite, write_first_survey
+
+    refuse_to_overwrite(out)
+    with looking(folder) as progress:
+        found = find_logs(folder, progress)
+    made = write_first_survey(found, out)
+    print_table(
+        ("run", "sensor", "log", "format", "to state"),
+        [
+            (run.id, log.sensor or "", os.path.relpath(log.path, found.folder), log.format.name,
+             ", ".join(need.key for need in log.needs))
+            for run in [*found.runs, *found.further]
+            for log in run.logs
+        ],
+    )  # fmt: skip
+    for log, companion, setting in found.pairs:
+        names = [os.path.relpath(one.path, found.folder) for one in (companion, log)]
+        typer.echo(f"paired: {names[0]} with {names[1]}, as its options.{setting}")
+    for path, words in found.unknown:
+        typer.echo(f"not understood: {os.path.relpath(path, found.folder)}: {words}")
+    written = " and ".join(str(file) for file in (made.survey_file, made.rig_file) if file is not None)
+    typer.echo(f"written: {written}, with {made.questions} lines to complete (they begin with #?)")

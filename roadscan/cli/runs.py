@@ -1,0 +1,157 @@
+"""Commands that run a survey: all of it, one stage, or some tiles."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from roadscan.cli.arguments import USUAL, AsJson, Scheduler, SurveyFile, Workers, surveys_for
+from roadscan.cli.state import found_status, print_status
+from roadscan.cli.survey import run_and_sum_up, run_survey, stages_named, sum_up
+from roadscan.cli.terminal import print_table
+
+if TYPE_CHECKING:
+    from roadscan.jobs.tiles.selection import Selection
+
+
+def run(
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: AsJson = False,
+    flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
+) -> None:
+    """Run a survey: ingest, navigate, footprints, tiles, surfaces, products. Does only what is missing or stale."""
+    if dry_run:
+        found = found_status(survey_file)
+        print_status(found, survey_file)
+        raise typer.Exit(2 if found.would_fail else 0)
+    if flow or os.environ.get("PREFECT_API_URL"):
+        from flows.conduct import require_api
+        from flows.survey import survey
+
+        require_api()
+        survey(str(survey_file), workers, scheduler)
+        sum_up(survey_file, as_json)
+        return
+    from roadscan.jobs.stage import stages
+
+    run_and_sum_up(survey_file, stages(), workers, scheduler, as_json)
+
+
+def ingest(
+    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+) -> None:
+    """Raw logs into tables."""
+    run_and_sum_up(survey_file, stages_named("ingest"), workers, scheduler, as_json)
+
+
+def navigate(survey_file: SurveyFile) -> None:
+    """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
+    from roadscan.jobs.ingest.ingest import survey_records
+    from roadscan.jobs.navigate.navigate import plan_trajectories
+
+    run = run_survey(survey_file, stages_named("navigate"), 0, None)
+    if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
+        typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
+
+
+def footprints(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
+    """Which raw block touches which tile."""
+    run_survey(survey_file, stages_named("footprints"), workers, scheduler)
+
+
+def tile(
+    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+) -> None:
+    """Readings into points, cells and tile files."""
+    run_and_sum_up(survey_file, stages_named("tiles"), workers, scheduler, as_json)
+
+
+def surfaces(
+    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+) -> None:
+    """Cells or points of tiles into the reconstructed surface and its files (section `surface` of the survey file)."""
+    run_and_sum_up(survey_file, stages_named("surfaces"), workers, scheduler, as_json)
+
+
+def make_products(
+    survey_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar=USUAL,
+            help="Make its products; without it, list all there are.",
+            autocompletion=surveys_for,
+        ),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: AsJson = False,
+) -> None:
+    """Mosaics, pictures and tables over all tiles; without a survey file, list the products there are."""
+    if survey_file is not None:
+        run_and_sum_up(survey_file, stages_named("products"), workers, scheduler, as_json)
+        return
+    from roadscan.products.base import SurfaceProduct, TileProduct, products
+
+    of = {TileProduct: "tile", SurfaceProduct: "surface"}
+    made = {"any": "yes", "fine": "of cells below 2 cm", "coarse": "of cells of 2 cm or more"}
+    rows = [
+        (
+            name,
+            next((word for kind, word in of.items() if isinstance(p, kind)), "survey"),
+            made[p.default_cells] if p.default else "on request",
+            p.title,
+        )
+        for name, p in products().items()
+    ]
+    print_table(("product", "of", "made", "what"), rows)
+
+
+def reprocess(
+    survey_file: SurveyFile,
+    tiles: Annotated[list[str] | None, typer.Option("--tile", help="Tile COLUMN_ROW; may be repeated.")] = None,
+    bbox: Annotated[str | None, typer.Option(help="WEST,SOUTH,EAST,NORTH on the map, metres.")] = None,
+    span: Annotated[str | None, typer.Option(help="START/END in UTC, such as 2026-05-04T09:30:00Z/….")] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute some tiles once more, whether stale or not."""
+    from roadscan.jobs.stage import stages
+    from roadscan.model.errors import ConfigError
+
+    if not (tiles or bbox or span):
+        raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
+    done = run_and_sum_up(survey_file, stages(), workers, scheduler, as_json, selected(tiles, bbox, span))
+    typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings", err=as_json)
+
+
+def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Selection:
+    """The selection of tiles that the options state."""
+    import datetime as dt
+
+    from roadscan.jobs.tiles.selection import Selection
+    from roadscan.model.errors import ConfigError
+    from roadscan.model.gpstime import gps_ns_from_utc
+    from roadscan.model.ids import TileId
+    from roadscan.tiles.grid import Bounds
+
+    box = times = None
+    if bbox is not None:
+        try:
+            west, south, east, north = (float(part) for part in bbox.split(","))
+        except ValueError:
+            raise ConfigError(f"--bbox {bbox}", expected="WEST,SOUTH,EAST,NORTH in metres") from None
+        box = Bounds(west, south, east, north)
+    if span is not None:
+        try:
+            start, end = (dt.datetime.fromisoformat(part) for part in span.split("/"))
+        except ValueError:
+            raise ConfigError(f"--span {span}", expected="START/END, such as 2026-05-04T09:30:00Z/…") from None
+        times = (gps_ns_from_utc(start), gps_ns_from_utc(end))
+    return Selection(tuple(TileId.parse(t) for t in tiles or ()), box, times)

@@ -1,0 +1,69 @@
+"""Commands of the simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadscan.cli.arguments import AsJson, Workers, scenes_for
+from roadscan.cli.survey import run_survey, sum_up
+from roadscan.cli.terminal import print_table
+
+
+def simulate(
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help="A scene file (TOML), or the name of a shipped scene (roadscan scenes).", autocompletion=scenes_for
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    hits: Annotated[bool, typer.Option("--hits", help="Also write where each beam hit, into truth/hits.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Overwrite survey file, rig file and control points that were edited.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all errors, in place of the scene's own.")] = None,
+) -> None:
+    """Write a survey with known truth as raw logs."""
+    from roadscan.simulate import Scene
+    from roadscan.simulate import simulate as write
+
+    loaded = Scene.load(scene)
+    changed = loaded if seed is None else loaded.changed(seed=seed)
+    made = write(changed, out, write_hits=hits, progress=typer.echo, overwrite=force)
+    typer.echo(
+        f"{made.poses:,} poses, {made.profiles:,} profiles with {made.readings:,} readings in all, "
+        f"{made.returns:,} returns"
+    )
+    typer.echo(f"survey file: {made.survey_file}")
+
+
+def list_scenes() -> None:
+    """List the scenes that ship with roadscan."""
+    from roadscan.simulate import Scene
+    from roadscan.simulate.scene import shipped_scenes
+
+    scenes = {name: Scene.load(name) for name in shipped_scenes()}
+    print_table(
+        ("scene", "length m", "passes", "what"),
+        [(name, f"{one.length_m:g}", str(len(one.passes)), one.title) for name, one in scenes.items()],
+    )
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("demo"),
+    workers: Workers = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a small survey, run it, and compare the surface with the truth."""
+    from roadscan.jobs.demo import prepare_demo, summarise
+    from roadscan.jobs.stage import stages
+
+    survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
+    run_survey(survey_file, stages(), workers, None)
+    compared = summarise(survey_file)
+    sum_up(survey_file, as_json, {"height_error_m": compared.height_error()})
+    for line in () if as_json else compared.lines():
+        typer.echo(line)

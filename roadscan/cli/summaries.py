@@ -1,0 +1,88 @@
+"""How the summary at the end of a run is printed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from roadscan.jobs.summary import LogSummary, Spread, SurveySummary, TilesSummary
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+_MOST_REASONS = 10
+_WIDTH = 14
+_UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+
+
+def print_summary(survey: Survey, store: Store, *, as_json: bool = False, beside: dict[str, Any] | None = None) -> None:
+    """Print what the store holds, as lines or as one JSON object (with `beside` in it)."""
+    from roadscan.jobs.summary import survey_summary
+
+    found = survey_summary(survey, store)
+    if as_json:
+        typer.echo(json.dumps(found.as_json() | (beside or {}), indent=2, ensure_ascii=False))
+        return
+    for head, text in _lines(found):
+        typer.echo(f"{head:<{_WIDTH}}{text}")
+
+
+def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
+    yield "survey", f"{found.survey}, in {found.store}"
+    yield from _of_logs(found.logs)
+    if found.readings:
+        lost = {name: count for name, count in found.readings.items() if name != "kept"}
+        left = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in lost.items())
+        yield "readings", f"{sum(found.readings.values()):,}, of which kept {found.readings.get('kept', 0):,}"
+        yield "not kept", left or "none"
+    if found.tiles is not None:
+        yield from _of_tiles(found.tiles)
+    for product, files in found.files.items():
+        yield product, f"{_count(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
+    for failure in found.failures:
+        yield "failed", f"{failure['stage']} {failure['unit']}: {failure['reason']}"
+    if not found.failures:
+        yield "failed", "nothing"
+
+
+def _of_logs(logs: LogSummary) -> Iterator[tuple[str, str]]:
+    yield "logs", f"{logs.logs:,} with {_count(logs.rows, 'row')}; rejected {_count(logs.rejected, 'record')}"
+    for number, (reason, count) in enumerate(logs.reject_reasons.items()):
+        if number == _MOST_REASONS:
+            yield "", f"… and {len(logs.reject_reasons) - number:,} more reasons (table rejects)"
+            return
+        yield "rejected", f"{count:,}: {reason}"
+
+
+def _of_tiles(tiles: TilesSummary) -> Iterator[tuple[str, str]]:
+    yield "tiles", f"{tiles.with_readings:,} hold readings, of {tiles.looked_at:,} looked at"
+    overlap = "not known: some tiles were made by an older version"
+    if tiles.overlap_area_m2 is not None:
+        share = tiles.overlap_area_m2 / tiles.area_m2 if tiles.area_m2 else 0.0
+        overlap = f"{tiles.overlap_area_m2:,.1f} m² seen by two or more passes ({share:.0%})"
+    yield "area", f"{tiles.area_m2:,.1f} m² in {_count(tiles.cells, 'cell')}"
+    yield "overlap", overlap
+    if tiles.sigma_horizontal_m is not None:
+        yield "σ of poses", f"horizontal {_spread(tiles.sigma_horizontal_m)} (the largest in each tile)"
+    if tiles.sigma_down_m is not None:
+        yield "σ of poses", f"vertical {_spread(tiles.sigma_down_m)} (the largest in each tile)"
+    if tiles.sigma_cells_m is not None:
+        yield "σ in cells", f"{_spread(tiles.sigma_cells_m)} (the median of each tile)"
+
+
+def _spread(values: Spread) -> str:
+    return f"median {values.median * 1e3:.2f} mm, largest {values.largest * 1e3:.2f} mm"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number:,} {word}{'' if number == 1 else 's'}"
+
+
+def _size(size: int) -> str:
+    for unit, name in _UNITS:
+        if size >= unit:
+            return f"{size / unit:,.1f} {name}"
+    return f"{size:,} bytes"

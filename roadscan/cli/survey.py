@@ -1,0 +1,92 @@
+"""What the commands do with a survey file: load it, open its store, run stages of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from roadscan.cli.summaries import print_summary
+from roadscan.cli.terminal import new_reporter
+
+if TYPE_CHECKING:
+    from roadscan.jobs.session import Session
+    from roadscan.jobs.stage import Stage
+    from roadscan.jobs.tiles.selection import Selection
+    from roadscan.tables.store import Store
+
+
+def stages_named(name: str) -> tuple[Stage, ...]:
+    """The stage of this name, as the stages of a run."""
+    from roadscan.jobs.stage import stages
+
+    return tuple(s for s in stages() if s.name == name)
+
+
+def run_survey(
+    survey_file: Path,
+    stages: tuple[Stage, ...],
+    workers: int | None,
+    scheduler: str | None,
+    selection: Selection | None = None,
+) -> Session:
+    """The run of these stages, when it is done.
+
+    Raises
+    ------
+    RunError
+        at the end, if any unit failed; all others are finished and kept.
+    """
+    from roadscan.jobs.engine.compute_on import compute_on
+    from roadscan.jobs.preflight import preflight
+    from roadscan.jobs.run import run_stages
+    from roadscan.jobs.session import Session
+    from roadscan.model.errors import Stopped
+
+    run, reporter = Session.open(survey_file), new_reporter()
+    run.selection, run.reporter = selection, reporter
+    preflight(run.survey, run.store, stages[-1].name, selection).begin(reporter.line)
+    with compute_on(workers, scheduler) as run.compute:
+        try:
+            run_stages(run, stages)
+        except Stopped as stop:
+            stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
+            raise
+        finally:
+            reporter.close()
+    return run
+
+
+def run_and_sum_up(
+    survey_file: Path,
+    stages: tuple[Stage, ...],
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+    selection: Selection | None = None,
+) -> Session:
+    """The same, with a summary of the survey printed at the end, also of a run of which some units failed."""
+    from roadscan.model.errors import RunError
+
+    try:
+        run = run_survey(survey_file, stages, workers, scheduler, selection)
+    except RunError:
+        sum_up(survey_file, as_json)
+        raise
+    sum_up(survey_file, as_json)
+    return run
+
+
+def sum_up(survey_file: Path, as_json: bool, beside: dict[str, Any] | None = None) -> None:
+    """Print the summary of a survey."""
+    from roadscan.model.survey import Survey
+
+    print_summary(Survey.load(survey_file), opened_store(survey_file), as_json=as_json, beside=beside)
+
+
+def opened_store(survey_file: Path) -> Store:
+    """The store that a survey file names."""
+    from roadscan.model.survey import Survey
+    from roadscan.tables.store import Store
+
+    loaded = Survey.load(survey_file)
+    return Store(loaded.store_url, loaded.config.id)

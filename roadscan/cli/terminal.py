@@ -1,0 +1,57 @@
+"""How the commands show tables and progress."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+
+
+def print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    """Print rows below their head, in columns as wide as they need."""
+    widths = [max(len(str(r[i])) for r in [head, *rows]) for i in range(len(head))]
+    for row in [head, tuple("─" * w for w in widths), *rows]:
+        typer.echo("  ".join(str(v).ljust(w) for v, w in zip(row, widths, strict=True)).rstrip())
+
+
+def print_whole(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    """The same on a terminal: what is wider is folded within its column, and nothing is cut."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for name in head:
+        table.add_column(Text(name), overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console().print(table)
+
+
+def new_reporter() -> Any:
+    """What shows a run's progress: bars on a terminal, lines in a pipe."""
+    from roadscan.progress import LineReporter, TerminalReporter
+
+    return TerminalReporter() if sys.stderr.isatty() else LineReporter()
+
+
+@contextmanager
+def looking(file: Path) -> Iterator[Callable[[int, float | None], None]]:
+    """Show on a terminal how far a file is read; nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda rows, share: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(str(file)) as status:
+
+        def show(rows: int, share: float | None) -> None:
+            done = "" if share is None else f", {share:.0%}"
+            status.update(f"{file}: {rows:,} rows{done}")
+
+        yield show

@@ -1,0 +1,248 @@
+"""Digests of the code that an output depends on, so that a key changes with that code and with no other.
+
+The unit is a definition: a function, a class, or a name that a module assigns. Starting from the function or class
+that makes an output, every definition whose name occurs in one that is reached is reached as well, annotations
+included (what a function is handed has the class that its annotation names). So an edit counts for an output only if
+its making can come across the edited lines. Comments and docstrings do not count.
+
+What is found by looking into a folder or at an entry point (formats, products, stages) is not reached, since no name
+leads there: each of these belongs to the keys of its own outputs.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib.util
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, TypeAlias
+
+Place: TypeAlias = tuple[str, str | None]
+"""A module and a name in it; None for all of the module."""
+
+CARRIERS: Final = (
+    "roadscan.compiler",
+    "roadscan.jobs.engine.compute",
+    "roadscan.jobs.engine.fingerprint",
+    "roadscan.model.errors",
+    "roadscan.model.strict",
+    "roadscan.model.survey:Survey",
+    "roadscan.model.survey:SurveyConfig",
+    "roadscan.tables.logs",
+    "roadscan.tables.manifest",
+    "roadscan.tables.records",
+    "roadscan.tables.store",
+)
+"""What carries values and bytes, and shapes none: it is not followed. Settings count by their values, files by their
+digests."""
+
+_EFFECTS = "<statements>"
+"""Stands for the statements of a module that define nothing: whoever uses the module depends on them."""
+
+
+def code_digest(*entries: str) -> str:
+    """Hash (16 hexadecimal digits) of all definitions that `entries` reach.
+
+    Parameters
+    ----------
+    entries : "package.module:name", or "package.module" for all of a module.
+
+    Raises
+    ------
+    LookupError
+        if an entry does not exist.
+    """
+    _count_in(entry.partition(":")[0].partition(".")[0] for entry in entries)
+    return _digest_of(entries)
+
+
+def name_of(kind: type) -> str:
+    """The entry of a class for :func:`code_digest`."""
+    return f"{kind.__module__}:{kind.__qualname__.partition('.')[0]}"
+
+
+@functools.cache
+def _digest_of(entries: tuple[str, ...]) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for place, text in sorted(reached_code(entries).items()):
+        digest.update(f"{place}\0{text}\0".encode())
+    return digest.hexdigest()
+
+
+def reached_code(entries: Iterable[str]) -> dict[str, str]:
+    """Source text, without comments and docstrings, of each definition ("module:name") that `entries` reach."""
+    found: dict[str, str] = {}
+    waiting = [_place_of(entry) for entry in entries]
+    seen: set[Place] = set()
+    while waiting:
+        place = waiting.pop()
+        if place in seen:
+            continue
+        seen.add(place)
+        name, definition = place
+        if name in CARRIERS or f"{name}:{definition}" in CARRIERS:
+            continue
+        module = _module(name)
+        if definition is None:
+            waiting += [(name, own) for own in module.texts]
+        elif definition in module.texts:
+            found[f"{name}:{definition}"] = module.texts[definition]
+            waiting += [*module.uses[definition], (name, _EFFECTS)]
+        elif definition in module.imports:  # handed on by a module that imports it
+            waiting.append(module.imports[definition])
+    return found
+
+
+@dataclass
+class _Module:
+    """Definitions of a module: their texts, and what they use, by name."""
+
+    texts: dict[str, str] = field(default_factory=dict)
+    uses: dict[str, list[Place]] = field(default_factory=dict)
+    imports: dict[str, Place] = field(default_factory=dict)
+    """What a name that the module imports stands for."""
+
+
+@functools.cache
+def _module(name: str) -> _Module:
+    file = _file_of(name)
+    if file is None:
+        raise LookupError(f"there is no module {name}")
+    source = file.read_text(encoding="utf-8")
+    lines, tree, package = source.splitlines(), ast.parse(source), _package_of(name, file)
+    module = _Module(texts={_EFFECTS: ""}, uses={_EFFECTS: []})
+    defined = [(own, node) for node in tree.body for own in _names_of(node)]
+    for node in tree.body:
+        module.imports |= _imported(node, package)
+    known = {own for own, _ in defined}
+    for own, node in defined:
+        module.texts[own] = module.texts.get(own, "") + _text(node, lines)
+        module.uses[own] = module.uses.get(own, []) + _used(node, known, module.imports, name, package)
+    return module
+
+
+def _names_of(node: ast.stmt) -> list[str]:
+    """Names that a statement of a module defines; what defines none is an effect, unless it only imports or tells."""
+    match node:
+        case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+            return [name]
+        case ast.Import() | ast.ImportFrom() | ast.Expr(value=ast.Constant()):
+            return []
+        case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+            return []
+        case ast.Assign() | ast.AnnAssign():
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+            plain = all(isinstance(target, ast.Name | ast.Tuple) for target in targets)
+            return (names if plain else [_EFFECTS]) if names != ["__all__"] else []
+    return [_EFFECTS]
+
+
+def _text(node: ast.stmt, lines: list[str]) -> str:
+    """Lines of a definition, without docstrings and lines that hold nothing but a comment."""
+    decorators = getattr(node, "decorator_list", [])
+    first = min([node.lineno, *(d.lineno for d in decorators)])
+    told = {number for said in _docstrings(node) for number in range(said.lineno, (said.end_lineno or 0) + 1)}
+    kept = (lines[number - 1].rstrip() for number in range(first, (node.end_lineno or first) + 1) if number not in told)
+    return "\n".join(line for line in kept if line and not line.lstrip().startswith("#")) + "\n"
+
+
+def _docstrings(node: ast.stmt) -> Iterator[ast.stmt]:
+    """Statements that are nothing but a text: docstrings, and the texts under fields."""
+    for part in ast.walk(node):
+        if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str):
+            yield part
+
+
+def _used(node: ast.stmt, known: set[str], imports: dict[str, Place], module: str, package: str) -> list[Place]:
+    """What the names in a definition stand for, as far as a package of ours defines it."""
+    within: dict[str, Place] = {}
+    for part in ast.walk(node):
+        within |= _imported(part, package)
+    found: dict[Place, None] = {}
+    for part in ast.walk(node):
+        for name in _names_in(part):
+            if name in within:
+                found[within[name]] = None
+            elif name in known:
+                found[module, name] = None
+            elif name in imports:
+                found[imports[name]] = None
+    return list(found)
+
+
+def _names_in(part: ast.AST) -> Iterator[str]:
+    if isinstance(part, ast.Name):
+        yield part.id
+    elif isinstance(part, ast.arg | ast.AnnAssign) and isinstance(part.annotation, ast.Constant):
+        yield from (n.id for n in ast.walk(ast.parse(str(part.annotation.value))) if isinstance(n, ast.Name))
+
+
+def _imported(node: ast.AST, package: str) -> dict[str, Place]:
+    """What each name stands for that an import statement, or those under `if TYPE_CHECKING`, brings."""
+    found: dict[str, Place] = {}
+    match node:
+        case ast.If(test=ast.Name(id="TYPE_CHECKING"), body=body):
+            for one in body:
+                found |= _imported(one, package)
+        case ast.Import(names=names):
+            for alias in names:
+                if _file_of(alias.name):
+                    found[alias.asname or alias.name.partition(".")[0]] = (alias.name, None)
+        case ast.ImportFrom(names=names):
+            source = _absolute(node, package)
+            for alias in names:
+                below = f"{source}.{alias.name}"
+                if _file_of(below):
+                    found[alias.asname or alias.name] = (below, None)
+                elif _file_of(source):
+                    found[alias.asname or alias.name] = (source, alias.name)
+    return found
+
+
+def _absolute(node: ast.ImportFrom, package: str) -> str:
+    if not node.level:
+        return node.module or ""
+    above = package.split(".")
+    return ".".join([*above[: len(above) - node.level + 1], *([node.module] if node.module else [])])
+
+
+def _place_of(entry: str) -> Place:
+    module, _, name = entry.partition(":")
+    if not _file_of(module) or (name and name not in _module(module).texts | _module(module).imports):
+        raise LookupError(f"there is no definition {entry}")
+    return module, name or None
+
+
+def _package_of(name: str, file: Path) -> str:
+    return name if file.name == "__init__.py" else name.rpartition(".")[0]
+
+
+@functools.cache
+def _file_of(module: str) -> Path | None:
+    """Source of a module of roadscan, or of a package that an entry lies in; None for libraries."""
+    top, _, below = module.partition(".")
+    if top not in _OWN:
+        return None
+    spec = importlib.util.find_spec(top)
+    if spec is None or spec.origin is None:
+        return None
+    if not below and not spec.submodule_search_locations:  # a package that is one file
+        return Path(spec.origin)
+    at = Path(spec.origin).parent.joinpath(*below.split(".")) if below else Path(spec.origin).parent
+    return next((file for file in (at.with_suffix(".py"), at / "__init__.py") if file.is_file()), None)
+
+
+_OWN = {"roadscan"}
+"""Packages whose code counts."""
+
+
+def _count_in(packages: Iterable[str]) -> None:
+    """Let the code of further packages count: those that add a product or a stage of their own."""
+    if new := set(packages) - _OWN:
+        _OWN.update(new)
+        for known in (_file_of, _module, _digest_of):
+            known.cache_clear()

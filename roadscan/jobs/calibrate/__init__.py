@@ -1,0 +1,1 @@
+"""Mountings of sensors and interior orientation of cameras from evidence."""

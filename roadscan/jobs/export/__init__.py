@@ -1,0 +1,1 @@
+"""Readings and passes as files of other programs."""

@@ -1,0 +1,1 @@
+"""Trajectories and clocks that are computed from logs, their records and pictures."""

@@ -1,0 +1,1 @@
+"""What places the readings of a survey: sources, mountings, road, centre lines, drives."""

@@ -1,0 +1,86 @@
+"""Stages run one after another on a session; what fails is kept and told at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from roadscan.jobs.engine.compute import damaged_file, rare_collections
+from roadscan.jobs.plan.plan import NothingToPlaceError
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, stages
+from roadscan.model.errors import RoadscanError, RunError
+from roadscan.tables.logs import read_log_records
+from roadscan.tables.manifest import begin_changes, end_changes, write_failures
+from roadscan.tables.mend import mend_records
+from roadscan.tables.verified import note_written, recorded_files
+
+_CLOCK_TICK_NS: Final = 50_000_000
+"""A file's time may lie that much before the clock's."""
+
+
+def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
+    """Run stages in their order (all, where none are chosen), then close the run.
+
+    Raises
+    ------
+    RunError
+        at the end, if any unit failed; all others are finished and kept.
+    """
+    wanted = stages() if chosen is None else chosen
+    with session.store.lock():
+        for stage in wanted:
+            started = time.perf_counter()
+            run_stage(session, stage)
+            session.reporter.line(f"{stage.name}: {time.perf_counter() - started:.1f} s")
+        close_run(session, wanted)
+
+
+def run_stage(session: Session, stage: Stage) -> None:
+    """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
+    session.stage = stage.name
+    if session.goes_on is None:
+        mend_records(session.store, session.note)
+        session.goes_on = begin_changes(session.store)
+        session.began_ns = time.time_ns() - _CLOCK_TICK_NS
+    try:
+        with rare_collections():
+            stage.run(session)
+    except NothingToPlaceError as nothing:
+        if not session.places_nothing:
+            session.note(str(nothing))
+        session.places_nothing = True
+    except RoadscanError as error:
+        if damaged := damaged_file(error):
+            session.manifest.doubt_files({damaged})  # the next run makes it again
+        if not session.failures:
+            with contextlib.suppress(RoadscanError):  # a store that cannot be written is the error itself
+                write_failures(session.store, [{"stage": stage.name, "unit": "as a whole", "reason": str(error)}])
+            raise
+        session.failed(stage.name, [("as a whole", error)])
+
+
+def close_run(session: Session, done: Sequence[Stage]) -> None:
+    """Keep the list of failures for `roadscan status`, and raise if there are any.
+
+    A whole run without failures has a record for every file that is due: what a run before it left without one is
+    removed.
+    """
+    if {stage.name for stage in done}.issuperset(stage.name for stage in stages()):
+        session.manifest.compact()
+        if session.selection is None and not session.failures:
+            folders = [folder for stage in stages() for folder in stage.folders()]
+            end_changes(session.store, session.manifest, folders if session.goes_on else ())
+    write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
+    if session.store.is_folder:
+        logs = read_log_records(session.store, damaged=[])
+        note_written(session.store, session.began_ns, recorded_files(session.store, logs, session.manifest))
+    if session.failures:
+        listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
+        more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
+        raise RunError(
+            f"{len(session.failures)} units failed: {listed}{more}",
+            change="everything else is finished; the next run does only these",
+        )

@@ -1,0 +1,45 @@
+"""Stage `navigate`: trajectories from GNSS, IMU and odometer; clocks from shared motion."""
+
+from __future__ import annotations
+
+from roadscan.jobs.calibrate.calibrate import renew_reports
+from roadscan.jobs.navigate.clock_tables import set_damaged_clocks_aside
+from roadscan.jobs.navigate.clocks import estimate_clocks
+from roadscan.jobs.navigate.navigate import navigate
+from roadscan.jobs.navigation_status import navigation_status
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.tables.logs import read_log_records
+
+
+class Navigate(Stage):
+    """Computed trajectories are logs of their own; clocks are a small table."""
+
+    name = "navigate"
+    title = "trajectories from GNSS, IMU and odometer, clocks from shared motion"
+    after = ("ingest",)
+    uses_workers = False
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or out of date."""
+        survey, store, say = session.survey, session.store, session.reporter.line
+        for done in set_damaged_clocks_aside(store):
+            session.note(done)
+        try:
+            if any(evidence.against != "trajectory" for evidence in survey.config.clocks):
+                estimate_clocks(survey, store, before_navigation=True, logs=session.logs)
+            navigate(survey, store, say, session.logs)
+            estimate_clocks(survey, store, say, logs=session.logs)
+            renew_reports(store, say)
+        finally:
+            session.renew("records")
+            session.renew("manifest")  # pictures were recorded beside it
+
+    def state(self, session: Session) -> StageState:
+        """Computed trajectories, estimated clocks, calibrated mountings."""
+        held = {r.key: r for r in read_log_records(session.store, damaged=[])}
+        own = [held[log.key] for log in session.logs[0] if log.key in held]
+        found = navigation_status(session.survey, session.store, own, held)
+        waiting = sum(one["state"] != "computed" for one in found.trajectories)
+        lines = list(found.lines())
+        return StageState(len(found.trajectories) - waiting, waiting, notes=found.doubts, lines=lines)

@@ -1,0 +1,89 @@
+"""Stage `tiles`: readings into cells and tile files, by way of points where these are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.jobs.engine.compute import Made
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.stages.footprints import faults_of_plan
+from roadscan.jobs.surfaces.surface_colours import check_colours
+from roadscan.jobs.tile_work import memory_of, plan_tile_work
+from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
+from roadscan.jobs.tiles.tile_fates import fate_words, lost_notes, told
+from roadscan.jobs.tiles.tile_files import tile_file_names
+from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TileTask
+from roadscan.jobs.tiles.tiles import compute_tiles, run_tasks
+from roadscan.model.ids import TileId
+
+
+class Tiles(Stage):
+    """Cells, overviews and tile products of each tile that a reading touches."""
+
+    name = "tiles"
+    title = "readings into points, cells and tile files"
+    after = ("footprints",)
+    command = "tile"
+
+    def run(self, session: Session) -> None:
+        """Compute the tiles that are missing or stale, or those that are chosen."""
+        manifest, work = session.manifest, plan_tile_work(session)
+        if work.chosen:
+            check_colours(session.plan, folders=True)  # before the tiles are computed for them
+        manifest.remove(work.gone)
+
+        def counted(task: TileTask) -> TileTask:
+            session.raw_bytes_read += task.raw_bytes
+            return task
+
+        tasks = Made(work.planned.tasks(work.chosen, session.compute.workers), counted)
+        failures = run_tasks(
+            compute_tiles, tasks, len(work.chosen), work.planned.singly, manifest, session.compute,
+            session.bar(self.name),
+        )  # fmt: skip
+        manifest.forget(TILE, [unit for unit, _ in failures])
+        empty = manifest.without_file(TILE)
+        names = {OVERVIEWS, *tile_file_names()} if empty else ()
+        manifest.remove([r for name in names for unit, r in manifest.of(name).items() if unit in empty])
+        if work.chosen:
+            held = len({str(tile) for tile in work.chosen} - empty - {unit for unit, _ in failures})
+            session.reporter.line(f"tiles: {len(work.chosen):,} looked at, {held:,} of them hold readings")
+        session.failed(self.name, failures)
+        self._tell_of_readings(session, work.chosen)
+
+    def _tell_of_readings(self, session: Session, chosen: Sequence[TileId]) -> None:
+        """Fail logs that give nothing, and the survey where no tile holds anything; say how much of what was computed
+        has no pose.
+        """
+        manifest = session.manifest
+        session.failed(self.name, faults_of_plan(session))
+        computed = [manifest.get(TILE, str(tile)) for tile in chosen]
+        fates = told([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
+        if manifest.without_file(TILE) and not manifest.files().get(TILE):
+            why = fate_words(fates) or "all lie off the centre lines of filters.centre_line, or outside all passes"
+            reason = f"no tile holds a reading: {why}; check the settings that leave them out"
+            session.failed(self.name, [("as a whole", reason)])
+        for note in lost_notes(fates, session.survey.config.checks.lost_share) if chosen else ():
+            session.note(note)
+
+    def state(self, session: Session) -> StageState:
+        """Tiles, tasks and memory."""
+        work = plan_tile_work(session)
+        tasks = list(work.planned.tasks(work.chosen))
+        stale = {str(tile) for t in tasks for tile in t.block.tiles}
+        current = sum(1 for r in session.manifest.of(TILE).values() if r.path and r.unit not in stale)
+        doing = {
+            "tasks": len(tasks),
+            "tiles": len(stale),
+            "raw_bytes": sum(t.raw_bytes for t in tasks),
+            "worker_memory_bytes": memory_of(tasks),
+        }
+        empty = len(session.manifest.without_file(TILE) - stale)
+        readings = told([*session.manifest.of(FOOTPRINTS).values(), *session.manifest.of(TILE).values()])
+        notes = lost_notes(readings, session.survey.config.checks.lost_share)
+        return StageState(current, len(stale), empty, next_run=doing, notes=notes)
+
+    def folders(self) -> Sequence[str]:
+        """Files a tile, those of surfaces too."""
+        return ("tiles",)

@@ -1,0 +1,1 @@
+"""Footprints, keys and tasks of tiles; what workers do with them; files of tiles."""

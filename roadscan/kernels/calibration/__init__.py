@@ -1,0 +1,1 @@
+"""Residuals of a calibration, and the surfaces that it compares."""

@@ -1,0 +1,1 @@
+"""Readings counted into cells, the cells' statistics, and what is made of cells."""

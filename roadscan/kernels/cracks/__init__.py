@@ -1,0 +1,1 @@
+"""Cracks and other narrow valleys of a surface."""

@@ -1,0 +1,1 @@
+"""Poses, and readings placed on the map with them."""

@@ -1,0 +1,1 @@
+"""Strapdown mechanisation, Kalman filter and smoother of an inertial navigation system."""

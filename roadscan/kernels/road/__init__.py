@@ -1,0 +1,1 @@
+"""Which readings hit the road, and places along it."""

@@ -1,0 +1,1 @@
+"""Surfaces: triangulation, smoothing, holes, coarse heights, colours."""

@@ -1,0 +1,84 @@
+"""Folders of code that is run as the user: the cache of compiled kernels."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import stat
+from pathlib import Path
+from typing import NoReturn
+
+try:
+    import grp
+    import pwd
+except ImportError:  # a system without such users
+    pass
+
+
+class UnsafeFolderError(RuntimeError):
+    """Others could put code into a folder, which this process would run."""
+
+
+def check_private(folder: Path) -> None:
+    """Refuse a folder that others may write to, as OpenSSH does with keys.
+
+    The folder, all above it and the files in it have to belong to this user or to root, and nobody else may write to
+    them. Above it, a folder like /tmp will do, where everyone may write and nobody may move what is another's.
+
+    Raises
+    ------
+    UnsafeFolderError
+        says which of them it is, and what to change.
+    """
+    if not hasattr(os, "getuid") or not folder.exists():
+        return
+    real = folder.resolve()
+    _check_place(real, real.stat(), sticky=False)
+    _check_above(real.parent)
+    with os.scandir(real) as entries:
+        for entry in entries:
+            with contextlib.suppress(FileNotFoundError):  # Numba replaces files by rename
+                _check_place(Path(entry.path), entry.stat(follow_symlinks=False), sticky=False)
+
+
+@functools.cache
+def _check_above(folder: Path) -> None:
+    for place in (folder, *folder.parents):
+        _check_place(place, place.stat(), sticky=True)
+
+
+def _check_place(place: Path, found: os.stat_result, *, sticky: bool) -> None:
+    if found.st_uid not in (0, os.getuid()):
+        _refuse(place, f"belongs to another user (number {found.st_uid})")
+    if stat.S_ISLNK(found.st_mode) or (sticky and found.st_mode & stat.S_ISVTX):
+        return
+    if found.st_mode & stat.S_IWOTH:
+        _refuse(place, "can be written by every user")
+    if found.st_mode & stat.S_IWGRP and not _is_private(found.st_gid):
+        _refuse(place, f"can be written by others of its group (number {found.st_gid})")
+
+
+def _refuse(place: Path, reason: str) -> NoReturn:
+    raise UnsafeFolderError(
+        f"{place}: the cache of compiled code {reason}; expected a place where you alone can write, since what lies "
+        f"there is run as you; `chmod go-w {place}` if it is yours, remove what is not, or set NUMBA_CACHE_DIR to a "
+        "folder of your own"
+    )
+
+
+def _is_private(group: int) -> bool:
+    """True for root's group, and for one of the user's own name that nobody else is in, as many systems make them."""
+    if group == 0:
+        return True
+    try:
+        user, found = pwd.getpwuid(os.getuid()).pw_name, grp.getgrgid(group)
+    except KeyError:
+        return False
+    return found.gr_name == user and set(found.gr_mem) <= {user}
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, for this user alone."""
+    for place in reversed([one for one in (folder, *folder.parents) if not one.exists()]):
+        place.mkdir(mode=0o700, exist_ok=True)

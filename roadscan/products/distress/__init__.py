@@ -1,0 +1,1 @@
+"""Cracks and potholes: pieces a tile, and tables of what they join to."""

@@ -1,0 +1,1 @@
+"""Files of the reconstructed surface, a tile or the whole survey."""

@@ -1,0 +1,1 @@
+"""Formats of GNSS solutions, IMU and wheel encoders."""

@@ -1,0 +1,1 @@
+"""Formats of laser profilers and line scanners."""

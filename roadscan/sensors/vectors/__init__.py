@@ -1,0 +1,1 @@
+"""Control points and lines of roads."""

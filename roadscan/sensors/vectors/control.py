@@ -1,0 +1,250 @@
+"""Control points as files write them, turned into rows of the `control_points` table.
+
+The CRS and the kind of the heights are stated by the survey file. Heights change between
+ellipsoidal and orthometric only by a named geoid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.model.crs import (
+    LOCAL_WORLD,
+    Geoid,
+    HeightKind,
+    MapFrame,
+    crs_from_text,
+    world_frame_of,
+    world_from_geodetic,
+)
+from roadscan.model.errors import ConfigError, CrsError, Missing
+from roadscan.sensors.base import Item, LogSource, Rows
+from roadscan.sensors.records import Sieve, drop_failing
+from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Index = Int64 | slice
+
+Role = Literal["gcp", "check"]
+CrsKind = Literal["geographic", "projected", "local"]
+
+SIGMA_MAX_M: Final = 1_000.0
+NO_TEXT: Final = "\ufffd"
+"""Stands for bytes that could not be decoded."""
+
+
+@dataclass(frozen=True)
+class ControlFrame:
+    """Frame of a control file's coordinates, and the way from there into the survey's map."""
+
+    crs: str
+    kind: CrsKind
+    horizontal_scale: float
+    """Degrees, or metres, in one unit of the CRS's horizontal axes."""
+    height: HeightKind
+    geoid: Geoid | None
+    map: MapFrame
+    file: Path
+
+    @classmethod
+    def of(cls, source: LogSource) -> ControlFrame:
+        """Frame that the survey states for a control file.
+
+        Raises
+        ------
+        ConfigError, CrsError
+            if the CRS is not stated or is not geographic, projected or local, or if orthometric
+            heights lack the geoid that their use asks for.
+        """
+        crs = source.need_crs("EPSG:25832")
+        if source.map is None:
+            raise ConfigError("control points need the survey's map", expected="a map frame", file=source.path)
+        geoid = source.geoid
+        if source.height == "orthometric" and geoid is None and source.map.height == "orthometric":
+            geoid = source.map.geoid  # both heights stand on the survey's own geoid
+        if crs == LOCAL_WORLD:
+            return cls(crs, "local", 1.0, source.height, None, source.map, source.path)
+        if source.height == "orthometric" and geoid is None:
+            raise CrsError(
+                "the control points' heights are orthometric, the map's are ellipsoidal, and no geoid is named",
+                expected="geoid, the file name of a grid",
+                change='add geoid = "…" to this control file, or height = "ellipsoidal" if they are',
+                file=source.path,
+            )
+        stated = crs_from_text(crs)
+        if stated.is_compound or not (stated.is_geographic or stated.is_projected):
+            raise CrsError(
+                f"control points in '{crs}' ({stated.name})",
+                expected="a geographic or projected CRS; heights are stated apart",
+                file=source.path,
+            )
+        kind: CrsKind = "projected" if stated.is_projected else "geographic"
+        scale = float(stated.axis_info[0].unit_conversion_factor)  # to metres or radians
+        if kind == "geographic":
+            scale = float(np.degrees(scale))
+        own_geoid = geoid if source.height == "orthometric" else None
+        return cls(crs, kind, scale, source.height, own_geoid, source.map, source.path)
+
+    def check(self, coordinates: Float64, sieve: Sieve) -> None:
+        """Drop points whose coordinates (3, n) are missing or absurd."""
+        first, second, height = coordinates
+        if self.kind == "geographic":
+            sieve.require("longitude", first, -360.0, 360.0, "°")
+            sieve.require("latitude", second, -90.0, 90.0, "°")
+        else:
+            sieve.require("easting", first, -GRID_MAX_M, GRID_MAX_M, "m")
+            sieve.require("northing", second, -GRID_MAX_M, GRID_MAX_M, "m")
+        sieve.require("height", height, HEIGHT_MIN_M, HEIGHT_MAX_M, "m")
+
+    def to_map(self, coordinates: Float64) -> Float64:
+        """Easting, northing, height (3, n) in the map, metres.
+
+        Parameters
+        ----------
+        coordinates : (3, n) longitude and latitude in degrees, or easting and northing in metres,
+            and the height in metres.
+
+        Raises
+        ------
+        CrsError
+            if a point cannot be brought into the map.
+        """
+        if self.kind == "local":
+            return self.map.map_from_world(LOCAL_WORLD, coordinates.T).T
+        world = world_frame_of(self.crs)
+        if self.kind == "projected":
+            own = MapFrame(crs=self.crs, height=self.height, geoid=self.geoid)
+            xyz = own.world_from_map(world, coordinates.T)
+        else:
+            longitude, latitude, height = coordinates
+            if self.geoid is not None:
+                height = height + self.geoid.undulation_m(longitude, latitude)
+            xyz = world_from_geodetic(world, np.stack([longitude, latitude, height], axis=-1))
+        if not np.all(np.isfinite(xyz)):
+            raise CrsError(f"a point lies outside the projection '{self.crs}'", expected="coordinates in that CRS")
+        return self.map.map_from_world(world, xyz).T
+
+
+@dataclass(frozen=True)
+class RawControl:
+    """A block of control points as a file writes them."""
+
+    records: Int64
+    """(n,) record numbers."""
+    offsets: Int64
+    """(n,) byte offsets, −1 where there are none."""
+    names: list[str]
+    roles: list[str]
+    codes: list[str | None]
+    coordinates: Float64
+    """(3, n) longitude and latitude (°), or easting and northing (m); height (m)."""
+    sigma_horizontal_m: Float64
+    """(n,), NaN where missing."""
+    sigma_height_m: Float64
+    """(n,), NaN where missing."""
+
+
+class ControlReader:
+    """Turns the blocks of one file into rows of `control_points` and rejects."""
+
+    def __init__(self, frame: ControlFrame) -> None:
+        self._frame = frame
+        self._names: set[str] = set()
+        self._placed_any = False
+
+    def items(self, raw: RawControl) -> Iterator[Item]:
+        """Rows of the sound points of a block, then its rejects.
+
+        Raises
+        ------
+        CrsError
+            if no point of the file's first block can be brought into the map.
+        """
+        sieve = Sieve(raw.records.size)
+        self._frame.check(raw.coordinates, sieve)
+        roles = [role.strip().lower() for role in raw.roles]
+        sieve.drop(np.array([role not in ("gcp", "check") for role in roles]), "role is neither 'gcp' nor 'check'")
+        for name, sigma in (("horizontal", raw.sigma_horizontal_m), ("height", raw.sigma_height_m)):
+            sieve.drop(
+                ~(np.isnan(sigma) | ((sigma >= 0) & (sigma <= SIGMA_MAX_M))),
+                f"σ of the {name} position is outside 0 to {SIGMA_MAX_M:g} m",
+            )
+        words = zip(raw.names, raw.codes, strict=True)
+        sieve.drop(np.array([NO_TEXT in f"{name}{code}" for name, code in words]), "name or code is not UTF-8 text")
+        placed = self._placed(raw, sieve)
+        self._drop_repeated(raw.names, sieve)
+        kept = np.flatnonzero(sieve.good)
+        if placed is not None and kept.size:
+            yield self._rows(raw, roles, placed, kept)
+        yield from sieve.rejects(raw.records, raw.offsets)
+
+    def _drop_repeated(self, names: list[str], sieve: Sieve) -> None:
+        empty, repeated = np.zeros(len(names), dtype=bool), np.zeros(len(names), dtype=bool)
+        for i in np.flatnonzero(sieve.good).tolist():
+            empty[i] = not names[i]
+            repeated[i] = names[i] in self._names
+            self._names.add(names[i])
+        sieve.drop(empty, "the point has no name")
+        sieve.drop(repeated, "a point of this name came before")
+
+    def _placed(self, raw: RawControl, sieve: Sieve) -> Float64 | None:
+        """Map coordinates (3, n), zero where the point is dropped; None where none is left."""
+
+        def attempt(rows: Int64) -> Float64:
+            return self._frame.to_map(raw.coordinates[:, rows])
+
+        if not sieve.good.any():
+            return None
+        out = np.zeros_like(raw.coordinates)
+        failed = drop_failing(sieve, attempt)
+        if failed is not None:
+            if not self._placed_any:
+                raise failed.at(self._frame.file, int(raw.records[np.flatnonzero(sieve.good)[0]]))
+            sieve.drop(sieve.good.copy(), failed.arrived)
+            return None
+        self._placed_any = True
+        kept = np.flatnonzero(sieve.good)
+        out[:, kept] = attempt(kept)
+        return out
+
+    def _rows(self, raw: RawControl, roles: list[str], placed: Float64, kept: Int64) -> Rows:
+        def chosen(values: list[str] | list[str | None]) -> pa.Array:
+            return pa.array([values[i] for i in kept.tolist()], pa.string())
+
+        easting, northing, height = placed[:, kept]
+        columns = {
+            "name": chosen(raw.names),
+            "role": chosen(roles),
+            "code": chosen(raw.codes),
+            "easting_m": pa.array(easting),
+            "northing_m": pa.array(northing),
+            "height_m": pa.array(height),
+            "sigma_horizontal_m": pa.array(raw.sigma_horizontal_m[kept], from_pandas=True),
+            "sigma_height_m": pa.array(raw.sigma_height_m[kept], from_pandas=True),
+        }
+        first = int(kept[0])
+        return Rows(
+            "control_points",
+            pa.record_batch(columns),
+            first_record=int(raw.records[first]),
+            first_offset=int(raw.offsets[first]),
+        )
+
+
+def need_role(column: bool, role: Role | None, file: Path) -> None:
+    """Refuse a file that says nowhere whether its points are control or check points."""
+    if not column and role is None:
+        raise ConfigError(
+            "nothing says whether the points are ground control or check points",
+            expected="a column 'role' with gcp or check, or options.role",
+            file=file,
+            missing=Missing("options.role", "gcp"),
+        )

@@ -1,0 +1,152 @@
+"""Control points as text with named columns and units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.crs import crs_from_text
+from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.sensors.columns import ColumnOption, Found, Quantity, find_columns, fits
+from roadscan.sensors.records import options_of
+from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, TextOptions, sniff_layout, text_blocks, text_layout
+from roadscan.sensors.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
+
+Float64 = npt.NDArray[np.float64]
+
+NAME: Final = Quantity("name", "text", ("point", "id", "point_id"))
+WORDS: Final = (Quantity("code", "text", optional=True), Quantity("role", "text", optional=True))
+GEODETIC: Final = (Quantity("longitude", "angle", ("lon", "lng")), Quantity("latitude", "angle", ("lat",)))
+GRID: Final = (Quantity("easting", "length"), Quantity("northing", "length"))
+LOCAL: Final = (Quantity("easting", "length", ("x",)), Quantity("northing", "length", ("y",)))
+HEIGHT: Final = Quantity("height", "length", ("altitude",))
+LOCAL_HEIGHT: Final = Quantity("height", "length", ("z", "altitude"))
+SIGMAS: Final = (
+    Quantity("sigma_horizontal", "length", optional=True),
+    Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),
+)
+_NOT_CONTROL: Final = ("roll", "pitch", "heading", "qw", "r11", "gpstime", "timestamp")
+
+
+class ControlCsvOptions(TextOptions):
+    """Settings of `control_csv`."""
+
+    columns: dict[str, ColumnOption] = {}
+    """Which column holds which quantity, where its name does not say so: name, code, role; longitude,
+    latitude, or easting, northing; height; sigma_horizontal, sigma_height.
+    For example { height = { name = "H", unit = "m" } }."""
+    role: Role | None = None
+    """Role of all points ("gcp" or "check") where the file has no column for it."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How one file is read."""
+
+    layout: TextLayout
+    columns: dict[str, Found]
+    frame: ControlFrame
+    role: str
+
+
+class ControlCsv(LogFormat):
+    """A line a point: name, code, role, longitude and latitude or easting and northing, height, σ.
+
+    Columns are found by names that carry the unit (``easting_m``, ``height_m``, ``latitude_deg``).
+    Columns called just easting, northing, longitude or latitude are in the unit of the stated CRS;
+    so is a height, where the CRS has a height axis or is a local frame.
+    """
+
+    name = "control_csv"
+    title = "Ground control and check points as CSV (name, code, role, position, height, σ)"
+    yields = ("control_points",)
+    column_sets: ClassVar[tuple[tuple[Quantity, ...], ...]] = ((NAME, *GEODETIC, HEIGHT), (NAME, *GRID, HEIGHT))
+    time = "holds no time"
+    options = ControlCsvOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True if there are names and positions, and neither attitude nor time."""
+        layout = sniff_layout(path)
+        if layout is None or any(stem in name.lower() for name in layout.names for stem in _NOT_CONTROL):
+            return False
+        plain = ("longitude", "latitude", "easting", "northing", "height")
+        return any(fits((NAME, *position, HEIGHT), layout.names, plain) for position in (GEODETIC, GRID))
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Find the columns and check CRS, heights and roles."""
+        plan = _plan(source)
+        columns = {quantity: found.column for quantity, found in plan.columns.items()}
+        return LogHeader({"crs": plan.frame.crs, "height": plan.frame.height, "columns": columns})
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream points; a line without a name, position or height is rejected."""
+        plan = _plan(source)
+        reader = ControlReader(plan.frame)
+        words = {"name", "code", "role"}
+        kinds: dict[str, Kind] = {
+            found.column: "text" if quantity in words else "number" for quantity, found in plan.columns.items()
+        }
+        for block in text_blocks(source.path, plan.layout, kinds):
+            if isinstance(block, Reject):
+                yield block
+                continue
+            yield from reader.items(_raw(block, plan))
+
+
+def _plan(source: LogSource) -> _Plan:
+    options = options_of(source, ControlCsvOptions)
+    frame = ControlFrame.of(source)
+    position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
+    layout = text_layout(source.path, options)
+    columns = find_columns(
+        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, _units(frame)
+    )
+    need_role("role" in columns, options.role, source.path)
+    return _Plan(layout, columns, frame, options.role or "")
+
+
+def _units(frame: ControlFrame) -> dict[str, float]:
+    """Size (rad, m) of the units that the CRS itself fixes, by quantity."""
+    if frame.kind == "local":
+        return {"easting": 1.0, "northing": 1.0, "height": 1.0}
+    axes = crs_from_text(frame.crs).axis_info
+    names = ("easting", "northing") if frame.kind == "projected" else ("longitude", "latitude")
+    units = dict.fromkeys(names, float(axes[0].unit_conversion_factor))
+    if len(axes) == 3:
+        units["height"] = float(axes[2].unit_conversion_factor)
+    return units
+
+
+def _raw(block: TextBlock, plan: _Plan) -> RawControl:
+    def number(name: str) -> Float64:
+        if name not in plan.columns:
+            return np.full(block.records.size, np.nan)
+        found = plan.columns[name]
+        with np.errstate(over="ignore"):
+            return block.number(found.column) * found.scale
+
+    def words(name: str, otherwise: str) -> list[str]:
+        if name not in plan.columns:
+            return [otherwise] * block.records.size
+        return [word or otherwise for word in block.text(plan.columns[name].column)]
+
+    if plan.frame.kind == "geographic":
+        horizontal = [number(name) * (180 / math.pi) for name in ("longitude", "latitude")]
+    else:
+        horizontal = [number(name) for name in ("easting", "northing")]
+    return RawControl(
+        records=block.records,
+        offsets=block.offsets,
+        names=words("name", ""),
+        roles=words("role", plan.role),
+        codes=[word or None for word in words("code", "")],
+        coordinates=np.stack([*horizontal, number("height")]),
+        sigma_horizontal_m=number("sigma_horizontal"),
+        sigma_height_m=number("sigma_height"),
+    )

@@ -1,0 +1,1 @@
+"""Cracks and potholes of a reconstructed surface."""

@@ -1,0 +1,51 @@
+"""A store that an older version made: nothing ingested is lost, and products are current or made again.
+
+`tests/stores/version-0.1.tar.xz` was made by version 0.1 before its kernels had rooms: a simulated street of 4 m with
+profilers and a lidar, run whole. Its raw logs are archived: what the store holds is all there is.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from roadscan.cli import app
+from roadscan.jobs.session import Session
+from roadscan.jobs.status import survey_status, verify_store
+from roadscan.tables.sql import query
+
+OLD = Path(__file__).resolve().parents[1] / "stores" / "version-0.1.tar.xz"
+ROWS = {"scans": (164, 80328896), "trajectory": (580, 350080502)}
+"""Rows, and sum of their epochs modulo 1,000,003: as version 0.1 counted them."""
+TILES = (4, 9830)
+"""Tiles, and points in them."""
+
+
+@pytest.fixture(scope="module")
+def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("older")
+    with tarfile.open(OLD) as archive:
+        archive.extractall(folder, filter="data")
+    return folder / "SURVEY.toml"
+
+
+def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
+    session = Session.open(survey_file)
+    faults = verify_store(session.store)
+    assert all("was made by an older version" in fault and "next run makes it again" in fault for fault in faults), (
+        faults
+    )
+    state = survey_status(Session.open(survey_file))
+    assert {log["state"] for log in state.logs} == {"ingested"}
+    done = CliRunner().invoke(app, ["run", str(survey_file), "--workers", "0"])
+    assert done.exit_code == 0, done.output
+    assert survey_status(Session.open(survey_file)).is_complete
+    assert verify_store(session.store) == []
+    for table, expected in ROWS.items():
+        found = query(session.store, f"SELECT count(*) AS rows, sum(epoch_gps_ns % 1000003) AS epochs FROM {table}")
+        assert tuple(found.to_pylist()[0].values()) == expected
+    tiles = query(session.store, "SELECT count(*) AS tiles, sum(points) AS points FROM tiles").to_pylist()[0]
+    assert tuple(tiles.values()) == TILES

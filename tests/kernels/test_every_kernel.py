@@ -1,0 +1,120 @@
+"""Every kernel that other files call is tested by name: directly, or through the one function that calls it.
+
+A kernel is what Python can call, or an instruction; pieces that are compiled into their callers are tested there.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+KERNELS = ROOT / "roadscan/kernels"
+
+THROUGH_ITS_CALLER = {
+    "cells.bucket_readings.bucket_mirror": "tests/jobs/test_cell_path.py",
+    "cells.bucket_readings.bucket_returns": "tests/jobs/test_cell_path.py",
+    "cells.profile_counting.accumulate_profiles": "tests/jobs/test_cell_path.py",
+    "cracks.faint_cracks.confirm_strips": "tests/surfaces/test_faint_cracks.py",
+    "georeferencing.flat_profiles.georeference_flat_profiles": "tests/points/test_place.py",
+    "georeferencing.poses.interpolate": "tests/navigation/test_trajectory.py",
+    "georeferencing.poses.interval_coefficients": "tests/navigation/test_trajectory.py",
+    "georeferencing.profile_forms.profile_forms": "tests/points/test_place.py",
+    "georeferencing.reach.reach_of_profiles": "tests/points/test_reach.py",
+    "georeferencing.reach.reach_of_returns": "tests/points/test_reach.py",
+    "georeferencing.timed_points.georeference_mirror": "tests/points/test_place.py",
+    "georeferencing.timed_points.georeference_returns": "tests/points/test_place.py",
+    "georeferencing.timed_points.places": "tests/points/test_place.py",
+    "inertial.kalman.filter_forwards": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_smoother.spread": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_transition.advance": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_transition.predict": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_updates.apply": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_updates.offered": "tests/navigation/test_inertial_smoother.py",
+    "inertial.kalman_updates.prepare": "tests/navigation/test_inertial_smoother.py",
+    "road.carriageway.mark_off_road": "tests/points/test_segmentation.py",
+    "road.segmentation.fitted": "tests/points/test_segmentation.py",
+    "road.segmentation.segment_profiles": "tests/points/test_segmentation.py",
+    "surface.clough_tocher.control_points": "tests/surfaces/test_detailed.py",
+    "surface.clough_tocher.cross_slopes": "tests/surfaces/test_detailed.py",
+    "surface.patch_grid.evaluate": "tests/surfaces/test_detailed.py",
+    "surface.spline_gradients.load": "tests/surfaces/test_detailed.py",
+    "surface.spline_gradients.spline_gradients": "tests/surfaces/test_detailed.py",
+    "surface.vertex_gradients.vertex_gradients": "tests/surfaces/test_detailed.py",
+    "surface.vertex_neighbourhoods.neighbourhoods": "tests/surfaces/test_detailed.py",
+}
+"""Kernels whose input takes a room to make, and the test that holds what comes out against truth from outside."""
+
+
+def kernels_of(file: Path) -> Iterator[str]:
+    """Public kernels of a file that Python or other kernels call, and instructions."""
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            if {"kernel", "bare"} & {ast.unparse(decorator) for decorator in node.decorator_list}:
+                yield node.name
+        elif isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) == "Kernel":
+            yield ast.unparse(node.target)
+
+
+@functools.cache
+def imported(file: Path) -> set[str]:
+    """Dotted names that a file imports from the kernels, or uses of a module of theirs."""
+    text = file.read_text(encoding="utf-8")
+    if "roadscan.kernels" not in text:
+        return set()
+    tree = ast.parse(text)
+    found: set[str] = set()
+    modules: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("roadscan.kernels"):
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}".removeprefix("roadscan.kernels.")
+                found.add(name)
+                modules[alias.asname or alias.name] = name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            found.add(f"{modules[node.value.id]}.{node.attr}")
+    return found
+
+
+def names_in(*folders: str) -> dict[Path, set[str]]:
+    return {file: imported(file) for folder in folders for file in (ROOT / folder).rglob("*.py")}
+
+
+def test_every_kernel_is_tested_by_name() -> None:
+    library, tests = names_in("roadscan"), set().union(*names_in("tests").values())
+    wanted = set()
+    for file in KERNELS.rglob("*.py"):
+        module = ".".join(file.relative_to(KERNELS).with_suffix("").parts)
+        elsewhere = set().union(*(names for other, names in library.items() if other != file))
+        wanted |= {f"{module}.{name}" for name in kernels_of(file)} & elsewhere
+    assert len(wanted) > 100
+    untested = wanted - tests - set(THROUGH_ITS_CALLER)
+    # Kernels of `packing` are held against the libraries that know them by tests of tables and products.
+    assert sorted(name for name in untested if name.count(".") == 2 and not name.startswith("packing.")) == []
+
+
+def test_what_is_tested_through_its_caller_exists_and_is_not_tested_directly() -> None:
+    tests = set().union(*names_in("tests").values())
+    for name, place in THROUGH_ITS_CALLER.items():
+        module, _, kernel = name.rpartition(".")
+        assert kernel in kernels_of(KERNELS / f"{module.replace('.', '/')}.py"), name
+        assert (ROOT / place).is_file(), place
+        assert name not in tests, f"{name} has a direct test now"
+
+
+MOST_PARAMETERS, MOST_FILES = 12, 25
+
+
+def test_kernels_take_structures_and_rooms_stay_small() -> None:
+    """What belongs together is one parameter; a room is read in an hour."""
+    long = {}
+    for file in (ROOT / "roadscan").rglob("kernels/**/*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and len(node.args.args) > MOST_PARAMETERS:
+                long[f"{file.stem}.{node.name}"] = len(node.args.args)
+    assert long == {}
+    folders = {folder for folder in KERNELS.rglob("*") if folder.is_dir() and folder.name != "__pycache__"}
+    assert {folder.name for folder in {KERNELS, *folders} if len(list(folder.glob("*.py"))) > MOST_FILES} == set()

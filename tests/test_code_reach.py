@@ -1,0 +1,145 @@
+"""Which code counts for a key: all that can be come across, and nothing else."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadscan import code_reach
+from roadscan.code_reach import CARRIERS, code_digest, reached_code
+
+PARTS = {
+    "__init__.py": "",
+    "maker.py": '''
+"""Makes."""
+from typing import TYPE_CHECKING
+
+from added_package import below
+from added_package.handed import helper
+from added_package.tuples import LEFT as TURN
+
+if TYPE_CHECKING:
+    from added_package.kinds import Kind
+
+SCALE = 2
+UNUSED = 3
+
+
+class Maker:
+    """Docstring."""
+
+    def make(self, kind: "Kind") -> int:
+        """Docstring."""
+        from added_package.late import late
+
+        return SCALE * helper(kind.size) + late() + below.deep() + TURN
+
+
+def other() -> int:
+    return UNUSED
+''',
+    "handed.py": "from added_package.origin import helper\n",
+    "origin.py": "def helper(size):\n    return size\n\n\ndef neighbour():\n    return 1\n",
+    "kinds.py": "from dataclasses import dataclass\n\n\n@dataclass\nclass Kind:\n    size: int = 1\n",
+    "late.py": "_FIRST, _SECOND = 1, 2\n\n\ndef late():\n    return _SECOND\n",
+    "below.py": "def deep():\n    return 1\n",
+    "tuples.py": "LEFT, RIGHT = range(2)\nregistry = {}\nregistry['x'] = 1\n",
+}
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package of another project, which adds a class of its own."""
+    folder = tmp_path / "added_package"
+    folder.mkdir()
+    for name, text in PARTS.items():
+        (folder / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield folder
+    for name in [n for n in sys.modules if n.partition(".")[0] == "added_package"]:
+        del sys.modules[name]
+    forget()
+
+
+def forget() -> None:
+    for known in (code_reach._file_of, code_reach._module, code_reach._digest_of):
+        known.cache_clear()
+
+
+def digest() -> str:
+    forget()
+    return code_digest("added_package.maker:Maker")
+
+
+def edited(file: Path, old: str, new: str) -> bool:
+    """True if an edit changes the digest."""
+    text, before = file.read_text(), digest()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    after = digest()
+    file.write_text(text)
+    assert digest() == before
+    return after != before
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("maker.py", "SCALE * helper", "SCALE + helper"),
+        ("maker.py", "SCALE = 2", "SCALE = 4"),
+        ("origin.py", "return size", "return size + 1"),
+        ("kinds.py", "size: int = 1", "size: int = 2"),
+        ("late.py", "1, 2", "2, 1"),
+        ("below.py", "return 1", "return 2"),
+        ("tuples.py", "range(2)", "range(1, 3)"),
+        ("tuples.py", "registry['x'] = 1", "registry['x'] = 2"),
+    ],
+    ids=["own", "constant", "handed on", "annotated", "imported late", "module", "tuple", "statement of a module"],
+)
+def test_an_edit_of_what_is_reached_counts(package: Path, file: str, old: str, new: str) -> None:
+    assert edited(package / file, old, new)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("maker.py", "UNUSED = 3", "UNUSED = 4"),
+        ("maker.py", "return UNUSED", "return 5"),
+        ("origin.py", "return 1", "return 2"),
+        ("maker.py", '"""Docstring."""', '"""Another\n    text."""'),
+        ("origin.py", "    return size", "    # why\n\n    return size"),
+    ],
+    ids=["constant of another", "another", "neighbour", "docstring", "comment"],
+)
+def test_an_edit_beside_it_does_not(package: Path, file: str, old: str, new: str) -> None:
+    assert not edited(package / file, old, new)
+
+
+def test_a_new_file_does_not_count(package: Path) -> None:
+    before = digest()
+    (package / "new.py").write_text("def helper(size):\n    return 0\n")
+    assert digest() == before
+
+
+def test_an_entry_that_is_gone_is_told() -> None:
+    with pytest.raises(LookupError, match=r"roadscan\.jobs\.tiles\.tiles:no_such_thing"):
+        code_digest("roadscan.jobs.tiles.tiles:no_such_thing")
+
+
+def test_every_carrier_exists() -> None:
+    for carrier in CARRIERS:
+        code_reach._place_of(carrier)
+
+
+def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> None:
+    reached = reached_code(["roadscan.jobs.tiles.tiles:compute_tiles"])
+    modules = {place.partition(":")[0] for place in reached}
+    assert {"roadscan.navigation.trajectory:Corrections", "roadscan.points.charts:Charts"} <= reached.keys()
+    assert {"roadscan.navigation.clocks.correction", "roadscan.tiles.cells", "roadscan.model.crs"} <= modules
+    rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")
+    assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
+    assert not [
+        p for p in reached if p.startswith(("roadscan.model.smoothing:Smoother", "roadscan.model.calibration:C"))
+    ]

@@ -11,6 +11,7 @@ from roadscan.jobs.engine.compute import damaged_file, rare_collections
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, stages
+from roadscan.jobs.tiles.selection import SelectionError
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import begin_changes, end_changes, write_failures
@@ -48,6 +49,8 @@ def run_stage(session: Session, stage: Stage) -> None:
     try:
         with rare_collections():
             stage.run(session)
+    except SelectionError:
+        raise
     except NothingToPlaceError as nothing:
         if not session.places_nothing:
             session.note(str(nothing))

@@ -164,6 +164,9 @@ def test_selections(finished: Simulated) -> None:
         finished.run(selection=Selection(named=(TileId(1, 1),)))
     with pytest.raises(ConfigError, match="no tile with readings"):
         finished.run(selection=Selection(span_gps_ns=(0, 1)))
+    assert survey_status(
+        Session(Survey.load(finished.survey_file), store)
+    ).is_complete  # a refused choice is no failure
 
 
 def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path: Path) -> None:

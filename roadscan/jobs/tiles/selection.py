@@ -13,6 +13,10 @@ from roadscan.model.ids import TileId
 from roadscan.tiles.grid import Bounds, TileGrid
 
 
+class SelectionError(ConfigError):
+    """The choice names what the survey does not hold; the store is as it was."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """A choice of tiles; the parts that are given add up."""
@@ -28,7 +32,7 @@ class Selection:
         with_readings = set(known)
         unknown = [t for t in self.named if t not in with_readings]
         if unknown:
-            raise ConfigError(
+            raise SelectionError(
                 f"no reading touches tile {unknown[0]}", expected="a tile of the survey (see the tile table)"
             )
         chosen = set(self.named)
@@ -40,7 +44,7 @@ class Selection:
             pairs = np.unique(np.column_stack([footprints.tile_column, footprints.tile_row])[rows], axis=0)
             chosen |= {TileId(int(c), int(r)) for c, r in pairs}
         if not chosen:
-            raise ConfigError("the choice holds no tile with readings", expected="tiles of the survey")
+            raise SelectionError("the choice holds no tile with readings", expected="tiles of the survey")
         return sorted(chosen, key=lambda t: (t.row, t.column))
 
 

@@ -1,0 +1,102 @@
+"""Observations of an adjustment: each is one number that the corrections of one or two poses explain.
+
+A correction is that of `schemas/corrections.toml`: north, east, down (m, local level) and a small turn about the axes
+of the body (rad). A point of the body, `arm_body_m` from its origin, moves in local level by
+
+    d = position + R · (turn × arm),    R = level from body.
+
+An observation with direction n (unit, local level) sees n · d of each of its ends, so its partial derivatives by the
+six corrections are n and arm × (Rᵀ n) (Skaloud & Lichti 2006, linearised). Its second end counts negatively: after the
+correction, the two ends agree along n.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Int32 = npt.NDArray[np.int32]
+UInt8 = npt.NDArray[np.uint8]
+
+KINDS: Final = ("height_tie", "shift_tie", "plane_tie", "control_height", "control_position")
+"""Height of one pass against another's; shift of one picture or relief against another's; distance of two planes;
+height, or a component of the place, of a control point."""
+
+COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
+"""The unknowns of a pose, in the order of the partial derivatives."""
+
+FIXED: Final = -1
+"""Run of an end that no correction moves: a control point."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """n observations; `observed_m` = Σ over ends of partials · correction, plus noise of `sigma_m`."""
+
+    kind: UInt8
+    """(n,) index into `KINDS`."""
+    run: Int32
+    """(n, 2) index of the run of each end; `FIXED` for control."""
+    epoch_gps_ns: Int64
+    """(n, 2) epoch of the pose of each end; 0 for control."""
+    partials: Float64
+    """(n, 2, 6) derivatives by `COMPONENTS`, the sign of the end included; 0 for control."""
+    observed_m: Float64
+    """(n,) second end minus first along the direction, as the recorded poses place them; of control: surveyed minus
+    measured."""
+    sigma_m: Float64
+    """(n,) 1 σ, without that of the poses."""
+    group: Int64
+    """(n,) observations of one group stand or fall together: the two components of one shift."""
+    place: Int64
+    """(n,) place, or control point, that it was made at."""
+
+    @property
+    def size(self) -> int:
+        """Number of observations."""
+        return self.kind.size
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """All of them, in order; groups are numbered anew."""
+        if not parts:
+            return cls.none()
+        columns = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)}
+        groups, last = [], 0
+        for part in parts:
+            _, own = np.unique(part.group, return_inverse=True)
+            groups.append(own.astype(np.int64) + last)
+            last += int(own.max()) + 1 if own.size else 0
+        columns["group"] = np.concatenate(groups)
+        return cls(**columns)
+
+    @classmethod
+    def none(cls) -> Self:
+        """No observation."""
+        return cls(
+            np.zeros(0, np.uint8), np.zeros((0, 2), np.int32), np.zeros((0, 2), np.int64), np.zeros((0, 2, 6)),
+            np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64),
+        )  # fmt: skip
+
+    def chosen(self, which: npt.NDArray[np.bool_] | Int64) -> Self:
+        """Some of them."""
+        return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+
+def partials(direction_level: Float64, level_from_body: Float64, arm_body_m: Float64) -> Float64:
+    """Derivatives (n, 6) of the movement along a direction by the corrections of a pose.
+
+    Parameters
+    ----------
+    direction_level : (n, 3) unit vectors, north-east-down.
+    level_from_body : (n, 3, 3) rotation of the recorded pose.
+    arm_body_m : (n, 3) from the body's origin to the point, body axes (m).
+    """
+    in_body = np.einsum("nji,nj->ni", level_from_body, direction_level)
+    return np.concatenate([direction_level, np.cross(arm_body_m, in_body)], axis=-1)

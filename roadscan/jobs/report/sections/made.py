@@ -1,0 +1,99 @@
+"""Section of the report: the files that the survey has, with a small picture of each raster and each picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from PIL import Image
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+
+from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
+from roadscan.jobs.report.section import Section
+from roadscan.jobs.session import Session
+from roadscan.jobs.summary import survey_summary
+from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.store import Store
+
+_EDGE: Final = 900
+"""Longer edge of a small picture (pixels)."""
+_MOST_BYTES: Final = 512_000_000
+"""A file of an object store that is larger is not fetched for a small picture."""
+_SUFFIXES: Final = (".tif", ".png", ".jpg")
+
+UInt8 = npt.NDArray[np.uint8]
+
+
+class Made(Section):
+    """Products: how many files, how large, where; what they look like."""
+
+    name = "products"
+    title = "Products"
+    position = 900
+
+    def blocks(self, session: Session) -> Iterator[Block]:
+        """A row a product, then a small picture of the largest raster or picture of each survey product."""
+        files = survey_summary(session.survey, session.store).files
+        files.pop("report", None)
+        if not files:
+            return
+        rows = [(name, f"{one.files:,}", f"{one.bytes / 1e6:,.1f} MB", one.folder) for name, one in files.items()]
+        yield Table(("product", "files", "size", "folder"), rows, numbers=False)
+        for name, record in sorted(_largest(session).items()):
+            try:
+                small = _small_picture(session.store, record)
+            except (RasterioError, OSError, ValueError) as error:
+                yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
+                continue
+            if small is not None:
+                yield Picture(small, f"{name}: {record.path}")
+
+
+def _largest(session: Session) -> dict[str, OutputRecord]:
+    """The largest raster or picture of each product over many tiles."""
+    largest: dict[str, OutputRecord] = {}
+    for record in session.manifest.all():
+        if not record.path.startswith("products/") or not record.path.endswith(_SUFFIXES):
+            continue
+        known = largest.get(record.product)
+        if known is None or (record.bytes, record.path) > (known.bytes, known.path):
+            largest[record.product] = record
+    return largest
+
+
+def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
+    if store.is_folder:
+        return _reduced(store.path(record.path))
+    if record.bytes > _MOST_BYTES:
+        return None
+    with MemoryFile(store.read_bytes(record.path)) as held:
+        return _reduced(held.name)
+
+
+def _reduced(path: str) -> bytes:
+    with rasterio.open(path) as file:
+        share = min(1.0, _EDGE / max(file.width, file.height))
+        shape = (max(1, round(file.height * share)), max(1, round(file.width * share)))
+        bands = file.read(
+            indexes=[1, 2, 3] if file.count >= 3 else [1], out_shape=shape, masked=True, resampling=Resampling.average
+        )
+    grey = np.stack([_stretched(band) for band in bands], axis=-1)
+    picture = Image.fromarray(grey if grey.shape[-1] == 3 else grey[:, :, 0])
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+def _stretched(band: np.ma.MaskedArray) -> UInt8:
+    """Eight bits; numbers that are no bytes are stretched from their 2nd to their 98th percentile. White: no value."""
+    values = np.ma.masked_invalid(band).astype(np.float64)
+    if band.dtype != np.uint8 and values.count():
+        low, high = np.percentile(values.compressed(), [2, 98])
+        values = np.ma.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255
+    return np.ma.filled(values, 255.0).round().astype(np.uint8)

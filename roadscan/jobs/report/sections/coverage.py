@@ -15,9 +15,10 @@ from roadscan.jobs.plan.drives import Drives
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
 from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.sections.recorded import seconds_of
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import OutputRecord
 
@@ -56,7 +57,7 @@ class Coverage(Section):
             ("pass", "run", "lane", "direction", "from", "seconds"),
             [
                 (
-                    str(p.pass_id), p.run, p.lane or "–", p.direction or "–", iso_from_gps_ns(p.start_gps_ns),
+                    str(p.pass_id), p.run, p.lane or "–", p.direction or "–", seconds_of(p.start_gps_ns),
                     f"{(p.end_gps_ns - p.start_gps_ns) / NS_PER_S:,.1f}",
                 )
                 for p in plan.passes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
@@ -25,6 +26,7 @@ _EDGE: Final = 900
 """Longer edge of a small picture (pixels)."""
 _MOST_BYTES: Final = 512_000_000
 """A file of an object store that is larger is not fetched for a small picture."""
+_MOST_OF_A_PRODUCT: Final = 4
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
 
 UInt8 = npt.NDArray[np.uint8]
@@ -38,45 +40,52 @@ class Made(Section):
     position = 900
 
     def blocks(self, session: Session) -> Iterator[Block]:
-        """A row a product, then a small picture of the largest raster or picture of each survey product."""
+        """A row a product, then small pictures of the first rasters and pictures of each survey product."""
         files = survey_summary(session.survey, session.store).files
         files.pop("report", None)
         if not files:
             return
-        rows = [(name, f"{one.files:,}", f"{one.bytes / 1e6:,.1f} MB", one.folder) for name, one in files.items()]
+        root = session.store.root.rstrip("/") + "/"
+        rows = [
+            (name, f"{one.files:,}", f"{one.bytes / 1e6:,.1f} MB", one.folder.removeprefix(root))
+            for name, one in files.items()
+        ]
         yield Table(("product", "files", "size", "folder"), rows, numbers=False)
-        for name, record in sorted(_largest(session).items()):
+        for record in _shown(session):
             try:
                 small = _small_picture(session.store, record)
             except (RasterioError, OSError, ValueError) as error:
                 yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
                 continue
             if small is not None:
-                yield Picture(small, f"{name}: {record.path}")
+                yield Picture(small, f"{record.product}: {record.path}")
 
 
-def _largest(session: Session) -> dict[str, OutputRecord]:
-    """The largest raster or picture of each product over many tiles."""
-    largest: dict[str, OutputRecord] = {}
-    for record in session.manifest.all():
+def _shown(session: Session) -> Iterator[OutputRecord]:
+    """The first rasters and pictures of each product over many tiles, by path."""
+    counts: Counter[str] = Counter()
+    for record in sorted(session.manifest.all(), key=lambda r: r.path):
         if not record.path.startswith("products/") or not record.path.endswith(_SUFFIXES):
             continue
-        known = largest.get(record.product)
-        if known is None or (record.bytes, record.path) > (known.bytes, known.path):
-            largest[record.product] = record
-    return largest
+        counts[record.product] += 1
+        if counts[record.product] <= _MOST_OF_A_PRODUCT:
+            yield record
 
 
 def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
-    if store.is_folder:
-        return _reduced(store.path(record.path))
-    if record.bytes > _MOST_BYTES:
+    if record.bytes > _MOST_BYTES and not store.is_folder:
         return None
+    if not record.path.endswith(".tif"):
+        picture = Image.open(io.BytesIO(store.read_bytes(record.path)))
+        picture.thumbnail((_EDGE, _EDGE))
+        return _png(picture)
+    if store.is_folder:
+        return _png(_reduced(store.path(record.path)))
     with MemoryFile(store.read_bytes(record.path)) as held:
-        return _reduced(held.name)
+        return _png(_reduced(held.name))
 
 
-def _reduced(path: str) -> bytes:
+def _reduced(path: str) -> Image.Image:
     with rasterio.open(path) as file:
         share = min(1.0, _EDGE / max(file.width, file.height))
         shape = (max(1, round(file.height * share)), max(1, round(file.width * share)))
@@ -84,7 +93,10 @@ def _reduced(path: str) -> bytes:
             indexes=[1, 2, 3] if file.count >= 3 else [1], out_shape=shape, masked=True, resampling=Resampling.average
         )
     grey = np.stack([_stretched(band) for band in bands], axis=-1)
-    picture = Image.fromarray(grey if grey.shape[-1] == 3 else grey[:, :, 0])
+    return Image.fromarray(grey if grey.shape[-1] == 3 else grey[:, :, 0])
+
+
+def _png(picture: Image.Image) -> bytes:
     stream = io.BytesIO()
     picture.save(stream, "PNG", optimize=True)
     return stream.getvalue()

@@ -10,7 +10,7 @@ from roadscan.jobs.report.blocks import Block, Table
 from roadscan.jobs.report.section import Section
 from roadscan.jobs.session import Session
 from roadscan.jobs.summary import survey_summary
-from roadscan.model.gpstime import iso_from_gps_ns
+from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.tables.logs import LogRecord, read_log_records
 
 
@@ -44,10 +44,15 @@ class Recorded(Section):
             yield Table(("what became of it", "readings", "share"), rows, "Readings")
 
 
+def seconds_of(epoch_gps_ns: int) -> str:
+    """``2026-05-04 09:30:00`` (UTC) for a GPS epoch."""
+    return f"{utc_from_gps_ns(epoch_gps_ns):%Y-%m-%d %H:%M:%S}"
+
+
 def _row(record: LogRecord) -> tuple[str, ...]:
     spans = [span for table in record.tables if (span := record.span(table)) is not None]
-    first = iso_from_gps_ns(min(s[0] for s in spans)) if spans else "–"
-    last = iso_from_gps_ns(max(s[1] for s in spans)) if spans else "–"
+    first = seconds_of(min(s[0] for s in spans)) if spans else "–"
+    last = seconds_of(max(s[1] for s in spans)) if spans else "–"
     return (
         record.path, record.run, record.sensor, record.format, first, last,
         f"{record.rows:,}", f"{record.rejected:,}",

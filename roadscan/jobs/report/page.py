@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from pathlib import Path
 from typing import Final
 
 from jinja2 import Environment, StrictUndefined
@@ -48,7 +49,11 @@ def keep_report(session: Session) -> str:
     manifest = Manifest(session.store, [])
     known, key = manifest.get(REPORT, REPORT), key_of(page.hex())
     if known is None or known.key != key or not session.store.exists(PATH):
-        keep_file(session.store, manifest, (REPORT, REPORT), key, PATH, lambda file: file.write_bytes(page) and None)
+
+        def write(file: Path) -> None:
+            file.write_bytes(page)
+
+        keep_file(session.store, manifest, (REPORT, REPORT), key, PATH, write)
     return PATH
 
 

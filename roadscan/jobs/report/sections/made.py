@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -102,10 +102,11 @@ def _png(picture: Image.Image) -> bytes:
     return stream.getvalue()
 
 
-def _stretched(band: np.ma.MaskedArray) -> UInt8:
+def _stretched(band: Any) -> UInt8:
     """Eight bits; numbers that are no bytes are stretched from their 2nd to their 98th percentile. White: no value."""
-    values = np.ma.masked_invalid(band).astype(np.float64)
-    if band.dtype != np.uint8 and values.count():
-        low, high = np.percentile(values.compressed(), [2, 98])
-        values = np.ma.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255
-    return np.ma.filled(values, 255.0).round().astype(np.uint8)
+    values = np.ma.filled(band.astype(np.float64), np.nan)
+    there = values[np.isfinite(values)]
+    if band.dtype != np.uint8 and there.size:
+        low, high = np.percentile(there, [2, 98])
+        values = np.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255
+    return np.nan_to_num(values, nan=255.0).round().astype(np.uint8)

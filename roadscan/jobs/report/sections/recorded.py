@@ -40,8 +40,8 @@ class Recorded(Section):
         fates = survey_summary(session.survey, session.store).readings
         if fates:
             total = sum(fates.values())
-            rows = [(name.replace("_", " "), f"{count:,}", f"{count / total:.2%}") for name, count in fates.items()]
-            yield Table(("what became of it", "readings", "share"), rows, "Readings")
+            shares = [(name.replace("_", " "), f"{count:,}", f"{count / total:.2%}") for name, count in fates.items()]
+            yield Table(("what became of it", "readings", "share"), shares, "Readings")
 
 
 def seconds_of(epoch_gps_ns: int) -> str:

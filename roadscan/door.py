@@ -120,6 +120,12 @@ class OpenSurvey:
 
         return verify_store(self.store)
 
+    def report(self) -> str:
+        """The report page as HTML; it needs nothing beside it."""
+        from roadscan.jobs.report.page import report_page
+
+        return report_page(self.session)
+
     def connect(self) -> duckdb.DuckDBPyConnection:
         """A DuckDB connection in which each table of the survey is a view; the caller closes it."""
         from roadscan.jobs.navigate.navigate import known_keys

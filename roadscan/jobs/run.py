@@ -71,12 +71,15 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
     A whole run without failures has a record for every file that is due: what a run before it left without one is
     removed.
     """
-    if {stage.name for stage in done}.issuperset(stage.name for stage in stages()):
+    whole = {stage.name for stage in done}.issuperset(stage.name for stage in stages())
+    if whole:
         session.manifest.compact()
         if session.selection is None and not session.failures:
             folders = [folder for stage in stages() for folder in stage.folders()]
             end_changes(session.store, session.manifest, folders if session.goes_on else ())
     write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
+    if whole:
+        _report(session)
     if session.store.is_folder:
         logs = read_log_records(session.store, damaged=[])
         note_written(session.store, session.began_ns, recorded_files(session.store, logs, session.manifest))
@@ -87,3 +90,15 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
             f"{len(session.failures)} units failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
         )
+
+
+def _report(session: Session) -> None:
+    """Write the report; what keeps it from being made costs nothing else."""
+    from roadscan.jobs.report.page import keep_report
+
+    try:
+        path = keep_report(session)
+    except RoadscanError as error:
+        session.note(f"the report could not be written: {error}")
+    else:
+        session.reporter.line(f"report: {session.store.path(path)}")

@@ -83,12 +83,13 @@ def test_keys_are_for_the_user_alone(started: Started) -> None:
 
 
 def test_no_certificate_lets_nobody_in(started: Started) -> None:
-    with pytest.raises(RoadscanError, match=r"reached by TLS, and no certificate.*ca-file"):
-        with connected(started.address):
-            pass
-    with pytest.raises(RoadscanError, match="no Dask scheduler answers"):
-        with connected(started.address.replace("tls", "tcp")):
-            pass
+    with pytest.raises(RoadscanError, match=r"reached by TLS, and no certificate.*ca-file"), connected(started.address):
+        pass
+    with (
+        pytest.raises(RoadscanError, match="no Dask scheduler answers"),
+        connected(started.address.replace("tls", "tcp")),
+    ):
+        pass
 
 
 def test_a_certificate_of_another_authority_lets_nobody_in(started: Started, tmp_path: Path) -> None:
@@ -97,6 +98,9 @@ def test_a_certificate_of_another_authority_lets_nobody_in(started: Started, tmp
     (tmp_path / "key").write_text(other.tls_client_key)
     client = {"cert": str(tmp_path / "cert"), "key": str(tmp_path / "key")}
     tls = {"distributed.comm.tls.ca-file": str(started.certificates / "ca.pem"), "distributed.comm.tls.client": client}
-    with dask.config.set(tls), pytest.raises(RoadscanError, match="no Dask scheduler answers"):
-        with connected(started.address):
-            pass
+    with (
+        dask.config.set(tls),
+        pytest.raises(RoadscanError, match="no Dask scheduler answers"),
+        connected(started.address),
+    ):
+        pass

@@ -118,7 +118,9 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
         opened.enter_context(dask.config.set(QUIET_CLUSTER | {"temporary-directory": opened.enter_context(_scratch())}))
         with _held_back(), _without_interrupts():
             number = workers or dask.system.CPU_COUNT
-            cluster = opened.enter_context(_cluster(number, with_dashboard=dashboard is not None))
+            cluster = opened.enter_context(
+                closed_cluster(number, Security.temporary(), with_dashboard=dashboard is not None)
+            )
         client = opened.enter_context(Client(cluster))
         if dashboard is not None:
             dashboard(f"http://{LOOPBACK}:{cluster.scheduler.http_server.port}/status")
@@ -131,13 +133,12 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
             raise
 
 
-def _cluster(workers: int, *, with_dashboard: bool) -> SpecCluster:
-    """As Dask's ``LocalCluster``, with doors closed.
+def closed_cluster(workers: int, security: Security, *, with_dashboard: bool = False) -> SpecCluster:
+    """As Dask's ``LocalCluster``, with doors closed; it is opened with :data:`QUIET_CLUSTER`, and a private folder.
 
     The key travels to the workers through a pipe from their parent. OpenSSL reads keys from files alone: for that
     moment, it lies in a folder that only this user can open.
     """
-    security = Security.temporary()
     quiet = "CRITICAL"  # of a worker that dies, the run itself says what is lost
     shared = {"host": LOOPBACK, "protocol": "tls://", "security": security}
     nanny = {

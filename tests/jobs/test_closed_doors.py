@@ -151,6 +151,7 @@ def test_a_temporary_folder_that_others_can_change_is_refused(tmp_path: Path, mo
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.nightly
 def test_a_dashboard_is_served_where_one_is_asked_for() -> None:
     pytest.importorskip("bokeh", reason="Bokeh draws the dashboard: pip install bokeh")
     heard: list[str] = []

@@ -23,6 +23,8 @@ from roadscan.model.errors import RoadscanError
 from tests.conftest import REPOSITORY
 from tests.flows.prefect_server import background
 
+pytestmark = pytest.mark.nightly
+
 BLOCKS = dict(
     re.findall(r"^```bash (\w+)\n(.*?)^```", (REPOSITORY / "docs/deployment.md").read_text(), flags=re.M | re.DOTALL)
 )

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, cont2discrete, lsim
 
-from roadscan.condition.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri, rough_places
+from roadscan.condition.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
 from roadscan.condition.ride import ride
 from roadscan.condition.segments import Segments, segments_of
+from roadscan.condition.stretches import stretches_above
 from roadscan.kernels.condition.quarter_car import roll
 from roadscan.model.errors import ProfileError
 
@@ -163,9 +164,9 @@ def test_rolling_iri_and_rough_places() -> None:
     there = Segments(x[k : k + 1] - 3.81, x[k : k + 1] + 3.81)
     assert rolling[k] == pytest.approx(iri_of(on, there).iri_m_per_km[0, 0])
     assert np.isnan(rolling[x < 3.8]).all() and np.isfinite(rolling[(x > 3.82) & (x < 96.1)]).all()
-    place = max(rough_places(x, rolling, 10.0), key=lambda one: one.peak_m_per_km)
+    place = max(stretches_above(x, rolling, 10.0), key=lambda one: one.peak)
     assert 55.0 < place.from_m < 60.0 < place.to_m < 68.0
-    assert place.peak_m_per_km == np.nanmax(rolling) == rolling[x == place.peak_m]
+    assert place.peak == np.nanmax(rolling) == rolling[x == place.peak_m]
     assert (rolling[(x >= place.from_m) & (x <= place.to_m)] > 10.0).all()
 
 

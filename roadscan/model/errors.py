@@ -147,6 +147,10 @@ class NavigationError(RoadscanError):
     """A pose was asked for where the trajectory has none."""
 
 
+class ProfileError(RoadscanError):
+    """A profile of a road cannot be given the index that was asked for."""
+
+
 class StoreError(RoadscanError):
     """The store is damaged, locked or not a roadscan store."""
 

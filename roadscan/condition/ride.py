@@ -1,0 +1,109 @@
+"""The response of a quarter car to longitudinal profiles, and its mean over any stretch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.profiles import Breaks, breaks_of, fault_of, heights_of, stations_of
+from roadscan.condition.quarter_car import GOLDEN_CAR, RULES
+from roadscan.condition.segments import Segments
+from roadscan.kernels.condition.quarter_car import QuarterCar, roll
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ride:
+    """What a quarter car felt on profiles that share their stations."""
+
+    x_m: Floats
+    """(n,) stations (m)."""
+    response_m: Floats
+    """(profiles, n) integral of the suspension's |slope|, or of its square, from the first sample on (m)."""
+    measured_m: Floats
+    """(profiles, n) length rolled over from the first sample on (m); gaps do not count."""
+    breaks: tuple[Breaks, ...]
+    """Gaps and jumps of each profile."""
+    faults: tuple[str, ...]
+    """Why a profile can be given no index; empty where it can."""
+
+    def means(self, segments: Segments, least_share: float = 0.5) -> tuple[Floats, Floats]:
+        """Means of the response over segments, and the share of each segment that was rolled over.
+
+        Returns
+        -------
+        (profiles, segments) twice. The mean is NaN where less than `least_share` of a segment was rolled over, and of
+        profiles with a fault.
+        """
+        shape = (len(self.faults), segments.from_m.size)
+        means, shares = np.full(shape, np.nan), np.zeros(shape)
+        for row, fault in enumerate(self.faults):
+            if fault:
+                continue
+            felt, rolled = self._over(self.response_m[row], segments), self._over(self.measured_m[row], segments)
+            shares[row] = rolled / (segments.to_m - segments.from_m)
+            enough = (shares[row] >= least_share) & (rolled > 0.0)
+            means[row, enough] = felt[enough] / rolled[enough]
+        return means, np.minimum(shares, 1.0)
+
+    def notes(self, segments: Segments, nominal_m: float | None = None) -> list[list[str]]:
+        """What to know of each profile's segments, as words with commas between them; empty where there is nothing.
+
+        `start`: the car begins in it, so its first 11 m depend on how it begins. `gap`: more than a foot was not
+        measured. `jump`: a step that no road has was left out. `short`: less than `nominal_m` long.
+        """
+        return [[self._note(row, k, segments, nominal_m) for k in range(segments.from_m.size)]
+                for row in range(len(self.faults))]  # fmt: skip
+
+    def _over(self, sums: Floats, segments: Segments) -> Floats:
+        """Differences of sums over segments."""
+        return np.interp(segments.to_m, self.x_m, sums) - np.interp(segments.from_m, self.x_m, sums)
+
+    def _note(self, row: int, k: int, segments: Segments, nominal_m: float | None) -> str:
+        begin, end, broken = segments.from_m[k], segments.to_m[k], self.breaks[row]
+        starts = (self.x_m[:1], broken.gap_to_m, broken.jump_m)
+        ends = Segments(segments.from_m[k : k + 1], segments.to_m[k : k + 1])
+        missing_m = end - begin - float(self._over(self.measured_m[row], ends)[0])
+        told: dict[Literal["start", "gap", "jump", "short"], bool] = {
+            "start": any(bool(((at + RULES.start_m > begin) & (at < end)).any()) for at in starts),
+            "gap": bool(((broken.gap_from_m < end) & (broken.gap_to_m > begin)).any())
+            or missing_m > RULES.longest_step_m,
+            "jump": bool(((broken.jump_m >= begin) & (broken.jump_m <= end)).any()),
+            "short": nominal_m is not None and bool(end - begin < nominal_m * (1.0 - 1e-6)),
+        }
+        return ", ".join(word for word, said in told.items() if said)
+
+
+def ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike, car: QuarterCar = GOLDEN_CAR, *, squared: bool = False) -> Ride:
+    """The response of a quarter car to profiles of any spacing up to a foot, regular or not.
+
+    The state passes from sample to sample by the exact solution of the equations of motion. The car begins at rest on
+    the mean slope of the first 11 m, and so it does behind each gap of more than a foot and each jump of more than
+    0.1 m; pieces of less than 11 m are left out.
+
+    Parameters
+    ----------
+    x_m : (n,) stations, ascending (m).
+    height_m : (n,) or (profiles, n) heights; NaN where there is none (m).
+    squared : the square of the suspension's slope is summed up in place of its absolute value.
+
+    Raises
+    ------
+    ProfileError
+        where the stations do not ascend, or heights do not fit them. A profile that cannot be judged has a fault.
+    """
+    x = stations_of(x_m)
+    heights = heights_of(height_m, x.size)
+    response, measured = np.empty_like(heights), np.empty_like(heights)
+    roll(x, heights, car, RULES, squared, response, measured)
+    return Ride(
+        x,
+        response,
+        measured,
+        tuple(breaks_of(x, row, RULES) for row in heights),
+        tuple(fault_of(x, row, RULES) for row in heights),
+    )

@@ -1,0 +1,1 @@
+"""Kernels of condition: vehicles that roll over a profile, straightedges on it."""

@@ -1,7 +1,7 @@
-"""Readings of painted targets, drawn without a formula of the fit: shapes are masks, wear is noise held against a level.
+"""Readings of painted targets without a formula of the fit: shapes are masks, wear is noise held against a level.
 
-Two sources of a road's intensity: the simulator's surface (`from_simulator`), and a picture painted by OpenCV at
-0.5 mm (`from_picture`), both read at the places of a profiler's readings by a drive in any direction.
+Two sources of a road's intensity: the simulator's surface (`SimulatedRoad`), and a picture painted by OpenCV at
+0.5 mm (`painted_sample`), both read at the places of a profiler's readings by a drive in any direction.
 """
 
 from __future__ import annotations

@@ -48,8 +48,8 @@ def spacing_m(place_m: Float64, block_m: float) -> float:
 
     Blocks with less than a third of the median's readings lie at a border and do not count.
     """
-    _, count = np.unique(np.floor(place_m / block_m).astype(np.int64), axis=0, return_counts=True)
-    if not count.size:
+    if not place_m.size:
         return float("inf")
+    count = cells_of(place_m, np.zeros(len(place_m)), block_m).count
     full = count[count >= np.median(count) / 3]
     return float(block_m / np.sqrt(full.mean()))

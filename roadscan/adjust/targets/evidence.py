@@ -6,6 +6,7 @@ paint from no paint: wear takes a part of each share, while another thing misses
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ _TOLERANCE = 0.05
 """An outline may miss its place by this share of the radius, besides half of the readings' distance."""
 _LEAST_PER_SECTOR = 4
 _LEAST_IN_CENTRE = 4
+_WORN = 0.35
+"""Weight of road within the outline against white beyond it."""
 _BLOCKS = 3
 
 
@@ -85,25 +88,28 @@ def _of_disc(away: Float64, white: Bool, shape: Disc, slack_m: float) -> Evidenc
     tolerance = _TOLERANCE * half + slack_m
     azimuth = np.arctan2(away[:, 1], away[:, 0])
     sector = np.minimum(((azimuth / np.pi + 1.0) / 2.0 * _SECTORS).astype(np.int64), _SECTORS - 1)
-    band = (r > max(0.5 * half, 1.1 * centre)) & (r < 1.5 * half)
-    good = sum(
-        _edge_near(r[band & (sector == k)], white[band & (sector == k)], half, tolerance) for k in range(_SECTORS)
-    )
+    band = np.flatnonzero((r > max(0.5 * half, 1.1 * centre)) & (r < 1.5 * half))
+    band = band[np.lexsort((r[band], sector[band]))]
+    ends = np.searchsorted(sector[band], np.arange(_SECTORS + 1))
+    pieces = (band[first:last] for first, last in itertools.pairwise(ends))
+    good = sum(_edge_near(r[piece], white[piece], half, tolerance) for piece in pieces)
     return Evidence(paint, good / _SECTORS, clear)
 
 
 def _edge_near(r: Float64, white: Bool, half_m: float, tolerance_m: float) -> bool:
-    """Whether the radius that parts white from other values best lies where the outline is."""
+    """Whether the radius that parts white from other values best lies where the outline is; radii ascend.
+
+    White beyond it counts more than road within it, which may be worn paint.
+    """
     if r.size < _LEAST_PER_SECTOR:
         return False
-    order = np.argsort(r, kind="stable")
-    r = r[order]
-    gain = np.append(0, np.cumsum(np.where(white[order], 1, -1)))
-    best = np.flatnonzero(gain == gain.max())
+    gain = np.append(0.0, np.cumsum(np.where(white, 1.0, -_WORN)))
+    most = gain.max()
+    best = np.flatnonzero(gain >= most - 1e-9)
     ends = np.concatenate([r[:1], r, r[-1:]])
     low, high = float(ends[best[0]]), float(ends[best[-1] + 1])
-    within = gain.max() >= _LEAST_PER_SECTOR / 2
-    return bool(within and low - tolerance_m <= half_m <= high + tolerance_m and high - low < 4 * tolerance_m)
+    here = low - tolerance_m <= half_m <= high + tolerance_m
+    return bool(most >= _LEAST_PER_SECTOR / 2 and here and high - low < 4 * tolerance_m)
 
 
 def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float) -> Evidence:

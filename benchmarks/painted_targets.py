@@ -1,7 +1,7 @@
 """Readings of painted targets without a formula of the fit: shapes are masks, wear is noise held against a level.
 
 Two sources of a road's intensity: the simulator's surface (`SimulatedRoad`), and a picture painted by OpenCV at
-0.5 mm (`painted_sample`), both read at the places of a profiler's readings by a drive in any direction.
+1 mm (`painted_sample`), both read at the places of a profiler's readings by a drive in any direction.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from roadscan.simulate.surface import Surface
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 
-HALF_M = 1.25
+HALF_M = 1.05
 """Half of the edge of the square that is read."""
-PIXEL_M = 0.0005
+PIXEL_M = 0.001
 ASPHALT, PAINT, BLACK = 70.0, 190.0, 15.0
 TARGET = Disc(0.30, 0.06)
 STATION_M, OFFSET_M = 50.0, 2.6
@@ -240,7 +240,7 @@ def read_picture(road: Float32, rng: np.random.Generator, shape: Shape, reading:
     """Readings of a picture whose middle is where the survey has the target; the road rises and is crowned."""
     if reading.footprint_m:
         road = gaussian_filter(road, reading.footprint_m / PIXEL_M)
-    sight = Sight.of(rng, reading, HALF_M - 0.3)
+    sight = Sight.of(rng, reading, HALF_M - 0.1)
     rise, bend = rng.normal(0.0, 0.02, 2), 0.002
     height = 312.4 + sight.place_m @ rise - bend * sight.place_m[:, 0] ** 2
     height = height + 0.0005 * rng.standard_normal(height.size)

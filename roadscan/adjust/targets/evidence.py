@@ -123,9 +123,9 @@ def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float)
     number = np.where(inside, (quadrant * _BLOCKS + block[1]) * _BLOCKS + block[0], -1)[inside]
     right = (white == (u * v > 0))[inside]
     seen = np.bincount(number, minlength=4 * _BLOCKS**2)
-    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2) > 0.6 * np.maximum(seen, 1)
+    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2) > 0.5 * np.maximum(seen, 1)
     of_quadrants = agree.reshape(2, 2, _BLOCKS**2).mean(axis=2)
     painted = float((of_quadrants[0, 0] + of_quadrants[1, 1]) / 2)
     bare = float(min(of_quadrants[0, 1], of_quadrants[1, 0]))
     weakest = float(min(of_quadrants[0, 0], of_quadrants[1, 1]))
-    return Evidence(painted, (weakest + bare) / 2, min(clear, bare))
+    return Evidence(painted, min(weakest, bare), min(clear, bare))

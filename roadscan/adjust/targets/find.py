@@ -17,7 +17,7 @@ import numpy.typing as npt
 from roadscan.adjust.targets.candidates import Candidate, candidates
 from roadscan.adjust.targets.cells import Cells, cells_of, spacing_m
 from roadscan.adjust.targets.evidence import Evidence, evidence
-from roadscan.adjust.targets.fit import ShapeFit, fit_radius_m, fit_shape, parted
+from roadscan.adjust.targets.fit import ShapeFit, first_levels, fit_radius_m, fit_shape
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.pictures import picture_of
 from roadscan.adjust.targets.settings import TargetSettings
@@ -26,14 +26,16 @@ from roadscan.adjust.targets.values import ExpectedTarget, Status, TargetFind, T
 
 Float64 = npt.NDArray[np.float64]
 
-_GRID_CELLS = 32
+_GRID_CELLS = 24
 """Cells of the search's grid along the size of a shape, where readings are dense enough."""
 _FIT_CELLS = 75
 """Cells of the fit along the size."""
 _LEAST_READINGS = 8
 """Readings along the size: with fewer there is no outline."""
-_SAME = 0.25
-"""Finds nearer than this share of the size are one."""
+_OVERLAP = 0.9
+"""Two targets do not lie nearer than this share of the size."""
+_WANDERS = 0.25
+"""A fit ends no farther than this share of the size from where it began."""
 _EASED = 0.6
 """Share of the limits that a candidate has to reach before the fit."""
 
@@ -88,23 +90,25 @@ class _Search:
         held: list[_Held] = []
         faults = []
         for candidate in likely:
+            if any(self._overlap(one.fit.centre_m, candidate.centre_m) for one in held):
+                continue
             found, fault = self._examined(candidate, spacing, cell)
             faults.append(fault)
-            if found is not None and self._is_new(found, held):
+            if found is not None and not any(self._overlap(o.fit.centre_m, found.fit.centre_m) for o in held):
                 held.append(found)
         held.sort(key=lambda one: -one.evidence.score)
         return held, faults[0] if faults else "nothing near its stated place looks like it"
 
-    def _is_new(self, found: _Held, held: Sequence[_Held]) -> bool:
-        away = [np.hypot(*(one.fit.centre_m - found.fit.centre_m)) for one in held]
-        return all(d > _SAME * self.size_m for d in away)
+    def _overlap(self, first_m: Float64, second_m: Float64) -> bool:
+        """Whether two places cannot both be targets."""
+        return bool(np.hypot(*(first_m - second_m)) < _OVERLAP * self.size_m)
 
     def _examined(self, candidate: Candidate, spacing: float, cell: float) -> tuple[_Held | None, str]:
         """A candidate as it fits, or its fault."""
         settings, shape, fine_m = self.settings, self.shape, self.size_m / _FIT_CELLS
         fine = self._cells_around(candidate.centre_m, fine_m)
         near = fine.within(candidate.centre_m, fit_radius_m(shape))
-        threshold = parted(near.value).threshold
+        threshold = first_levels(near, shape, candidate.centre_m).threshold
         rough = evidence(near, shape, candidate.centre_m, candidate.turn_rad, threshold, 1.5 * cell)
         if fault := rough.fault(settings, slack=_EASED):
             return None, fault
@@ -123,14 +127,14 @@ class _Search:
 
     def _cells_around(self, centre_m: Float64, cell_m: float) -> Cells:
         """Small cells of all that a fit that begins at a place can ask for."""
-        reach = fit_radius_m(self.shape) + _SAME * self.size_m
+        reach = fit_radius_m(self.shape) + _WANDERS * self.size_m
         near = np.all(np.abs(self.place_m - centre_m) <= reach, axis=1)
         return cells_of(self.place_m[near], self.value[near], cell_m)
 
     def _wandered(self, fit: ShapeFit, candidate: Candidate) -> bool:
         """Whether a fit left its candidate, or the ground that is searched."""
         away = np.hypot(*(fit.centre_m - candidate.centre_m))
-        return bool(away > _SAME * self.size_m or np.hypot(*fit.centre_m) > self.settings.search_radius_m)
+        return bool(away > _WANDERS * self.size_m or np.hypot(*fit.centre_m) > self.settings.search_radius_m)
 
     def _moved(self, fit: ShapeFit) -> tuple[Status, str]:
         expected, points, settings = self.expected, self.points, self.settings

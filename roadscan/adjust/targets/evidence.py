@@ -25,8 +25,11 @@ _TOLERANCE = 0.05
 _LEAST_PER_SECTOR = 4
 _LEAST_IN_CENTRE = 4
 _WORN = 0.35
-"""Weight of road within the outline against white beyond it."""
+"""Weight of road within the outline against white beyond it, and share of paint that still makes a block white."""
 _BLOCKS = 3
+"""Along an edge of a quadrant."""
+_OF_PAINT = 0.75
+"""The outline shows at least this part of the share of paint: what is not worn has its whole outline."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,15 @@ class Evidence:
     def fault(self, settings: TargetSettings, *, slack: float = 1.0) -> str:
         """What is wanting, "" if nothing; slack : share of the limits that suffices."""
         limits = (
-            ("paint", self.paint, settings.least_paint, "of the painted area shows paint"),
-            ("outline", self.outline, settings.least_outline, "of the outline lies where the shape has it"),
-            ("clear", self.clear, settings.least_clear, "of what should be unpainted is so"),
+            (self.paint, settings.least_paint, "of the painted area shows paint"),
+            (
+                self.outline,
+                max(settings.least_outline, _OF_PAINT * self.paint),
+                "of the outline lies where the shape has it",
+            ),
+            (self.clear, settings.least_clear, "of what should be unpainted is so"),
         )
-        for _, share, least, what in limits:
+        for share, least, what in limits:
             if share < slack * least:
                 return f"only {share:.0%} {what}"
         return ""
@@ -123,9 +130,8 @@ def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float)
     number = np.where(inside, (quadrant * _BLOCKS + block[1]) * _BLOCKS + block[0], -1)[inside]
     right = (white == (u * v > 0))[inside]
     seen = np.bincount(number, minlength=4 * _BLOCKS**2)
-    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2) > 0.5 * np.maximum(seen, 1)
-    of_quadrants = agree.reshape(2, 2, _BLOCKS**2).mean(axis=2)
-    painted = float((of_quadrants[0, 0] + of_quadrants[1, 1]) / 2)
-    bare = float(min(of_quadrants[0, 1], of_quadrants[1, 0]))
-    weakest = float(min(of_quadrants[0, 0], of_quadrants[1, 1]))
-    return Evidence(painted, min(weakest, bare), min(clear, bare))
+    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2).reshape(4, -1) / np.maximum(seen, 1).reshape(4, -1)
+    agree = agree >= np.array([_WORN, 0.5, 0.5, _WORN])[:, None]
+    weakest = float(agree.mean(axis=1).min())
+    paint = _share(white, inside & (u * v > 0))
+    return Evidence(paint, weakest, min(clear, _share(~white, inside & (u * v < 0))))

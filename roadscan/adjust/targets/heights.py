@@ -38,7 +38,7 @@ def height_at(readings: TargetReadings, easting_m: float, northing_m: float, set
         return _none(height.size, f"{height.size} readings within {settings.height_radius_m:g} m")
     if not _surrounds(place):
         return _none(height.size, "the readings lie to one side of it")
-    design = np.column_stack([np.ones(height.size), place])
+    design: Float64 = np.column_stack([np.ones(height.size), place])
     if height.size >= _CURVED_COUNT:
         design = np.column_stack([design, place**2, place[:, 0] * place[:, 1]])
     level = float(np.median(height))
@@ -71,8 +71,8 @@ def _robust_plane(design: Float64, height: Float64) -> tuple[Float64, Float64]:
     for turn in range(_ROUNDS):
         before = plane
         weighted = design * weight[:, None]
-        plane = np.linalg.lstsq(weighted.T @ design, weighted.T @ height, rcond=None)[0]
-        left = np.abs(height - design @ plane)
+        plane = np.asarray(np.linalg.lstsq(weighted.T @ design, weighted.T @ height, rcond=None)[0], np.float64)
+        left: Float64 = np.abs(height - design @ plane)
         scale = max(_MAD_TO_SIGMA * float(np.median(left)), _LEAST_SCALE_M)
         if turn < _ROUNDS // 3:
             weight = 1.0 / np.maximum(left, 0.1 * scale)

@@ -22,7 +22,8 @@ from distributed.protocol import pickle
 from tornado.ioloop import PeriodicCallback
 
 from roadscan.jobs.engine.compute import Done
-from roadscan.model.errors import RoadscanError, Stopped
+from roadscan.model.errors import RoadscanError
+from roadscan.model.stopping import Stopped
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -1,7 +1,7 @@
 """The request to end the program (Ctrl-C, or a signal of the system), remembered until the program ends.
 
-It is raised as :class:`Stopped`, but a library that was just calling back may hand on an error of its own instead (lazrs
-does). So whoever catches any error asks :func:`stop_if_asked` before it goes on.
+It is raised as :class:`Stopped`, but a library that was just calling back may hand on an error of its own instead
+(lazrs does). So whoever catches any error asks :func:`stop_if_asked` before it goes on.
 """
 
 from __future__ import annotations

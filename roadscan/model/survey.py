@@ -358,7 +358,7 @@ class ChecksConfig(Strict):
     """When a run warns of what it lost; a log that gives nothing at all always fails."""
 
     lost_share: float = Field(default=0.1, ge=0, le=1)
-    """Share of a log's records that are rejected, or of the readings that have no pose, above which `roadscan run` and
+    """Share of a log's records that are rejected, or of its readings that have no pose, above which `roadscan run` and
     `roadscan status` say so."""
 
 

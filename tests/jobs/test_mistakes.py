@@ -266,8 +266,22 @@ def test_readings_without_poses_are_warned_of(tmp_path: Path) -> None:
     write_scans(tmp_path / "scans.parquet", FIRST_GPS_S + 0.853)
     code, text = run(tmp_path)
     assert code == 0
-    assert re.search(r"note: \d+ of 1,200 readings \(6\d%\) have no pose", text)
-    assert re.search(r"note: \d+ of 1,200 readings \(6\d%\) have no pose", said(tmp_path, "status")[1])
+    note = r"note: scans\.parquet: \d+ of 1,200 readings \(6\d%\) have no pose"
+    assert re.search(note, text)
+    assert re.search(note, said(tmp_path, "status")[1])
+
+
+def test_a_log_that_loses_most_readings_is_named_beside_larger_ones(tmp_path: Path) -> None:
+    """Of one log of eight, two thirds: 8 % of all readings."""
+    log = '[[runs.logs]]\npath = "more_{}.parquet"\nsensor = "profiler"\n\n'
+    scans = '[[runs.logs]]\npath = "scans'
+    changed(tmp_path, (scans, "".join(map(log.format, range(7))) + scans))
+    for number in range(7):
+        write_scans(tmp_path / f"more_{number}.parquet", FIRST_GPS_S + 0.1 + 0.01 * number)
+    write_scans(tmp_path / "scans.parquet", FIRST_GPS_S + 0.853)
+    for code, text in (run(tmp_path), said(tmp_path, "status")):
+        assert code == 0
+        assert re.findall(r"note: (\S+): \d+ of [\d,]+ readings \(6\d%\) have no pose", text) == ["scans.parquet"]
 
 
 @pytest.mark.parametrize(

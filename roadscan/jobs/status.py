@@ -87,7 +87,7 @@ def survey_status(session: Session) -> Status:
     """Look at everything the manifest says; reads no readings."""
     store, damaged = session.store, session.hear_of_damage()
     found = preflight(session.survey, store)
-    causes = [str(cause) for cause in found.causes]
+    causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
     planned, unplanned = session.logs
     unsaid = [u for u in unplanned if not causes]  # else it is said there, once for a cause

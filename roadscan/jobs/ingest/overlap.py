@@ -38,6 +38,8 @@ Clocks = Mapping[tuple[str, str], ClockCorrection]
 
 MEASURED: Final = ("scans", "returns", "images", "imu", "encoder", "gnss", "trajectory_accuracy")
 """Tables whose rows belong to the time that the vehicle drove. Clouds have been placed by another program."""
+DRIVEN: Final = {"trajectory": "the poses", "gnss": "the GNSS positions"}
+"""Tables that say when a run was driven, in words; the first that a run has counts."""
 _MOST_HOURS: Final = 14
 """No time zone is farther from UTC."""
 _REASONS: Final = 3
@@ -197,7 +199,7 @@ class _Driven:
 
 def _driven(records: Sequence[LogRecord]) -> _Driven | None:
     computed = [r for r in records if r.sensor == NAVIGATION]
-    for table, words in (("trajectory", "the poses"), ("gnss", "the GNSS positions")):
+    for table, words in DRIVEN.items():
         own = [r for r in (computed or records) if r.tables.get(table)]
         spans = [span for r in own for file in r.tables[table] for span in file.group_spans]
         if spans:

@@ -23,7 +23,7 @@ from roadscan.jobs.ingest.first_look import LookedAt, key_of_look, look_at, name
 from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.jobs.ingest.planned_logs import CONTROL_RUN, grid_folder, log_source
-from roadscan.jobs.ingest.sources import remembered_formats
+from roadscan.jobs.ingest.sources import listed_name, remembered_formats
 from roadscan.jobs.navigate.clocks import check_clocks
 from roadscan.jobs.plan.centre_line import CentreLines, load_buffer
 from roadscan.jobs.plan.road import looks_across
@@ -120,7 +120,7 @@ class Asked:
     @cached_property
     def logs(self) -> list[CheckedLog]:
         """Logs of the survey file with their headers."""
-        moved = remembered_formats(self.store)
+        moved = remembered_formats(self.store, self.survey.folder)
         listed: list[tuple[str, LogConfig | ControlConfig]] = [
             (run.id, log) for run in self.survey.config.runs for log in run.logs
         ]
@@ -557,8 +557,8 @@ def _map_words(asked: Asked) -> str:
 def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved: dict[str, str]) -> CheckedLog:
     """Open a log as far as its header."""
     path = survey.resolve(config.path)
-    if not is_there(path) and str(path) in moved:
-        return CheckedLog(run, config, path, format_named(config.format or moved[str(path)]))
+    if not is_there(path) and (known := moved.get(listed_name(path, survey.folder))) is not None:
+        return CheckedLog(run, config, path, format_named(config.format or known))
     format_: LogFormat | None = None
     source: LogSource | None = None
     try:

@@ -94,7 +94,7 @@ def _mend_logs(
     for one in broken:
         try:
             log = _log_of(one.record, planned, [u.path for u in unplanned])
-            _check_whole(store, log)
+            _check_whole(survey, store, log)
             task = IngestTask(store, with_span(log, spans.get(log.run)), (), grid_folder(survey))
             done.lines += _read_again(task, one)
             done.lost = [lost for lost in done.lost if lost.log != one.record.key]
@@ -139,13 +139,13 @@ def _log_of(record: LogRecord, planned: Sequence[PlannedLog], unplanned: Sequenc
     raise RoadscanError(f"the survey file lists its log {record.path} no more", change="list it again, or leave it")
 
 
-def _check_whole(store: Store, log: PlannedLog) -> None:
+def _check_whole(survey: Survey, store: Store, log: PlannedLog) -> None:
     """_LostLogError where the log's bytes are not those that were read before."""
     path, companions = log.source.path, log.format.companions(log.source.path, log.source.options)
     if not path.exists():
         raise _LostLogError(f"the raw log {log.config.path} is gone")
     try:
-        whole = is_unchanged(store, path, log.format, companions)
+        whole = is_unchanged(store, survey.folder, path, log.format, companions)
     except OSError as error:
         raise _LostLogError(f"the raw log {log.config.path} cannot be read ({error.strerror or error})") from error
     if not whole:

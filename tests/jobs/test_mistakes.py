@@ -16,6 +16,7 @@ from docs.mistakes import FIRST_GPS_S, MISTAKES, Mistake, heard, write_scans, wr
 from roadscan.cli import app
 from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import gps_ns_from_utc
+from roadscan.tables.sealed import seal, unseal
 
 from .conftest import Simulated
 
@@ -248,6 +249,33 @@ def test_a_gnss_log_of_another_day_fails(tmp_path: Path) -> None:
     code, text = said(tmp_path, "ingest", "--workers", "0")
     assert code == 2
     assert "failed: ingest rover.pos: the gnss last from 2026-05-06 09:29:42 to 2026-05-06 09:29:50 UTC" in text
+
+
+def test_a_store_that_moved_with_its_survey_knows_its_archived_logs(tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir()
+    changed(tmp_path / "here", ('id = "street"', 'id = "street"\nproducts.make = ["geotiff"]'))
+    assert run(tmp_path / "here")[0] == 0
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "here").rename(tmp_path / "far" / "away" / "there")
+    for name in ("poses.csv", "scans.parquet"):
+        (tmp_path / "far" / "away" / "there" / name).unlink()
+    code, text = said(tmp_path / "far" / "away" / "there", "status")
+    assert code == 0 and text.count("ingested") == 2
+    code, text = run(tmp_path / "far" / "away" / "there")
+    assert code == 0 and text.count("known: ") == 2
+
+
+def test_an_older_list_of_logs_is_read(tmp_path: Path) -> None:
+    """It names them by their absolute paths."""
+    changed(tmp_path, ('id = "street"', 'id = "street"\nproducts.make = ["geotiff"]'))
+    assert run(tmp_path)[0] == 0
+    for name in ("sources", "sources_copy"):
+        file = tmp_path / "store" / "survey=street" / "manifest" / f"{name}.json"
+        known = unseal(file.read_bytes())
+        assert set(known) == {"poses.csv", "scans.parquet"}
+        file.write_bytes(seal({str((tmp_path / path).resolve()): of for path, of in known.items()}))
+    (tmp_path / "scans.parquet").unlink()
+    assert said(tmp_path, "status")[0] == 0
 
 
 # --- stamps and mountings ---------------------------------------------------------------------------

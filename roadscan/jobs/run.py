@@ -65,6 +65,12 @@ def run_stage(session: Session, stage: Stage) -> None:
         session.failed(stage.name, [("as a whole", error)])
 
 
+def _removed_words(paths: Sequence[str]) -> str:
+    folders = dict.fromkeys(path.rpartition("/")[0] for path in paths)
+    count = "1 file" if len(paths) == 1 else f"{len(paths):,} files"
+    return f"removed {count} that a stopped run left without a record, in {', '.join(folders)}"
+
+
 def close_run(session: Session, done: Sequence[Stage]) -> None:
     """Keep the list of failures for `roadscan status`, and raise if there are any.
 
@@ -75,7 +81,9 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         session.manifest.compact()
         if session.selection is None and not session.failures:
             folders = [folder for stage in stages() for folder in stage.folders()]
-            end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            removed = end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            if removed:
+                session.note(_removed_words(removed))
     write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
     if session.store.is_folder:
         logs = read_log_records(session.store, damaged=[])

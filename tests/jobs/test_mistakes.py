@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -263,6 +264,21 @@ def test_a_store_that_moved_with_its_survey_knows_its_archived_logs(tmp_path: Pa
     assert code == 0 and text.count("ingested") == 2
     code, text = run(tmp_path / "far" / "away" / "there")
     assert code == 0 and text.count("known: ") == 2
+
+
+def test_a_run_after_a_stopped_one_leaves_foreign_files_and_tells_of_the_others(tmp_path: Path) -> None:
+    changed(tmp_path, ('id = "street"', 'id = "street"\nproducts.make = ["geotiff"]'))
+    assert run(tmp_path)[0] == 0
+    folder = tmp_path / "store" / "survey=street"
+    (foreign := folder / "tiles" / "geotiff" / "map.qgz").write_text("of a GIS")
+    os.utime(foreign, (1e9, 1e9))
+    (folder / "manifest" / "changing").write_bytes(b"")  # as a run leaves it that is stopped now
+    (left := folder / "tiles" / "geotiff" / "5_5.tif").write_text("whole, and not recorded")
+    code, text = run(tmp_path)
+    assert code == 0 and foreign.exists() and not left.exists()
+    assert "note: removed 1 file that a stopped run left without a record, in tiles/geotiff" in text
+    code, text = run(tmp_path)
+    assert code == 0 and foreign.exists() and "removed" not in text
 
 
 def test_an_older_list_of_logs_is_read(tmp_path: Path) -> None:

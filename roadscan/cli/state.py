@@ -36,6 +36,7 @@ def verify(
     from roadscan.jobs.repair import repair_store
     from roadscan.jobs.session import Session
     from roadscan.jobs.status import verify_store
+    from roadscan.model.counted import counted
     from roadscan.tables.salvage import read_lost
 
     session, reporter = Session.open(survey_file), new_reporter()
@@ -51,13 +52,12 @@ def verify(
     lost = read_lost(session.store)
     for line in [*told, *(f"lost: {one.told}" for one in lost), *faults]:
         typer.echo(line)
-    gone = f"; {sum(one.rows for one in lost):,} rows are lost" if lost else ""
-    typer.echo(f"{_not_whole(len(faults)) if faults else 'every file is whole'}{gone}")
+    rows = sum(one.rows for one in lost)
+    gone = f"; {counted(rows, 'row')} {'is' if rows == 1 else 'are'} lost" if lost else ""
+    are = "is" if len(faults) == 1 else "are"
+    whole = f"{counted(len(faults), 'file')} {are} not whole" if faults else "every file is whole"
+    typer.echo(f"{whole}{gone}")
     raise typer.Exit(1 if faults or any(not one.accepted for one in lost) else 0)
-
-
-def _not_whole(files: int) -> str:
-    return "1 file is not whole" if files == 1 else f"{files:,} files are not whole"
 
 
 def found_status(survey_file: Path) -> Status:

@@ -12,6 +12,7 @@ from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, stages
 from roadscan.jobs.tiles.selection import SelectionError
+from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import begin_changes, end_changes, write_failures
@@ -67,8 +68,7 @@ def run_stage(session: Session, stage: Stage) -> None:
 
 def _removed_words(paths: Sequence[str]) -> str:
     folders = dict.fromkeys(path.rpartition("/")[0] for path in paths)
-    count = "1 file" if len(paths) == 1 else f"{len(paths):,} files"
-    return f"removed {count} that a stopped run left without a record, in {', '.join(folders)}"
+    return f"removed {counted(len(paths), 'file')} that a stopped run left without a record, in {', '.join(folders)}"
 
 
 def close_run(session: Session, done: Sequence[Stage]) -> None:
@@ -92,6 +92,6 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
         more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
         raise RunError(
-            f"{len(session.failures)} units failed: {listed}{more}",
+            f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
         )

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.jobs.ingest.overlap import NothingPlacedError
-from roadscan.jobs.ingest.planned_logs import PlannedLog
+from roadscan.jobs.ingest.planned_logs import PlannedLog, UnplannedLog
 from roadscan.jobs.ingest.sources import damaged_sources
 from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.plan.plan import NothingToPlaceError
@@ -97,6 +97,7 @@ def survey_status(session: Session) -> Status:
     status.damaged = list(map(str, damaged))
     status.lost = read_lost(store)
     status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
+    status.logs += [_unplanned_state(one) for one in unplanned]
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, session.logs)}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
@@ -131,6 +132,12 @@ def _log_state(store: Store, log: PlannedLog, record: LogRecord | None) -> dict[
         "state": "ingested" if record else "damaged" if has_log(store, log.key) else "waiting",
         "bytes": log.bytes,
     }
+
+
+def _unplanned_state(log: UnplannedLog) -> dict[str, Any]:
+    """Of a log that cannot be planned: a file of it is missing, or its settings are wrong."""
+    unknown = dict.fromkeys(("rows", "rejected", "bytes"), 0)
+    return {"run": log.run, "sensor": "", "path": log.path, "format": "", "state": "cannot be read", **unknown}
 
 
 @dataclass

@@ -13,6 +13,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from roadscan.model.counted import counted
 from roadscan.model.errors import FormatError, RunError, TimeSystemError
 from roadscan.model.gpstime import (
     ADJUSTED_OFFSET_S,
@@ -287,7 +288,7 @@ def _changes(clock: ClockConfig | None, own: Span, other: Span) -> Iterator[tupl
     days = round(missing_s / 86_400)
     if clock is not None and clock.date is not None and days:
         date = utc_from_gps_ns(own[0] + days * 86_400 * NS_PER_S).date()
-        yield days * 86_400, f"clock.date = {date.isoformat()} ({_count_words(abs(days), 'day')} {_sense(days)})"
+        yield days * 86_400, f"clock.date = {date.isoformat()} ({counted(abs(days), 'day')} {_sense(days)})"
 
 
 def _other_systems(clock: ClockConfig, first_s: int) -> Iterator[tuple[int, str]]:
@@ -303,7 +304,7 @@ def _other_systems(clock: ClockConfig, first_s: int) -> Iterator[tuple[int, str]
 def _other_week(clock: ClockConfig, own: Span, weeks: int) -> Iterator[tuple[int, str]]:
     if clock.system is not TimeSystem.GPS_WEEK or not weeks:
         return
-    why = f"{_count_words(abs(weeks), 'week')} {_sense(weeks)}"
+    why = f"{counted(abs(weeks), 'week')} {_sense(weeks)}"
     if abs(weeks) == WEEKS_A_ROLLOVER:
         why += ": a receiver that counts weeks modulo 1024"
     if clock.week is not None:
@@ -328,10 +329,6 @@ def _slips(first_s: int, missing_s: float) -> Iterator[tuple[int, str]]:
 
 def _sense(amount: float) -> str:
     return "later" if amount > 0 else "earlier"
-
-
-def _count_words(number: int, what: str) -> str:
-    return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
 def _amount(shift_s: int) -> str:

@@ -175,16 +175,16 @@ def _check_accuracy(source: LogSource) -> None:
     if named is None:
         return
     file, change = beside(source.path, named), "check options.accuracy of the SBET log"
-    if not Smrmsg().sniff(file):
-        what = "is an SBET trajectory itself" if Sbet().sniff(file) else "holds no records of an SMRMSG"
+    if Sbet().sniff(file) and not Smrmsg().sniff(file):
         expected = f"the SMRMSG file of the same mission, with records of {ACCURACY_BYTES} bytes"
-        raise FormatError(f"the accuracy file {what}", expected=expected, change=change, file=file)
+        raise FormatError("the accuracy file is an SBET trajectory itself", expected=expected, change=change, file=file)
     poses, accuracy = _ends(source.path, RECORD_BYTES), _ends(file, ACCURACY_BYTES)
     weeks = (-WEEK_S, 0, WEEK_S)  # either may count on past the week's end
     if poses and accuracy and not any(poses[0] <= accuracy[1] + w and accuracy[0] + w <= poses[1] for w in weeks):
+        count = source.path.stat().st_size // RECORD_BYTES
         raise FormatError(
-            f"the accuracy file holds second {accuracy[0]:.0f} to {accuracy[1]:.0f} of the week, the trajectory "
-            f"{poses[0]:.0f} to {poses[1]:.0f}: no record lies within the time of the poses",
+            f"no record lies within the time of the trajectory's {count} poses: they last from second {poses[0]:.0f} "
+            f"to {poses[1]:.0f} of the week, the accuracy file from {accuracy[0]:.0f} to {accuracy[1]:.0f}",
             expected="the SMRMSG file of the same mission",
             change=change,
             file=file,
@@ -193,6 +193,8 @@ def _check_accuracy(source: LogSource) -> None:
 
 def _ends(path: Path, record_bytes: int) -> tuple[float, float] | None:
     """First and last stamp (s) of a file of records, None where these do not tell: it is packed, or damaged."""
+    if not path.is_file() or path.stat().st_size < record_bytes:
+        return None  # who reads it tells of that
     with path.open("rb") as stream:
         if stream.read(8) != head_of(path, 8):
             return None

@@ -47,7 +47,7 @@ def run_survey(
     from roadscan.jobs.preflight import preflight
     from roadscan.jobs.run import run_stages
     from roadscan.jobs.session import Session
-    from roadscan.model.errors import Stopped
+    from roadscan.model.stopping import Stopped
 
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter

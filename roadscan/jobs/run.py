@@ -12,6 +12,7 @@ from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, stages
 from roadscan.jobs.tiles.selection import SelectionError
+from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import begin_changes, end_changes, write_failures
@@ -65,6 +66,11 @@ def run_stage(session: Session, stage: Stage) -> None:
         session.failed(stage.name, [("as a whole", error)])
 
 
+def _removed_words(paths: Sequence[str]) -> str:
+    folders = dict.fromkeys(path.rpartition("/")[0] for path in paths)
+    return f"removed {counted(len(paths), 'file')} that a stopped run left without a record, in {', '.join(folders)}"
+
+
 def close_run(session: Session, done: Sequence[Stage]) -> None:
     """Keep the list of failures for `roadscan status`, and raise if there are any.
 
@@ -76,7 +82,9 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         session.manifest.compact()
         if session.selection is None and not session.failures:
             folders = [folder for stage in stages() for folder in stage.folders()]
-            end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            removed = end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            if removed:
+                session.note(_removed_words(removed))
     write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
     if whole:
         _report(session)
@@ -87,7 +95,7 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
         more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
         raise RunError(
-            f"{len(session.failures)} units failed: {listed}{more}",
+            f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
         )
 

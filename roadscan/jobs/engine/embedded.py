@@ -22,7 +22,8 @@ from distributed.worker_memory import parse_memory_limit
 from tornado.ioloop import PeriodicCallback
 
 from roadscan.jobs.engine.on_dask import QUIET_CLIENT, OnDask
-from roadscan.model.errors import ConfigError, Stopped
+from roadscan.model.errors import ConfigError
+from roadscan.model.stopping import Stopped
 from roadscan.private_folder import Code, check_private
 
 LOOPBACK = "127.0.0.1"

@@ -219,9 +219,7 @@ class Page(NamedTuple):
     """Bytes that it had before it was compressed; None where it was not."""
 
 
-def chunk(
-    kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]
-) -> Value:
+def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]) -> Value:
     """What the footer says of a column chunk of one page."""
     start, length = i64(page.at), i64(page.size)
     before, codec = (length, _UNCOMPRESSED) if page.raw is None else (i64(page.raw), _LZ4_RAW)

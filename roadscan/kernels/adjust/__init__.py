@@ -1,0 +1,1 @@
+"""Loops of the adjustment: sums of normal equations, and the entries of their inverse that are wanted."""

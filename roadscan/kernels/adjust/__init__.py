@@ -1,1 +1,1 @@
-"""Loops of the adjustment: sums of normal equations, and the entries of their inverse that are wanted."""
+"""Loops of the adjustment: normal equations and the inverse, targets, cells of patches."""

@@ -9,12 +9,9 @@ from pydantic import Field, model_validator
 from roadscan.model.strict import Strict
 
 
-class AdjustmentSettings(Strict):
-    """How corrections of poses are computed from ties and control."""
+class SolverSettings(Strict):
+    """How corrections of poses are computed from ties and control, whatever is adjusted."""
 
-    mode: Literal["joint", "each_pass", "vertical"] = "joint"
-    """What is adjusted: all runs together ("joint"), each run alone by its control without ties ("each_pass"), or all
-    runs together but in height alone ("vertical")."""
     knot_spacing_s: float = Field(default=0.25, gt=0.0)
     """Corrections change linearly between knots so far apart in time (s), at most. Where a process of σ 15 mm and
     τ 120 s is true, it leaves a line between knots 0.25 s apart by 0.4 mm (RMS)."""
@@ -32,3 +29,11 @@ class AdjustmentSettings(Strict):
         if self.reject_beyond <= self.full_weight_within:
             raise ValueError("reject_beyond has to be larger than full_weight_within")
         return self
+
+
+class AdjustmentSettings(SolverSettings):
+    """What is adjusted, and how."""
+
+    mode: Literal["joint", "each_pass", "vertical"] = "joint"
+    """What is adjusted: all runs together ("joint"), each run alone by its control without ties ("each_pass"), or all
+    runs together but in height alone ("vertical")."""

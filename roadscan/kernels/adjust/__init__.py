@@ -1,0 +1,1 @@
+"""Loops of the adjustment: where tracks meet, patches of the road and how they lie to one another, its equations."""

@@ -1,4 +1,4 @@
-"""Poses as an adjustment needs them: places on the map, attitudes against the local level, and grid against true north."""
+"""Poses as an adjustment needs them: places on the map, attitudes against the local level, grid against true north."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,10 @@ _MAP_SCALE = 2.0
 """No map in use shows a metre of the ground longer than that (Web Mercator up to 60°)."""
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
 _SIGMA_COLUMNS = ["sigma_north_m", "sigma_east_m", "sigma_down_m"]
+CORRECTION_SIGMAS: Final = tuple(
+    f"sigma_{name}" for name in ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
+)
+"""Columns of the table `corrections`."""
 _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz", *_SIGMA_COLUMNS]
 
 
@@ -75,8 +79,8 @@ class ReadingSource:
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: recorded poses, mounting, clock, range limits, map, grid. Corrections of the
-    poses belong to the keys of what lies in their span of time, the code to the keys of what it makes."""
+    """Hash of all that places the readings: recorded poses, mounting, clock, range limits, map, grid. Corrections of
+    the poses belong to the keys of what lies in their span of time, the code to the keys of what it makes."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None
@@ -320,7 +324,15 @@ def _corrections(rows: pa.Table, run: str) -> Corrections | None:
         rows.column("epoch_gps_ns").to_numpy(),
         np.stack([rows.column(c).to_numpy() for c in ("north_m", "east_m", "down_m")], axis=-1),
         np.stack([rows.column(c).to_numpy() for c in ("roll_rad", "pitch_rad", "heading_rad")], axis=-1),
+        _sigma(rows),
     )
+
+
+def _sigma(rows: pa.Table) -> npt.NDArray[np.float64] | None:
+    """1 σ (k, 6) of corrected poses; None in tables that state none."""
+    if any(name not in rows.column_names for name in CORRECTION_SIGMAS):
+        return None
+    return np.stack([pc.fill_null(rows.column(c), np.nan).to_numpy() for c in CORRECTION_SIGMAS], axis=-1)
 
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:

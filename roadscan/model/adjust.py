@@ -21,8 +21,8 @@ class PosePriors(Strict):
     """What is known of the errors of the recorded poses: of each component a first-order Gauss–Markov process."""
 
     source: Literal["sigma", "stated"] = "sigma"
-    """`sigma`: the 1 σ that a run's logs state (SMRMSG, σ columns, a computed trajectory), the median over the run; where
-    they state none, and with `stated`, those below."""
+    """`sigma`: the 1 σ that a run's logs state (SMRMSG, σ columns, a computed trajectory), the median over the run;
+    where they state none, and with `stated`, those below."""
     sigma_horizontal_m: float = Field(default=0.02, ge=0.0, le=100.0)
     """1 σ of north and of east (m); 0: they are not corrected."""
     sigma_down_m: float = Field(default=0.03, ge=0.0, le=100.0)
@@ -85,8 +85,8 @@ class ControlUse(Strict):
     radius_m: float = Field(default=0.15, gt=0.0, le=2.0)
     """Readings so near a point (m) give the height there, by a plane through them."""
     largest_m: float = Field(default=0.5, gt=0.0)
-    """Where the median of all points differs in height from what was measured by more than this (m), they are in another
-    CRS or height datum: none of them is used."""
+    """Where the median of all points differs in height from what was measured by more than this (m), they are in
+    another CRS or height datum: none of them is used. A single point that does so is not used either."""
 
 
 class AdjustConfig(Strict):
@@ -98,9 +98,9 @@ class AdjustConfig(Strict):
     on: bool = True
     """`false`: the poses hold as they were recorded."""
     mode: AdjustMode = "joint"
-    """`joint`: all runs at once, with ties and control; `each_pass`: each run by itself, to control alone; `vertical`: as
-    joint, and heights alone are corrected; `helmert`: the survey as a whole is shifted and turned onto its control
-    points, nothing else."""
+    """`joint`: all runs at once, with ties and control; `each_pass`: each run by itself, to control alone; `vertical`:
+    as joint, and heights alone are corrected; `helmert`: the survey as a whole is shifted and turned onto its control
+    points with targets, nothing else."""
     priors: PosePriors = PosePriors()
     """Errors of the recorded poses."""
     places: PlaceSettings = PlaceSettings()

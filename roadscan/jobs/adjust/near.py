@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,10 @@ Int64 = npt.NDArray[np.int64]
 _POSE_STEP_NS: Final = 2_000_000
 """Readings so near in time share a pose: at 30 m/s arms of 60 mm more or less."""
 _KEPT_GROUPS: Final = 8
+
+
+Sources: TypeAlias = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
+"""Readings of sensors in runs, with their data files."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,21 @@ class NearFile:
     def key(self, road: Sequence[object]) -> list[object]:
         """What of it shapes readings near a place; `road` : how the road is told."""
         return [self.source.key, *road, self.digest, list(self.groups)]
+
+
+def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str]) -> list[NearFile]:
+    """Row groups of all sources that hold readings of some traverses, which count the runs as in `runs`."""
+    spans: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for one in traverses:
+        spans.setdefault((runs[one.run], one.sensor), []).append((one.first_gps_ns, one.last_gps_ns))
+    found = [
+        NearFile.of(source, file, wanted)
+        for source, files in sources
+        if (wanted := spans.get((source.run, source.sensor)))
+        for file in files
+        if file.group_spans
+    ]
+    return [one for one in found if one is not None]
 
 
 @dataclass(frozen=True)

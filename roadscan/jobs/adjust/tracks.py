@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
-from roadscan.jobs.adjust.near import placed_points
+from roadscan.jobs.adjust.near import Sources, placed_points
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import Placer, RawSlice, ReadingSource, load_recorded, read_rows
 from roadscan.tables.logs import DataFile
@@ -26,8 +26,6 @@ _SAMPLE_ROWS: Final = 64
 _SAMPLE_RETURNS: Final = 20_000
 _LIDAR_REACH_M: Final = 12.0
 """Of a lidar only what lies so near is compared between passes: farther off, returns are sparse."""
-
-Sources = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
 
 
 def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:

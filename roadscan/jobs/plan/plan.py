@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -63,7 +63,7 @@ class SurveyPlan:
     """Hash of all that shapes any tile, beside its readings."""
     apart: tuple[Fault, ...] = ()
     """Logs that do not overlap the poses of their run: none of their readings is a source."""
-    corrections: KnownCorrections = KnownCorrections({})
+    corrections: KnownCorrections = field(default_factory=lambda: KnownCorrections({}))
     """Corrections of the poses that hold now."""
 
     @property

@@ -103,7 +103,9 @@ def _tasks(plan: SurveyPlan) -> list[FootprintTask]:
     """A task for each data file."""
     code = code_digest("roadscan.jobs.tiles.footprints:footprint_task")
     return [
-        FootprintTask(plan.store, plan.ground, one, key_of(code, one.source.key, one.source.allowance, one.file, digest))
+        FootprintTask(
+            plan.store, plan.ground, one, key_of(code, one.source.key, one.source.allowance, one.file, digest)
+        )
         for one, digest in zip(plan.slices(), _digests(plan), strict=True)
     ]
 

@@ -43,13 +43,14 @@ class Allowance(NamedTuple):
 NO_CORRECTION: Final = Allowance(0.0, 0.0)
 
 
-def allowance_for(corrections: Corrections | None, *, expected: bool) -> Allowance:
+def allowance_for(corrections: Corrections | None) -> Allowance:
     """The least allowance that covers corrections, in steps of four from 0.05 m and 0.5 mrad on.
+
+    The first step is left room for where there are none yet: most corrections to come stay within it.
 
     Parameters
     ----------
     corrections : of one run; None where it has none.
-    expected : corrections may come: the first step is left room for.
 
     Raises
     ------
@@ -57,8 +58,6 @@ def allowance_for(corrections: Corrections | None, *, expected: bool) -> Allowan
         where corrections are beyond all reason (819 m, 8 rad).
     """
     shift, turn = largest(corrections)
-    if not expected and shift == 0.0 and turn == 0.0:
-        return NO_CORRECTION
     return Allowance(_step(shift, _LEAST_SHIFT_M), _step(turn, _LEAST_TURN_RAD))
 
 

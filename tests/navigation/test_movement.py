@@ -17,9 +17,11 @@ def corrections(north_m: float, down_m: float, roll_rad: float) -> Corrections:
     )
 
 
-def test_no_room_where_nothing_is_expected() -> None:
-    assert allowance_for(None, expected=False) == NO_CORRECTION
-    assert allowance_for(corrections(0.0, 5.0, 0.0), expected=False) == NO_CORRECTION  # straight down moves no place
+def test_the_first_step_is_always_left_room_for() -> None:
+    assert allowance_for(None) == (0.05, 0.0005)
+    assert allowance_for(corrections(0.0, 5.0, 0.0)) == (0.05, 0.0005)  # straight down moves no place on the map
+    assert NO_CORRECTION.is_none
+    assert not allowance_for(None).is_none
 
 
 @pytest.mark.parametrize(
@@ -32,7 +34,7 @@ def test_no_room_where_nothing_is_expected() -> None:
     ],
 )
 def test_room_grows_in_steps_of_four(north_m: float, roll_rad: float, room: tuple[float, float]) -> None:
-    found = allowance_for(corrections(north_m, 0.0, roll_rad), expected=True)
+    found = allowance_for(corrections(north_m, 0.0, roll_rad))
     assert found == pytest.approx(room)
     assert found.shift_m >= north_m
     assert found.turn_rad >= roll_rad
@@ -44,4 +46,4 @@ def test_a_point_moves_by_shift_and_turn() -> None:
 
 def test_what_is_beyond_all_reason_is_refused() -> None:
     with pytest.raises(ValueError, match="5000"):
-        allowance_for(corrections(5000.0, 0.0, 0.0), expected=True)
+        allowance_for(corrections(5000.0, 0.0, 0.0))

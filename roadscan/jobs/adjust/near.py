@@ -114,22 +114,21 @@ class NearReader:
         ]
         return self._joined(traverse, run, parts)
 
-    def _placed(
-        self, file: NearFile, group: int, traverse: Traverse, circle: Circle
-    ) -> Iterator[tuple[Float64, Int64, npt.NDArray[np.uint16]]]:
-        """Points (n, 3), epochs and intensities of a row group within the traverse and the circle."""
+    def _placed(self, file: NearFile, group: int, traverse: Traverse, circle: Circle) -> Iterator[PlacedReadings]:
+        """Readings of a row group within the traverse and the circle."""
         batch = self._batch(file, group)
         column = batch.column("epoch_gps_ns").to_numpy()
         rows = np.flatnonzero((column >= traverse.first_gps_ns) & (column <= traverse.last_gps_ns))
         if not rows.size:
             return
         if rows.size < batch.num_rows:
-            ordered = rows[-1] - rows[0] + 1 == rows.size
-            batch = batch.slice(int(rows[0]), rows.size) if ordered else batch.take(rows)
-        points, epochs, intensity = placed_points(batch, file.source, self._placer.placement(file.source))
-        near = np.hypot(points[:, 0] - circle.easting_m, points[:, 1] - circle.northing_m) <= circle.radius_m
+            in_order = rows[-1] - rows[0] + 1 == rows.size
+            batch = batch.slice(int(rows[0]), rows.size) if in_order else batch.take(rows)
+        found = placed_readings(batch, file.source, self._placer.placement(file.source))
+        away = found.points_m[:, :2] - [circle.easting_m, circle.northing_m]
+        near = np.einsum("ni,ni->n", away, away) <= circle.radius_m**2
         if near.any():
-            yield points[near], epochs[near], intensity[near]
+            yield found.chosen(near)
 
     def _batch(self, file: NearFile, group: int) -> pa.RecordBatch:
         known = self._kept.get((file.path, group))
@@ -140,58 +139,78 @@ class NearReader:
                 self._kept.pop(next(iter(self._kept)))
         return known
 
-    def _joined(
-        self, traverse: Traverse, run: str, parts: Sequence[tuple[Float64, Int64, npt.NDArray[np.uint16]]]
-    ) -> PassReadings:
+    def _joined(self, traverse: Traverse, run: str, parts: Sequence[PlacedReadings]) -> PassReadings:
         files = self._files.get((run, traverse.sensor), ())
-        none = (np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.uint16))
-        points, epochs, intensity = (np.concatenate(part) for part in zip(none, *parts, strict=True))
-        steps, pose = np.unique(epochs // _POSE_STEP_NS, return_inverse=True)
+        found = PlacedReadings.joined(parts)
         trajectory = self._placer.trajectory(files[0].source) if files else None
+        steps, pose = np.unique(found.epoch_gps_ns // _POSE_STEP_NS, return_inverse=True)
         if trajectory is None or not steps.size:
             poses = _no_poses()
         else:
             poses = level_poses(trajectory, self._frame, steps * _POSE_STEP_NS + _POSE_STEP_NS // 2)
-            points, pose, intensity = _with_poses(points, pose, intensity, steps, poses)
+        has_pose = np.isin(steps, poses.epoch_gps_ns // _POSE_STEP_NS)
+        of_reading = pose[found.row]
+        keep = has_pose[of_reading]
+        found, of_reading = found.chosen(keep), (np.cumsum(has_pose) - 1)[of_reading[keep]]
         turned = float(poses.convergence_rad[0]) if poses.epoch_gps_ns.size else 0.0
         return PassReadings(
-            traverse.run, traverse.sensor, *(np.ascontiguousarray(points[:, k]) for k in range(3)), intensity,
-            pose.astype(np.int32), poses.epoch_gps_ns, poses.body_m, poses.level_from_body, turned,
+            traverse.run, traverse.sensor, *(np.ascontiguousarray(found.points_m[:, k]) for k in range(3)),
+            found.intensity, of_reading.astype(np.int32), poses.epoch_gps_ns, poses.body_m, poses.level_from_body,
+            turned,
             bool(files) and files[0].source.table == "returns",
         )  # fmt: skip
 
 
-def placed_points(
-    batch: pa.RecordBatch, source: ReadingSource, placement: Placement
-) -> tuple[Float64, Int64, npt.NDArray[np.uint16]]:
-    """Points (n, 3; easting, northing, height), epochs (n,) and intensities (n,) of the readings that count."""
+@dataclass(frozen=True)
+class PlacedReadings:
+    """n readings that count, of profiles (or returns) at r epochs."""
+
+    points_m: Float64
+    """(n, 3) easting, northing, height."""
+    intensity: npt.NDArray[np.uint16]
+    """(n,)"""
+    row: Int64
+    """(n,) profile of each."""
+    epoch_gps_ns: Int64
+    """(r,)"""
+
+    def chosen(self, which: npt.NDArray[np.bool_]) -> PlacedReadings:
+        """Some of them."""
+        return PlacedReadings(self.points_m[which], self.intensity[which], self.row[which], self.epoch_gps_ns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[PlacedReadings]) -> PlacedReadings:
+        """All of them, in order."""
+        if not parts:
+            return cls(np.zeros((0, 3)), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int64))
+        first = np.cumsum([0, *(p.epoch_gps_ns.size for p in parts[:-1])])
+        return cls(
+            np.concatenate([p.points_m for p in parts]),
+            np.concatenate([p.intensity for p in parts]),
+            np.concatenate([p.row + start for p, start in zip(parts, first, strict=True)]),
+            np.concatenate([p.epoch_gps_ns for p in parts]),
+        )
+
+
+def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Placement) -> PlacedReadings:
+    """Readings of rows of a source's table that no filter leaves out."""
     geometry = geometry_of(source)
     if geometry is None:
         placed = placement.returns(batch, EVERYWHERE)
         corner = placed.tiles.astype(np.int64) * placement.tile_quanta
         east, north = ((corner[:, k] + placed.quanta[:, k]) / QUANTA_PER_M for k in (0, 1))
         points = np.stack([east, north, placed.quanta[:, 2] / QUANTA_PER_M], axis=-1)
-        return points, placed.epoch_gps_ns, placed.intensity
+        return PlacedReadings(points, placed.intensity, np.arange(len(points)), placed.epoch_gps_ns)
     profiles = placement.by_profile(batch, geometry)
-    kept = profiles.kept
-    points = np.stack([profiles.easting_m[kept], profiles.northing_m[kept], profiles.height_m[kept]], axis=-1)
-    epochs = np.broadcast_to(profiles.epoch_gps_ns[:, None], kept.shape)[kept]
-    intensity = np.zeros(epochs.size, np.uint16)
+    kept = np.flatnonzero(profiles.kept.ravel())
+    columns = [profiles.easting_m, profiles.northing_m, profiles.height_m]
+    points = np.stack([column.ravel()[kept] for column in columns], axis=-1)
+    intensity = np.zeros(kept.size, np.uint16)
     if batch.column("intensity").null_count == 0:
-        digital = batch.column("intensity").flatten().to_numpy(zero_copy_only=False).reshape(kept.shape)
+        digital = batch.column("intensity").flatten().to_numpy(zero_copy_only=False)
         intensity = digital[kept].astype(np.uint16) * np.uint16(EIGHT_TO_SIXTEEN_BITS)
-    return points, epochs, intensity
+    return PlacedReadings(points, intensity, kept // geometry.readings, profiles.epoch_gps_ns)
 
 
 def _no_poses() -> LevelPoses:
     return LevelPoses(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
-
-
-def _with_poses(
-    points: Float64, pose: Int64, intensity: npt.NDArray[np.uint16], steps: Int64, poses: LevelPoses
-) -> tuple[Float64, Int64, npt.NDArray[np.uint16]]:
-    """Readings whose step of time has a pose, counted by these."""
-    found = np.isin(steps, poses.epoch_gps_ns // _POSE_STEP_NS)
-    keep = found[pose]
-    number = np.cumsum(found) - 1
-    return points[keep], number[pose[keep]], intensity[keep]

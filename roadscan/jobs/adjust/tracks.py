@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
-from roadscan.jobs.adjust.near import Sources, placed_points
+from roadscan.jobs.adjust.near import PlacedReadings, Sources, placed_readings
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import Placer, RawSlice, ReadingSource, load_recorded, read_rows
 from roadscan.tables.logs import DataFile
@@ -93,24 +93,28 @@ def _swath(plan: SurveyPlan, source: ReadingSource, files: Sequence[DataFile]) -
     """The strip that some row groups of a source show, spread over its time; None where they show nothing."""
     groups = [(file, group) for file in files for group in range(len(file.group_rows))]
     chosen = sorted({round(k) for k in np.linspace(0, len(groups) - 1, min(_SAMPLES, len(groups)))})
-    points: list[Float64] = []
-    epochs: list[Int64] = []
-    for file, group in (groups[k] for k in chosen):
-        own = RawSlice(source, file.path, [group], source.spans([file.group_spans[group]]), 0)
-        placement = Placer(plan.store, plan.ground, [own], recorded=True).placement(source)
-        batch = read_rows(plan.store, source, file.path, [group]).combine_chunks().to_batches()[0]
+    slices = [
+        RawSlice(source, file.path, [group], source.spans([file.group_spans[group]]), 0)
+        for file, group in (groups[k] for k in chosen)
+    ]
+    placement = Placer(plan.store, plan.ground, slices, recorded=True).placement(source)
+    parts: list[PlacedReadings] = []
+    for own in slices:
+        batch = read_rows(plan.store, source, own.file, own.groups).combine_chunks().to_batches()[0]
         most = _SAMPLE_ROWS if source.table == "scans" else _SAMPLE_RETURNS
-        batch = batch.take(np.arange(0, batch.num_rows, max(1, -(-batch.num_rows // most))))
-        at, when, _ = placed_points(batch, source, placement)
-        poses = level_poses(placement.trajectory, plan.ground.map, np.unique(when))
-        keep = np.isin(when, poses.epoch_gps_ns)
-        if keep.any():
-            points.append(at[keep])
-            epochs.append(when[keep])
-    if not points or source.trajectory is None:
+        parts.append(placed_readings(batch.take(_spread(batch.num_rows, most)), source, placement))
+    found = PlacedReadings.joined(parts)
+    every = _spread(len(found.points_m), _SAMPLE_RETURNS)
+    points, when = found.points_m[every], found.epoch_gps_ns[found.row[every]]
+    epochs, pose = np.unique(when, return_inverse=True)
+    poses = level_poses(placement.trajectory, plan.ground.map, epochs)
+    has_pose = np.isin(epochs, poses.epoch_gps_ns)
+    keep = has_pose[pose]
+    if not keep.any():
         return None
-    when = np.concatenate(epochs)
-    spans = [(int(e.min()), int(e.max())) for e in epochs]
-    recorded = load_recorded(plan.store, source.trajectory, spans, plan.ground.max_gap_s)
-    poses = level_poses(recorded, plan.ground.map, np.unique(when))
-    return swath_of(np.concatenate(points), poses, np.searchsorted(poses.epoch_gps_ns, when))
+    return swath_of(points[keep], poses, (np.cumsum(has_pose) - 1)[pose[keep]])
+
+
+def _spread(count: int, most: int) -> Int64:
+    """About so many numbers below `count`, evenly spread."""
+    return np.arange(0, count, max(1, -(-count // most)))

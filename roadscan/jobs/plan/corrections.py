@@ -28,13 +28,11 @@ class KnownCorrections:
     """Corrections of all runs, as the table holds them."""
 
     by_run: Mapping[str, Corrections]
-    expected: bool = False
-    """The survey is adjusted: there may be others after the next adjustment."""
 
     @classmethod
-    def load(cls, store: Store, *, expected: bool) -> Self:
+    def load(cls, store: Store) -> Self:
         """What the table says. Damage is told here, before tiles are asked to bear it."""
-        return cls(load_all_corrections(store), expected)
+        return cls(load_all_corrections(store))
 
     def allowance(self, run: str) -> Allowance:
         """Corrections that bounds on the recorded poses of a run leave room for.
@@ -46,7 +44,7 @@ class KnownCorrections:
         """
         own = self.by_run.get(run)
         try:
-            return allowance_for(own, expected=self.expected)
+            return allowance_for(own)
         except ValueError:
             shift, turn = largest(own)
             raise NavigationError(

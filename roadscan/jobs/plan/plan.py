@@ -123,7 +123,7 @@ def plan_survey(
     known = load_mountings(store) if calibrated is None else calibrated
     clocks = load_clocks(store)
     apart = tuple(apart_logs(survey, records, clocks, estimated=True))
-    corrections = KnownCorrections.load(store, expected=config.adjust.on)
+    corrections = KnownCorrections.load(store)
     sources = tuple(_sources(survey, store, _without(records, apart), ground, known, corrections))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)

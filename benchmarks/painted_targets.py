@@ -1,7 +1,7 @@
-"""Readings of painted targets, drawn without a formula of the fit: shapes are masks, wear is noise held against a level.
+"""Readings of painted targets without a formula of the fit: shapes are masks, wear is noise held against a level.
 
-Two sources of a road's intensity: the simulator's surface (`from_simulator`), and a picture painted by OpenCV at
-0.5 mm (`from_picture`), both read at the places of a profiler's readings by a drive in any direction.
+Two sources of a road's intensity: the simulator's surface (`SimulatedRoad`), and a picture painted by OpenCV at
+1 mm (`painted_sample`), both read at the places of a profiler's readings by a drive in any direction.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from roadscan.simulate.surface import Surface
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 
-HALF_M = 1.25
+HALF_M = 1.05
 """Half of the edge of the square that is read."""
-PIXEL_M = 0.0005
+PIXEL_M = 0.001
 ASPHALT, PAINT, BLACK = 70.0, 190.0, 15.0
 TARGET = Disc(0.30, 0.06)
 STATION_M, OFFSET_M = 50.0, 2.6
@@ -176,6 +176,45 @@ class SimulatedRoad:
         return _sample(sight, reading, self.shape, true, (self.without.intensity(*at), self.without.height_m(*at)))
 
 
+def furnished_road() -> SimulatedRoad:
+    """A road with all that may be taken for a target, a thing each 5 m, and no target at those places."""
+    return SimulatedRoad.of(
+        stains=[
+            {"station_m": 5.0, "offset_m": 1.0, "length_m": 0.3, "width_m": 0.3},
+            {"station_m": 5.0, "offset_m": -1.0, "length_m": 0.32, "width_m": 0.28, "shade": 120.0},
+        ],
+        tyre_marks=[
+            {"points_m": [[9.0, 0.8], [11.0, 1.2]]},
+            {"points_m": [[14.0, 1.0], [15.0, 1.05], [16.0, 0.9]], "width_m": 0.06, "shade": 15.0},
+            {"points_m": [[14.0, -1.0], [15.0, -1.1], [16.0, -0.9]], "width_m": 0.06, "shade": 160.0},
+            {"points_m": [[15.0, -2.0], [15.0, -0.2]], "width_m": 0.06, "shade": 160.0},
+        ],
+        markings=[
+            {"offset_m": 3.3, "width_m": 0.12},
+            {"offset_m": 0.0, "width_m": 0.15, "dash_m": 0.3, "gap_m": 0.7},
+            {"offset_m": -3.2, "width_m": 0.3, "dash_m": 0.3, "gap_m": 0.7},
+        ],
+        patches=[
+            {"station_m": 20.0, "offset_m": 1.5, "shape": "circle", "length_m": 0.6, "shade": 150.0},
+            {"station_m": 20.0, "offset_m": -1.5, "shape": "circle", "length_m": 0.24, "shade": 180.0},
+            {"station_m": 25.0, "offset_m": 1.5, "shape": "circle", "length_m": 0.37, "shade": 180.0},
+            {"station_m": 25.0, "offset_m": -1.5, "length_m": 0.3, "width_m": 0.3, "shade": 180.0},
+        ],
+        stop_bars=[{"station_m": 30.0, "from_m": -2.5, "to_m": 2.5, "width_m": 0.3}],
+        crosswalks=[{"station_m": 37.0, "from_m": -3.0, "to_m": 3.0, "stripe_m": 0.3, "gap_m": 0.3}],
+    )
+
+
+def other_places() -> list[tuple[str, float, float]]:
+    """What lies where on that road: name, station and offset (m)."""
+    return [
+        ("stain", 5.0, 1.0), ("bright stain", 5.0, -1.0), ("tyre mark", 10.0, 1.0), ("dark seal", 15.0, 1.0),
+        ("bright seals", 15.0, -1.0), ("line", 12.0, 3.3), ("dashes", 12.3, 0.0), ("square dashes", 12.3, -3.2),
+        ("large disc", 20.0, 1.5), ("small disc", 20.0, -1.5), ("larger disc", 25.0, 1.5), ("square", 25.0, -1.5),
+        ("stop bar", 30.0, 1.0), ("crossing", 37.0, 1.0), ("bare asphalt", 7.0, 1.8),
+    ]  # fmt: skip
+
+
 Painter = Callable[[Float32, np.random.Generator], None]
 """Draws things on a road's picture (pixels of `PIXEL_M`)."""
 
@@ -240,7 +279,7 @@ def read_picture(road: Float32, rng: np.random.Generator, shape: Shape, reading:
     """Readings of a picture whose middle is where the survey has the target; the road rises and is crowned."""
     if reading.footprint_m:
         road = gaussian_filter(road, reading.footprint_m / PIXEL_M)
-    sight = Sight.of(rng, reading, HALF_M - 0.3)
+    sight = Sight.of(rng, reading, HALF_M - 0.1)
     rise, bend = rng.normal(0.0, 0.02, 2), 0.002
     height = 312.4 + sight.place_m @ rise - bend * sight.place_m[:, 0] ** 2
     height = height + 0.0005 * rng.standard_normal(height.size)

@@ -49,7 +49,7 @@ def candidates(cells: Cells, cell_m: float, shape: Shape, radius_m: float, least
     likeness, turn = _likeness(value, seen, shape, cell_m)
     middle = (np.arange(-reach, reach) + 0.5) * cell_m
     likeness[np.hypot(middle[None], middle[:, None]) > radius_m] = 0.0
-    found = []
+    found: list[Candidate] = []
     while len(found) < most:
         row, column = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
         if likeness[row, column] < least:

@@ -30,12 +30,9 @@ class Cells:
 
 def cells_of(place_m: Float64, value: Float64, cell_m: float) -> Cells:
     """Means of readings (n, 2), (n,) in the cells of an even grid through the origin, by row and column."""
-    index = np.floor(place_m / cell_m).astype(np.int64)
-    if not index.size:
+    if not value.size:
         return Cells(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
-    low = index.min(axis=0)
-    columns = int(np.ptp(index[:, 0])) + 1
-    number = (index[:, 1] - low[1]) * columns + index[:, 0] - low[0]
+    number = _numbers(place_m, cell_m)
     count = np.bincount(number)
     taken = np.flatnonzero(count)
     many = count[taken]
@@ -43,13 +40,21 @@ def cells_of(place_m: Float64, value: Float64, cell_m: float) -> Cells:
     return Cells(np.stack(sums[:2], axis=-1), sums[2], many)
 
 
+def _numbers(place_m: Float64, cell_m: float) -> Int64:
+    """Number (n,) of each reading's cell, by row and column."""
+    column, row = (np.floor(axis / cell_m).astype(np.int64) for axis in place_m.T)
+    numbers: Int64 = (row - row.min()) * (int(np.ptp(column)) + 1) + column - column.min()
+    return numbers
+
+
 def spacing_m(place_m: Float64, block_m: float) -> float:
     """Mean distance (m) between readings (n, 2) where there are any, from their number in blocks of a size.
 
     Blocks with less than a third of the median's readings lie at a border and do not count.
     """
-    _, count = np.unique(np.floor(place_m / block_m).astype(np.int64), axis=0, return_counts=True)
-    if not count.size:
+    if not place_m.size:
         return float("inf")
+    count = np.bincount(_numbers(place_m, block_m))
+    count = count[count > 0]
     full = count[count >= np.median(count) / 3]
     return float(block_m / np.sqrt(full.mean()))

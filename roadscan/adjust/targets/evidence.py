@@ -6,6 +6,7 @@ paint from no paint: wear takes a part of each share, while another thing misses
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,12 @@ _TOLERANCE = 0.05
 """An outline may miss its place by this share of the radius, besides half of the readings' distance."""
 _LEAST_PER_SECTOR = 4
 _LEAST_IN_CENTRE = 4
+_WORN = 0.35
+"""Weight of road within the outline against white beyond it, and share of paint that still makes a block white."""
 _BLOCKS = 3
+"""Along an edge of a quadrant."""
+_OF_PAINT = 0.75
+"""The outline shows at least this part of the share of paint: what is not worn has its whole outline."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +51,15 @@ class Evidence:
     def fault(self, settings: TargetSettings, *, slack: float = 1.0) -> str:
         """What is wanting, "" if nothing; slack : share of the limits that suffices."""
         limits = (
-            ("paint", self.paint, settings.least_paint, "of the painted area shows paint"),
-            ("outline", self.outline, settings.least_outline, "of the outline lies where the shape has it"),
-            ("clear", self.clear, settings.least_clear, "of what should be unpainted is so"),
+            (self.paint, settings.least_paint, "of the painted area shows paint"),
+            (
+                self.outline,
+                max(settings.least_outline, _OF_PAINT * self.paint),
+                "of the outline lies where the shape has it",
+            ),
+            (self.clear, settings.least_clear, "of what should be unpainted is so"),
         )
-        for _, share, least, what in limits:
+        for share, least, what in limits:
             if share < slack * least:
                 return f"only {share:.0%} {what}"
         return ""
@@ -85,25 +95,28 @@ def _of_disc(away: Float64, white: Bool, shape: Disc, slack_m: float) -> Evidenc
     tolerance = _TOLERANCE * half + slack_m
     azimuth = np.arctan2(away[:, 1], away[:, 0])
     sector = np.minimum(((azimuth / np.pi + 1.0) / 2.0 * _SECTORS).astype(np.int64), _SECTORS - 1)
-    band = (r > max(0.5 * half, 1.1 * centre)) & (r < 1.5 * half)
-    good = sum(
-        _edge_near(r[band & (sector == k)], white[band & (sector == k)], half, tolerance) for k in range(_SECTORS)
-    )
+    band = np.flatnonzero((r > max(0.5 * half, 1.1 * centre)) & (r < 1.5 * half))
+    band = band[np.lexsort((r[band], sector[band]))]
+    ends = np.searchsorted(sector[band], np.arange(_SECTORS + 1))
+    pieces = (band[first:last] for first, last in itertools.pairwise(ends))
+    good = sum(_edge_near(r[piece], white[piece], half, tolerance) for piece in pieces)
     return Evidence(paint, good / _SECTORS, clear)
 
 
 def _edge_near(r: Float64, white: Bool, half_m: float, tolerance_m: float) -> bool:
-    """Whether the radius that parts white from other values best lies where the outline is."""
+    """Whether the radius that parts white from other values best lies where the outline is; radii ascend.
+
+    White beyond it counts more than road within it, which may be worn paint.
+    """
     if r.size < _LEAST_PER_SECTOR:
         return False
-    order = np.argsort(r, kind="stable")
-    r = r[order]
-    gain = np.append(0, np.cumsum(np.where(white[order], 1, -1)))
-    best = np.flatnonzero(gain == gain.max())
+    gain = np.append(0.0, np.cumsum(np.where(white, 1.0, -_WORN)))
+    most = gain.max()
+    best = np.flatnonzero(gain >= most - 1e-9)
     ends = np.concatenate([r[:1], r, r[-1:]])
     low, high = float(ends[best[0]]), float(ends[best[-1] + 1])
-    within = gain.max() >= _LEAST_PER_SECTOR / 2
-    return bool(within and low - tolerance_m <= half_m <= high + tolerance_m and high - low < 4 * tolerance_m)
+    here = low - tolerance_m <= half_m <= high + tolerance_m
+    return bool(most >= _LEAST_PER_SECTOR / 2 and here and high - low < 4 * tolerance_m)
 
 
 def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float) -> Evidence:
@@ -117,9 +130,8 @@ def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float)
     number = np.where(inside, (quadrant * _BLOCKS + block[1]) * _BLOCKS + block[0], -1)[inside]
     right = (white == (u * v > 0))[inside]
     seen = np.bincount(number, minlength=4 * _BLOCKS**2)
-    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2) > 0.6 * np.maximum(seen, 1)
-    of_quadrants = agree.reshape(2, 2, _BLOCKS**2).mean(axis=2)
-    painted = float((of_quadrants[0, 0] + of_quadrants[1, 1]) / 2)
-    bare = float(min(of_quadrants[0, 1], of_quadrants[1, 0]))
-    weakest = float(min(of_quadrants[0, 0], of_quadrants[1, 1]))
-    return Evidence(painted, (weakest + bare) / 2, min(clear, bare))
+    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2).reshape(4, -1) / np.maximum(seen, 1).reshape(4, -1)
+    agree = agree >= np.array([_WORN, 0.5, 0.5, _WORN])[:, None]
+    weakest = float(agree.mean(axis=1).min())
+    paint = _share(white, inside & (u * v > 0))
+    return Evidence(paint, weakest, min(clear, _share(~white, inside & (u * v < 0))))

@@ -17,24 +17,25 @@ import numpy.typing as npt
 from roadscan.adjust.targets.candidates import Candidate, candidates
 from roadscan.adjust.targets.cells import Cells, cells_of, spacing_m
 from roadscan.adjust.targets.evidence import Evidence, evidence
-from roadscan.adjust.targets.fit import ShapeFit, fit_radius_m, fit_shape
+from roadscan.adjust.targets.fit import ShapeFit, first_levels, fit_radius_m, fit_shape
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.pictures import picture_of
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered
 from roadscan.adjust.targets.values import ExpectedTarget, Status, TargetFind, TargetPicture, TargetReadings
-from roadscan.kernels.adjust.target_shapes import PAINT, TURN
 
 Float64 = npt.NDArray[np.float64]
 
-_GRID_CELLS = 32
+_GRID_CELLS = 24
 """Cells of the search's grid along the size of a shape, where readings are dense enough."""
 _FIT_CELLS = 75
 """Cells of the fit along the size."""
 _LEAST_READINGS = 8
 """Readings along the size: with fewer there is no outline."""
-_SAME = 0.25
-"""Finds nearer than this share of the size are one."""
+_OVERLAP = 0.9
+"""Two targets do not lie nearer than this share of the size."""
+_WANDERS = 0.25
+"""A fit ends no farther than this share of the size from where it began."""
 _EASED = 0.6
 """Share of the limits that a candidate has to reach before the fit."""
 
@@ -83,47 +84,57 @@ class _Search:
         """Places that hold, the best first; why the likeliest one did not."""
         settings, cell = self.settings, max(1.25 * spacing, self.size_m / _GRID_CELLS)
         coarse = cells_of(self.place_m, self.value, cell)
-        fine = cells_of(self.place_m, self.value, self.size_m / _FIT_CELLS)
         likely = candidates(
             coarse, cell, self.shape, settings.search_radius_m, settings.least_likeness, settings.most_candidates
         )
         held: list[_Held] = []
         faults = []
         for candidate in likely:
-            found, fault = self._examined(candidate, fine, spacing, cell)
+            if any(self._overlap(one.fit.centre_m, candidate.centre_m) for one in held):
+                continue
+            found, fault = self._examined(candidate, spacing, cell)
             faults.append(fault)
-            if found is not None and self._is_new(found, held):
+            if found is not None and not any(self._overlap(o.fit.centre_m, found.fit.centre_m) for o in held):
                 held.append(found)
         held.sort(key=lambda one: -one.evidence.score)
         return held, faults[0] if faults else "nothing near its stated place looks like it"
 
-    def _is_new(self, found: _Held, held: Sequence[_Held]) -> bool:
-        away = [np.hypot(*(one.fit.centre_m - found.fit.centre_m)) for one in held]
-        return all(d > _SAME * self.size_m for d in away)
+    def _overlap(self, first_m: Float64, second_m: Float64) -> bool:
+        """Whether two places cannot both be targets."""
+        return bool(np.hypot(*(first_m - second_m)) < _OVERLAP * self.size_m)
 
-    def _examined(self, candidate: Candidate, fine: Cells, spacing: float, cell: float) -> tuple[_Held | None, str]:
+    def _examined(self, candidate: Candidate, spacing: float, cell: float) -> tuple[_Held | None, str]:
         """A candidate as it fits, or its fault."""
-        settings, shape = self.settings, self.shape
+        settings, shape, fine_m = self.settings, self.shape, self.size_m / _FIT_CELLS
+        fine = self._cells_around(candidate.centre_m, fine_m)
         near = fine.within(candidate.centre_m, fit_radius_m(shape))
-        rough = evidence(near, shape, candidate.centre_m, candidate.turn_rad, _middle(near), 1.5 * cell)
+        threshold = first_levels(near, shape, candidate.centre_m).threshold
+        rough = evidence(near, shape, candidate.centre_m, candidate.turn_rad, threshold, 1.5 * cell)
         if fault := rough.fault(settings, slack=_EASED):
             return None, fault
-        fit = fit_shape(fine, shape, candidate.centre_m, candidate.turn_rad, spacing)
-        if fit is None:
+        fit = fit_shape(fine, shape, candidate.centre_m, candidate.turn_rad, max(spacing, fine_m))
+        if fit is None or self._wandered(fit, candidate):
             return None, "no shape of its kind fits the readings"
-        if np.hypot(*fit.centre_m) > settings.search_radius_m or self._wandered(fit, candidate):
-            return None, "no shape of its kind fits the readings there"
-        if fit.state[PAINT] < settings.least_contrast * fit.noise:
-            return None, f"paint stands out by {fit.state[PAINT] / fit.noise:.1f} σ of the readings"
+        stands_out = fit.levels.contrast / max(fit.levels.noise, 1e-9)
+        if stands_out < settings.least_contrast:
+            return None, f"paint stands out by {stands_out:.1f} σ of the readings"
         if abs(fit.scale - 1.0) > settings.size_tolerance:
             return None, f"the shape there is {fit.scale * self.size_m:.3f} m across"
         near = fine.within(fit.centre_m, fit_radius_m(shape))
-        shown = evidence(near, shape, fit.centre_m, float(fit.state[TURN]), fit.threshold, 0.5 * spacing)
+        shown = evidence(near, shape, fit.centre_m, fit.turn_rad, fit.levels.threshold, 0.5 * spacing)
         fault = shown.fault(settings)
         return (None, fault) if fault else (_Held(fit, shown), "")
 
+    def _cells_around(self, centre_m: Float64, cell_m: float) -> Cells:
+        """Small cells of all that a fit that begins at a place can ask for."""
+        reach = fit_radius_m(self.shape) + _WANDERS * self.size_m
+        near = np.all(np.abs(self.place_m - centre_m) <= reach, axis=1)
+        return cells_of(self.place_m[near], self.value[near], cell_m)
+
     def _wandered(self, fit: ShapeFit, candidate: Candidate) -> bool:
-        return bool(np.hypot(*(fit.centre_m - candidate.centre_m)) > _SAME * self.size_m)
+        """Whether a fit left its candidate, or the ground that is searched."""
+        away = np.hypot(*(fit.centre_m - candidate.centre_m))
+        return bool(away > _WANDERS * self.size_m or np.hypot(*fit.centre_m) > self.settings.search_radius_m)
 
     def _moved(self, fit: ShapeFit) -> tuple[Status, str]:
         expected, points, settings = self.expected, self.points, self.settings
@@ -150,11 +161,11 @@ class _Search:
             covariance_m2=fit.covariance_m2 + self.settings.sigma_paint_m**2 * np.eye(2),
             sigma_height_m=height.sigma_m,
             count=fit.count,
-            contrast=float(fit.state[PAINT]),
-            noise=fit.noise,
+            contrast=fit.levels.contrast,
+            noise=fit.levels.noise,
             score=shown.score,
             diameter_m=fit.scale * self.size_m,
-            azimuth_rad=float((-fit.state[TURN]) % np.pi) if turned else 0.0,
+            azimuth_rad=-fit.turn_rad % np.pi if turned else 0.0,
             others_m=np.array([self.origin_m + one.fit.centre_m for one in held[1:]]).reshape(-1, 2),
             picture=self._picture(held),
         )
@@ -173,19 +184,7 @@ class _Search:
         middle, half = np.zeros(2), wide
         if len(held) == 1:
             middle, half = held[0].fit.centre_m, min(2.0 * self.shape.reach_m, wide)
-        outlines = np.array([[*(o.fit.centre_m - middle), o.fit.state[TURN], o.fit.scale] for o in held])
+        outlines = np.array([[*(o.fit.centre_m - middle), o.fit.turn_rad, o.fit.scale] for o in held])
         return picture_of(
             self.place_m - middle, self.value, half, self.shape, outlines.reshape(-1, 4), self.origin_m + middle
         )
-
-
-def _middle(cells: Cells) -> float:
-    """Intensity between the brighter and the darker part (Otsu 1979)."""
-    value = np.sort(cells.value)
-    if value.size < 2:
-        return float("inf")
-    count = np.arange(1, value.size)
-    total = np.cumsum(value)
-    below, above = total[:-1] / count, (total[-1] - total[:-1]) / (value.size - count)
-    best = int(np.argmax(count * (value.size - count) * (above - below) ** 2))
-    return float((below[best] + above[best]) / 2)

@@ -1,16 +1,16 @@
 """Centre of a target by a fit of its shape to the intensities, and how well it is known.
 
-Unknown are the centre, the size, the blur of the edges (footprint of a reading, distance between readings, ragged
-paint), the turn of a chequered target, and the intensities of road and paint, the road's with a slope. Residuals count
-by Tukey's biweight, so that worn paint and neighbouring markings have no weight. At an edge, readings that do not
-average over their surroundings show paint or road and nothing between; the scale of residuals grows there with the
-model's slope.
+Each intensity becomes a label from 0, the road around, to 1, paint. The shape gives the chance of paint at each place;
+its centre, size and turn are those under which the labels are likeliest. Paint may be worn off, and there may be some
+beside the shape; how often, the labels themselves say. So the fit knows that missing paint says little and that paint
+outside the shape says much: a worn edge does not pull the centre away from it. The chance passes from paint to road
+over a blur that begins wide, so that the search finds its way, and ends at the distance between readings.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,179 +18,223 @@ import numpy.typing as npt
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
 from roadscan.kernels.adjust import target_shapes as kernels
-from roadscan.kernels.adjust.target_shapes import BLUR, DARK, EAST, LEVEL, NORTH, PAINT, SIZE, TURN, UNKNOWNS
+from roadscan.kernels.adjust.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
-SECTORS: Final = 36
-"""Residuals of one sector around the centre are taken to be of one piece of paint."""
-_SURROUNDINGS: Final = {"disc": 1.5, "chequered": 1.7}
-"""Radius of what is fitted, in radii or edges of a quadrant."""
-_CUT: Final = 4.685
-_EDGE: Final = 0.7
-_MAD_TO_SIGMA: Final = 1.4826
-_EVEN: Final = 0.03
-"""Where the model's slope times the blur is a smaller part of the contrast, a place is even."""
+_SECTORS: Final = 36
+"""Around the centre; what labels of one sector say is one piece of evidence."""
+_ALIKE: Final = 3
+"""Sectors nearer than this many share their wear."""
+_SURROUNDINGS: Final = 1.5
+"""Radius of what is fitted, in radii of a disc or half diagonals of a square."""
+_LAST_BLUR: Final = 0.15
+"""Of the distance between cells: the narrower, the less a worn edge pulls."""
+_CURVATURE_BLUR: Final = 0.4
+"""The same, for the curvature of the likelihood; narrower, it would be that of chance between few readings."""
+_PARTED: Final = 1.2
+_STAGES: Final = 5
+_ROUNDS: Final = 12
+_DONE_M: Final = 1e-6
+_LEAST_CELLS: Final = 60
+_LEAST_CHANCE: Final = 0.02
+_MOST_LOST: Final = 0.6
+_MOST_STRAY: Final = 0.2
 _SIGMA_LOG_SIZE: Final = 0.05
-_SIGMA_LOG_BLUR: Final = 0.5
-_ROUGH_ROUNDS, _ROUNDS = 6, 25
-_DONE_M: Final = 2e-6
-_LEAST_NOISE: Final = 0.3
-"""Least scale of residuals, as intensities are whole numbers."""
+_MAD_TO_SIGMA: Final = 1.4826
 
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """A shape as it fits."""
+    """A shape as it fits; places count from the caller's middle."""
 
-    state: Float64
-    """(10,) unknowns, `kernels/adjust/target_shapes.py`."""
+    centre_m: Float64
+    """(2,) east and north."""
     covariance_m2: Float64
     """(2, 2) of the centre."""
-    noise: float
-    """1 σ of values in even places, units of the intensity."""
+    scale: float
+    """Size over the stated size."""
+    turn_rad: float
+    """Of a chequered target, east to north."""
+    levels: Levels
     count: int
-    """Readings with weight."""
+    """Readings that were looked at."""
 
-    @property
-    def centre_m(self) -> Float64:
-        """(2,) east and north."""
-        return self.state[[EAST, NORTH]]
 
-    @property
-    def scale(self) -> float:
-        """Size over the stated size."""
-        return float(np.exp(self.state[SIZE]))
+class Levels(NamedTuple):
+    """Intensities of a place."""
+
+    road: float
+    contrast: float
+    """Paint above the road."""
+    noise: float
+    """1 σ of single values of the road."""
 
     @property
     def threshold(self) -> float:
-        """Intensity halfway between road and paint."""
-        return float(self.state[LEVEL] + 0.5 * self.state[PAINT])
+        """Halfway between road and paint."""
+        return self.road + 0.5 * self.contrast
 
 
 def fit_radius_m(shape: Shape) -> float:
     """Cells within this of the centre are fitted (m)."""
-    return shape.half_m * _SURROUNDINGS["disc" if isinstance(shape, Disc) else "chequered"]
+    return shape.reach_m * _SURROUNDINGS
 
 
-def drawn(shape: Shape) -> kernels.Drawn:
-    """The shape as kernels have it."""
-    if isinstance(shape, Disc):
-        return kernels.Drawn(kernels.DISC, shape.half_m, shape.centre_m / 2)
-    return kernels.Drawn(kernels.CHEQUERED, shape.half_m, 0.0)
+def first_levels(cells: Cells, shape: Shape, centre_m: Float64) -> Levels:
+    """Levels where a shape may be: values parted so that both parts are most even (Otsu 1979).
+
+    Paint makes up a third to two thirds of what is looked at; of less, noise would be parted instead.
+    """
+    value = np.sort(cells.within(centre_m, _PARTED * shape.half_m).value)
+    if value.size < 2:
+        return Levels(0.0, 0.0, 0.0)
+    below = np.arange(1, value.size)
+    total = np.cumsum(value)
+    low, high = total[:-1] / below, (total[-1] - total[:-1]) / (value.size - below)
+    best = int(np.argmax(below * (value.size - below) * (high - low) ** 2)) + 1
+    return _levels(value[:best], value[best:])
+
+
+def _levels(road: Float64, paint: Float64) -> Levels:
+    level = float(np.median(road))
+    noise = _MAD_TO_SIGMA * float(np.median(np.abs(road - level)))
+    return Levels(level, float(np.median(paint)) - level, noise)
 
 
 def fit_shape(cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, spacing_m: float) -> ShapeFit | None:
-    """The shape that fits best, from a start within a tenth of its size; None where there is no such.
+    """The shape under which the labels are likeliest, from a start within a tenth of its size; None: there is none.
 
     Parameters
     ----------
     cells : intensities by place. centre_m : (2,) start. turn_rad : of a chequered target, within 15°.
-    spacing_m : mean distance between readings.
+    spacing_m : mean distance between cells.
     """
     near = cells.within(centre_m, fit_radius_m(shape))
-    if near.value.size < 3 * UNKNOWNS:
+    if near.value.size < _LEAST_CELLS:
         return None
-    fit = _Fit(near, shape, centre_m, turn_rad, spacing_m)
-    return fit.solved()
+    fit = _Fit(near, shape, centre_m)
+    state = np.array([*centre_m, 0.0, turn_rad])
+    levels = first_levels(near, shape, centre_m)
+    last = _LAST_BLUR * spacing_m
+    for blur in np.geomspace(max(2 * last, 0.1 * shape.half_m), last, _STAGES):
+        levels = fit.labelled(state, levels)
+        if levels.contrast <= 0.0:
+            return None
+        state = fit.likeliest(state, float(blur))
+    covariance = fit.covariance(state, _CURVATURE_BLUR * spacing_m)
+    if covariance is None or not np.all(np.isfinite(covariance)):
+        return None
+    scale, turn = float(np.exp(state[SIZE])), float(state[TURN])
+    return ShapeFit(state[[EAST, NORTH]], covariance, scale, turn, levels, int(near.count.sum()))
 
 
 class _Fit:
-    """One fit: what stays the same from round to round."""
+    """One fit: the labels, and what stays the same from round to round."""
 
-    def __init__(self, cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, spacing_m: float) -> None:
-        self.cells, self.drawn, self.reach_m = cells, drawn(shape), shape.half_m
+    def __init__(self, cells: Cells, shape: Shape, centre_m: Float64) -> None:
+        self.cells, self.shape = cells, shape
+        if isinstance(shape, Disc):
+            self.drawn = kernels.Drawn(kernels.DISC, shape.half_m, shape.centre_m / 2)
+        else:
+            self.drawn = kernels.Drawn(kernels.CHEQUERED, shape.half_m, 0.0)
         away = cells.place_m - centre_m
         azimuth = np.arctan2(away[:, 1], away[:, 0])
-        self.group = np.minimum(((azimuth / np.pi + 1.0) / 2.0 * SECTORS).astype(np.int64), SECTORS - 1)
-        n = cells.value.size
-        self.out = kernels.Fitted(
-            np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((SECTORS, UNKNOWNS)), np.zeros(n), np.zeros(n), np.zeros(n)
-        )
-        self.least_blur_m = 0.2 * spacing_m
-        self.start = self._start(centre_m, turn_rad, max(spacing_m, 0.1 * shape.half_m))
-        self.active = np.ones(UNKNOWNS, bool)
-        if isinstance(shape, Disc):
-            self.active[TURN] = False
-            self.active[DARK] = shape.centre_m > 2.0 * spacing_m
-        else:
-            self.active[DARK] = shape.quadrants == 4
-        self.prior = np.zeros(UNKNOWNS)
-        self.prior[SIZE], self.prior[BLUR] = _SIGMA_LOG_SIZE**-2, _SIGMA_LOG_BLUR**-2
-        self.expected_blur = np.log(max(0.4 * spacing_m, self.least_blur_m))
+        self.group = np.minimum(((azimuth / np.pi + 1.0) / 2.0 * _SECTORS).astype(np.int64), _SECTORS - 1)
+        self.active = np.array([True, True, True, not isinstance(shape, Disc)])
+        self.label = np.zeros(cells.value.size)
+        self.chances = (_LEAST_CHANCE, _LEAST_CHANCE)
+        self.out = kernels.Fitted(np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((_SECTORS, UNKNOWNS)))
 
-    def _start(self, centre_m: Float64, turn_rad: float, blur_m: float) -> Float64:
-        state = np.zeros(UNKNOWNS)
-        state[[EAST, NORTH]], state[TURN], state[BLUR] = centre_m, turn_rad, np.log(blur_m)
-        layers = np.zeros((self.cells.value.size, 2))
-        kernels.draw_layers(self.cells.place_m, self.drawn, state, layers)
-        bare = layers.sum(axis=1) < 0.05
-        white, dark = (layers[:, 0] > 0.9) & (layers[:, 1] < 0.1), layers[:, 1] > 0.9
-        if self.drawn.kind == kernels.CHEQUERED:
-            white, dark = layers[:, 0] > 0.9, layers[:, 1] > 0.9
-        for which, parts in ((LEVEL, bare), (PAINT, white), (DARK, dark)):
-            state[which] = np.median(self.cells.value[parts]) if parts.any() else 0.0
-        state[PAINT] -= state[LEVEL]
-        state[DARK] -= state[LEVEL] + (state[PAINT] if self.drawn.kind == kernels.DISC else 0.0)
+    def labelled(self, state: Float64, levels: Levels) -> Levels:
+        """Make the labels, and the chances of worn and stray paint, from the levels within and beside the shape."""
+        white = np.zeros(self.cells.value.size)
+        kernels.draw_white(self.cells.place_m, self.drawn, state, 0.05 * self.shape.half_m, white)
+        away = np.hypot(*(self.cells.place_m - state[[EAST, NORTH]]).T)
+        inside, beside = white > 0.95, (white < 0.05) & (away > self.shape.half_m)
+        value, bright = self.cells.value, self.cells.value > levels.threshold
+        if (inside & bright).any() and (beside & ~bright).any():
+            levels = _levels(value[beside & ~bright], value[inside & bright])
+        self.label = np.clip((value - levels.road) / max(levels.contrast, 1e-9), 0.0, 1.0)
+        lost = float(1.0 - self.label[inside].mean()) if inside.any() else _MOST_LOST
+        stray = float(self.label[beside].mean()) if beside.any() else _MOST_STRAY
+        self.chances = (
+            float(np.clip(lost, _LEAST_CHANCE, _MOST_LOST)),
+            float(np.clip(stray, _LEAST_CHANCE, _MOST_STRAY)),
+        )
+        return levels
+
+    def likeliest(self, state: Float64, blur_m: float) -> Float64:
+        """The likeliest state from a start, by Fisher scoring with steps that are halved until they help."""
+        likelihood, step = self._step(state, blur_m)
+        for _ in range(_ROUNDS):
+            for _ in range(6):
+                tried = state + step
+                after, following = self._step(tried, blur_m)
+                if after >= likelihood:
+                    break
+                step = 0.5 * step
+            else:
+                return state
+            moved = float(np.hypot(step[EAST], step[NORTH]))
+            state, likelihood, step = tried, after, following
+            if moved < _DONE_M:
+                break
         return state
 
-    def solved(self) -> ShapeFit | None:
-        """Rounds with the scale of a quarter of the contrast first, then with that of the residuals."""
-        state = self.start.copy()
-        if state[PAINT] <= 0.0:
+    def _score(self, state: Float64, blur_m: float) -> tuple[float, Float64]:
+        """Log-likelihood with the prior of the size, and its derivatives (4,)."""
+        paint = kernels.Paint(blur_m, *self.chances)
+        likelihood = kernels.fit_equations(
+            self.cells.place_m, self.label, self.group, self.drawn, state, paint, self.out
+        )
+        right: Float64 = self.out.scores.sum(axis=0)
+        right[SIZE] -= state[SIZE] / _SIGMA_LOG_SIZE**2
+        return float(likelihood) - 0.5 * (state[SIZE] / _SIGMA_LOG_SIZE) ** 2, right
+
+    def _step(self, state: Float64, blur_m: float) -> tuple[float, Float64]:
+        likelihood, right = self._score(state, blur_m)
+        normal = self.out.normal[np.ix_(self.active, self.active)].copy()
+        normal[SIZE, SIZE] += _SIGMA_LOG_SIZE**-2
+        step = np.zeros(UNKNOWNS)
+        step[self.active] = np.linalg.lstsq(normal, right[self.active], rcond=None)[0]
+        reach = 0.1 * self.shape.half_m
+        limits = np.array([reach, reach, 0.1, 0.1])
+        limited: Float64 = step * min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-300))))
+        return likelihood, limited
+
+    def covariance(self, state: Float64, blur_m: float) -> Float64 | None:
+        """Covariance (2, 2) of the centre: the sandwich of Huber (1967), scores summed by neighbouring sectors.
+
+        Wear reaches over sectors, so the products of scores of neighbours count with Bartlett's weights (Newey and
+        West 1987), around the circle.
+        """
+        self._score(state, blur_m)
+        scores = self.out.scores[:, self.active].copy()
+        meat = np.zeros((scores.shape[1], scores.shape[1]))
+        for lag in range(1 - _ALIKE, _ALIKE):
+            meat += (1.0 - abs(lag) / _ALIKE) * scores.T @ np.roll(scores, lag, axis=0)
+        curvature = self._curvature(state, blur_m)
+        if np.linalg.eigvalsh(curvature).min() <= 0.0:
             return None
-        state = np.where(self.active, state, 0.0)
-        noise = 0.25 * state[PAINT]
-        for turn in range(_ROUGH_ROUNDS + _ROUNDS):
-            self._equations(state, noise)
-            if turn >= _ROUGH_ROUNDS:
-                noise = self._noise(state)
-                self._equations(state, noise)
-            step = self._step(state)
-            if step is None:
-                return None
-            state = state + step
-            state[BLUR] = max(state[BLUR], np.log(self.least_blur_m))
-            if turn > _ROUGH_ROUNDS + 1 and np.hypot(*step[[EAST, NORTH]]) < _DONE_M:
-                break
-        return self._finished(state, noise)
+        inverse = np.linalg.inv(curvature)
+        pieces = _SECTORS / _ALIKE
+        covariance: Float64 = (inverse @ meat @ inverse)[:2, :2] * pieces / (pieces - len(curvature))
+        return 0.5 * (covariance + covariance.T)
 
-    def _equations(self, state: Float64, noise: float) -> None:
-        robust = kernels.Robust(noise, _EDGE, _CUT)
-        kernels.fit_equations(self.cells.place_m, self.cells.value, self.group, self.drawn, state, robust, self.out)
-
-    def _noise(self, state: Float64) -> float:
-        even = self.out.edge < _EVEN * abs(state[PAINT])
-        left = np.abs(self.out.residual[even])
-        return max(_MAD_TO_SIGMA * float(np.median(left)) if left.size else 0.0, _LEAST_NOISE)
-
-    def _normal(self) -> Float64:
-        normal = self.out.normal + np.diag(self.prior)
-        normal[~self.active], normal[:, ~self.active] = 0.0, 0.0
-        normal[~self.active, ~self.active] = 1.0
-        return normal
-
-    def _step(self, state: Float64) -> Float64 | None:
-        right = self.out.scores.sum(axis=0)
-        right[SIZE] -= self.prior[SIZE] * state[SIZE]
-        right[BLUR] -= self.prior[BLUR] * (state[BLUR] - self.expected_blur)
-        try:
-            step: Float64 = np.linalg.solve(self._normal(), np.where(self.active, right, 0.0))
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(step)):
-            return None
-        most = {EAST: 0.1 * self.reach_m, NORTH: 0.1 * self.reach_m, SIZE: 0.1, BLUR: 0.7, TURN: 0.1}
-        share = min(1.0, *(limit / max(abs(step[which]), 1e-300) for which, limit in most.items()))
-        return share * step
-
-    def _finished(self, state: Float64, noise: float) -> ShapeFit | None:
-        self._equations(state, noise)
-        inverse = np.linalg.pinv(self._normal())
-        meat = self.out.scores.T @ self.out.scores
-        groups = np.unique(self.group).size
-        if groups <= UNKNOWNS or not np.isfinite(state).all():
-            return None
-        covariance = inverse @ meat @ inverse * groups / (groups - 5)
-        count = int(self.cells.count[self.out.weight > 0.0].sum())
-        return ShapeFit(state, covariance[:2, :2], noise, count)
+    def _curvature(self, state: Float64, blur_m: float) -> Float64:
+        """Second derivatives of the log-likelihood, negative, from the scores a third of a blur to both sides."""
+        active = np.flatnonzero(self.active)
+        steps = np.full(UNKNOWNS, blur_m / 3)
+        steps[SIZE:] /= self.shape.half_m
+        columns = []
+        for which in active:
+            change = np.zeros(UNKNOWNS)
+            change[which] = steps[which]
+            before, after = self._score(state - change, blur_m)[1], self._score(state + change, blur_m)[1]
+            columns.append((before - after)[active] / (2.0 * steps[which]))
+        found = np.array(columns)
+        symmetric: Float64 = 0.5 * (found + found.T)
+        return symmetric

@@ -61,8 +61,8 @@ def _surrounds(place: Float64) -> bool:
 
 def _robust_plane(design: Float64, height: Float64) -> tuple[Float64, Float64]:
     """Coefficients (3,) and weights (n,) by iteratively re-weighted least squares."""
-    weight = np.ones(height.size)
-    plane = np.zeros(3)
+    weight: Float64 = np.ones(height.size)
+    plane: Float64 = np.zeros(3)
     for turn in range(_ROUNDS):
         before = plane
         weighted = design * weight[:, None]

@@ -1,9 +1,7 @@
-"""Painted shapes with soft edges, and the equations that fit them to intensities.
+"""Painted shapes with soft edges, and the equations that fit them to labels of paint and road.
 
-A shape has two layers, white paint and dark paint, each from 0 to 1. An edge is a normal distribution function of the
-distance to it, with the blur as its standard deviation. Intensities are modelled as
-
-    level + slope · place + paint · white + dark · black.
+A shape is a share of white paint, from 0 to 1. An edge is a normal distribution function of the distance to it, with
+the blur as its standard deviation.
 """
 
 from __future__ import annotations
@@ -18,9 +16,9 @@ from roadscan.kernels.options import inlined, kernel
 
 DISC, CHEQUERED = 0, 1
 """Kinds of shapes."""
-EAST, NORTH, SIZE, BLUR, TURN, LEVEL, SLOPE_EAST, SLOPE_NORTH, PAINT, DARK = range(10)
-"""Unknowns: centre (m), logarithms of size and blur, turn (rad), and the intensities above."""
-UNKNOWNS = 10
+EAST, NORTH, SIZE, TURN = range(4)
+"""Unknowns: centre (m), logarithm of the size over the stated one, turn (rad, east to north)."""
+UNKNOWNS = 4
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 _FAR = 6.0
@@ -37,30 +35,24 @@ class Drawn(NamedTuple):
     """Radius of the dark centre of a disc; 0: none."""
 
 
-class Robust(NamedTuple):
-    """How residuals are weighed: Tukey's biweight of the residual over its scale."""
+class Paint(NamedTuple):
+    """How paint shows."""
 
-    noise: float
-    """Scale of a residual in an even place, units of the intensity."""
-    edge: float
-    """What the scale gains at an edge, in units of the slope there times the blur."""
-    cut: float
-    """A residual beyond this many scales has no weight."""
+    blur_m: float
+    """Standard deviation of an edge."""
+    lost: float
+    """Chance that paint is worn off, above 0."""
+    stray: float
+    """Chance that there is paint beside the shape, above 0."""
 
 
 class Fitted(NamedTuple):
-    """Sums over n values, written by the kernel."""
+    """Sums over n labels, written by the kernel."""
 
     normal: npt.NDArray[np.float64]
-    """(10, 10) normal matrix."""
+    """(4, 4) information matrix of Fisher."""
     scores: npt.NDArray[np.float64]
-    """(g, 10) right-hand side, the part of each group of values."""
-    residual: npt.NDArray[np.float64]
-    """(n,) value minus model."""
-    edge: npt.NDArray[np.float64]
-    """(n,) slope of the model times the blur."""
-    weight: npt.NDArray[np.float64]
-    """(n,) 0 to 1."""
+    """(g, 4) derivative of the log-likelihood, the part of each group."""
 
 
 @inlined
@@ -75,107 +67,92 @@ def _step(t):
 
 @inlined
 def _disc(x, y, half, centre, blur):
-    """White and dark layer of a disc, and the derivatives of each by centre, size, blur and turn."""
+    """White share of a disc, and its derivatives by the unknowns."""
     r = math.sqrt(x * x + y * y) + 1e-12
-    t = (half - r) / blur
-    white, slope = _step(t)
-    slope /= blur
-    dark, dark_slope, u = 0.0, 0.0, 0.0
+    white, outer = _step((half - r) / blur)
+    inner = 0.0
     if centre > 0.0:
-        u = (centre - r) / blur
-        dark, dark_slope = _step(u)
-        dark_slope /= blur
-    return (
-        white, slope * x / r, slope * y / r, slope * half, -slope * blur * t, 0.0,
-        dark, dark_slope * x / r, dark_slope * y / r, dark_slope * centre, -dark_slope * blur * u, 0.0,
-    )  # fmt: skip
+        dark, inner = _step((centre - r) / blur)
+        white -= dark
+    slope = (outer - inner) / blur / r
+    return white, slope * x, slope * y, (outer * half - inner * centre) / blur, 0.0
 
 
 @inlined
 def _halves(u, half, blur):
-    """Share within (0, half) and within (−half, 0), each with its derivatives by u, log size and log blur."""
+    """Share within (0, half) and within (−half, 0), each with its derivatives by u and log size."""
     middle, a = _step(u / blur)
     right, b = _step((u - half) / blur)
     left, c = _step((u + half) / blur)
     a, b, c = a / blur, b / blur, c / blur
-    return (
-        middle - right, a - b, b * half, -a * u + b * (u - half),
-        left - middle, c - a, c * half, -c * (u + half) + a * u,
-    )  # fmt: skip
+    return middle - right, a - b, b * half, left - middle, c - a, c * half
 
 
 @inlined
 def _chequered(x, y, half, turn, blur):
-    """White and dark layer of a square of four, and the derivatives of each by centre, size, blur and turn."""
+    """White share of a square of four, and its derivatives by the unknowns."""
     cos, sin = math.cos(turn), math.sin(turn)
     u, v = cos * x + sin * y, cos * y - sin * x
-    p, pu, pk, ps, n, nu, nk, ns = _halves(u, half, blur)
-    q, qv, qk, qs, m, mv, mk, ms = _halves(v, half, blur)
-    white_u, white_v = pu * q + nu * m, p * qv + n * mv
-    dark_u, dark_v = pu * m + nu * q, p * mv + n * qv
-    return (
-        p * q + n * m, sin * white_v - cos * white_u, -sin * white_u - cos * white_v,
-        pk * q + p * qk + nk * m + n * mk, ps * q + p * qs + ns * m + n * ms, white_u * v - white_v * u,
-        p * m + n * q, sin * dark_v - cos * dark_u, -sin * dark_u - cos * dark_v,
-        pk * m + p * mk + nk * q + n * qk, ps * m + p * ms + ns * q + n * qs, dark_u * v - dark_v * u,
-    )  # fmt: skip
-
-
-@inlined
-def _layers(x, y, drawn, state):
-    kind, half, centre = drawn
-    scale, blur = math.exp(state[SIZE]), math.exp(state[BLUR])
-    if kind == DISC:
-        return _disc(x, y, half * scale, centre * scale, blur)
-    return _chequered(x, y, half * scale, state[TURN], blur)
+    p, pu, pk, n, nu, nk = _halves(u, half, blur)
+    q, qv, qk, m, mv, mk = _halves(v, half, blur)
+    by_u, by_v = pu * q + nu * m, p * qv + n * mv
+    by_size = pk * q + p * qk + nk * m + n * mk
+    return p * q + n * m, sin * by_v - cos * by_u, -sin * by_u - cos * by_v, by_size, by_u * v - by_v * u
 
 
 @kernel
-def fit_equations(place, value, group, drawn, state, robust, out):
-    """Equations of one step of Gauss and Newton towards the shape that fits the values best.
+def fit_equations(place, label, group, drawn, state, paint, out):
+    """Log-likelihood of labels under a shape, and the equations of one step towards the likeliest (Fisher scoring).
+
+    A label is Bernoulli's with the chance ``stray + (1 − lost − stray) · white``, or a share between.
 
     Parameters
     ----------
-    place : (n, 2) float64, m, east and north; value : (n,) float64, intensities; group : (n,) int64.
-    drawn : Drawn. state : (10,) float64, the unknowns. robust : Robust. out : Fitted.
+    place : (n, 2) float64, m, east and north; label : (n,) float64, 0 road to 1 paint; group : (n,) int64.
+    drawn : Drawn. state : (4,) float64, the unknowns. paint : Paint. out : Fitted.
     """
-    noise, edge, cut = robust
-    normal, scores, residual, steep, weight = out
+    kind, half, centre = drawn
+    blur, lost, stray = paint
+    normal, scores = out
     normal[:] = 0.0
     scores[:] = 0.0
     slopes = np.zeros(UNKNOWNS)
-    blur = math.exp(state[BLUR])
-    for i in range(value.size):
-        east, north = place[i, 0], place[i, 1]
-        layers = _layers(east - state[EAST], north - state[NORTH], drawn, state)
-        white, dark = layers[0], layers[6]
-        for k in range(5):
-            slopes[k] = state[PAINT] * layers[1 + k] + state[DARK] * layers[7 + k]
-        slopes[LEVEL], slopes[SLOPE_EAST], slopes[SLOPE_NORTH] = 1.0, east, north
-        slopes[PAINT], slopes[DARK] = white, dark
-        model = state[LEVEL] + state[SLOPE_EAST] * east + state[SLOPE_NORTH] * north
-        model += state[PAINT] * white + state[DARK] * dark
-        left = value[i] - model
-        residual[i] = left
-        steep[i] = blur * math.hypot(slopes[EAST], slopes[NORTH])
-        variance = noise * noise + (edge * steep[i]) ** 2
-        share = 1.0 - left * left / (variance * cut * cut)
-        weight[i] = share * share if share > 0.0 else 0.0
-        if share <= 0.0:
-            continue
-        w = weight[i] / variance
+    scale = math.exp(state[SIZE])
+    rise = 1.0 - lost - stray
+    total = 0.0
+    for i in range(label.size):
+        x, y = place[i, 0] - state[EAST], place[i, 1] - state[NORTH]
+        if kind == DISC:
+            white, slopes[0], slopes[1], slopes[2], slopes[3] = _disc(x, y, half * scale, centre * scale, blur)
+        else:
+            white, slopes[0], slopes[1], slopes[2], slopes[3] = _chequered(x, y, half * scale, state[TURN], blur)
+        chance = stray + rise * white
+        total += label[i] * math.log(chance) + (1.0 - label[i]) * math.log(1.0 - chance)
+        information = 1.0 / (chance * (1.0 - chance))
         for a in range(UNKNOWNS):
-            scores[group[i], a] += w * slopes[a] * left
+            scores[group[i], a] += rise * slopes[a] * (label[i] - chance) * information
             for b in range(a + 1):
-                normal[a, b] += w * slopes[a] * slopes[b]
+                normal[a, b] += rise * rise * slopes[a] * slopes[b] * information
     for a in range(UNKNOWNS):
         for b in range(a):
             normal[b, a] = normal[a, b]
+    return total
 
 
 @kernel
-def draw_layers(place, drawn, state, out):
-    """White and dark layer (n, 2) of a shape at places (n, 2); state : (10,) its unknowns; out : float64, written."""
+def draw_white(place, drawn, state, blur_m, out):
+    """White share (n,) of a shape at places (n, 2).
+
+    Parameters
+    ----------
+    place : (n, 2) float64, m. drawn : Drawn. state : (4,) float64, the unknowns. blur_m : float64.
+    out : (n,) float64, written.
+    """
+    kind, half, centre = drawn
+    scale = math.exp(state[SIZE])
     for i in range(place.shape[0]):
-        layers = _layers(place[i, 0] - state[EAST], place[i, 1] - state[NORTH], drawn, state)
-        out[i, 0], out[i, 1] = layers[0], layers[6]
+        x, y = place[i, 0] - state[EAST], place[i, 1] - state[NORTH]
+        if kind == DISC:
+            out[i] = _disc(x, y, half * scale, centre * scale, blur_m)[0]
+        else:
+            out[i] = _chequered(x, y, half * scale, state[TURN], blur_m)[0]

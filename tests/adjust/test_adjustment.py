@@ -334,7 +334,7 @@ def test_modes() -> None:
 
 def test_wrong_statistics_are_found_by_variance_components() -> None:
     """σ of ties and of the heights' process stated three times too small and too large."""
-    road = Road(4000.0, 3, 5.0, 500.0, lane_m=3.5)
+    road = Road(4000.0, 3, 5.0, 500.0, lane_m=3.5, height_tie_sigma_m=0.001)
     observations, _, _ = drawn(road, 14)
     stated = replace(
         observations, sigma_m=np.where(observations.kind == 0, observations.sigma_m / 3.0, observations.sigma_m)

@@ -162,7 +162,7 @@ def _canonical(observations: Observations) -> Int64:
     """Order that depends on the observations alone, not on how they arrived."""
     o = observations
     keys = [o.kind, o.place, *o.run.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
-    keys += list(o.partials.reshape(o.size, -1).T)
+    keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
     return np.lexsort(keys[::-1])
 
 

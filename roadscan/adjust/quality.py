@@ -78,7 +78,7 @@ def vertical_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> 
     ASPRS Positional Accuracy Standards, edition 2 (2023): RMSE_V = √(RMSE_V1² + RMSE_V2²), of the fit to the check
     points and of their survey.
     """
-    there = np.asarray(np.isfinite(error_m))
+    there = np.asarray(np.isfinite(error_m), dtype=bool)
     error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
     rmse = _rms(error)
     deviation = float(error.std(ddof=1)) if error.size > 1 else float("nan")

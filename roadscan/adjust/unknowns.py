@@ -24,6 +24,8 @@ Int64 = npt.NDArray[np.int64]
 
 _SIZE = len(COMPONENTS)
 _DOWN = 2
+_ALONG = 0.5
+"""A direction with so much of an axis tells of the σ of that coordinate; every direction has it of one or two."""
 HEIGHT_ALONE = np.arange(_SIZE) == _DOWN
 """Components that a vertical adjustment corrects."""
 
@@ -52,12 +54,10 @@ class ControlPoints:
         index = np.full(observations.size, -1, np.int64)
         index[seen] = own.ravel()
         sigma = np.zeros((len(points), 3))
-        direction = directions_of(observations)[seen]
-        # A coordinate's σ is that of the observations along it; of oblique ones it is that of the nearest axes.
-        upright = np.abs(direction[:, _DOWN]) > np.sqrt(0.5)
-        for axes, which in (([_DOWN], upright), ([0, 1], ~upright)):
-            for axis in axes:
-                np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
+        along = np.abs(directions_of(observations)[seen]) >= _ALONG
+        for axis in range(3):
+            which = along[:, axis]
+            np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
         return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, index)
 
 
@@ -187,8 +187,14 @@ class Unknowns:
         Raises
         ------
         ConfigError
-            for an end of a run that is not among the priors, or at an epoch outside of its run.
+            for an end of a run that is not among the priors, or at an epoch outside of its run, what is not a number,
+            and where there is nothing to correct.
         """
+        if self.first[-1] == 0:
+            raise ConfigError(
+                "no component of any run is to be corrected",
+                expected="a process with σ above 0 for one component or more",
+            )
         for end in (0, 1):
             run = observations.run[:, end]
             strange = np.flatnonzero((run < FIXED) | (run >= len(self.priors)))

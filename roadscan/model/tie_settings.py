@@ -53,7 +53,21 @@ class TieSettings(Strict):
     misplaced_m: float = Field(default=0.03, ge=0.0)
     """1 σ of how far two passes may lie apart horizontally (m): with the unevenness of the patch it adds to the σ of a
     height tie."""
-    sigma_floor_m: float = Field(default=5e-5, gt=0.0)
+    sigma_floor_m: float = Field(default=2e-5, gt=0.0)
     """No tie is better than this (m, 1 σ): rounding, what a pose changes within a patch."""
     outlying: float = Field(default=4.0, gt=1.0)
     """Cells that differ from the rest by more than so many σ are left out."""
+    shift_cell_m: float = Field(default=0.01, gt=0.0)
+    """Edge of the cells of the pictures and reliefs that horizontal shifts are found in (m)."""
+    search_m: float = Field(default=0.15, gt=0.0)
+    """Shifts are sought up to so far along and across (m)."""
+    least_correlation: float = Field(default=0.3, gt=0.0, lt=1.0)
+    """Correlation of two pictures or reliefs from which on they may show the same place."""
+    rival_share: float = Field(default=0.75, gt=0.0, lt=1.0)
+    """A shift is ambiguous where another one correlates with this share of the best correlation."""
+    coherence: float = Field(default=0.4, gt=0.0, lt=1.0)
+    """A direction counts where this share of the slopes' energy is common to both; the rest is noise."""
+    most_shift_sigma_m: float = Field(default=0.01, gt=0.0)
+    """A direction that is known worse than this makes no tie (m, 1 σ)."""
+    shift_floor_m: float = Field(default=2e-4, gt=0.0)
+    """No shift is known better than this (m, 1 σ): spacing of readings, what a pose changes within a patch."""

@@ -158,8 +158,10 @@ def _inside(place: Place, readings: PassReadings, cell_m: float, edge: int, coun
     number = np.empty(along.size, np.int32)
     cell_numbers(along, across, 0.5 * edge * cell_m, cell_m, edge, number, count)
     which = np.flatnonzero(number >= 0)
-    columns = (along, across, readings.height_m, readings.intensity, readings.pose, number)
-    return Inside(*(column[which] for column in columns))
+    return Inside(
+        along[which], across[which], readings.height_m[which], readings.intensity[which], readings.pose[which],
+        number[which],
+    )  # fmt: skip
 
 
 def frame_of(place: Place) -> Frame:

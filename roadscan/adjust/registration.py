@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -120,13 +120,14 @@ def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
     place, sums = found
     shift = _known(place, sums, one.sampling_m2 + other.sampling_m2, len(first), settings)
     why = _why_not(likeness, shifts, start, shift, settings)
-    return shift if not why else Shift(**{**shift.__dict__, "why_not": why})
+    return replace(shift, why_not=why)
 
 
 def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, _Equations] | None:
     """The shift (row, column; cells) of least squares near a start and the sums there; None where there is none."""
     place, edge = start.copy(), len(first)
     laid = Laid(np.empty((edge, edge)), np.empty((edge, edge, 2)), np.empty((edge, edge, 2)))
+    found = None
     for _ in range(_ROUNDS):
         lay_upon(first, second, float(place[0]), float(place[1]), laid)
         sums = _equations(first, laid)
@@ -136,9 +137,10 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
         place = place + np.clip(sums.step, -1.0, 1.0)
         if np.abs(place - start).max() > _ASTRAY_CELLS:
             return None
+        found = place, sums
         if np.abs(sums.step).max() < _DONE_CELLS:
             break
-    return place, sums
+    return found
 
 
 def _equations(first: Float64, laid: Laid) -> _Equations | None:

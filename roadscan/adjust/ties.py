@@ -14,6 +14,7 @@ from roadscan.adjust.height_ties import height_tie
 from roadscan.adjust.observations import KINDS, Observations, partials
 from roadscan.adjust.patches import PassReadings, patch_of
 from roadscan.adjust.places import Place
+from roadscan.adjust.plane_ties import plane_ties
 from roadscan.adjust.shift_ties import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.tie import SAME_PASS, Tie
 from roadscan.model.gpstime import NS_PER_S
@@ -68,12 +69,15 @@ def ties_at(place: Place, readings: Sequence[PassReadings], settings: TieSetting
     -------
     One row a tie, also for those that do not count.
     """
-    patches = [patch_of(place, one, settings.cell_m, settings.least_readings) for one in readings if one.pose.size]
+    dense = [one for one in readings if not one.returns]
+    patches = [patch_of(place, one, settings.cell_m, settings.least_readings) for one in dense]
     pictures = Pictures([p for p in patches if p is not None], settings)
     found: list[Tie] = []
     for number, (a, b) in enumerate(pairs_of(len(pictures.patches))):
         found += [replace(tie, group=_GROUPS * number + tie.group) for tie in _of_pair(pictures, a, b)]
-    return as_ties(place, shared(found))
+    planes = plane_ties(place, [one for one in readings if one.returns], settings)
+    above = 1 + max((tie.group for tie in found), default=0)
+    return as_ties(place, [*shared(found), *(replace(tie, group=above + tie.group) for tie in planes)])
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:

@@ -71,3 +71,15 @@ class TieSettings(Strict):
     """A direction that is known worse than this makes no tie (m, 1 σ)."""
     shift_floor_m: float = Field(default=2e-4, gt=0.0)
     """No shift is known better than this (m, 1 σ): spacing of readings, what a pose changes within a patch."""
+    window_s: float = Field(default=0.2, gt=0.0)
+    """Returns of a lidar that are taken together as seen from one pose (s)."""
+    plane_cell_m: float = Field(default=1.0, gt=0.0)
+    """Edge of the cubes in which planes are sought (m)."""
+    least_returns: int = Field(default=8, ge=3)
+    """A window sees a plane where it has so many returns on it."""
+    thickest_m: float = Field(default=0.05, gt=0.0)
+    """Returns of a plane scatter about it no more than this (m, 1 σ)."""
+    uneven_m: float = Field(default=0.003, ge=0.0)
+    """1 σ of how far the means of returns on different spots of a plane differ because it is uneven (m)."""
+    most_planes: int = Field(default=60, ge=1)
+    """Planes of a place that make ties: those with the most returns."""

@@ -1,1 +1,1 @@
-"""Loops of the adjustment: where tracks meet, patches of the road and how they lie to one another, its equations."""
+"""Loops of the adjustment: meetings of tracks, patches and their shifts, normal equations, parts of their inverse."""

@@ -78,11 +78,27 @@ def level_from_map(vector_m: Float64, convergence_rad: float) -> Float64:
 
 
 @dataclass(frozen=True)
+class Inside:
+    """The readings of a traverse that lie inside a patch."""
+
+    along_m: Float64
+    """(n,) from the middle of the patch."""
+    across_m: Float64
+    """(n,) to the right."""
+    height_m: Float64
+    intensity: UInt16
+    pose: Int32
+    number: Int32
+    """(n,) cell, row · edge + column."""
+
+
+@dataclass(frozen=True)
 class Patch:
     """A square of road, centred at a place, as cells (along, across); the axis across is positive to the right."""
 
     place: Place
     readings: PassReadings
+    inside: Inside
     cell_m: float
     height_m: Float64
     """(k, k); NaN where too little was seen."""
@@ -118,38 +134,39 @@ def patch_of(place: Place, readings: PassReadings, cell_m: float, least_readings
     cell_m : edge of a cell. least_readings : a cell with fewer has no height.
     """
     edge = max(round(2.0 * place.radius_m / cell_m), 4)
-    along, across = axes_at(place, readings)
-    half = 0.5 * edge * cell_m
-    number, count = np.empty(along.size, np.int32), np.zeros(edge * edge, np.int64)
-    cell_numbers(along, across, half, cell_m, edge, number, count)
-    inside = np.flatnonzero(number >= 0)
-    if inside.size == 0:
+    count = np.zeros(edge * edge, np.int64)
+    inside = _inside(place, readings, cell_m, edge, count)
+    if inside.pose.size == 0:
         return None
     cells = Cells._make(np.empty(edge * edge, t) for t in (np.float64, np.float64, np.int32, np.float64))
-    fill_cells(number, readings.height_m, readings.intensity, count, least_readings, cells)
+    fill_cells(inside.number, inside.height_m, inside.intensity, count, least_readings, cells)
     usual = np.nanmedian(cells.spread_m) if np.isfinite(cells.spread_m).any() else math.nan
     # The quartiles of a handful are worth little by themselves.
     spread = np.sqrt((cells.spread_m**2 + usual**2) / 2.0)
     sigma = np.where(np.isfinite(spread), spread, usual) / np.sqrt(np.maximum(cells.used, 1))
     shape = (edge, edge)
-    pose = int(np.median(readings.pose[inside]))
     return Patch(
-        place, readings, cell_m, cells.height_m.reshape(shape), sigma.reshape(shape), cells.used.reshape(shape),
-        cells.intensity.reshape(shape), pose,
+        place, readings, inside, cell_m, cells.height_m.reshape(shape), sigma.reshape(shape), cells.used.reshape(shape),
+        cells.intensity.reshape(shape), int(np.median(inside.pose)),
     )  # fmt: skip
 
 
-def axes_at(place: Place, readings: PassReadings) -> tuple[Float64, Float64]:
-    """Coordinates (n,) of readings along the heading of a place and across it, from its centre."""
+def _inside(place: Place, readings: PassReadings, cell_m: float, edge: int, count: Int64) -> Inside:
+    """Readings inside the cells of a place, which are counted into `count`."""
     along, across = np.empty(readings.pose.size), np.empty(readings.pose.size)
-    local_axes(readings.easting_m, readings.northing_m, frame_of(place, 0.0), along, across)
-    return along, across
+    local_axes(readings.easting_m, readings.northing_m, frame_of(place), along, across)
+    number = np.empty(along.size, np.int32)
+    cell_numbers(along, across, 0.5 * edge * cell_m, cell_m, edge, number, count)
+    which = np.flatnonzero(number >= 0)
+    return Inside(
+        along[which], across[which], readings.height_m[which], readings.intensity[which], readings.pose[which],
+        number[which],
+    )  # fmt: skip
 
 
-def frame_of(place: Place, cell_m: float) -> Frame:
-    """Frame of a place's cells, as kernels take it."""
-    sine, cosine = math.sin(place.heading_rad), math.cos(place.heading_rad)
-    return Frame(place.easting_m, place.northing_m, sine, cosine, place.radius_m, cell_m)
+def frame_of(place: Place) -> Frame:
+    """Axes of a place, as kernels take them."""
+    return Frame(place.easting_m, place.northing_m, math.sin(place.heading_rad), math.cos(place.heading_rad))
 
 
 def map_from_axes(place: Place, along_m: Float64, across_m: Float64, height_m: Float64) -> Float64:

@@ -12,8 +12,10 @@ import numpy.typing as npt
 
 from roadscan.adjust.height_ties import height_tie
 from roadscan.adjust.observations import KINDS, Observations, partials
-from roadscan.adjust.patches import PassReadings, Patch, patch_of
+from roadscan.adjust.patches import PassReadings, patch_of
 from roadscan.adjust.places import Place
+from roadscan.adjust.plane_ties import plane_ties
+from roadscan.adjust.shift_ties import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.tie import SAME_PASS, Tie
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.tie_settings import TieSettings
@@ -22,6 +24,8 @@ Float64 = npt.NDArray[np.float64]
 
 _PARTNERS: Final = 2
 """Traverses that each one is tied to: with all their pairs, many passes of a place would say the same many times."""
+_GROUPS: Final = 1 + KINDS_OF_PICTURES
+"""Groups of a pair: its height, and the shift of each kind of picture."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,15 @@ def ties_at(place: Place, readings: Sequence[PassReadings], settings: TieSetting
     -------
     One row a tie, also for those that do not count.
     """
-    patches = [patch_of(place, one, settings.cell_m, settings.least_readings) for one in readings if one.pose.size]
-    known = [p for p in patches if p is not None]
-    found = [_of_pair(known[a], known[b], settings) for a, b in pairs_of(len(known))]
-    return as_ties(place, shared([tie for pair in found for tie in pair]))
+    dense = [one for one in readings if not one.returns]
+    patches = [patch_of(place, one, settings.cell_m, settings.least_readings) for one in dense]
+    pictures = Pictures([p for p in patches if p is not None], settings)
+    found: list[Tie] = []
+    for number, (a, b) in enumerate(pairs_of(len(pictures.patches))):
+        found += [replace(tie, group=_GROUPS * number + tie.group) for tie in _of_pair(pictures, a, b)]
+    planes = plane_ties(place, [one for one in readings if one.returns], settings)
+    above = 1 + max((tie.group for tie in found), default=0)
+    return as_ties(place, [*shared(found), *(replace(tie, group=above + tie.group) for tie in planes)])
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
@@ -77,11 +86,14 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
     return sorted((min(pair), max(pair)) for pair in ring)
 
 
-def _of_pair(first: Patch, second: Patch, settings: TieSettings) -> list[Tie]:
+def _of_pair(pictures: Pictures, a: int, b: int) -> list[Tie]:
     """Ties of two patches; those of heads that passed together do not count for the poses."""
-    found = [height_tie(first, second, settings)]
+    first, second = pictures.patches[a], pictures.patches[b]
+    height = height_tie(first, second, pictures.settings)
+    # Where not even the heights agree, what would be matched is no road.
+    found = [height, *(shift_ties(pictures, a, b) if height.counts else ())]
     apart_s = abs(first.epoch_gps_ns - second.epoch_gps_ns) / NS_PER_S
-    if first.readings.run == second.readings.run and apart_s < settings.return_s:
+    if first.readings.run == second.readings.run and apart_s < pictures.settings.return_s:
         return [replace(tie, why_not=tie.why_not or SAME_PASS) for tie in found]
     return found
 

@@ -53,7 +53,33 @@ class TieSettings(Strict):
     misplaced_m: float = Field(default=0.03, ge=0.0)
     """1 σ of how far two passes may lie apart horizontally (m): with the unevenness of the patch it adds to the σ of a
     height tie."""
-    sigma_floor_m: float = Field(default=5e-5, gt=0.0)
+    sigma_floor_m: float = Field(default=2e-5, gt=0.0)
     """No tie is better than this (m, 1 σ): rounding, what a pose changes within a patch."""
     outlying: float = Field(default=4.0, gt=1.0)
     """Cells that differ from the rest by more than so many σ are left out."""
+    shift_cell_m: float = Field(default=0.01, gt=0.0)
+    """Edge of the cells of the pictures and reliefs that horizontal shifts are found in (m)."""
+    search_m: float = Field(default=0.15, gt=0.0)
+    """Shifts are sought up to so far along and across (m)."""
+    least_correlation: float = Field(default=0.3, gt=0.0, lt=1.0)
+    """Correlation of two pictures or reliefs from which on they may show the same place."""
+    rival_share: float = Field(default=0.75, gt=0.0, lt=1.0)
+    """A shift is ambiguous where another one correlates with this share of the best correlation."""
+    coherence: float = Field(default=0.4, gt=0.0, lt=1.0)
+    """A direction counts where this share of the slopes' energy is common to both; the rest is noise."""
+    most_shift_sigma_m: float = Field(default=0.01, gt=0.0)
+    """A direction that is known worse than this makes no tie (m, 1 σ)."""
+    shift_floor_m: float = Field(default=2e-4, gt=0.0)
+    """No shift is known better than this (m, 1 σ): spacing of readings, what a pose changes within a patch."""
+    window_s: float = Field(default=0.2, gt=0.0)
+    """Returns of a lidar that are taken together as seen from one pose (s)."""
+    plane_cell_m: float = Field(default=1.0, gt=0.0)
+    """Edge of the cubes in which planes are sought (m)."""
+    least_returns: int = Field(default=8, ge=3)
+    """A window sees a plane where it has so many returns on it."""
+    thickest_m: float = Field(default=0.05, gt=0.0)
+    """Returns of a plane scatter about it no more than this (m, 1 σ)."""
+    uneven_m: float = Field(default=0.003, ge=0.0)
+    """1 σ of how far the means of returns on different spots of a plane differ because it is uneven (m)."""
+    most_planes: int = Field(default=60, ge=1)
+    """Planes of a place that make ties: those with the most returns."""

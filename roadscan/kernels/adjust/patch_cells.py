@@ -17,7 +17,7 @@ QUARTILES_OF_SIGMA = 1.349
 
 
 class Frame(NamedTuple):
-    """Square of cells around a place."""
+    """Axes of a place."""
 
     easting_m: float
     """Centre, map."""
@@ -25,9 +25,6 @@ class Frame(NamedTuple):
     sine: float
     """Of the heading of the axis along, clockwise from grid north."""
     cosine: float
-    half_m: float
-    """Half the edge."""
-    cell_m: float
 
 
 class Cells(NamedTuple):
@@ -107,3 +104,41 @@ def fill_cells(number, height_m, intensity, count, least, cells):
         cells.height_m[k] = total / (high - low)
         cells.spread_m[k] = (held[high - 1] - held[low]) / QUARTILES_OF_SIGMA if n >= 4 else math.nan
         cells.intensity[k] = light[k] / n
+
+
+class Splat(NamedTuple):
+    """Sums of readings over the cells of a picture, (rows, columns), in/out of `splat`."""
+
+    mass: npt.NDArray[np.float64]
+    """Sum of weights."""
+    height: npt.NDArray[np.float64]
+    """Sum of weight · height."""
+    intensity: npt.NDArray[np.float64]
+
+
+@kernel
+def splat(along_m, across_m, height_m, intensity, number, road_m, deepest_m, level_m, cell_m, out):
+    """Add readings to the four cells around each, by their nearness; those far from the height of their cell are not.
+
+    Parameters
+    ----------
+    along_m, across_m : (n,) float64, from the corner of the picture. height_m : (n,) float64. intensity : (n,) uint16.
+    number : (n,) int32, cell of `road_m` of each reading. road_m : (c,) float64.
+    deepest_m : float64, farther from its cell's height a reading is no road. level_m : float64, taken off all heights.
+    cell_m : float64. out : Splat, in/out.
+    """
+    rows, columns = out.mass.shape
+    for i in range(number.size):
+        u, v = along_m[i] / cell_m - 0.5, across_m[i] / cell_m - 0.5
+        if not (0.0 <= u < rows - 1.0 and 0.0 <= v < columns - 1.0):
+            continue
+        if not abs(height_m[i] - road_m[number[i]]) <= deepest_m:
+            continue
+        h, w = height_m[i] - level_m, float(intensity[i])
+        r, c = int(u), int(v)
+        for j in range(2):
+            for k in range(2):
+                part = (u - r if j else 1.0 - u + r) * (v - c if k else 1.0 - v + c)
+                out.mass[r + j, c + k] += part
+                out.height[r + j, c + k] += part * h
+                out.intensity[r + j, c + k] += part * w

@@ -110,7 +110,7 @@ class Unknowns:
         active = self.sigmas[run] > 0.0
         numbers = np.full((self.knots[run].size, _SIZE), -1, np.int64)
         count = self.knots[run].size * int(active.sum())
-        numbers[:, active] = self.first[run] + np.arange(count).reshape(-1, int(active.sum()))
+        numbers[:, active] = self.first[run] + np.arange(count).reshape(self.knots[run].size, int(active.sum()))
         return numbers
 
     def intervals(self, run: int, epochs_gps_ns: Int64) -> tuple[Int64, Float64, Float64]:

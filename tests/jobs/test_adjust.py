@@ -29,7 +29,11 @@ from roadscan.tables.store import Store
 from .conftest import Lines, Simulated, changed
 
 ROLES = ("gcp", "check", "gcp", "check", "gcp", "gcp")
-TARGETS = [{"station_m": 3.0 + 4.0 * k, "offset_m": 3.2, "role": role} for k, role in enumerate(ROLES)]
+OFFSETS_M = (3.2, 0.6, 0.6, 3.2, 3.2, 0.6)
+TARGETS = [
+    {"station_m": 3.0 + 4.0 * k, "offset_m": offset, "role": role}
+    for k, (role, offset) in enumerate(zip(ROLES, OFFSETS_M, strict=True))
+]
 CIRCLES = {"adjust__targets": {"shape": "circle", "size_m": 0.30, "centre_m": 0.06, "search_m": 0.3}}
 NO_FILES: dict[str, object] = {"products__make": ["tile_table"]}
 OFF = {"on": False}

@@ -22,7 +22,7 @@ from roadscan.jobs.adjust.control_work import (
     sight_control,
 )
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, relative_rows, tie_rows
-from roadscan.jobs.adjust.outcome import PICTURES, TABLES, keep_pictures, keep_tables
+from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
 from roadscan.jobs.adjust.publication import digest_of, foreign_runs, publish
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
 from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
@@ -37,10 +37,6 @@ from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import file_digest
 
-ADJUSTMENT: Final = "adjustment"
-"""Manifest name of the solution; it has no file of its own."""
-
-_UNIT: Final = "solution"
 _BUNDLE_BYTES: Final = 20_000_000.0
 """Compressed bytes that a task reads, about."""
 _BUNDLE_POINTS: Final = 8
@@ -79,7 +75,7 @@ def solution_key(plan: SurveyPlan) -> str:
 
 def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
     """True where nothing has changed since the last solution, and what it made is there."""
-    record = manifest.get(ADJUSTMENT, _UNIT)
+    record = manifest.get(ADJUSTMENT, SOLUTION)
     if not plan.survey.config.adjust.on:
         return record is None
     if record is None or record.key != solution_key(plan):
@@ -89,24 +85,12 @@ def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
     return whole and record.figures()["table"] == digest_of(plan.store)
 
 
-def known_lines(manifest: Manifest) -> list[str]:
-    """What the last solution said, in words."""
-    record = manifest.get(ADJUSTMENT, _UNIT)
-    return [] if record is None else list(record.figures()["lines"])
-
-
-def known_notes(manifest: Manifest) -> list[str]:
-    """What it found wrong."""
-    record = manifest.get(ADJUSTMENT, _UNIT)
-    return [] if record is None else list(record.figures()["notes"])
-
-
 def withdraw(session: Session) -> None:
     """Take away what the stage made: the poses hold as they were recorded."""
     manifest, plan = session.manifest, session.plan
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, plan.survey.config.adjust)
-    manifest.forget(ADJUSTMENT, [_UNIT])
+    manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
 def adjust_survey(session: Session) -> None:
@@ -184,7 +168,7 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[st
     lines, notes = said
     detail = {"runs": sorted(held), "table": digest_of(session.store), "lines": lines, "notes": notes}
     own = key if not failed else key_of(key, "failed")
-    session.manifest.add([OutputRecord(ADJUSTMENT, _UNIT, own, "", 0, "", json.dumps(detail))])
+    session.manifest.add([OutputRecord(ADJUSTMENT, SOLUTION, own, "", 0, "", json.dumps(detail))])
     for line in lines:
         session.reporter.line(f"adjust: {line}")
     for note in notes:

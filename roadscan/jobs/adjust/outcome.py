@@ -20,11 +20,26 @@ from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
 from roadscan.tables.writer import parquet_bytes
 
+ADJUSTMENT: Final = "adjustment"
+SOLUTION: Final = "solution"
+"""Name and unit in the manifest of the solution; it has no file of its own."""
 TABLES: Final = ("tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy")
 """Tables of the outcome; each is a product of the manifest with one unit."""
 PICTURES: Final = "adjustment_picture"
 FOLDER: Final = "products/adjustment"
 _WHOLE: Final = "all"
+
+
+def known_lines(manifest: Manifest) -> list[str]:
+    """What the last solution said, in words."""
+    record = manifest.get(ADJUSTMENT, SOLUTION)
+    return [] if record is None else list(record.figures()["lines"])
+
+
+def known_notes(manifest: Manifest) -> list[str]:
+    """What it found wrong."""
+    record = manifest.get(ADJUSTMENT, SOLUTION)
+    return [] if record is None else list(record.figures()["notes"])
 
 
 def keep_tables(store: Store, manifest: Manifest, key: str, tables: Mapping[str, Rows]) -> None:

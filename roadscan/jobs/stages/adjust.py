@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from roadscan.jobs.adjust.adjustment import adjust_survey, is_current, known_lines, known_notes, withdraw
-from roadscan.jobs.adjust.outcome import FOLDER, TABLES
+from roadscan.jobs.adjust.adjustment import adjust_survey, is_current, withdraw
+from roadscan.jobs.adjust.outcome import FOLDER, TABLES, known_lines, known_notes
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.footprints import index_footprints
+from roadscan.model.errors import ConfigError, RoadscanError
+from roadscan.model.survey import Survey
 from roadscan.tables.schema import table_schema
 
 
@@ -32,6 +34,14 @@ class Adjust(Stage):
         found = index_footprints(session.plan, session.manifest, session.compute, session.bar("footprints"))
         session.renew("footprints")
         session.failed(self.name, found)
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Whether the file of picked targets is there."""
+        picked = survey.config.adjust.targets.picked
+        file = None if picked is None else survey.resolve(picked)
+        if file is None or not survey.config.adjust.on or file.is_file():
+            return []
+        return [ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)]
 
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""

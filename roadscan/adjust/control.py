@@ -139,9 +139,12 @@ def sight(
     picked : stands in for what would be found.
     """
     readings = TargetReadings(
-        *(np.concatenate([getattr(h, name) for h in heads]) for name in ("easting_m", "northing_m", "height_m")),
-        np.concatenate([h.intensity for h in heads]), sigma_pose_m,
-    )  # fmt: skip
+        easting_m=np.concatenate([h.easting_m for h in heads]),
+        northing_m=np.concatenate([h.northing_m for h in heads]),
+        height_m=np.concatenate([h.height_m for h in heads]),
+        intensity=np.concatenate([h.intensity for h in heads]),
+        sigma_horizontal_m=sigma_pose_m,
+    )
     nan, none = float("nan"), np.full((2, 2), np.nan)
     status: SightStatus = "height"
     why_not, find = "", None
@@ -239,8 +242,8 @@ def _of_one(number: int, one: Sighting) -> list[Observations]:
         variance, axes = np.linalg.eigh(one.covariance_m2)
         for axis, own in zip(axes.T, variance, strict=True):
             direction = level_from_map(np.array([[axis[0], axis[1], 0.0]]), one.convergence_rad)
-            sigma = (float(np.sqrt(own)), point.sigma_horizontal_m)
-            parts.append(_observation("control_position", one, direction, float(axis @ away), sigma, 2 * number + 1))
+            sigmas = (float(np.sqrt(own)), point.sigma_horizontal_m)
+            parts.append(_observation("control_position", one, direction, float(axis @ away), sigmas, 2 * number + 1))
     return parts
 
 

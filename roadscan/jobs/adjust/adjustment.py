@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from roadscan.jobs.adjust.control_work import (
     sight_control,
 )
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
 from roadscan.jobs.adjust.publication import digest_of, foreign_runs, publish
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
@@ -129,7 +130,7 @@ def adjust_survey(session: Session) -> None:
     _keep(session, key, held, (lines, [*notes, *solution.notes, *_of_points(work, sightings)]), failed)
 
 
-def plan_work(plan: SurveyPlan, sources: Any, sigma_pose_m: Sequence[float]) -> Work:
+def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float]) -> Work:
     """Where passes overlap and where they come by control points: tasks for both."""
     tracks = tracks_of(plan, sources)
     config = plan.survey.config.adjust

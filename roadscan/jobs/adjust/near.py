@@ -153,12 +153,21 @@ class NearReader:
         keep = has_pose[of_reading]
         found, of_reading = found.chosen(keep), (np.cumsum(has_pose) - 1)[of_reading[keep]]
         turned = float(poses.convergence_rad[0]) if poses.epoch_gps_ns.size else 0.0
+        easting, northing, height = (np.ascontiguousarray(found.points_m[:, k]) for k in range(3))
         return PassReadings(
-            traverse.run, traverse.sensor, *(np.ascontiguousarray(found.points_m[:, k]) for k in range(3)),
-            found.intensity, of_reading.astype(np.int32), poses.epoch_gps_ns, poses.body_m, poses.level_from_body,
-            turned,
-            bool(files) and files[0].source.table == "returns",
-        )  # fmt: skip
+            run=traverse.run,
+            sensor=traverse.sensor,
+            easting_m=easting,
+            northing_m=northing,
+            height_m=height,
+            intensity=found.intensity,
+            pose=of_reading.astype(np.int32),
+            epoch_gps_ns=poses.epoch_gps_ns,
+            body_m=poses.body_m,
+            level_from_body=poses.level_from_body,
+            convergence_rad=turned,
+            returns=bool(files) and files[0].source.table == "returns",
+        )
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
-from roadscan.jobs.adjust.tracks import Sources, span_of
+from roadscan.jobs.adjust.tracks import span_of
 from roadscan.jobs.navigate.pose_sigma import median_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import load_recorded

@@ -13,6 +13,7 @@ from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
+from roadscan.adjust.quality import mean_corrections
 from roadscan.model.errors import ConfigError
 
 S = 10**9
@@ -318,6 +319,22 @@ def test_a_wrong_control_point_is_named_and_not_absorbed() -> None:
     assert (found.weight[wrong] > 0.5).all()
     rms = [np.sqrt(np.mean(heights_off(f, ROAD, stations, truth) ** 2)) for f in (before, found)]
     assert rms[1] < 1.5 * rms[0]
+
+
+def test_control_that_is_wrong_as_a_whole_is_told_by_the_means() -> None:
+    """60 mm between two height datums, which no single point contradicts; 0.5 m, which none of them gets through."""
+    observations, _, _ = drawn(ROAD, 21)
+    right = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
+    assert np.abs(right.normalised).max() < 4.0
+    height = observations.kind == KINDS.index("control_height")
+    observations.observed_m[height] += 0.06
+    moved = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
+    np.testing.assert_allclose(moved.mean[:, 2] - right.mean[:, 2], 0.06, atol=0.005)
+    assert (moved.normalised[:, 2] > 3.0).all()
+    observations.observed_m[height] += 0.44
+    found = adjust(observations, ROAD.priors(), AdjustmentSettings())
+    assert (found.control.weight[:, 2] == 0.0).all()
+    assert np.abs(mean_corrections(found).mean[:, 2]).max() < 0.02
 
 
 def test_a_target_that_one_run_saw_wrongly_costs_that_one() -> None:

@@ -68,7 +68,7 @@ def of_mode(road: Road, mode: str, bar: float, seeds: int) -> Iterator[Figure]:
     yield Figure(f"{name}: expected of the best estimate", 1e3 * best.expected, "mm")
     if mode == "joint":
         yield Figure(f"{name}: repeatability (bar {REPEATABILITY_MM})", 1e3 * float(np.mean(repeated)), "mm")
-    low, high = nees_bounds(road, seeds, mode)
+    low, high = nees_bounds(road, seeds, mode, best.runs_alike)
     yield Figure(f"{name}: normalised squared error", float(np.mean(nees)), "", None, f"95 %: {low:.2f} to {high:.2f}")
     yield Figure(f"{name}: the same of control left out", float(np.mean(loo)), "")
 
@@ -85,7 +85,7 @@ def errors(found: Adjustment, road: Road, drawn: Drawn, checks: Float64) -> tupl
 
 
 def spaced(mode: str) -> tuple[slice, slice]:
-    """Runs and check points whose errors are all but independent: a kilometre apart, one run where all are tied."""
+    """Check points a kilometre apart, whose errors are all but independent; one run where all are tied."""
     return slice(0, 1) if mode == "joint" else slice(None), slice(CHECKS // 6, None, CHECKS // 3)
 
 
@@ -94,9 +94,10 @@ def independent_nees(error: Float64, sigma: Float64, mode: str) -> float:
     return float(np.mean((error / sigma)[spaced(mode)] ** 2))
 
 
-def nees_bounds(road: Road, seeds: int, mode: str) -> tuple[float, float]:
-    """Its 95 % bounds."""
-    count = seeds * np.zeros((road.runs, CHECKS))[spaced(mode)].size
+def nees_bounds(road: Road, seeds: int, mode: str, runs_alike: float) -> tuple[float, float]:
+    """Its 95 % bounds; runs that share the errors of the control's survey count for fewer."""
+    runs, stations = np.zeros((road.runs, CHECKS))[spaced(mode)].shape
+    count = seeds * stations * runs / (1.0 + (runs - 1) * runs_alike**2)
     low, high = chi2.ppf([0.025, 0.975], count) / count
     return float(low), float(high)
 
@@ -112,6 +113,8 @@ class BestEstimate:
     across: Float64
     """(runs · checks, used) covariance of the wanted heights with them."""
     checks: Float64
+    runs_alike: float
+    """Correlation of the errors of two runs that are estimated alone, at one check point half-way."""
     expected: float
     """Mean absolute error that it has by its own covariance at every tenth check point (m)."""
 
@@ -133,10 +136,15 @@ class BestEstimate:
         wanted = cls._wanted(road, checks)
         across = cls._covariance(road, wanted, chosen)
         factor = cho_factor(own, overwrite_a=True, lower=True)
-        some = across[:: checks.size // 50]
+        some = across[:: max(1, checks.size // 50)]
         prior = sum(p.sigma**2 * d**2 for p, d in zip(road.processes, CHECK_ROW, strict=True))
         variance = prior - np.einsum("ij,ji->i", some, cho_solve(factor, some.T))
-        return cls(used, factor, across, checks, float(np.sqrt(2.0 / np.pi * variance).mean()))
+        halfway = across[[checks.size // 2, checks.size // 2 + checks.size]]
+        first, second = cho_solve(factor, halfway.T).T
+        same_point = (chosen.place[:, None] == chosen.place) & (survey[:, None] > 0.0) & (survey > 0.0)
+        alike = first @ np.where(same_point, survey[:, None] * survey, 0.0) @ second
+        alike /= prior - halfway[0] @ first
+        return cls(used, factor, across, checks, float(alike), float(np.sqrt(2.0 / np.pi * variance).mean()))
 
     def errors(self, observations: Observations, drawn: Drawn) -> Float64:
         """Its errors (runs · checks) for drawn observations."""

@@ -1,9 +1,10 @@
 """Control targets in intensities: how many of 500 are found, new and worn, how well, and what else passes for one.
 
-Targets of 0.30 m with a black centre of 0.06 m on the simulator's road, readings each 5 × 10 mm from any direction with
-noise of 4 digital numbers, stated places with σ 50 mm. Worn paint has half the contrast and lacks 30 % in patches of
-some centimetres. "Other things" are places of a road with stains, tyre marks, lane markings, discs of other sizes, seals
-of cracks, stop bars and crossings. Chequered targets are those of :mod:`benchmarks.painted_targets`, drawn by OpenCV.
+Targets of 0.30 m with a black centre of 0.06 m on the simulator's road, readings each 5 × 10 mm from any direction
+with noise of 4 digital numbers, stated places with σ 50 mm. Worn paint has half the contrast and lacks 30 % in
+patches of some centimetres. "Other things" are places of a road with stains, tyre marks, lane markings, discs of
+other sizes, seals of cracks, stop bars and crossings. Chequered targets are those of
+:mod:`benchmarks.painted_targets`, drawn by OpenCV.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from roadscan.adjust.targets.values import TargetFind
 
 Float64 = npt.NDArray[np.float64]
 
-TARGETS, PAINTED, EMPTY = 500, 60, 500
+TARGETS, PAINTED, EMPTY = 500, 30, 300
 """Targets of the simulator, of each painted kind, and places without one."""
 PLACE_BAR_MM = 1.5
 SETTINGS = TargetSettings()

@@ -254,7 +254,7 @@ def asphalt(rng: np.random.Generator) -> Float32:
     stones = gaussian_filter(coarse, 0.8)
     broad = gaussian_filter(rng.standard_normal((size // 8, size // 8), dtype=np.float32), 40.0)
     grey = 6.0 * stones / stones.std() + 5.0 * broad / broad.std() + ASPHALT
-    return cv2.resize(grey.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(cv2.resize(grey.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
 def painted_sample(

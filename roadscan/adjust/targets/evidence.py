@@ -130,8 +130,8 @@ def _of_chequered(away: Float64, white: Bool, shape: Chequered, turn_rad: float)
     number = np.where(inside, (quadrant * _BLOCKS + block[1]) * _BLOCKS + block[0], -1)[inside]
     right = (white == (u * v > 0))[inside]
     seen = np.bincount(number, minlength=4 * _BLOCKS**2)
-    agree = np.bincount(number, right, minlength=4 * _BLOCKS**2).reshape(4, -1) / np.maximum(seen, 1).reshape(4, -1)
-    agree = agree >= np.array([_WORN, 0.5, 0.5, _WORN])[:, None]
+    share = np.bincount(number, right, minlength=4 * _BLOCKS**2).reshape(4, -1) / np.maximum(seen, 1).reshape(4, -1)
+    agree = share >= np.array([_WORN, 0.5, 0.5, _WORN])[:, None]
     weakest = float(agree.mean(axis=1).min())
     paint = _share(white, inside & (u * v > 0))
     return Evidence(paint, weakest, min(clear, _share(~white, inside & (u * v < 0))))

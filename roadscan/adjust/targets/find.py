@@ -2,7 +2,7 @@
 
 Places that look like the target (:mod:`candidates`) are held against the shares of paint, outline and clear road that
 it should have (:mod:`evidence`), its shape is fitted to the readings (:mod:`fit`), and the shares are asked again where
-the fit puts it. One place that holds is the target, two are too many. Its height is that of a plane through the
+the fit puts it. One place that holds is the target, two are too many. Its height is that of a surface through the
 readings at its centre (:mod:`heights`).
 """
 

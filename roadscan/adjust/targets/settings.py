@@ -31,10 +31,6 @@ class TargetSettings(Strict):
     sigma_paint_m: float = Field(default=0.0003, ge=0.0)
     """Standard deviation (m, each axis) by which a painted shape's middle misses the surveyed mark: stencil, edges."""
     height_radius_m: float = Field(default=0.15, gt=0.0, le=2.0)
-    """Readings within this of a control point make the plane that its height is taken from (m)."""
+    """Readings within this of a control point make the surface that its height is taken from (m)."""
     sigma_plane_m: float = Field(default=0.0002, ge=0.0)
-    """Standard deviation (m) by which the road's surface departs from a plane at that size."""
-
-
-TARGETS = TargetSettings()
-"""The defaults."""
+    """Standard deviation (m) by which the road departs from that surface, which bends evenly."""

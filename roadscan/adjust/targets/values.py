@@ -132,13 +132,13 @@ class HeightFind:
     sigma_m: float
     """1 σ, without that of the poses."""
     slope_east: float
-    """Rise of the plane to the east (m/m)."""
+    """Rise of the surface to the east (m/m)."""
     slope_north: float
-    """Rise of the plane to the north (m/m)."""
+    """Rise of the surface to the north (m/m)."""
     count: int
     """Readings within the radius."""
     used: float
-    """Share of them that the plane goes by."""
+    """Share of them that the surface goes by."""
     why_not: str
     """"" where there is a height; else a sentence."""
 

@@ -42,6 +42,8 @@ _HUBER: Final = 3.0
 _BLOCK_CELLS: Final = 8
 _INDEPENDENT: Final = 4.0 * math.pi * (BLUR_CELLS**2 + 1.0 / 6.0)
 """Cells that count as one independent value: area under the correlation of smoothed noise (bilinear splat too)."""
+_SHARP: Final = 9
+"""An edge that leaves the axes by some degrees crosses the grid of the readings often enough to lie anywhere in it."""
 _PRIOR_BLOCKS: Final = 4.0
 """So many blocks is the noise of the whole picture worth beside the scatter of the blocks."""
 
@@ -168,11 +170,10 @@ def _equations(first: Float64, laid: Laid) -> _Equations | None:
     step = vectors[:, known] @ ((vectors[:, known].T @ score.sum(axis=0)) / values[known])
     energy = np.einsum("ni,ni->n", mean_slope, mean_slope)
     felt = np.array([energy @ row, energy @ column]) / max(energy.sum(), 1e-300)
-    across_axes = (mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2) ** 2 - (
-        2.0 * mean_slope[:, 0] * mean_slope[:, 1]
-    ) ** 2
-    # |g|² cos 4θ, as cos 4θ = cos² 2θ − sin² 2θ.
-    aligned = float(np.clip((across_axes / np.maximum(energy, 1e-300)).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
+    # cos 4θ = cos² 2θ − sin² 2θ; its odd power is sharp, and 0 in the mean over all directions.
+    double = np.stack([mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2, 2.0 * mean_slope[:, 0] * mean_slope[:, 1]])
+    along_axes = (double[0] ** 2 - double[1] ** 2) / np.maximum(energy, 1e-300) ** 2
+    aligned = float(np.clip((energy * along_axes**_SHARP).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
     a, b = first[row, column], there
     a, b = a - a.mean(), b - b.mean()
     correlation = float(a @ b / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-300))

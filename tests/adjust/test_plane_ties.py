@@ -76,7 +76,7 @@ def test_planes_of_other_passes_are_tied_too() -> None:
 
 def test_leaves_are_no_planes() -> None:
     rng = np.random.default_rng(6)
-    cloud = rng.uniform(-4.0, 4.0, (20_000, 3)) + [1000.0, 2000.0, 55.0]
+    cloud = np.array([1000.0, 2000.0, 55.0]) + rng.uniform(-4.0, 4.0, (20_000, 3))
     pose = np.repeat(np.arange(4, dtype=np.int32), 5000)
     bush = PassReadings(
         0, "lidar", *cloud.T, np.zeros(20_000, np.uint16), pose, 300_000_000 * np.arange(4, dtype=np.int64),

@@ -51,7 +51,7 @@ def lifted(result: Adjustment, run: str, epoch: int) -> float:
 
 
 def test_heights_of_two_passes_agree_where_they_were_not_tied(recordings: Path) -> None:
-    """dz has a median of −0.044 m and a standard deviation of 0.027 m where the passes come within 1 m of each other."""
+    """dz has a median of −0.044 m and a standard deviation of 0.027 m where the passes come within 1 m."""
     tracks = [pass_track(recordings / "two_pass", run) for run in (0, 1)]
     settings = PlaceSettings(per_km=100.0, radius_m=0.2, least_overlap_m=0.01, height_apart_m=1.0)
     places = [p for p in places_of_overlap(tracks, settings) if {t.run for t in p.traverses} == {0, 1}]

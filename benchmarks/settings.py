@@ -36,6 +36,8 @@ class Settings:
     """Length of each of its surveys."""
     adjustment_km: float = 100.0
     """Length of the road whose passes are adjusted."""
+    adjustment_seeds: int = 10
+    """Draws of the reference site's observations."""
 
     @classmethod
     def current(cls) -> Settings:

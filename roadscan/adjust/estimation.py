@@ -29,6 +29,8 @@ _LEAST: Final = 1e-6
 _ENOUGH: Final = 30.0
 """Redundancy from which on a factor of variances is estimated."""
 _FACTORS: Final = (1e-3, 1e3)
+_STEP: Final = 4.0
+"""A factor changes by no more in a round."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +142,14 @@ class Rounds:
     ) -> float:
         """Estimate the factors once more (Förstner 1979); the largest change of their logarithms."""
         before = np.concatenate([self._kinds, self._processes])
+        # Of an observation's variance, the share that is its own counts; the rest is that of lines between knots.
+        share = self.problem.variance * self._kinds[self.problem.kind] / own
         squares, redundancy = weight * residual**2 / own, np.where(weight > 0.0, without.redundancy, 0.0)
         for kind in range(len(KINDS)):
             here = self.problem.kind == kind
-            self._kinds[kind] = _stepped(self._kinds[kind], squares[here].sum(), redundancy[here].sum())
+            told, own_part = redundancy[here].sum(), (share * redundancy)[here].sum()
+            ratio = (share * squares)[here].sum() / max(own_part, 1e-300)
+            self._kinds[kind] = _stepped(self._kinds[kind], ratio, told, own_part / max(told, 1e-300))
         twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
         moved = twice * solution[self._row] * solution[self._column]
         shrunk = twice * inverse.at(self._row, self._column)
@@ -152,13 +158,21 @@ class Rounds:
             factor = self._processes[component]
             unknowns = float((here & (self._row == self._column)).sum())
             told = unknowns - shrunk[here].sum() / factor
-            self._processes[component] = _stepped(factor, moved[here].sum() / factor, told)
+            ratio = moved[here].sum() / factor / max(told, 1e-300)
+            self._processes[component] = _stepped(factor, ratio, told)
         after = np.concatenate([self._kinds, self._processes])
         return float(np.abs(np.log(after / before)).max())
 
 
-def _stepped(factor: float, squares: float, redundancy: float) -> float:
-    """The factor that makes the squares as large as their redundancy; the same where that is too little to tell."""
+def _stepped(factor: float, ratio: float, redundancy: float, share: float = 1.0) -> float:
+    """The factor that makes squares as large as their redundancy; the same where that is too little to tell.
+
+    Parameters
+    ----------
+    ratio : squares over redundancy, with the factor of now.
+    share : of the variance that the factor multiplies, in that of what is squared.
+    """
     if redundancy < _ENOUGH:
         return factor
-    return float(np.clip(factor * squares / redundancy, *_FACTORS))
+    step = np.clip(1.0 + (ratio - 1.0) / share, 1.0 / _STEP, _STEP)
+    return float(np.clip(factor * step, *_FACTORS))

@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import ControlErrors
+from roadscan.adjust.adjustment import Adjustment, ControlErrors
 from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -106,7 +107,7 @@ def horizontal_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -
     Accuracy_r of NSSDA holds for RMSE_north = RMSE_east; where the smaller is above 0.6 of the larger it errs by
     little (FGDC-STD-007.3-1998, appendix 3-A, case 2). RMSE_H of ASPRS (2023) is composed as RMSE_V.
     """
-    there = np.isfinite(error_m).all(axis=1)
+    there = np.asarray(np.isfinite(error_m).all(axis=1), dtype=bool)
     error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
     north, east = _rms(error[:, 0]), _rms(error[:, 1])
     rmse_r, of_survey = float(np.hypot(north, east)), float(np.hypot(_rms(survey[:, 0]), _rms(survey[:, 1])))
@@ -144,6 +145,36 @@ def leave_one_out(control: ControlErrors) -> LeaveOneOut:
         horizontal_accuracy(level) if np.isfinite(level).all(axis=1).any() else None,
         control.left_out_m / np.where(control.left_out_sigma_m > 0.0, control.left_out_sigma_m, np.nan),
     )
+
+
+@dataclass(frozen=True)
+class MeanCorrections:
+    """By how much each run was moved as a whole."""
+
+    mean: Float64
+    """(runs, 6) mean of the corrections over the run's time (m, rad), `COMPONENTS`."""
+    normalised: Float64
+    """(runs, 6) over the σ that the run's process has for it; NaN where a component is not corrected. Several σ, alike
+    in all runs, are no error of navigation: control and trajectories are of two datums or frames."""
+
+
+def mean_corrections(adjustment: Adjustment) -> MeanCorrections:
+    """The mean correction of each run, held against its prior.
+
+    Control that is wrong as a whole contradicts nothing but the prior, so no single point is rejected for it.
+
+    Notes
+    -----
+    The mean over a time T of a process with σ, τ has the variance 2 σ² τ/T (1 − τ/T (1 − e^(−T/τ))).
+    """
+    mean = np.array([v.mean(axis=0) for v in adjustment.values])
+    sigma = np.zeros(mean.shape)
+    for run, prior in enumerate(adjustment.priors):
+        span = max((prior.last_gps_ns - prior.first_gps_ns) / NS_PER_S, 1e-9) / prior.taus_s
+        # (T/τ − (1 − e^(−T/τ))) / (T/τ)², 1/2 for a short run.
+        share = np.where(span > 1e-4, (span + np.expm1(-span)) / span**2, 0.5)
+        sigma[run] = prior.sigmas * np.sqrt(2.0 * share)
+    return MeanCorrections(mean, mean / np.where(adjustment.active, sigma, np.nan))
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ class AdjustmentSettings(Strict):
     mode: Literal["joint", "each_pass", "vertical"] = "joint"
     """What is adjusted: all runs together ("joint"), each run alone by its control without ties ("each_pass"), or all
     runs together but in height alone ("vertical")."""
-    knot_spacing_s: float = Field(default=0.25, gt=0.0)
+    knot_spacing_s: float = Field(default=0.1, gt=0.0)
     """Corrections change linearly between knots so far apart in time (s), at most. Where a process of σ 15 mm and
-    τ 120 s is true, it leaves a line between knots 0.25 s apart by 0.4 mm (RMS)."""
+    τ 120 s is true, it leaves a line between knots 0.1 s apart by 0.25 mm (RMS)."""
     full_weight_within: float = Field(default=2.5, gt=0.0)
     """A residual up to so many σ counts fully; beyond it counts less (IGG III, Yang 1994)."""
     reject_beyond: float = Field(default=5.0, gt=0.0)

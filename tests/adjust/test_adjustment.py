@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.bench_reference_site import BestEstimate, errors
 from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
+from roadscan.adjust.quality import mean_corrections
 from roadscan.model.errors import ConfigError
 
 S = 10**9
@@ -248,6 +250,25 @@ def heights_off(found: Adjustment, road: Road, stations: np.ndarray, truth: np.n
     return np.array(shifts) - truth[:, :, 2]
 
 
+@pytest.mark.parametrize("mode", ["joint", "each_pass"])
+def test_heights_are_as_good_as_the_best_linear_estimate(mode: str) -> None:
+    """The benchmark finds it from dense covariances of the processes at the observations themselves, without knots."""
+    road, checks = Road(900.0, 4, 10.0, 300.0), np.linspace(0.0, 900.0, 52)[1:-1]
+    best = BestEstimate.of(road, checks, joint=mode == "joint")
+    ours, theirs = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(300 + seed)
+        truth = drawn_errors(road, np.concatenate([road.ties_m, road.control_m, checks]), rng)
+        observations = Observations.joined([ties(road, truth, rng), control(road, truth, rng)])
+        found = adjust(observations, road.priors(), ALL_COUNT.model_copy(update={"mode": mode, "knot_spacing_s": 0.1}))
+        error, sigma = errors(found, road, truth, checks)
+        ours.append(np.abs(error).mean())
+        theirs.append(np.abs(best.errors(observations, truth)).mean())
+    assert np.mean(ours) == pytest.approx(np.mean(theirs), rel=0.03)
+    # And its σ, which does not depend on what was drawn, is that of the best estimate.
+    assert np.sqrt(2.0 / np.pi) * sigma.mean() == pytest.approx(best.expected, rel=0.05)
+
+
 def test_false_matches_do_not_bend_a_road() -> None:
     """20 % of the ties replaced by false ones, most of them to one side: the heights are as good as before."""
     clean, bent = [], []
@@ -271,11 +292,11 @@ def test_false_matches_do_not_bend_a_road() -> None:
 
 def test_stated_sigmas_are_honest() -> None:
     """Normalised squared errors at stations 10 s apart, 12 draws, within their 99 % bounds."""
-    road = replace(ROAD, length_m=1500.0)
+    road, settings = replace(ROAD, length_m=1500.0), AdjustmentSettings(knot_spacing_s=0.25)
     squares, relative = [], []
     for seed in range(12):
         observations, stations, truth = drawn(road, 200 + seed)
-        found = adjust(observations, road.priors(), AdjustmentSettings())
+        found = adjust(observations, road.priors(), settings)
         off = heights_off(found, road, stations, truth)
         row = np.tile(np.eye(6)[2], (stations.size, 1))
         sigma = np.array([found.sigma_of(r, road.epochs(stations), row) for r in range(road.runs)])
@@ -298,6 +319,22 @@ def test_a_wrong_control_point_is_named_and_not_absorbed() -> None:
     assert (found.weight[wrong] > 0.5).all()
     rms = [np.sqrt(np.mean(heights_off(f, ROAD, stations, truth) ** 2)) for f in (before, found)]
     assert rms[1] < 1.5 * rms[0]
+
+
+def test_control_that_is_wrong_as_a_whole_is_told_by_the_means() -> None:
+    """60 mm between two height datums, which no single point contradicts; 0.5 m, which none of them gets through."""
+    observations, _, _ = drawn(ROAD, 21)
+    right = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
+    assert np.abs(right.normalised).max() < 4.0
+    height = observations.kind == KINDS.index("control_height")
+    observations.observed_m[height] += 0.06
+    moved = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
+    np.testing.assert_allclose(moved.mean[:, 2] - right.mean[:, 2], 0.06, atol=0.005)
+    assert (moved.normalised[:, 2] > 3.0).all()
+    observations.observed_m[height] += 0.44
+    found = adjust(observations, ROAD.priors(), AdjustmentSettings())
+    assert (found.control.weight[:, 2] == 0.0).all()
+    assert np.abs(mean_corrections(found).mean[:, 2]).max() < 0.02
 
 
 def test_a_target_that_one_run_saw_wrongly_costs_that_one() -> None:
@@ -334,7 +371,7 @@ def test_modes() -> None:
 
 def test_wrong_statistics_are_found_by_variance_components() -> None:
     """σ of ties and of the heights' process stated three times too small and too large."""
-    road = Road(4000.0, 3, 5.0, 500.0, lane_m=3.5)
+    road = Road(2500.0, 3, 5.0, 500.0, lane_m=3.5, height_tie_sigma_m=0.001)
     observations, _, _ = drawn(road, 14)
     stated = replace(
         observations, sigma_m=np.where(observations.kind == 0, observations.sigma_m / 3.0, observations.sigma_m)

@@ -39,7 +39,7 @@ def test_covariance_is_that_of_drawn_errors(with_scale: bool) -> None:
     errors, factors = [], []
     elsewhere = np.array([[700.0, -200.0, 5.0]])
     away = []
-    for _ in range(600):
+    for _ in range(300):
         seen = scale * TURN.apply(POINTS) + SHIFT + sigma * rng.standard_normal(POINTS.shape)
         found = helmert(POINTS, seen, sigma, with_scale=with_scale)
         turned = (Rotation.from_matrix(found.rotation) * TURN.inv()).as_rotvec()
@@ -51,7 +51,7 @@ def test_covariance_is_that_of_drawn_errors(with_scale: bool) -> None:
     normalised = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(found.covariance), errors)
     assert normalised.mean() == pytest.approx(size, rel=0.12)
     assert np.mean(factors) == pytest.approx(1.0, rel=0.06)
-    np.testing.assert_allclose(np.std(away, axis=0), found.sigma_of(elsewhere)[0], rtol=0.1)
+    np.testing.assert_allclose(np.std(away, axis=0), found.sigma_of(elsewhere)[0], rtol=0.15)
 
 
 def test_corrections_move_every_point_as_the_transformation_does() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of, line_variance, precision_of
+from roadscan.model.adjustment import AdjustmentSettings
 from roadscan.model.errors import ConfigError
 
 PROCESS = GaussMarkov(0.015, 120.0)
@@ -37,10 +38,10 @@ def test_how_far_a_process_leaves_a_line(share: float, step_s: float, tau_s: flo
 
 
 def test_the_stated_error_of_lines_between_knots() -> None:
-    """Settings state 0.4 mm for σ 15 mm, τ 120 s and knots each 0.25 s."""
+    """Settings state 0.25 mm for σ 15 mm, τ 120 s and knots each 0.1 s."""
     shares = np.linspace(0.0, 1.0, 1001)
-    mean = line_variance(shares, np.array(0.25), 120.0).mean()
-    assert 15.0 * np.sqrt(mean) == pytest.approx(0.4, abs=0.02)
+    mean = line_variance(shares, np.array(AdjustmentSettings().knot_spacing_s), 120.0).mean()
+    assert 15.0 * np.sqrt(mean) == pytest.approx(0.25, abs=0.005)
 
 
 def test_knots_are_evenly_spaced_from_end_to_end() -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from roadscan.adjust.adjustment import ControlErrors
+from roadscan.adjust.adjustment import AdjustmentSettings, ControlErrors, adjust
+from roadscan.adjust.observations import Observations
+from roadscan.adjust.process import GaussMarkov, RunPrior
 from roadscan.adjust.quality import (
     asprs_three_dimensional,
     horizontal_accuracy,
     leave_one_out,
+    mean_corrections,
     relative_accuracy,
     vertical_accuracy,
 )
@@ -68,6 +73,19 @@ def test_leave_one_out_leaves_the_rejected_out_of_its_figures() -> None:
     assert (found.vertical.count, found.vertical.mean) == (2, pytest.approx(-0.001))
     np.testing.assert_allclose(found.normalised[:, 2], [0.75, -1.0, 10.0])
     assert np.isnan(found.normalised[:, :2]).all()
+
+
+def test_the_mean_of_a_process_has_the_spread_that_it_is_held_against() -> None:
+    """Drawn processes of three lengths as if they were corrections."""
+    rng = np.random.default_rng(9)
+    process = GaussMarkov(0.015, 60.0)
+    for seconds in (5, 60, 600):
+        times = np.linspace(0.0, seconds, 101)
+        root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 60.0) + 1e-12 * np.eye(101))
+        runs = [RunPrior(str(i), 0, seconds * 10**9, (process,) * 6) for i in range(200)]
+        nothing = adjust(Observations.none(), runs, AdjustmentSettings(knot_spacing_s=1e6))
+        drawn = replace(nothing, values=tuple(0.015 * root @ rng.standard_normal((101, 6)) for _ in runs))
+        assert np.std(mean_corrections(drawn).normalised) == pytest.approx(1.0, rel=0.08)
 
 
 def test_passes_agree_by_section() -> None:

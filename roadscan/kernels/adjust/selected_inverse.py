@@ -20,6 +20,9 @@ from roadscan.kernels.options import kernel
 def selected_inverse(starts, rows, lower, pivots, diagonal, below):
     """Fill the entries of the inverse in the pattern of L.
 
+    All Z_ik of a column lie in a small full matrix, the last rows of L first. The next column to the left often has
+    the same pattern and one row more (Liu, Ng & Peyton 1993: a supernode): then the matrix only grows by that row.
+
     Parameters
     ----------
     starts, rows, lower : strictly lower triangle of L in compressed columns, rows ascending.
@@ -32,28 +35,39 @@ def selected_inverse(starts, rows, lower, pivots, diagonal, below):
     widest = 0
     for j in range(size):
         widest = max(widest, starts[j + 1] - starts[j])
-    sums = np.zeros(widest)
+    full, sums = np.zeros((widest, widest)), np.zeros(widest)
     for j in range(size - 1, -1, -1):
         begin, end = starts[j], starts[j + 1]
-        for p in range(begin, end):
-            place[rows[p]] = p - begin
-            sums[p - begin] = 0.0
-        for p in range(begin, end):
-            k, factor, own = rows[p], lower[p], p - begin
-            sums[own] += diagonal[k] * factor
-            # Column k holds Z_ik of all i > k, and by symmetry Z_ki.
-            for q in range(starts[k], starts[k + 1]):
-                other = place[rows[q]]
-                if other >= 0:
-                    sums[other] += below[q] * factor
-                    sums[own] += below[q] * lower[begin + other]
+        m = end - begin
+        if m > 0 and rows[begin] == j + 1 and starts[j + 2] - starts[j + 1] == m - 1:
+            for i in range(m - 1):
+                full[m - 1, i] = full[i, m - 1] = below[starts[j + 2] - 1 - i]
+            full[m - 1, m - 1] = diagonal[j + 1]
+        else:
+            for p in range(begin, end):
+                place[rows[p]] = end - 1 - p
+            for p in range(begin, end):
+                k = rows[p]
+                own = place[k]
+                full[own, own] = diagonal[k]
+                # Column k holds Z_ik of all i > k, and by symmetry Z_ki.
+                for q in range(starts[k], starts[k + 1]):
+                    other = place[rows[q]]
+                    if other >= 0:
+                        full[own, other] = full[other, own] = below[q]
+            for p in range(begin, end):
+                place[rows[p]] = -1
+        for i in range(m):
+            sums[i] = 0.0
+        for k in range(m):
+            factor = lower[end - 1 - k]
+            for i in range(m):
+                sums[i] += full[k, i] * factor
         total = 1.0 / pivots[j]
         for p in range(begin, end):
-            below[p] = -sums[p - begin]
+            below[p] = -sums[end - 1 - p]
             total -= lower[p] * below[p]
         diagonal[j] = total
-        for p in range(begin, end):
-            place[rows[p]] = -1
 
 
 @kernel

@@ -102,36 +102,40 @@ def _planes(near: _Returns, settings: TieSettings) -> _Planes:
     """Cubes in which two windows or more see one plane."""
     window = near.epoch_gps_ns // round(settings.window_s * NS_PER_S)
     whole = np.floor(near.point_m / settings.plane_cell_m).astype(np.int64)
-    keys = np.concatenate([whole, near.traverse[:, None], window[:, None]], axis=1)
-    windows, group = np.unique(keys, axis=0, return_inverse=True)
-    cube_of = _numbered(windows[:, :3])
+    cubes, cube = np.unique(_packed(whole), return_inverse=True)
+    keys, group = np.unique(_packed(np.stack([cube, near.traverse, window], axis=-1)), return_inverse=True)
+    first = np.empty(keys.size, np.int64)
+    first[group[::-1]] = np.arange(group.size)[::-1]
+    cube_of, traverse_of = cube[first], near.traverse[first]
     kept = np.ones(len(near.point_m), np.bool_)
     for _ in range(2):
-        count = np.bincount(group[kept], minlength=len(windows))
+        count = np.bincount(group[kept], minlength=keys.size)
         kept &= count[group] >= settings.least_returns
-        mean = _means(near.point_m, group, kept, len(windows))
+        mean = _means(near.point_m, group, kept, keys.size)
         centred = near.point_m - mean[group]
-        cubes = int(cube_of.max()) + 1
-        number, _, values, vectors = plane_moments(centred[kept], cube_of[group[kept]], cubes)
+        number, _, values, vectors = plane_moments(centred[kept], cube_of[group[kept]], cubes.size)
         values = np.maximum(values, 1e-10)
         away = np.abs(np.einsum("ni,ni->n", centred, vectors[cube_of[group], :, 0]))
         kept &= away <= _TRIM * np.sqrt(values[cube_of[group], 0])
     flat = (values[:, 0] < _FLAT**2 * values[:, 1]) & (values[:, 1] > (_WIDE * settings.plane_cell_m) ** 2)
     flat &= (values[:, 0] <= settings.thickest_m**2) & (number > 0)
-    count = np.bincount(group[kept], minlength=len(windows))
+    count = np.bincount(group[kept], minlength=keys.size)
     used = flat[cube_of] & (count >= settings.least_returns)
-    used &= np.bincount(cube_of[used], minlength=cubes)[cube_of] > 1
-    pose = np.bincount(group[kept], near.pose[kept], len(windows)) / np.maximum(count, 1)
+    used &= np.bincount(cube_of[used], minlength=cubes.size)[cube_of] > 1
+    pose = np.bincount(group[kept], near.pose[kept], keys.size) / np.maximum(count, 1)
     tilt = values[:, 0] / (np.maximum(number, 1) * values[:, 1])
     return _Planes(
-        cube_of[used], _means(near.point_m, group, kept, len(windows))[used], count[used], windows[used, 3],
+        cube_of[used], _means(near.point_m, group, kept, keys.size)[used], count[used], traverse_of[used],
         np.rint(pose[used]).astype(np.int64), vectors[:, :, 0], np.sqrt(values[:, 0]), tilt,
     )  # fmt: skip
 
 
-def _numbered(rows: Int64) -> Int64:
-    """Number (n,) of each of ascending rows (n, k), counted from 0; equal rows have one number."""
-    return np.asarray(np.cumsum(np.append(0, (np.diff(rows, axis=0) != 0).any(axis=1))), np.int64)
+def _packed(rows: Int64) -> Int64:
+    """One number (n,) for each of n rows (n, k), in the order of the rows."""
+    out = np.zeros(len(rows), np.int64)
+    for column in (rows - rows.min(axis=0)).T:
+        out = out * (int(column.max()) + 1) + column
+    return out
 
 
 def _means(point_m: Float64, group: Int64, kept: Bool, size: int) -> Float64:

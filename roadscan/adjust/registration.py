@@ -36,12 +36,17 @@ _LEAST_SHARE: Final = 0.25
 _LOBE_CELLS: Final = 4.0
 """Correlations this near to the best one, along what is known of the shift, belong to it."""
 _ROUNDS: Final = 12
-_DONE_CELLS: Final = 0.003
+_DONE_CELLS: Final = 0.01
+_COARSE: Final = 3
+"""Every so-manieth cell is enough until a step is this short."""
+_NEAR_CELLS: Final = 0.05
 _ASTRAY_CELLS: Final = 4.0
 _HUBER: Final = 3.0
 _BLOCK_CELLS: Final = 8
 _INDEPENDENT: Final = 4.0 * math.pi * (BLUR_CELLS**2 + 1.0 / 6.0)
 """Cells that count as one independent value: area under the correlation of smoothed noise (bilinear splat too)."""
+_SHARP: Final = 9
+"""An edge that leaves the axes by some degrees crosses the grid of the readings often enough to lie anywhere in it."""
 _PRIOR_BLOCKS: Final = 4.0
 """So many blocks is the noise of the whole picture worth beside the scatter of the blocks."""
 
@@ -127,25 +132,28 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
     """The shift (row, column; cells) of least squares near a start and the sums there; None where there is none."""
     place, edge = start.copy(), len(first)
     laid = Laid(np.empty((edge, edge)), np.empty((edge, edge, 2)), np.empty((edge, edge, 2)))
-    found = None
-    for _ in range(_ROUNDS):
+    found, coarse = None, True
+    for turn in range(_ROUNDS):
         lay_upon(first, second, float(place[0]), float(place[1]), laid)
-        sums = _equations(first, laid)
+        sums = _equations(first, laid, _COARSE if coarse else 1)
         if sums is None:
             return None
         # A direction without information does not move.
         place = place + np.clip(sums.step, -1.0, 1.0)
         if np.abs(place - start).max() > _ASTRAY_CELLS:
             return None
-        found = place, sums
-        if np.abs(sums.step).max() < _DONE_CELLS:
-            break
+        moved = float(np.abs(sums.step).max())
+        if not coarse:
+            found = place, sums
+            if moved < _DONE_CELLS:
+                break
+        coarse = coarse and moved > _NEAR_CELLS and turn < _ROUNDS // 2
     return found
 
 
-def _equations(first: Float64, laid: Laid) -> _Equations | None:
-    """Sums over the cells that both saw; offset, tilts and contrast between the pictures are eliminated."""
-    row, column = np.nonzero(np.isfinite(laid.left))
+def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
+    """Sums over each `every`-th cell that both saw; offset, tilts and contrast between the pictures are eliminated."""
+    row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
     if row.size < 64:
         return None
     left = laid.left[row, column]
@@ -168,11 +176,10 @@ def _equations(first: Float64, laid: Laid) -> _Equations | None:
     step = vectors[:, known] @ ((vectors[:, known].T @ score.sum(axis=0)) / values[known])
     energy = np.einsum("ni,ni->n", mean_slope, mean_slope)
     felt = np.array([energy @ row, energy @ column]) / max(energy.sum(), 1e-300)
-    across_axes = (mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2) ** 2 - (
-        2.0 * mean_slope[:, 0] * mean_slope[:, 1]
-    ) ** 2
-    # |g|² cos 4θ, as cos 4θ = cos² 2θ − sin² 2θ.
-    aligned = float(np.clip((across_axes / np.maximum(energy, 1e-300)).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
+    # cos 4θ = cos² 2θ − sin² 2θ; its odd power is sharp, and 0 in the mean over all directions.
+    double = np.stack([mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2, 2.0 * mean_slope[:, 0] * mean_slope[:, 1]])
+    along_axes = (double[0] ** 2 - double[1] ** 2) / np.maximum(energy, 1e-300) ** 2
+    aligned = float(np.clip((energy * along_axes**_SHARP).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
     a, b = first[row, column], there
     a, b = a - a.mean(), b - b.mean()
     correlation = float(a @ b / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-300))

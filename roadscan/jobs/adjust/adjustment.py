@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_faults import listed
-from roadscan.adjust.places import Track, places_of_overlap
+from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.control_work import (
     SIGHTINGS,
@@ -33,6 +33,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.session import Session
+from roadscan.model.tie_settings import PlaceSettings
 from roadscan.navigation.movement import largest
 from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord
@@ -134,11 +135,18 @@ def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float])
     """Where passes overlap and where they come by control points: tasks for both."""
     tracks = tracks_of(plan, sources)
     config = plan.survey.config.adjust
-    places = places_of_overlap(tracks, config.places)
+    places = _places(tracks, config.places)
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan))
     control = control_tasks(plan, sources, tracks, points, sigma_pose_m)
     return Work(tuple(tracks), tuple(ties), tuple(control), len(points))
+
+
+def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
+    """Places of dense sensors, then those of lidars, which are larger: they are numbered through."""
+    dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
+    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], settings)
+    return [*dense, *(replace(place, number=len(dense) + place.number) for place in sparse)]
 
 
 def _collect(session: Session, work: Work) -> bool:

@@ -29,9 +29,14 @@ _LIDAR_REACH_M: Final = 12.0
 
 
 def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
-    """Readings that recorded poses place, by run as the survey file lists them."""
+    """Readings that recorded poses place, by run as the survey file lists them.
+
+    Of a run with profiles, which are dense, these alone: returns of a lidar are for rigs that have nothing else.
+    """
     order = {run: number for number, run in enumerate(runs_of(plan))}
     own = [(s, files) for s, files in plan.sources if s.trajectory is not None and any(f.group_spans for f in files)]
+    dense = {s.run for s, _ in own if s.table == "scans"}
+    own = [(s, files) for s, files in own if s.table == "scans" or s.run not in dense]
     return sorted(own, key=lambda pair: (order[pair[0].run], pair[0].sensor, pair[0].key))
 
 

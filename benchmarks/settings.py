@@ -34,6 +34,10 @@ class Settings:
     """Length of the network whose scheduling is tried."""
     network_region_km: float = 200.0
     """Length of each of its surveys."""
+    adjustment_km: float = 100.0
+    """Length of the road whose passes are adjusted."""
+    adjustment_seeds: int = 10
+    """Draws of the reference site's observations."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -13,7 +13,7 @@ correction, the two ends agree along n.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Final, Self
 
 import numpy as np
@@ -56,6 +56,16 @@ class Observations:
     """(n,) observations of one group stand or fall together: the two components of one shift."""
     place: Int64
     """(n,) place, or control point, that it was made at."""
+    survey_sigma_m: Float64 = field(default_factory=lambda: np.zeros(0))
+    """(n,) of control: 1 σ of the surveyed coordinate along the direction, apart from `sigma_m`, which is that of the
+    measurement alone. All observations of a control point share the error of its survey. 0 for ties; zeros where none
+    are given."""
+
+    def __post_init__(self) -> None:
+        if self.survey_sigma_m.size != self.kind.size:
+            if self.survey_sigma_m.size:
+                raise ValueError(f"{self.survey_sigma_m.size} σ of a survey for {self.kind.size} observations")
+            object.__setattr__(self, "survey_sigma_m", np.zeros(self.kind.size))
 
     @property
     def size(self) -> int:

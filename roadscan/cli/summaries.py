@@ -44,6 +44,8 @@ def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
         yield "not kept", left or "none"
     if found.tiles is not None:
         yield from _of_tiles(found.tiles)
+    for line in found.adjustment:
+        yield "adjusted", line
     for product, files in found.files.items():
         yield product, f"{counted(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
     for failure in found.failures:

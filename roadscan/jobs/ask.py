@@ -23,6 +23,18 @@ _MADE_BY: Final = {
     "outputs": "`roadscan run` makes it",
     "clocks": "`roadscan clocks` makes it, where the survey file says what a clock is found from",
     "clock_residuals": "`roadscan clocks` makes it, where the survey file says what a clock is found from",
+    **dict.fromkeys(
+        (
+            "corrections",
+            "ties",
+            "tie_residuals",
+            "control_sightings",
+            "control_residuals",
+            "relative_accuracy",
+            "absolute_accuracy",
+        ),
+        "`roadscan adjust` makes it, where passes overlap or come by ground control",
+    ),
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
     "innovations": "`roadscan navigate` makes it, for runs with GNSS and IMU",
     "navigation_states": "`roadscan navigate` makes it, for runs with GNSS and IMU",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.model.crs import MapFrame, add_grid_folder
@@ -19,6 +21,7 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.segmentation import RoadSegmentation
 from roadscan.navigation.clocks import ClockCorrection
+from roadscan.navigation.movement import NO_CORRECTION, Allowance
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
 from roadscan.points.place import (
@@ -31,7 +34,7 @@ from roadscan.points.place import (
     cloud_classes,
     place_cloud,
 )
-from roadscan.points.readings import ScanGeometry
+from roadscan.points.readings import ScanGeometry, farthest_m
 from roadscan.points.road_profiles import RoadFinder
 from roadscan.points.turns import TICK_NS, WINDOW_NS
 from roadscan.tables.held import read_held
@@ -41,8 +44,14 @@ from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
 
 _CHUNK_READINGS = 1 << 20
+_MAP_SCALE = 2.0
+"""No map in use shows a metre of the ground longer than that (Web Mercator up to 60°)."""
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
 _SIGMA_COLUMNS = ["sigma_north_m", "sigma_east_m", "sigma_down_m"]
+CORRECTION_SIGMAS: Final = tuple(
+    f"sigma_{name}" for name in ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
+)
+"""Columns of the table `corrections`."""
 _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz", *_SIGMA_COLUMNS]
 
 
@@ -70,13 +79,15 @@ class ReadingSource:
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: poses, corrections, mounting, clock, range limits, map, grid. The
-    code that does it belongs to the keys of what it makes."""
+    """Hash of all that places the readings: recorded poses, mounting, clock, range limits, map, grid. Corrections of
+    the poses belong to the keys of what lies in their span of time, the code to the keys of what it makes."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None
     """How the road is told in profiles, so that nothing else counts; None where all readings do. Not in `key`: it
     belongs to the keys of tiles."""
+    allowance: Allowance = NO_CORRECTION
+    """Corrections of the poses that footprints leave room for. Not in `key`: it belongs to the keys of footprints."""
 
     def spans(self, ingested: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
         """First and last epochs (GPS ns) on time, of spans of ingested epochs."""
@@ -158,11 +169,13 @@ def read_rows(
 class Placer:
     """Places the readings of slices: loads the poses they need, once for each source."""
 
-    def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice]) -> None:
+    def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice], *, recorded: bool = False) -> None:
+        """`recorded`: with the poses as they were recorded, whatever corrections there are."""
         if ground.grids is not None:
             add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
         self._store = store
         self._ground = ground
+        self._load = load_recorded if recorded else load_trajectory
         self._placements: dict[str, Placement] = {}
         spans: dict[str, list[tuple[int, int]]] = {}
         sources: dict[str, ReadingSource] = {}
@@ -197,6 +210,15 @@ class Placer:
             return placed.tiles, placed.fates
         return self._placements[one.source.key].touched(batch, geometry_of(one.source), marked=self._ground.marks)
 
+    def moved_tiles(self, one: RawSlice, group: int) -> int:
+        """How many tiles further the points of one row group may lie once the poses are corrected, at most."""
+        source = one.source
+        if source.trajectory is None or source.allowance.is_none:
+            return 0
+        batch = read_rows(self._store, source, one.file, [group]).combine_chunks().to_batches()[0]
+        arm = min(farthest_m(batch, geometry_of(source)), source.range_max_m) + source.mountings.longest_lever_m()
+        return math.ceil(_MAP_SCALE * source.allowance.moved_m(arm) / self._ground.grid.size_m)
+
     def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Placed]]:
         """Rows of a slice, chunk by chunk, with the class of every reading in their order, and the points kept.
 
@@ -227,7 +249,7 @@ class Placer:
             raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
         wide = WINDOW_NS + TICK_NS if source.road is not None and source.road.turns is not None else 0
         around = [(first - wide, last + wide) for first, last in spans]
-        trajectory = load_trajectory(self._store, source.trajectory, around, self._ground.max_gap_s)
+        trajectory = self._load(self._store, source.trajectory, around, self._ground.max_gap_s)
         limits = source.range_min_m, source.range_max_m
         return Placement(
             trajectory=trajectory,
@@ -248,6 +270,13 @@ def load_trajectory(
 
     As much is read beyond each span as interpolation looks at, so poses do not depend on what was asked for.
     """
+    return load_recorded(store, source, spans, max_gap_s).corrected(load_corrections(store, source.run))
+
+
+def load_recorded(
+    store: Store, source: TrajectorySource, spans: Sequence[tuple[int, int]], max_gap_s: float
+) -> Trajectory:
+    """The same as they were recorded."""
     pad = round(STENCIL_KNOTS * max_gap_s * NS_PER_S)
     wanted = np.array(spans, dtype=np.int64).reshape(-1, 2) + np.array([-pad, pad])
     parts: list[pa.Table] = []
@@ -264,7 +293,7 @@ def load_trajectory(
     epochs = rows.column("epoch_gps_ns").to_numpy()
     rows = rows.filter((epochs >= wanted[:, 0].min()) & (epochs <= wanted[:, 1].max()))  # row groups hold minutes
     column = {name: rows.column(name).to_numpy() for name in _POSE_COLUMNS}
-    trajectory = Trajectory.of(
+    return Trajectory.of(
         source.world,
         column["epoch_gps_ns"],
         np.stack([column[f"{a}_world_m"] for a in "xyz"], axis=-1),
@@ -272,22 +301,38 @@ def load_trajectory(
         max_gap_s,
         np.stack([column[a] for a in _SIGMA_COLUMNS], axis=-1).astype(np.float64),
     )
-    return trajectory.corrected(load_corrections(store, source.run))
 
 
 def load_corrections(store: Store, run: str) -> Corrections | None:
     """Corrections of a run's trajectory, None where no adjustment wrote any."""
     rows = read_held(store, "corrections")
-    if rows is None:
-        return None
-    rows = rows.filter(pa.compute.equal(rows.column("run"), run))
+    return None if rows is None else _corrections(rows, run)
+
+
+def load_all_corrections(store: Store) -> dict[str, Corrections]:
+    """Corrections of the trajectories of all runs that have any."""
+    rows = read_held(store, "corrections")
+    runs = [] if rows is None else sorted(pc.unique(rows.column("run")).to_pylist())
+    return {run: found for run in runs if (found := _corrections(rows, run)) is not None}
+
+
+def _corrections(rows: pa.Table, run: str) -> Corrections | None:
+    rows = rows.filter(pc.equal(rows.column("run"), run))
     if rows.num_rows == 0:
         return None
     return Corrections(
         rows.column("epoch_gps_ns").to_numpy(),
         np.stack([rows.column(c).to_numpy() for c in ("north_m", "east_m", "down_m")], axis=-1),
         np.stack([rows.column(c).to_numpy() for c in ("roll_rad", "pitch_rad", "heading_rad")], axis=-1),
+        _sigma(rows),
     )
+
+
+def _sigma(rows: pa.Table) -> npt.NDArray[np.float64] | None:
+    """1 σ (k, 6) of corrected poses; None in tables that state none."""
+    if any(name not in rows.column_names for name in CORRECTION_SIGMAS):
+        return None
+    return np.stack([pc.fill_null(rows.column(c), np.nan).to_numpy() for c in CORRECTION_SIGMAS], axis=-1)
 
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:

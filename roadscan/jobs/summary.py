@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.jobs.adjust.outcome import known_lines
 from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
 from roadscan.jobs.tiles.tile_fates import told
@@ -92,6 +93,8 @@ class SurveySummary:
     """Readings by what became of them (`kept`, `range`, …); empty before the tiles are made."""
     tiles: TilesSummary | None
     """None before the tiles are made."""
+    adjustment: list[str]
+    """What the adjustment of the poses found, in words; empty where nothing was adjusted."""
     files: dict[str, ProductFiles]
     """Files by product."""
     failures: list[dict[str, str]]
@@ -115,6 +118,7 @@ def survey_summary(survey: Survey, store: Store) -> SurveySummary:
         logs=_logs(logs),
         readings=told([*manifest.of(FOOTPRINTS).values(), *tiles]),
         tiles=_tiles(tiles, survey.config.tiles.cell_m) if tiles else None,
+        adjustment=known_lines(manifest),
         files=_files(manifest.table(), store),
         failures=read_failures(store),
     )

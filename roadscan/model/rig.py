@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,10 @@ class Mountings:
     def one(cls, mounting: Mounting) -> Self:
         """The same mounting at all times."""
         return cls((0,), (mounting,))
+
+    def longest_lever_m(self) -> float:
+        """Length of the longest lever arm."""
+        return max(math.hypot(*mounting.lever_arm_body_m) for mounting in self.mountings)
 
     def pieces(self, epochs_gps_ns: npt.NDArray[np.int64]) -> Iterator[tuple[slice, Mounting]]:
         """Runs of readings under one mounting, in their order, for epochs (n,) in any order."""

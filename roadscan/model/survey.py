@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.adjust import AdjustConfig
 from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.model.crs import Anchor, Geoid, MapFrame
@@ -392,6 +393,8 @@ class SurveyConfig(Strict):
     """What mountings are calibrated from (`roadscan calibrate`)."""
     navigation: NavigationConfig = NavigationConfig()
     """Poses."""
+    adjust: AdjustConfig = AdjustConfig()
+    """Adjustment of the poses where passes overlap, and to ground control."""
     filters: FilterConfig = FilterConfig()
     """Filters of points."""
     checks: ChecksConfig = ChecksConfig()

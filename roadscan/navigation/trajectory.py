@@ -31,6 +31,8 @@ class Corrections:
     """(k, 3), added to the position, local level axes (local frame: y, x, −z)."""
     roll_pitch_heading_rad: Float64
     """(k, 3), small rotation vector about the body's axes."""
+    sigma: Float64 | None = None
+    """(k, 6) 1 σ of the corrected poses: north, east, down (m), turns about body axes (rad); NaN where unknown."""
 
     def at(self, epochs_gps_ns: Int64) -> tuple[Float64, Float64]:
         """Position (n, 3) and rotation (n, 3) corrections; the end values beyond the ends."""
@@ -42,6 +44,14 @@ class Corrections:
             for a in range(3)
         ]
         return np.stack(columns[:3], axis=-1), np.stack(columns[3:], axis=-1)
+
+    def sigma_ned_m(self, epochs_gps_ns: Int64) -> Float64 | None:
+        """1 σ (n, 3) of corrected positions; None where it is not known."""
+        if self.sigma is None or not np.isfinite(self.sigma[:, :3]).all():
+            return None
+        since = (epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
+        knots = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
+        return np.stack([np.interp(since, knots, self.sigma[:, a]) for a in range(3)], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -113,6 +123,7 @@ class Trajectory:
         if corrections is None or corrections.epochs_gps_ns.size == 0 or self.epochs_gps_ns.size == 0:
             return self
         shift, turn = corrections.at(self.epochs_gps_ns)
+        sigma = corrections.sigma_ned_m(self.epochs_gps_ns)
         position = self.position_world_m + np.einsum("nij,nj->ni", self._world_from_ned(), shift)
         return Trajectory(
             self.world,
@@ -120,7 +131,7 @@ class Trajectory:
             position,
             _turned(self.quaternion_world_from_body, turn),
             self.max_gap_s,
-            self.sigma_ned_m,
+            self.sigma_ned_m if sigma is None else sigma,
         )
 
     def interval_sigmas_m(self) -> Float64:

@@ -14,6 +14,7 @@ from roadscan.kernels.georeferencing.reach import SpannedProfiles, reach_of_prof
 from roadscan.kernels.georeferencing.readings import Georeference, Limits
 from roadscan.kernels.options import read_only
 from roadscan.model.rig import Mounting, Mountings
+from roadscan.navigation.movement import NO_CORRECTION, Allowance
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.charts import Charts
 from roadscan.points.cloud import QUANTA_PER_M
@@ -90,6 +91,8 @@ class Reach:
     range_min_m: float
     range_max_m: float
     tile_quanta: int
+    allowance: Allowance = NO_CORRECTION
+    """Corrections that the poses may get afterwards: the tiles hold for all of them."""
 
     def is_loose(self, spans: RangeSpans, geometry: ScanGeometry) -> bool:
         """True where spans of whole profiles would name far more tiles than their readings touch."""
@@ -121,6 +124,7 @@ class Reach:
             reach_of_profiles(
                 profiles._replace(starts=np.clip(starts, rows.start, rows.stop)),
                 self._georeference(mounting),
+                self._moved,
                 self._tile_m,
             )
             for rows, mounting in self.mountings.pieces(epochs)
@@ -141,7 +145,7 @@ class Reach:
         parts = [
             reach_of_returns(
                 np.column_stack([np.maximum(spans_gps_ns[:, 0], since), np.minimum(spans_gps_ns[:, 1], until)]),
-                boxes_m, readings, self._georeference(mounting), self._tile_m,
+                boxes_m, readings, self._georeference(mounting), self._moved, self._tile_m,
             )
             for since, until, mounting in zip(starts, ends, self.mountings.mountings, strict=True)
         ]  # fmt: skip
@@ -150,6 +154,12 @@ class Reach:
     def _georeference(self, mounting: Mounting) -> Georeference:
         limits = Limits(float(self.range_min_m), float(self.range_max_m), -np.inf, np.inf, -np.inf, np.inf)
         return georeference_of(mounting, self.trajectory, self.charts, limits)
+
+    @property
+    def _moved(self) -> tuple[float, float]:
+        """How far readings move: by the shift of a pose (m), and for each metre from the body's origin by its turn."""
+        shift = self.allowance.moved_m(0.0)
+        return shift, self.allowance.moved_m(1.0) - shift
 
     @property
     def _tile_m(self) -> float:

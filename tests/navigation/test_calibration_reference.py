@@ -21,7 +21,6 @@ from roadscan.model.survey import ClockConfig
 from roadscan.navigation.calibration.estimator import Prior, calibrate
 from roadscan.navigation.calibration.evidence import Known, Seen, Traverse
 from roadscan.navigation.calibration.reference import ReferenceOptions, Registration, register
-from roadscan.navigation.calibration.rigid import rigid_transform
 from roadscan.navigation.calibration.surfels import Surfels
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.sensors.base import Rows, format_named
@@ -376,56 +375,6 @@ def test_planes_and_their_own_uncertainty():
         variances.append(surfels.variance_m2(patch, on_plane)[0])
         assert abs(surfels.normal[patch[0]] @ normal) > np.cos(np.radians(2.0))
     assert np.std(errors) == pytest.approx(np.sqrt(np.mean(variances)), rel=0.15)
-
-
-def test_a_rigid_transformation_against_scipy():
-    rng = np.random.default_rng(14)
-    turn, shift = Rotation.from_euler("ZYX", [40.0, -8.0, 170.0], degrees=True), np.array([310.0, -20.0, 4.0])
-    picked = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.25], [0.4, 0.3, 0.0]])
-    sigma = np.array([0.001, 0.002, 0.002, 0.003, 0.001])
-    errors = []
-    for _ in range(300):
-        seen = turn.apply(picked) + shift + sigma[:, None] * rng.standard_normal(picked.shape)
-        found = rigid_transform(picked, seen, sigma)
-        error = np.concatenate([found.shift_m - shift, (Rotation.from_matrix(found.rotation) * turn.inv()).as_rotvec()])
-        errors.append(error)
-    align, _ = Rotation.align_vectors(
-        seen - np.average(seen, axis=0, weights=sigma**-2.0),
-        picked - np.average(picked, axis=0, weights=sigma**-2.0),
-        weights=sigma**-2.0,
-    )
-    np.testing.assert_allclose(found.rotation, align.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(found.apply(picked) + found.residual_m, seen, atol=1e-9)
-    normalised = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(found.covariance), errors)
-    assert normalised.mean() == pytest.approx(6.0, rel=0.15)
-    rotation, back = found.inverse()
-    np.testing.assert_allclose(found.apply(picked) @ rotation.T + back, picked, atol=1e-9)
-
-
-def test_what_a_transformation_adds_to_a_mounting():
-    """The frame of a scanner brought to the body: by differences over drawn transformations."""
-    rng = np.random.default_rng(15)
-    picked = rng.uniform(-0.3, 0.3, (4, 3))
-    scanner_m = np.array([6.0, -2.0, 1.0])
-    origins, carried = [], None
-    for _ in range(2_000):
-        found = rigid_transform(picked, picked + 0.001 * rng.standard_normal(picked.shape), 0.001)
-        origins.append(found.apply(scanner_m[None])[0])
-        carried = found.carried_to(scanner_m)
-    np.testing.assert_allclose(np.std(origins, axis=0), np.sqrt(np.diag(carried)[:3]), rtol=0.1)
-
-
-@pytest.mark.parametrize(
-    ("points", "words"),
-    [
-        (np.zeros((2, 3)), "2 points"),
-        (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "one line"),
-        (np.full((4, 3), np.nan), "not a finite number"),
-    ],
-)
-def test_points_that_hold_no_transformation(points: np.ndarray, words: str):
-    with pytest.raises(ConfigError, match=words):
-        rigid_transform(points, points, 0.001)
 
 
 @pytest.mark.parametrize("seed", [20, 21])

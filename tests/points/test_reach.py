@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import Anchor, MapFrame, world_frame_of
 from roadscan.model.rig import Mountings, Sensor
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.navigation.movement import Allowance
+from roadscan.navigation.trajectory import Corrections, Trajectory
 from roadscan.points.charts import charts_along
 from roadscan.points.place import HeightLimits, Placement
 from roadscan.points.reach import RangeSpans, Reach, Touched
@@ -216,3 +217,29 @@ def test_readings_without_a_pose_touch_nothing() -> None:
     epoch = path.epochs_gps_ns[-1] + 1 + np.arange(10)
     spans = whole_spans(ranges(PROFILER, 10), PROFILER)
     assert reach.profiles(epoch, spans, np.array([0, 10]), PROFILER).group.size == 0
+
+
+def moved(path: Trajectory, allowance: Allowance, place: str) -> Trajectory:
+    """The trajectory with corrections as large as they may be, which change their direction four times a second."""
+    rng = np.random.default_rng(len(place))
+    knots = np.arange(path.epochs_gps_ns[0], path.epochs_gps_ns[-1] + 1, 250_000_000)
+    azimuth = rng.uniform(0.0, 2 * np.pi, knots.size)
+    shift = np.column_stack([*(allowance.shift_m * np.array([np.cos(azimuth), np.sin(azimuth)])), azimuth - 3.0])
+    turn = rng.normal(size=(knots.size, 3))
+    turn *= allowance.turn_rad / np.linalg.norm(turn, axis=1, keepdims=True)
+    return path.corrected(Corrections(knots, shift, turn))
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("rate_hz", [4, 200])
+def test_bounds_hold_for_every_correction_that_is_allowed(place: str, rate_hz: float) -> None:
+    allowance = Allowance(0.25, 0.02)
+    path = turning(place, rate_hz)
+    _, reach = both(path, place, ONE, 12.0)
+    placed, _ = both(moved(path, allowance, place), place, ONE, 12.0)
+    epoch, found = epochs(1500), ranges(MIRROR, 1500)
+    starts = np.append(np.arange(0, 1500, 64), 1500)
+    spans = whole_spans(found, MIRROR)
+    seen = placed_pairs(placed, scans(epoch, found), starts, MIRROR)
+    assert seen - pairs(reach.profiles(epoch, spans, starts, MIRROR))  # bounds on recorded poses alone do not hold them
+    assert not seen - pairs(replace(reach, allowance=allowance).profiles(epoch, spans, starts, MIRROR))

@@ -49,13 +49,19 @@ def usual_pose_sigma(
     store: Store, records: Sequence[LogRecord], source: TrajectorySource, settings: CalibrationSettings
 ) -> Float64:
     """1 σ (6,) of a run's poses, the median over the run."""
+    usual = median_pose_sigma(store, records, source)
+    assumed = np.array([*settings.traverse_sigma_m, *settings.traverse_sigma_deg])
+    return _in_radians(np.where(np.isnan(usual), assumed, usual))
+
+
+def median_pose_sigma(store: Store, records: Sequence[LogRecord], source: TrajectorySource) -> Float64:
+    """1 σ (6,) of a run's poses as its logs state it, the median over the run (m, degrees); NaN where they do not."""
     usual = np.full(6, np.nan)
     for _, values in _stated(store, records, source):
         for k in range(6):
             if np.isnan(usual[k]) and np.isfinite(values[:, k]).any():
                 usual[k] = np.nanmedian(values[:, k])
-    assumed = np.array([*settings.traverse_sigma_m, *settings.traverse_sigma_deg])
-    return _in_radians(np.where(np.isnan(usual), assumed, usual))
+    return usual
 
 
 def _stated(store: Store, records: Sequence[LogRecord], source: TrajectorySource) -> list[tuple[Int64, Float64]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -18,6 +18,7 @@ from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs
 from roadscan.jobs.navigate.clocks import load_clocks
 from roadscan.jobs.navigate.navigate import records_with_trajectories
 from roadscan.jobs.plan.centre_line import CentreLines
+from roadscan.jobs.plan.corrections import KnownCorrections
 from roadscan.jobs.plan.road import check_road, road_of
 from roadscan.jobs.readings import (
     Ground,
@@ -31,9 +32,9 @@ from roadscan.model.gpstime import iso_from_gps_ns, utc_from_gps_ns
 from roadscan.model.ids import LanePass, RunId, of_run
 from roadscan.model.rig import Mounting, Mountings, Rig, Sensor
 from roadscan.model.survey import Survey
+from roadscan.navigation.movement import NO_CORRECTION
 from roadscan.points.place import HeightLimits
 from roadscan.sensors.base import log_formats
-from roadscan.tables.held import held_path, read_held
 from roadscan.tables.logs import NAVIGATION, DataFile, LogRecord
 from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
@@ -63,6 +64,8 @@ class SurveyPlan:
     """Hash of all that shapes any tile, beside its readings."""
     apart: tuple[Fault, ...] = ()
     """Logs that do not overlap the poses of their run: none of their readings is a source."""
+    corrections: KnownCorrections = field(default_factory=lambda: KnownCorrections({}))
+    """Corrections of the poses that hold now."""
 
     @property
     def raw_bytes(self) -> int:
@@ -121,7 +124,8 @@ def plan_survey(
     known = load_mountings(store) if calibrated is None else calibrated
     clocks = load_clocks(store)
     apart = (*apart_logs(survey, records, clocks, estimated=True), *one_stamp_logs(records))
-    sources = tuple(_sources(survey, store, _without(records, apart), ground, known))
+    corrections = KnownCorrections.load(store)
+    sources = tuple(_sources(survey, store, _without(records, apart), ground, known, corrections))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)
     if not sources:
@@ -141,7 +145,7 @@ def plan_survey(
         config.tiles.cell_table,
         None if centre_lines is None else centre_lines.key(),
     )
-    return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key, apart)
+    return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key, apart, corrections)
 
 
 def _without(records: Sequence[LogRecord], faults: Sequence[Fault]) -> list[LogRecord]:
@@ -183,10 +187,14 @@ def _mounted_alike(one: Sensor, other: Sensor) -> bool:
 
 
 def _sources(
-    survey: Survey, store: Store, records: Sequence[LogRecord], ground: Ground, calibrated: DatedMountings
+    survey: Survey,
+    store: Store,
+    records: Sequence[LogRecord],
+    ground: Ground,
+    calibrated: DatedMountings,
+    corrections: KnownCorrections,
 ) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
     clocks = load_clocks(store)
-    adjusted = _adjusted(store)
     found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
     for record in records:
         for table in DATA_TABLES:
@@ -200,7 +208,6 @@ def _sources(
             clock = of_run(clocks, record.run, record.sensor)
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
-                adjusted,
                 asdict(mountings),
                 None if clock is None else (clock.offset_s, clock.drift, clock.reference_gps_ns),
                 limits,
@@ -218,17 +225,11 @@ def _sources(
             source = ReadingSource(
                 record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
                 *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal),
+                NO_CORRECTION if trajectory is None else corrections.allowance(record.run),
             )  # fmt: skip
             found.append((source, files))
     check_road(survey.config.segmentation, [source for source, _ in found])
     return found
-
-
-def _adjusted(store: Store) -> str | None:
-    """What the table of corrections says, None without one. Damage is told here, before tiles are asked to bear it."""
-    if read_held(store, "corrections") is None:
-        return None
-    return store.read_bytes(held_path("corrections")).hex()
 
 
 def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:

@@ -23,7 +23,7 @@ class Tiles(Stage):
 
     name = "tiles"
     title = "readings into points, cells and tile files"
-    after = ("footprints",)
+    after = ("adjust",)
     command = "tile"
 
     def run(self, session: Session) -> None:

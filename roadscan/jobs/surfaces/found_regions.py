@@ -142,7 +142,9 @@ def _pieces(
                 share = file.bytes * groups.size // len(spans)
                 slices.append(RawSlice(source, file.path, tuple(groups.tolist()), (whole,), share))
                 inputs.append([file.digest, groups.tolist()])
-        work, key = round(rate * length / NS_PER_S), key_of(common, start, inputs)
+        span = np.array([[start - _MARGIN_NS, end + _MARGIN_NS]])
+        corrections = plan.corrections.digests(source, span, plan.ground.max_gap_s).tolist()
+        work, key = round(rate * length / NS_PER_S), key_of(common, start, inputs, corrections)
         yield RegionPiece(
             plan.store, plan.ground, context, settings, source, tuple(slices), start, end, work, key
         )  # fmt: skip

@@ -103,7 +103,9 @@ def _tasks(plan: SurveyPlan) -> list[FootprintTask]:
     """A task for each data file."""
     code = code_digest("roadscan.jobs.tiles.footprints:footprint_task")
     return [
-        FootprintTask(plan.store, plan.ground, one, key_of(code, one.source.key, one.file, digest))
+        FootprintTask(
+            plan.store, plan.ground, one, key_of(code, one.source.key, one.source.allowance, one.file, digest)
+        )
         for one, digest in zip(plan.slices(), _digests(plan), strict=True)
     ]
 
@@ -159,15 +161,31 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
 def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.NDArray[np.int64]]:
     """Tiles of some groups of a slice, by placing their readings, and the fates of these."""
     one = task.slice
-    placer = Placer(task.store, task.ground, [one])
+    placer = Placer(task.store, task.ground, [one], recorded=True)
     parts: list[Touched] = []
     fates = np.zeros(len(FATE_NAMES), np.int64)
     for number in numbers:
         tiles, own = placer.touched(one, one.groups[number])
         fates[: own.size] += own
-        column, row, count = count_tiles(tiles)
+        column, row, count = _with_neighbours(count_tiles(tiles), placer.moved_tiles(one, one.groups[number]))
         parts.append(Touched(np.full(column.size, number), column, row, count, np.zeros(0, dtype=bool)))
     return joined(parts), fates
+
+
+def _with_neighbours(
+    tiles: tuple[npt.NDArray[np.int64], ...], within: int
+) -> tuple[npt.NDArray[np.int64], ...]:  # fmt: skip
+    """Column, row and readings of tiles, and of those around them, up to so many columns and rows away."""
+    if not within:
+        return tiles
+    column, row, count = tiles
+    steps = np.arange(-within, within + 1)
+    wide = np.stack(np.broadcast_arrays(column[:, None, None] + steps[:, None], row[:, None, None] + steps), axis=-1)
+    around, where = np.unique(wide.reshape(-1, 2), axis=0, return_inverse=True)
+    middle = where.reshape(column.size, steps.size, steps.size)[:, within, within]
+    readings = np.zeros(len(around), np.int64)
+    readings[middle] = count
+    return around[:, 0], around[:, 1], readings
 
 
 def _ranges(pairs: Touched, one: RawSlice, group_spans_ns: npt.NDArray[np.int64]) -> pa.Table:

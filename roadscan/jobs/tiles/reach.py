@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.jobs.readings import Ground, RawSlice, ReadingSource, geometry_of, load_trajectory
+from roadscan.jobs.readings import Ground, RawSlice, ReadingSource, geometry_of, load_recorded
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import NavigationError, StoreError
 from roadscan.model.gpstime import NS_PER_S
@@ -62,7 +62,7 @@ def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
     They are those of the minutes that it lies in, and kept for the next slice: files may hold seconds.
     """
     spans = [(a // _WINDOW_NS * _WINDOW_NS, -(-b // _WINDOW_NS) * _WINDOW_NS) for a, b in one.spans]
-    wanted = (store.root, one.source.key, ground, spans)
+    wanted = (store.root, one.source.key, one.source.allowance, ground, spans)
     kept: tuple[object, Reach | None] | None = getattr(_KEPT, "reach", None)
     if kept is None or kept[0] != wanted:
         kept = _KEPT.reach = (wanted, _loaded(store, ground, one.source, spans))
@@ -74,7 +74,7 @@ def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence
         raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
     if ground.grids is not None:
         add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
-    trajectory = load_trajectory(store, source.trajectory, spans, ground.max_gap_s)
+    trajectory = load_recorded(store, source.trajectory, spans, ground.max_gap_s)
     if trajectory.epochs_gps_ns.size == 0:
         return None
     return Reach(
@@ -84,6 +84,7 @@ def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence
         range_min_m=0.0 if ground.marks else source.range_min_m,
         range_max_m=np.inf if ground.marks else source.range_max_m,
         tile_quanta=ground.grid.size_quanta,
+        allowance=source.allowance,
     )
 
 

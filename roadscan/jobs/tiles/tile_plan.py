@@ -156,8 +156,9 @@ def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
         [key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run), *road_key(s.source)) for s in f.slices],
         "S16",
     )
-    content = np.empty(order.size, dtype=[("name", "S16"), ("first", "<i4"), ("last", "<i4")])
+    content = np.empty(order.size, dtype=[("name", "S16"), ("corrections", "<u8"), ("first", "<i4"), ("last", "<i4")])
     content["name"] = names[f.slice_index[order]]
+    content["corrections"] = _correction_digests(f, plan)[order]
     content["first"], content["last"] = f.first_group[order], f.last_group[order]
     return PlannedTiles(
         column=column[starts],
@@ -169,6 +170,19 @@ def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
         else f.first_epoch_gps_ns[:0],
         groups=GroupsByTile(f, order, np.append(starts, order.size)),
     )
+
+
+def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.uint64]:
+    """Digest (n,) of the corrections that place the readings of each run of row groups."""
+    found = np.zeros(f.slice_index.size, np.uint64)
+    order = np.argsort(f.slice_index, kind="stable")
+    ends = np.searchsorted(f.slice_index[order], np.arange(len(f.slices)), side="right").tolist()
+    for one, (first, end) in zip(f.slices, itertools.pairwise([0, *ends]), strict=True):
+        if one.source.run in plan.corrections.by_run:
+            own = order[first:end]
+            spans = np.column_stack([f.first_epoch_gps_ns[own], f.last_epoch_gps_ns[own]])
+            found[own] = plan.corrections.digests(one.source, spans, plan.ground.max_gap_s)
+    return found
 
 
 def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> list[TileId]:

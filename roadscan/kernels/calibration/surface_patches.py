@@ -90,7 +90,7 @@ def splat(place_m, pose, corner_x, corner_y, cell, mass, height, carrier):
 
 
 @inlined
-def _weights(s):
+def catmull_rom(s):
     """Weights of four neighbours at part `s` between the middle two, Catmull and Rom, then their derivatives."""
     return (
         s * (-0.5 + s * (1.0 - 0.5 * s)), 1.0 + s * s * (-2.5 + 1.5 * s),
@@ -100,7 +100,7 @@ def _weights(s):
 
 
 @inlined
-def _sample(image, r, c, s, t):
+def sampled(image, r, c, s, t):
     """Value and derivatives by column and row (per cell) of an image beyond (r, c), with weights `s` and `t`."""
     value, along, across = 0.0, 0.0, 0.0
     for j in range(4):
@@ -119,7 +119,7 @@ def _equations(first, second, cell, row, column, size, step, move, crossed, mean
     half = 0.5 * (size - 1)
     du, dv = move[0] / cell, move[1] / cell
     ku, kv = math.floor(du), math.floor(dv)
-    s, t = _weights(du - ku), _weights(dv - kv)
+    s, t = catmull_rom(du - ku), catmull_rom(dv - kv)
     low_r, high_r = max(1, 1 - kv), min(rows - 1, rows - 2 - kv)
     low_c, high_c = max(1, 1 - ku), min(columns - 1, columns - 2 - ku)
     jacobian = np.empty(UNKNOWNS)
@@ -133,7 +133,7 @@ def _equations(first, second, cell, row, column, size, step, move, crossed, mean
             here = first[r, c]
             ax = 0.5 * (first[r, c + 1] - first[r, c - 1]) / cell
             ay = 0.5 * (first[r + 1, c] - first[r - 1, c]) / cell
-            there, bx, by = _sample(second, r + kv, c + ku, s, t)
+            there, bx, by = sampled(second, r + kv, c + ku, s, t)
             bx, by = bx / cell, by / cell
             x, y = (i - half) / half, (j - half) / half
             left = here + move[2] + move[3] * x + move[4] * y - there

@@ -7,7 +7,8 @@ its farthest range, of a lidar the box around its returns. Between two instants 
 
 with A₀, A₁ the first-order map of the sensor's frame at both ends. Over a box of p that is a zonotope: the box's
 half edges and half the motion are its generators. The margin, derived in :func:`frames_between`, covers all else, so
-a tile that is not marked holds no reading.
+a tile that is not marked holds no reading. Where poses are corrected afterwards, `moved` bounds how far on the ground
+that moves a reading; on the map it is that times the chart's slope, and widens the margin.
 """
 
 from __future__ import annotations
@@ -215,7 +216,7 @@ def pose_at(epoch, k, poses):
 
 
 @kernel
-def frames_between(k0, t0, k1, t1, speed, bend, reach, georeference):
+def frames_between(k0, t0, k1, t1, speed, bend, reach, moved_m, georeference):
     """The sensor's frame on the map between two instants of an unbroken piece of the trajectory.
 
     For a fixed point p of the sensor's frame, |p| ≤ reach, g(t) is a map coordinate of it. Its slope is continuous
@@ -227,6 +228,7 @@ def frames_between(k0, t0, k1, t1, speed, bend, reach, georeference):
     Parameters
     ----------
     k0, t0, k1, t1 : intervals and epochs (ns) of the two instants; speed, bend : v (m/s) and a (m/s²) between them.
+    moved_m : how far corrections may move p on the ground.
 
     Returns
     -------
@@ -254,6 +256,7 @@ def frames_between(k0, t0, k1, t1, speed, bend, reach, georeference):
     margin = (
         0.125 * dt * dt * (slope * bend + 2.0 * curved * speed * speed)
         + curved * reach * reach
+        + slope * moved_m
         + SLACK_M + (CHART_SLACK * away * away * away if curved > 0.0 else 0.0)
     )  # fmt: skip
     middle = (
@@ -343,12 +346,13 @@ def mark_profiles(t0, t1, first, end, profiles, limits, frames, found, count):
 
 
 @kernel
-def reach_of_profiles(profiles, georeference, tile_m):
+def reach_of_profiles(profiles, georeference, allowance, tile_m):
     """Tiles that the profiles of row groups may touch.
 
     Parameters
     ----------
     profiles : SpannedProfiles; georeference : Georeference, of which limits of heights and quanta do not matter.
+    allowance : (shift, turn), how far the poses may be moved (m) and turned (rad) afterwards.
     tile_m : float64, edge of a tile.
 
     Returns
@@ -374,6 +378,7 @@ def reach_of_profiles(profiles, georeference, tile_m):
         for block in range(high.shape[1]):
             far = max(far, nearest_and_farthest(low, high, block, first, stop)[1])
         reach = math.hypot(min(scale[0] + scale[1] * far, limits.range_max_m), widest)
+        moved = allowance[0] + allowance[1] * (reach + lever)
         k, t0, until = np.int64(-1), np.int64(0), np.int64(0)
         if far > 0 and first < stop and knots.size > 1:
             t0, until = max(epochs[first], knots[0]), min(epochs[stop - 1] + lag, knots[-1])
@@ -397,7 +402,7 @@ def reach_of_profiles(profiles, georeference, tile_m):
                 t2 = max(min(t1, epochs[end - 1] + lag), t0)
                 while k1 > k and knots[k1] > t2:
                     k1 -= 1
-                found, middle, half, margin = frames_between(k, t0, k1, t2, speed, bend, reach, georeference)
+                found, middle, half, margin = frames_between(k, t0, k1, t2, speed, bend, reach, moved, georeference)
                 if found:
                     frames = (middle, half, margin)
                     count = mark_profiles(t0, t2, first, end, profiles, limits, frames, touched, count)
@@ -448,7 +453,7 @@ def share_out(readings, e, n, found, count):
 
 
 @kernel
-def reach_of_returns(spans, boxes, readings, georeference, tile_m):
+def reach_of_returns(spans, boxes, readings, georeference, allowance, tile_m):
     """Tiles that the returns of row groups may touch.
 
     Parameters
@@ -473,6 +478,7 @@ def reach_of_returns(spans, boxes, readings, georeference, tile_m):
         z0, z1 = max(box[2, 0], -farthest_m), min(box[2, 1], farthest_m)
         corner = norm3(max(abs(x0), abs(x1)), max(abs(y0), abs(y1)), max(abs(z0), abs(z1)))
         reach = min(corner, farthest_m)
+        moved = allowance[0] + allowance[1] * (reach + lever)
         empty = x0 > x1 or y0 > y1 or z0 > z1
         if not (reach < math.inf or empty):
             unbounded[group] = True
@@ -492,7 +498,7 @@ def reach_of_returns(spans, boxes, readings, georeference, tile_m):
             if not valid[k] or t0 > until:
                 break
             k1, t1, speed, bend = stretch(k, t0, until, reach + lever, FAR_STEP_M, FAR_BEND_M, poses, motion)
-            found, middle, half, margin = frames_between(k, t0, k1, t1, speed, bend, reach, georeference)
+            found, middle, half, margin = frames_between(k, t0, k1, t1, speed, bend, reach, moved, georeference)
             if found:
                 frames = (middle, half, margin)
                 count = mark_box(centre, edge, reach, frames, touched, count)

@@ -60,10 +60,10 @@ class Surfels:
             where no cell holds a plane.
         """
         cell = _cells(cloud_m, cell_m)
-        count, mean, values, vectors = _moments(cloud_m, cell)
+        count, mean, values, vectors = plane_moments(cloud_m, cell)
         away = np.abs(np.einsum("ij,ij->i", cloud_m - mean[cell], vectors[cell, :, 0]))
         near = away <= _TRIM * np.sqrt(np.maximum(values[cell, 0], _LEAST_THICKNESS_M**2))
-        count, mean, values, vectors = _moments(cloud_m[near], cell[near], count.size)
+        count, mean, values, vectors = plane_moments(cloud_m[near], cell[near], count.size)
         values = np.maximum(values, _LEAST_THICKNESS_M**2)
         flat = (count >= least_points) & (values[:, 0] < _FLAT**2 * values[:, 1])
         flat &= values[:, 1] >= (_WIDE * cell_m) ** 2
@@ -166,7 +166,7 @@ def _cells(cloud_m: Float64, cell_m: float) -> Int64:
     return np.asarray(np.unique(key, return_inverse=True)[1], np.int64)
 
 
-def _moments(cloud_m: Float64, cell: Int64, cells: int | None = None) -> tuple[Int64, Float64, Float64, Float64]:
+def plane_moments(cloud_m: Float64, cell: Int64, cells: int | None = None) -> tuple[Int64, Float64, Float64, Float64]:
     """Count (m,), mean (m, 3), ascending eigenvalues (m, 3) and eigenvectors (m, 3, 3; columns) of each cell."""
     size = int(cell.max()) + 1 if cells is None else cells
     count = np.bincount(cell, minlength=size)

@@ -1,0 +1,255 @@
+"""The adjustment: from observations to corrections of every run's poses, with their covariance.
+
+Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
+process as prior (:mod:`roadscan.adjust.process`); ties and control are observations; what solves them is one sparse
+least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing changes
+(:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
+share its error, and a wrong one is told by all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
+from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
+from roadscan.adjust.process import RunPrior, line_variance
+from roadscan.adjust.sparse_normal import Rows
+from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
+from roadscan.adjust.weights import Groups
+from roadscan.model.adjustment import AdjustmentSettings
+from roadscan.navigation.trajectory import Corrections
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+__all__ = ["Adjustment", "AdjustmentSettings", "ControlErrors", "adjust"]
+
+
+@dataclass(frozen=True)
+class ControlErrors:
+    """What the adjustment says of each control point; c of them, one for each run where each is adjusted alone."""
+
+    place: Int64
+    """(c,) number of the point, as in the observations."""
+    run: Int64
+    """(c,) run, −1: all together."""
+    survey_sigma_m: Float64
+    """(c, 3) stated, north, east, down; 0: the coordinate was not observed."""
+    error_m: Float64
+    """(c, 3) estimated error of the survey (surveyed minus adjusted); NaN where not observed."""
+    weight: Float64
+    """(c, 3) that the survey counted with, 0 = rejected; NaN where not observed."""
+    left_out_m: Float64
+    """(c, 3) surveyed minus what all others say of the point: leave-one-out, coordinate by coordinate."""
+    left_out_sigma_m: Float64
+    """(c, 3) 1 σ of it, that of the survey included."""
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Corrections of each run, and what they say of the observations."""
+
+    runs: tuple[str, ...]
+    epochs_gps_ns: tuple[Int64, ...]
+    """Knots (k,) of each run."""
+    values: tuple[Float64, ...]
+    """(k, 6) of each run, `COMPONENTS`."""
+    covariance: tuple[Float64, ...]
+    """(k, 6, 6) of each run's knots."""
+    covariance_with_next: tuple[Float64, ...]
+    """(k − 1, 6, 6) of each knot (rows) with the next one (columns)."""
+    residual_m: Float64
+    """(n,) observed − computed, of each observation."""
+    used: Bool
+    """(n,) False where the mode leaves an observation out."""
+    weight: Float64
+    """(n,) 1 = counts fully, 0 = rejected or not used."""
+    redundancy: Float64
+    """(n,) share of its own error that its residual shows, 0 to 1; NaN where not used."""
+    normalised_residual: Float64
+    """(n,) against the prediction of all others, over its σ; NaN where not used."""
+    control: ControlErrors
+    variance_factors: Mapping[str, float]
+    """Of the stated variances, by kind of observation and by component of the processes; 1 where not estimated."""
+    rounds: int
+    settled: bool
+    """False where weights still changed in the last round."""
+    priors: tuple[RunPrior, ...]
+    """As they came in."""
+    active: Bool
+    """(runs, 6) components that were estimated."""
+
+    @property
+    def sigma(self) -> tuple[Float64, ...]:
+        """(k, 6) 1 σ of each run's knots."""
+        return tuple(np.sqrt(np.einsum("kii->ki", c)) for c in self.covariance)
+
+    def corrections(self, run: str) -> Corrections:
+        """A run's corrections as navigation takes them."""
+        index = self.runs.index(run)
+        values = self.values[index]
+        return Corrections(self.epochs_gps_ns[index], values[:, :3].copy(), values[:, 3:].copy())
+
+    def sigma_of(self, run_index: int, epochs_gps_ns: Int64, partials: Float64) -> Float64:
+        """1 σ (n,) of a predicted movement: of knots, of neighbours together, and of the line between them.
+
+        Parameters
+        ----------
+        run_index : place of the run in `runs`.
+        epochs_gps_ns : (n,) within the run.
+        partials : (n, 6) derivatives of the movement by `COMPONENTS`.
+        """
+        knots, own = self.epochs_gps_ns[run_index], self.covariance[run_index]
+        if knots.size == 1:
+            return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", partials, own[0], partials)))
+        prior, before = self.priors[run_index], np.searchsorted(knots, epochs_gps_ns, side="right") - 1
+        before = np.clip(before, 0, knots.size - 2)
+        step = (knots[before + 1] - knots[before]).astype(np.float64)
+        share = np.clip((epochs_gps_ns - knots[before]) / step, 0.0, 1.0)
+        left, right = (1.0 - share)[:, None] * partials, share[:, None] * partials
+        variance = np.einsum("ni,nij,nj->n", left, own[before], left)
+        variance += np.einsum("ni,nij,nj->n", right, own[before + 1], right)
+        variance += 2.0 * np.einsum("ni,nij,nj->n", left, self.covariance_with_next[run_index][before], right)
+        factors = np.array([self.variance_factors[c] for c in COMPONENTS]) * self.active[run_index]
+        lines = line_variance(share[:, None], step[:, None] / 1e9, prior.taus_s) * (prior.sigmas**2 * factors)
+        return np.asarray(np.sqrt(variance + (partials**2 * lines).sum(axis=1)))
+
+
+def adjust(observations: Observations, priors: Sequence[RunPrior], settings: AdjustmentSettings) -> Adjustment:
+    """Corrections of all runs.
+
+    Parameters
+    ----------
+    observations : in any order; the result does not depend on it.
+    priors : of each run that `Observations.run` counts.
+
+    Raises
+    ------
+    ConfigError
+        for an observation that is not a number, of no known run, or outside of its run's time.
+    """
+    order = _canonical(observations)
+    ordered = observations.chosen(order)
+    which = _used(ordered, settings.mode)
+    chosen = ordered.chosen(which)
+    components = HEIGHT_ALONE if settings.mode == "vertical" else np.ones(len(COMPONENTS), bool)
+    control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
+    unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components)
+    unknowns.check(observations)
+    estimate = Rounds(_problem(unknowns, chosen), settings).run()
+    values, covariance, with_next = _of_knots(unknowns, estimate)
+    told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
+    back = np.empty(order.size, np.int64)
+    back[order] = np.arange(order.size)
+    factors = dict(
+        zip((*KINDS, *COMPONENTS), [*estimate.kind_factors[:SURVEY], *estimate.process_factors], strict=True)
+    )
+    return Adjustment(
+        tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
+        told[0][back], which[back], told[1][back], told[2][back], told[3][back],
+        _of_control(unknowns, estimate, n), {k: float(v) for k, v in factors.items()},
+        estimate.rounds, estimate.settled, tuple(priors), unknowns.sigmas > 0.0,
+    )  # fmt: skip
+
+
+def _canonical(observations: Observations) -> Int64:
+    """Order that depends on the observations alone, not on how they arrived."""
+    o = observations
+    keys = [o.kind, o.place, *o.run.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
+    keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
+    return np.lexsort(keys[::-1])
+
+
+def _used(observations: Observations, mode: str) -> Bool:
+    """Observations that a mode takes: only control for each run alone, only upright ones for heights."""
+    if mode == "each_pass":
+        return np.asarray((observations.run == FIXED).any(axis=1))
+    if mode == "vertical":
+        return np.asarray(np.abs(directions_of(observations)[:, 2]) > np.sqrt(0.5))
+    return np.ones(observations.size, bool)
+
+
+def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
+    """Rows of the observations, then of the surveys of control points."""
+    rows, lines = unknowns.rows(observations, unknowns.control.of_observation)
+    numbers = unknowns.of_control
+    surveyed = numbers[numbers >= 0]
+    m = surveyed.size
+    _, first, own = np.unique(observations.group, return_index=True, return_inverse=True)
+    rank = np.empty(first.size, np.int64)
+    rank[np.argsort(first)] = np.arange(first.size)
+    # Height and horizontal place of a point's survey fall apart: one may be wrong, and the other right.
+    part = (2 * np.arange(len(numbers))[:, None] + np.array([0, 0, 1]))[numbers >= 0]
+    return Problem(
+        unknowns,
+        Rows(
+            np.concatenate([rows.first, rows.first[-1] + 1 + np.arange(m)]),
+            np.concatenate([rows.unknown, surveyed]),
+            np.concatenate([rows.derivative, np.ones(m)]),
+        ),
+        np.concatenate([observations.observed_m, np.zeros(m)]),
+        np.concatenate([observations.sigma_m**2, np.ones(m)]),
+        np.concatenate([lines, np.zeros((m, len(COMPONENTS)))]),
+        np.concatenate([observations.kind.astype(np.int64), np.full(m, SURVEY)]),
+        Groups(np.concatenate([rank[own.ravel()], first.size + part])),
+    )
+
+
+def _of_knots(
+    unknowns: Unknowns, estimate: Estimate
+) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
+    """Values, covariances, and those with the next knot, of each run."""
+    values, covariance, with_next = [], [], []
+    for run, sigma in enumerate(unknowns.sigmas):
+        numbers = unknowns.of_run(run)
+        there = numbers >= 0
+        values.append(np.where(there, estimate.solution[numbers], 0.0) * sigma)
+        covariance.append(_blocks(estimate, numbers, numbers, sigma))
+        with_next.append(_blocks(estimate, numbers[:-1], numbers[1:], sigma))
+    return tuple(values), tuple(covariance), tuple(with_next)
+
+
+def _blocks(estimate: Estimate, first: Int64, second: Int64, sigma: Float64) -> Float64:
+    """Covariances (k, 6, 6) of two tables (k, 6) of unknowns."""
+    i, j = np.broadcast_arrays(first[:, :, None], second[:, None, :])
+    there = (i >= 0) & (j >= 0)
+    blocks = np.zeros(i.shape)
+    blocks[there] = estimate.inverse.at(i[there], j[there])
+    return blocks * sigma[:, None] * sigma
+
+
+def _of_observations(
+    unknowns: Unknowns, observations: Observations, used: Int64, estimate: Estimate
+) -> tuple[Float64, Float64, Float64, Float64]:
+    """Residual, weight, redundancy and normalised residual of each observation, also of those not used."""
+    size, n = observations.size, used.size
+    rows, _ = unknowns.rows(observations, np.full(size, -1, np.int64))
+    residual = observations.observed_m - rows.times(estimate.solution)
+    weight, redundancy, normalised = np.zeros(size), np.full(size, np.nan), np.full(size, np.nan)
+    residual[used], weight[used] = estimate.residual[:n], estimate.weight[:n]
+    redundancy[used], normalised[used] = estimate.without.redundancy[:n], estimate.without.statistic[:n]
+    return residual, weight, redundancy, normalised
+
+
+def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors:
+    """The rows after the first n are those of surveys."""
+    control, numbers = unknowns.control, unknowns.of_control
+    there = numbers >= 0
+
+    def table(values: Float64) -> Float64:
+        found = np.full(numbers.shape, np.nan)
+        found[there] = values
+        return found
+
+    without, sigma = estimate.without, control.sigma_m
+    error = table(estimate.solution[numbers[there]]) * sigma
+    # The survey says that its error is nought; what the others say of it is the prediction.
+    left_out = table(-without.residual[n:]) * sigma
+    left_out_sigma = table(np.sqrt(1.0 + without.variance[n:])) * sigma
+    return ControlErrors(control.place, control.run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)

@@ -1,0 +1,259 @@
+"""Control points as passes saw them: when each pass came by, what it saw, and the observations that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.observations import FIXED, KINDS, Observations, partials
+from roadscan.adjust.patches import PassReadings, level_from_map
+from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.targets.find import find_target
+from roadscan.adjust.targets.heights import height_at
+from roadscan.adjust.targets.settings import TargetSettings
+from roadscan.adjust.targets.shapes import Shape
+from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.trajectory import Corrections
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]
+"""`height`: no target is looked for, the height alone was measured; `unseen`: not even that."""
+
+_NEAR_M: Final = 3.0
+_LONGEST_NS: Final = 20 * NS_PER_S
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """A surveyed point, in the map."""
+
+    number: int
+    name: str
+    role: str
+    """`gcp` or `check`."""
+    code: str
+    easting_m: float
+    northing_m: float
+    height_m: float
+    sigma_horizontal_m: float
+    sigma_height_m: float
+    shape: Shape | None
+    """None: no target is looked for."""
+
+
+@dataclass(frozen=True)
+class PickedPlace:
+    """Where the user sees a point's target in the recorded poses of a run (map, m)."""
+
+    easting_m: float
+    northing_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one pass saw of a point; what was not measured is NaN."""
+
+    point: ControlPoint
+    run: int
+    sensor: str
+    """Of the pose that `epoch_gps_ns` names: the one that saw the place."""
+    status: SightStatus
+    why_not: str
+    epoch_gps_ns: int
+    easting_m: float
+    """Of the target, as the recorded poses show it."""
+    northing_m: float
+    covariance_m2: Float64
+    """(2, 2) of easting and northing, without that of the poses."""
+    height_m: float
+    """Of the road at the target, or at the surveyed place where none was found."""
+    sigma_height_m: float
+    slope_east: float
+    slope_north: float
+    count: int
+    contrast: float
+    score: float
+    arm_body_m: Float64
+    """(3,) from the body's origin to the place, body axes."""
+    level_from_body: Float64
+    """(3, 3)"""
+    convergence_rad: float
+    find: TargetFind | None = None
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the place was measured, and not the height alone."""
+        return self.status in ("found", "picked")
+
+
+def passes_by(track: Track, easting_m: float, northing_m: float, radius_m: float, apart_s: float) -> list[Traverse]:
+    """When a sensor saw a circle of the road, one each time that it came by.
+
+    apart_s : a vehicle that is back after this time or more comes by anew.
+    """
+    east, north = easting_m - track.easting_m, northing_m - track.northing_m
+    sine, cosine = np.sin(track.heading_rad), np.cos(track.heading_rad)
+    along, across = east * sine + north * cosine, east * cosine - north * sine
+    reach = radius_m + track.ahead_m + _step_m(track)
+    beside = (across >= -np.asarray(track.left_m) - radius_m) & (across <= np.asarray(track.right_m) + radius_m)
+    rows = np.flatnonzero((np.abs(along) <= reach) & beside)
+    if not rows.size:
+        return []
+    epochs, found = track.epoch_gps_ns, []
+    for visit in np.split(rows, np.flatnonzero(np.diff(epochs[rows]) > apart_s * NS_PER_S) + 1):
+        first, last = int(epochs[visit[0]]), int(epochs[visit[-1]])
+        nearest = int(epochs[visit[np.argmin(np.abs(along[visit]))]])
+        found.append(
+            Traverse(track.run, track.sensor, max(first, nearest - _LONGEST_NS), min(last, nearest + _LONGEST_NS))
+        )
+    return found
+
+
+def _step_m(track: Track) -> float:
+    """Longest way from one position of a track to the next, but no gap."""
+    steps = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
+    return float(min(steps.max(initial=0.0), _NEAR_M))
+
+
+def sight(
+    point: ControlPoint,
+    heads: Sequence[PassReadings],
+    settings: TargetSettings,
+    sigma_pose_m: float,
+    picked: PickedPlace | None = None,
+) -> Sighting:
+    """What one pass saw of a point.
+
+    Parameters
+    ----------
+    heads : readings of the sensors of the pass near the point, one at least.
+    sigma_pose_m : 1 σ of the recorded poses on each horizontal axis.
+    picked : stands in for what would be found.
+    """
+    readings = TargetReadings(
+        easting_m=np.concatenate([h.easting_m for h in heads]),
+        northing_m=np.concatenate([h.northing_m for h in heads]),
+        height_m=np.concatenate([h.height_m for h in heads]),
+        intensity=np.concatenate([h.intensity for h in heads]),
+        sigma_horizontal_m=sigma_pose_m,
+    )
+    nan, none = float("nan"), np.full((2, 2), np.nan)
+    status: SightStatus = "height"
+    why_not, find = "", None
+    place, covariance = np.array([nan, nan]), none
+    if picked is not None:
+        status, place = "picked", np.array([picked.easting_m, picked.northing_m])
+        covariance = picked.sigma_m**2 * np.eye(2)
+    elif point.shape is not None:
+        expected = ExpectedTarget(
+            point.name, point.easting_m, point.northing_m, point.height_m, point.sigma_horizontal_m, point.shape
+        )
+        find = find_target(readings, expected, settings)
+        status, why_not = find.status, find.why_not
+        if find.found:
+            place, covariance = np.array([find.easting_m, find.northing_m]), find.covariance_m2
+    at = place if np.isfinite(place).all() else np.array([point.easting_m, point.northing_m])
+    height = height_at(readings, float(at[0]), float(at[1]), settings)
+    if not np.isfinite(height.height_m) and status == "height":
+        status, why_not = "unseen", height.why_not
+    return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
+
+
+def _with_pose(
+    point: ControlPoint,
+    heads: Sequence[PassReadings],
+    at: Float64,
+    height: HeightFind,
+    found: tuple[SightStatus, str, Float64, Float64, TargetFind | None],
+) -> Sighting:
+    status, why_not, place, covariance, find = found
+    away = [np.hypot(h.easting_m - at[0], h.northing_m - at[1]) for h in heads]
+    seen = [k for k, a in enumerate(away) if a.size]
+    if not seen:
+        return _unseen(point, heads[0])
+    head = heads[min(seen, key=lambda k: float(away[k].min()))]
+    reading = int(np.argmin(np.hypot(head.easting_m - at[0], head.northing_m - at[1])))
+    pose = int(head.pose[reading])
+    level = height.height_m if np.isfinite(height.height_m) else float(head.height_m[reading])
+    arm = head.arm_body_m(np.array([[at[0], at[1], level]]), np.array([pose]))[0]
+    return Sighting(
+        point, head.run, head.sensor, status, why_not, int(head.epoch_gps_ns[pose]), float(place[0]), float(place[1]),
+        covariance, height.height_m, height.sigma_m, height.slope_east, height.slope_north,
+        find.count if find is not None else height.count, find.contrast if find is not None else float("nan"),
+        find.score if find is not None else float("nan"), arm, head.level_from_body[pose], head.convergence_rad, find,
+    )  # fmt: skip
+
+
+def _unseen(point: ControlPoint, head: PassReadings) -> Sighting:
+    nan = float("nan")
+    return Sighting(
+        point, head.run, head.sensor, "unseen", "no reading near it", 0, nan, nan, np.full((2, 2), nan), nan, nan, nan,
+        nan, 0, nan, nan, np.full(3, nan), np.full((3, 3), nan), head.convergence_rad,
+    )  # fmt: skip
+
+
+def moved_m(one: Sighting, corrections: Corrections | None) -> Float64:
+    """How corrections move what a sighting saw: easting, northing, height (3,) (m); of a point that was not placed the
+    height at its surveyed place, on a road that slopes.
+    """
+    if corrections is None or not np.isfinite(one.arm_body_m).all():
+        return np.zeros(3)
+    shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
+    north, east, down = shift[0] + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    c, s = np.cos(one.convergence_rad), np.sin(one.convergence_rad)
+    easting, northing, height = c * east - s * north, c * north + s * east, -down
+    if not one.is_placed and np.isfinite(one.slope_east):
+        height -= one.slope_east * easting + one.slope_north * northing
+    return np.array([easting, northing, height])
+
+
+def observations_of(sightings: Sequence[Sighting]) -> Observations:
+    """Height of each sighting, and two components of those that were placed, in order of the sightings.
+
+    The height is that along the normal of the road at a point without a target, whose place on the road is known by the
+    poses alone. The components of a place are along the axes of its covariance, so that they are independent.
+    """
+    parts = [part for number, one in enumerate(sightings) for part in _of_one(number, one)]
+    groups = np.array([int(part.group[0]) for part in parts], np.int64)
+    return replace(Observations.joined(parts), group=groups)
+
+
+def _of_one(number: int, one: Sighting) -> list[Observations]:
+    parts = []
+    point = one.point
+    if np.isfinite(one.height_m):
+        lift, normal = 1.0, np.array([[0.0, 0.0, 1.0]])
+        if not one.is_placed:
+            normal = np.array([[-one.slope_east, -one.slope_north, 1.0]])
+            lift = float(1.0 / np.linalg.norm(normal))
+        direction = level_from_map(normal * lift, one.convergence_rad)
+        value, sigma = lift * (point.height_m - one.height_m), lift * one.sigma_height_m
+        parts.append(_observation("control_height", one, direction, value, (sigma, point.sigma_height_m), 2 * number))
+    if one.is_placed:
+        away = np.array([point.easting_m - one.easting_m, point.northing_m - one.northing_m])
+        variance, axes = np.linalg.eigh(one.covariance_m2)
+        for axis, own in zip(axes.T, variance, strict=True):
+            direction = level_from_map(np.array([[axis[0], axis[1], 0.0]]), one.convergence_rad)
+            sigmas = (float(np.sqrt(own)), point.sigma_horizontal_m)
+            parts.append(_observation("control_position", one, direction, float(axis @ away), sigmas, 2 * number + 1))
+    return parts
+
+
+def _observation(
+    kind: str, one: Sighting, direction: Float64, value_m: float, sigma_m: tuple[float, float], group: int
+) -> Observations:
+    derivatives = np.zeros((1, 2, 6))
+    derivatives[0, 0] = partials(direction, one.level_from_body[None], one.arm_body_m[None])[0]
+    return Observations(
+        np.array([KINDS.index(kind)], np.uint8), np.array([[one.run, FIXED]], np.int32),
+        np.array([[one.epoch_gps_ns, 0]], np.int64), derivatives, np.array([value_m]), np.array([sigma_m[0]]),
+        np.array([group], np.int64), np.array([one.point.number], np.int64), np.array([sigma_m[1]]),
+    )  # fmt: skip

@@ -1,0 +1,178 @@
+"""The rounds of an adjustment: solve, judge each observation by the others, weigh anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.observations import COMPONENTS, KINDS
+from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
+from roadscan.adjust.unknowns import Unknowns
+from roadscan.adjust.weights import Groups, LeftOut, left_out
+from roadscan.model.adjustment import AdjustmentSettings
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SURVEY: Final = len(KINDS)
+"""Kind of the rows that say that a control point lies where it was surveyed."""
+_HUBER_ROUNDS: Final = 10
+_SETTLED: Final = 0.01
+"""Weights, and logarithms of factors, that change by less are final."""
+_CALM: Final = 15
+"""From this round on, a weight goes half of the way: two that exclude one another no longer take turns."""
+_LEAST: Final = 1e-6
+"""Weight of a rejected survey: the point is then free, but has a place."""
+_ENOUGH: Final = 30.0
+"""Redundancy from which on a factor of variances is estimated."""
+_FACTORS: Final = (1e-3, 1e3)
+_STEP: Final = 4.0
+"""A factor changes by no more in a round."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All rows, those of surveys last."""
+
+    unknowns: Unknowns
+    rows: Rows
+    observed: Float64
+    """(n,)"""
+    variance: Float64
+    """(n,) as stated."""
+    line_variance: Float64
+    """(n, 6) that lines between knots add."""
+    kind: Int64
+    """(n,) index into `KINDS`, or `SURVEY`."""
+    groups: Groups
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the rounds end with."""
+
+    solution: Float64
+    """(u,)"""
+    inverse: SelectedInverse
+    residual: Float64
+    """(n,) observed minus computed."""
+    weight: Float64
+    """(n,) 0 to 1."""
+    without: LeftOut
+    kind_factors: Float64
+    """Of the stated variances of each kind, and 1 for surveys."""
+    process_factors: Float64
+    """(6,) of the stated variances of the processes."""
+    rounds: int
+    settled: bool
+
+
+class Rounds:
+    """An adjustment at work."""
+
+    def __init__(self, problem: Problem, settings: AdjustmentSettings) -> None:
+        self.problem, self.settings = problem, settings
+        self._row, self._column, self._value, self._component = problem.unknowns.prior_entries()
+        prior, wanted = (self._row, self._column, self._value), problem.unknowns.wanted_pairs()
+        self._equations = NormalEquations(problem.rows, prior, wanted, problem.unknowns.size)
+        self._weight = np.ones(problem.observed.size)
+        self._kinds, self._processes = np.ones(len(KINDS) + 1), np.ones(len(COMPONENTS))
+
+    def run(self) -> Estimate:
+        """All rounds."""
+        done = 0
+        while done < min(_HUBER_ROUNDS, self.settings.max_rounds - 1):
+            done += 1
+            residual = self._solved()[1]
+            if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
+                break
+        while True:
+            done += 1
+            estimate = self._judged(done)
+            if estimate.settled or done >= self.settings.max_rounds:
+                return estimate
+
+    def _own(self) -> Float64:
+        """Variance of each row beside that of the corrections at the knots."""
+        lines = self.problem.line_variance @ self._processes
+        return np.asarray(self.problem.variance * self._kinds[self.problem.kind] + lines)
+
+    def _counted(self) -> Float64:
+        """Weights that the equations are summed with."""
+        return np.where(self.problem.kind == SURVEY, np.maximum(self._weight, _LEAST), self._weight)
+
+    def _solved(self) -> tuple[Float64, Float64]:
+        """Solution and residuals with the weights of now."""
+        rows, scaled = self.problem.rows, self._counted() / self._own()
+        self._equations.factor(scaled, self._value / self._processes[self._component])
+        right = rows.transposed_times(scaled * self.problem.observed, self.problem.unknowns.size)
+        solution = self._equations.solve(right)
+        return solution, self.problem.observed - rows.times(solution)
+
+    def _judged(self, rounds: int) -> Estimate:
+        """One round of IGG III; it is settled when what comes out of it is what went in."""
+        solution, residual = self._solved()
+        inverse = self._equations.inverse()
+        own, weight = self._own(), self._weight.copy()
+        kinds, processes = self._kinds.copy(), self._processes.copy()
+        without = left_out(residual, inverse.variances(self.problem.rows), own, self._counted())
+        near, far = self.settings.full_weight_within, self.settings.reject_beyond
+        wanted = self.problem.groups.igg_iii(without.statistic, near, far)
+        moved = self._moved_to(wanted if rounds < _CALM else 0.5 * (weight + wanted))
+        if self.settings.estimate_variance_components:
+            moved = max(moved, self._new_factors(solution, inverse, residual, without, own, weight))
+        return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
+
+    def _moved_to(self, weight: Float64) -> float:
+        moved = float(np.abs(weight - self._weight).max(initial=0.0))
+        self._weight = weight
+        return moved
+
+    def _new_factors(
+        self,
+        solution: Float64,
+        inverse: SelectedInverse,
+        residual: Float64,
+        without: LeftOut,
+        own: Float64,
+        weight: Float64,
+    ) -> float:
+        """Estimate the factors once more (Förstner 1979); the largest change of their logarithms."""
+        before = np.concatenate([self._kinds, self._processes])
+        # Of an observation's variance, the share that is its own counts; the rest is that of lines between knots.
+        share = self.problem.variance * self._kinds[self.problem.kind] / own
+        squares, redundancy = weight * residual**2 / own, np.where(weight > 0.0, without.redundancy, 0.0)
+        for kind in range(len(KINDS)):
+            here = self.problem.kind == kind
+            told, own_part = redundancy[here].sum(), (share * redundancy)[here].sum()
+            ratio = (share * squares)[here].sum() / max(own_part, 1e-300)
+            self._kinds[kind] = _stepped(self._kinds[kind], ratio, told, own_part / max(told, 1e-300))
+        twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
+        moved = twice * solution[self._row] * solution[self._column]
+        shrunk = twice * inverse.at(self._row, self._column)
+        for component in range(len(COMPONENTS)):
+            here = self._component == component
+            factor = self._processes[component]
+            unknowns = float((here & (self._row == self._column)).sum())
+            told = unknowns - shrunk[here].sum() / factor
+            ratio = moved[here].sum() / factor / max(told, 1e-300)
+            self._processes[component] = _stepped(factor, ratio, told)
+        after = np.concatenate([self._kinds, self._processes])
+        return float(np.abs(np.log(after / before)).max())
+
+
+def _stepped(factor: float, ratio: float, redundancy: float, share: float = 1.0) -> float:
+    """The factor that makes squares as large as their redundancy; the same where that is too little to tell.
+
+    Parameters
+    ----------
+    ratio : squares over redundancy, with the factor of now.
+    share : of the variance that the factor multiplies, in that of what is squared.
+    """
+    if redundancy < _ENOUGH:
+        return factor
+    step = np.clip(1.0 + (ratio - 1.0) / share, 1.0 / _STEP, _STEP)
+    return float(np.clip(factor * step, *_FACTORS))

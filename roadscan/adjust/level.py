@@ -1,0 +1,54 @@
+"""Poses as an adjustment needs them: places on the map, attitudes against the local level, grid against true north."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.crs import MapFrame
+from roadscan.navigation.trajectory import Poses, Trajectory, world_from_ned
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_STEP_M = 10.0
+
+
+@dataclass(frozen=True)
+class LevelPoses:
+    """Poses at p epochs."""
+
+    epoch_gps_ns: Int64
+    """(p,)"""
+    body_m: Float64
+    """(p, 3) easting, northing and height of the body's origin."""
+    level_from_body: Float64
+    """(p, 3, 3) north, east, down from body axes."""
+    convergence_rad: Float64
+    """(p,) grid north is this far clockwise from true north."""
+
+    @property
+    def heading_rad(self) -> Float64:
+        """(p,) of the vehicle, clockwise from grid north."""
+        return np.asarray(
+            np.arctan2(self.level_from_body[:, 1, 0], self.level_from_body[:, 0, 0]) - self.convergence_rad
+        )
+
+
+def level_poses(trajectory: Trajectory, frame: MapFrame, epochs_gps_ns: Int64) -> LevelPoses:
+    """Those of the epochs (n,) that have a pose, in their order."""
+    found = trajectory.poses(epochs_gps_ns)
+    keep = found.found
+    poses = Poses(epochs_gps_ns[keep], found.position_world_m[keep], found.world_from_body[keep], keep[keep])
+    axes = world_from_ned(trajectory.world, poses.position_world_m)
+    body = frame.map_from_world(trajectory.world, poses.position_world_m)
+    north = frame.map_from_world(trajectory.world, poses.position_world_m + _STEP_M * axes[:, :, 0])
+    away = north[:, :2] - body[:, :2]
+    return LevelPoses(
+        poses.epochs_gps_ns,
+        body,
+        np.einsum("nji,njk->nik", axes, poses.world_from_body),
+        np.asarray(-np.arctan2(away[:, 0], away[:, 1])),
+    )

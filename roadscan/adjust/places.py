@@ -1,0 +1,264 @@
+"""Places where passes overlap: lanes side by side, a lane driven again, opposite directions, crossings, loops.
+
+Each track is sampled evenly along its path. Beside each lead sample, each `per_km`-th part of a kilometre, the part of
+its cross-line that other tracks (or the same one, later) see is an interval, and the fewest places that meet all
+intervals are taken. Where passes only abut, the place lies in the strip that both see. The first track in the given
+order leads; the others lead where it does not come.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.adjust.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
+from roadscan.model.errors import NavigationError
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.tie_settings import PlaceSettings
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_STEP_M: Final = 2.0
+"""Samples of a track are no farther apart; the chord of a bend of 10 m leaves it by 5 cm."""
+_ASIDE: Final = (0.0, -0.8, 0.8, -0.4, 0.4)
+"""Where in a wide strip places lie in turns: roll shows at its edges."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where a sensor went in one run, and how far it saw to both sides."""
+
+    run: int
+    """Index of the run."""
+    sensor: str
+    epoch_gps_ns: Int64
+    """(n,) ascending."""
+    easting_m: Float64
+    """(n,) map, of the road below what the sensor sees: of a line scanner, a point on its line."""
+    northing_m: Float64
+    height_m: Float64
+    heading_rad: Float64
+    """(n,) of the vehicle, clockwise from grid north."""
+    left_m: float | Float64
+    """Reach on the ground to the left of the position, (n,) or the same for all; negative where the sensor sees nothing
+    but the right."""
+    right_m: float | Float64
+    ahead_m: float = 0.0
+    """How far ahead and behind a lidar is taken to see; 0 for sensors that see a line across. A place of such a sensor
+    may have one traverse: it is seen for a while."""
+
+    def __post_init__(self) -> None:
+        sizes = {a.shape for a in (self.epoch_gps_ns, self.easting_m, self.northing_m, self.height_m, self.heading_rad)}
+        if sizes != {(self.epoch_gps_ns.size,)}:
+            raise NavigationError(
+                f"track of '{self.sensor}': columns of the shapes {sorted(sizes)}", expected="one value an epoch"
+            )
+        if (np.diff(self.epoch_gps_ns) <= 0).any():
+            raise NavigationError(f"track of '{self.sensor}': epochs do not ascend", expected="ascending epochs")
+
+
+@dataclass(frozen=True)
+class Traverse:
+    """One pass by a place, of one sensor."""
+
+    run: int
+    """Index of the run."""
+    sensor: str
+    first_gps_ns: int
+    """Between these epochs the sensor saw the place."""
+    last_gps_ns: int
+
+
+@dataclass(frozen=True)
+class Place:
+    """A square of road that is compared between passes."""
+
+    number: int
+    """From 0, in the order of the leading track, then along it."""
+    easting_m: float
+    """Centre, map."""
+    northing_m: float
+    heading_rad: float
+    """Of the leading track, clockwise from grid north: the axis along the patch."""
+    radius_m: float
+    """Half the edge of the square."""
+    traverses: tuple[Traverse, ...]
+    """Two or more, in the order of tracks and time; one where a lidar sees the place for a while."""
+
+    def quality_only(self, return_s: float) -> bool:
+        """Whether the traverses are heads of one run at one time: one correction moves them all."""
+        first, last = self.traverses[0], self.traverses[-1]
+        apart_s = (max(t.first_gps_ns for t in self.traverses) - min(t.last_gps_ns for t in self.traverses)) / NS_PER_S
+        return len(self.traverses) > 1 and first.run == last.run and apart_s < return_s
+
+
+def places_of_overlap(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
+    """Places where passes overlap, evenly spread along the road; the same for the same tracks in the same order.
+
+    Parameters
+    ----------
+    tracks : of all runs and sensors, by run; those of one run beside one another.
+    settings : how many, how large, what counts as another pass.
+    """
+    spacing_m = 1000.0 / settings.per_km
+    every = max(1, math.ceil(spacing_m / _STEP_M))
+    origin = min((int(t.epoch_gps_ns[0]) for t in tracks if t.epoch_gps_ns.size), default=0)
+    parts = [_sampled(t, k, spacing_m / every, origin, settings.gap_s) for k, t in enumerate(tracks)]
+    if not any(p.track.size for p in parts):
+        return []
+    samples = Samples._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    starts = np.searchsorted(samples.track, np.arange(len(tracks) + 1))
+    number = np.arange(samples.track.size) - starts[samples.track]
+    found = _visits(samples, Limits(settings.return_s, settings.height_apart_m), spacing_m / every)
+    leads = np.flatnonzero((number % every == 0) | _between(samples, found, number, every, settings.return_s))
+    found = _of_leads(found, leads, samples.track.size)
+    ahead = np.where(number % every == 0, np.array([t.ahead_m for t in tracks])[samples.track], 0.0)[leads]
+    met = _meetings(samples, found, leads, ahead, settings)
+    return _places(tracks, samples, found, leads, met, origin, settings)
+
+
+def _sampled(track: Track, number: int, step_m: float, origin_gps_ns: int, gap_s: float) -> Samples:
+    """Samples of one track each `step_m` of its path."""
+    moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
+    station = np.concatenate([[0.0], np.cumsum(moved)])[: track.epoch_gps_ns.size]
+    since = (track.epoch_gps_ns - origin_gps_ns) / NS_PER_S
+    at = step_m * np.arange(math.floor(station[-1] / step_m) + 1) if station.size > 1 else np.zeros(0)
+    goes_on = np.append(True, moved > 0)
+    column = [
+        np.interp(at, station[goes_on], np.broadcast_to(v, station.shape)[goes_on]) if at.size else at
+        for v in (track.easting_m, track.northing_m, track.height_m, np.unwrap(track.heading_rad), since,
+                  np.asarray(track.left_m, dtype=np.float64), np.asarray(track.right_m, dtype=np.float64))
+    ]  # fmt: skip
+    gap = np.flatnonzero(np.diff(since) > gap_s)
+    joined = np.append(np.ones(max(at.size - 1, 0), np.bool_), False)[: at.size]
+    for low, high in zip(station[gap], station[gap + 1], strict=True):
+        joined[max(math.floor(low / step_m), 0) : math.ceil(high / step_m)] = False
+    return Samples._make([*column, np.full(at.size, number, np.int32), joined])
+
+
+def _visits(samples: Samples, limits: Limits, step_m: float) -> Visits:
+    """Visits of the cross-lines of all samples."""
+    reach = np.maximum(np.abs(samples.left_m), np.abs(samples.right_m)).max()
+    edge = 2.0 * float(reach) + 2.0 * step_m
+    west, south = float(samples.easting_m.min()), float(samples.northing_m.min())
+    column, row = (
+        np.floor((v - low) / edge).astype(np.int64)
+        for v, low in ((samples.easting_m, west), (samples.northing_m, south))
+    )
+    rows = int(row.max()) + 1
+    key = column * rows + row
+    order = np.argsort(key, kind="stable")
+    bins = Bins(order, key[order], edge, rows, west, south)
+    leads = np.arange(samples.track.size)
+    size = 4 * leads.size + 16
+    while True:
+        out = Visits._make(np.empty(size, t) for t in (np.int64, np.int64, np.int64, np.float64, np.float64))
+        count = visits(samples, bins, leads, limits, out)
+        if count <= size:
+            return Visits._make(a[:count] for a in out)
+        size = count
+
+
+def _between(samples: Samples, found: Visits, number: Int64, every: int, return_s: float) -> Bool:
+    """Samples (n,) that lead as well, because a visit, a crossing say, comes between the even leads.
+
+    A visit goes on from sample to sample of the lead. Of one that no even lead within `every` samples meets, the middle
+    sample leads.
+    """
+    out = np.zeros(samples.track.size, np.bool_)
+    tracks = np.int64(samples.track.max()) + 1
+    pair = samples.track[found.lead] * tracks + samples.track[found.first]
+    since = samples.since_s[found.first]
+    # One pass of the other track beside this one has one label.
+    order = np.lexsort((since, pair))
+    begins = np.append(True, (np.diff(pair[order]) != 0) | (np.diff(since[order]) >= return_s))[: order.size]
+    label = np.empty(order.size, np.int64)
+    label[order] = np.cumsum(begins)
+    order = np.lexsort((found.lead, label))
+    label, lead = label[order], found.lead[order]
+    even = np.flatnonzero(number[lead] % every == 0)
+    far = np.iinfo(np.int64).max // 4
+    key = np.concatenate([[-far], label[even] * (4 * out.size) + lead[even], [far]])
+    own = label * (4 * out.size) + lead
+    at = np.searchsorted(key, own)
+    orphan = np.flatnonzero(np.minimum(key[np.minimum(at, key.size - 1)] - own, own - key[at - 1]) >= every)
+    ends = np.flatnonzero(np.append((np.diff(own[orphan]) > every), True)) if orphan.size else orphan
+    starts = np.append(0, ends[:-1] + 1)
+    out[lead[orphan[(starts[: ends.size] + ends) // 2]]] = True
+    return out
+
+
+def _of_leads(found: Visits, leads: Int64, size: int) -> Visits:
+    """Visits of some samples, numbered by their place among them."""
+    rank = np.full(size, -1, dtype=np.int64)
+    rank[leads] = np.arange(leads.size)
+    kept = rank[found.lead] >= 0
+    return Visits._make([rank[found.lead[kept]], *(a[kept] for a in found[1:])])
+
+
+def _meetings(samples: Samples, found: Visits, leads: Int64, ahead_m: Float64, settings: PlaceSettings) -> Meetings:
+    turn = np.array(_ASIDE)[np.arange(leads.size) % len(_ASIDE)]
+    aside = np.where(ahead_m > 0, np.nan, turn)
+    of_lead = np.bincount(found.lead, minlength=leads.size)
+    places, members = found.lead.size + leads.size, int((of_lead**2).sum()) + leads.size
+    sizes = ((places, np.int64), (places, np.float64), (members, np.int64), (members, np.int64))
+    out = Meetings._make(np.empty(size, t) for size, t in sizes)
+    spread = Spread(settings.least_overlap_m, settings.radius_m)
+    p, q = meetings(samples, found, leads, spread, aside, ahead_m > 0, out)
+    return Meetings(out.lead[:p], out.offset_m[:p], out.place[:q], out.visit[:q])
+
+
+def _places(
+    tracks: Sequence[Track], samples: Samples, found: Visits, leads: Int64, met: Meetings, origin: int,
+    settings: PlaceSettings,
+) -> list[Place]:  # fmt: skip
+    lead = leads[met.lead]
+    heading = samples.heading_rad[lead]
+    easting = samples.easting_m[lead] + met.offset_m * np.cos(heading)
+    northing = samples.northing_m[lead] - met.offset_m * np.sin(heading)
+    ahead = np.array([t.ahead_m for t in tracks])
+    radius = np.where(ahead[samples.track[lead]] > 0, settings.lidar_radius_m, settings.radius_m)
+    foot = np.empty(met.visit.size)
+    feet(samples, easting[met.place], northing[met.place], found.first[met.visit], found.last[met.visit], foot)
+    # The lead itself comes first of its place.
+    place = np.concatenate([np.arange(lead.size), met.place])
+    foot = np.concatenate([lead.astype(np.float64), foot])
+    order = np.argsort(place, kind="stable")
+    place, foot = place[order], foot[order]
+    track = samples.track[np.floor(foot + 1e-9).astype(np.int64)]
+    first, last = _windows(samples, foot, track, radius[place] + settings.margin_m + ahead[track], settings.longest_s)
+    ends = np.searchsorted(place, np.arange(lead.size + 1))
+    first_ns, last_ns = ((origin + np.rint(s * NS_PER_S).astype(np.int64)).tolist() for s in (first, last))
+    seen = [
+        Traverse(tracks[t].run, tracks[t].sensor, a, b)
+        for t, a, b in zip(track.tolist(), first_ns, last_ns, strict=True)
+    ]
+    columns = np.stack([easting, northing, np.mod(heading, 2 * math.pi), radius], axis=-1).tolist()
+    return [
+        Place(k, e, n, turned, half, tuple(seen[a:b]))
+        for k, ((e, n, turned, half), (a, b)) in enumerate(zip(columns, pairwise(ends.tolist()), strict=True))
+    ]
+
+
+def _windows(
+    samples: Samples, foot: Float64, track: npt.NDArray[np.int32], reach_m: Float64, longest_s: float
+) -> tuple[Float64, Float64]:
+    """First and last time (q,) since the origin at which tracks are within `reach_m` (q,) of their foot, along them."""
+    number = np.arange(samples.track.size, dtype=np.float64)
+    first_of = np.searchsorted(samples.track, track, side="left").astype(np.float64)
+    last_of = np.searchsorted(samples.track, track, side="right") - 1.0
+    # Samples are even: a distance along a track is a number of samples.
+    step = np.hypot(np.diff(samples.easting_m), np.diff(samples.northing_m))
+    even = np.median(step[samples.joined[:-1]]) if samples.joined.any() else 1.0
+    at = np.interp(foot, number, samples.since_s)
+    first = np.interp(np.clip(foot - reach_m / even, first_of, last_of), number, samples.since_s)
+    last = np.interp(np.clip(foot + reach_m / even, first_of, last_of), number, samples.since_s)
+    return np.maximum(first, at - longest_s / 2), np.minimum(last, at + longest_s / 2)

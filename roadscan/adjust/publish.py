@@ -1,0 +1,59 @@
+"""From a solution to the corrections that hold: what moves no pose stays as it is, to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.observations import Observations
+from roadscan.navigation.trajectory import Corrections
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+
+def published(before: Corrections | None, solved: Corrections, moved_m: float, arm_m: float) -> Corrections:
+    """Corrections to publish: knots of the solution where it moves a pose by more than stated, else those before.
+
+    Between knots corrections are linear, so nowhere do they depart from the solution by more than at a knot. Where the
+    knots lie at other epochs, all are replaced.
+
+    Parameters
+    ----------
+    moved_m : shift and turn together (m).
+    arm_m : a turn counts as the movement of a point so far from the body's origin (m).
+    """
+    if before is None or not np.array_equal(before.epochs_gps_ns, solved.epochs_gps_ns):
+        return solved
+    shift = np.linalg.norm(solved.north_east_down_m - before.north_east_down_m, axis=1)
+    turn = np.linalg.norm(solved.roll_pitch_heading_rad - before.roll_pitch_heading_rad, axis=1)
+    moved = shift + arm_m * turn > moved_m
+    if not moved.any():
+        return before
+    sigma = solved.sigma
+    if sigma is not None and before.sigma is not None:
+        sigma = np.where(moved[:, None], sigma, before.sigma)
+    return Corrections(
+        solved.epochs_gps_ns,
+        np.where(moved[:, None], solved.north_east_down_m, before.north_east_down_m),
+        np.where(moved[:, None], solved.roll_pitch_heading_rad, before.roll_pitch_heading_rad),
+        sigma,
+    )
+
+
+def left_after(
+    observations: Observations, corrections: Mapping[str, Corrections], runs: Sequence[str]
+) -> Float64:  # fmt: skip
+    """What is left (n,) of each observation once the poses are corrected (m); runs are counted as in `runs`."""
+    left = observations.observed_m.copy()
+    for number, run in enumerate(runs):
+        own = corrections.get(run)
+        if own is None:
+            continue
+        for end in (0, 1):
+            here = np.flatnonzero(observations.run[:, end] == number)
+            moved = np.concatenate(own.at(observations.epoch_gps_ns[here, end]), axis=1)
+            left[here] -= np.einsum("ni,ni->n", observations.partials[here, end], moved)
+    return left

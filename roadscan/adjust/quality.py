@@ -1,0 +1,219 @@
+"""Figures of accuracy: absolute from check points, leave-one-out from control, relative between passes by section."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.adjustment import Adjustment, ControlErrors
+from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import NS_PER_S
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+NSSDA_VERTICAL: Final = 1.9600
+"""95 % of normal errors lie within so many RMSE (FGDC-STD-007.3-1998, 3.2.1 and appendix 3-A)."""
+NSSDA_HORIZONTAL: Final = 1.7308
+"""The same of a length in the plane whose two components are equally accurate (ibid.)."""
+ASPRS_CHECK_POINTS: Final = 30
+"""Fewer check points do not make a statement after ASPRS (2023, 7.12); the figures are computed all the same."""
+_DOWN: Final = 2
+
+
+@dataclass(frozen=True)
+class VerticalAccuracy:
+    """Of heights (m)."""
+
+    count: int
+    mean: float
+    mean_absolute: float
+    standard_deviation: float
+    """About the mean, n − 1."""
+    rmse: float
+    largest: float
+    """Largest absolute error."""
+    nssda_95: float
+    """Accuracy_z of NSSDA: 1.9600 RMSE_z."""
+    asprs_rmse: float
+    """RMSE_V of ASPRS (2023): with the σ of the check points' own survey."""
+
+
+@dataclass(frozen=True)
+class HorizontalAccuracy:
+    """Of places in the plane (m)."""
+
+    count: int
+    mean_north: float
+    mean_east: float
+    mean_absolute: float
+    """Mean length of the errors."""
+    rmse_north: float
+    rmse_east: float
+    rmse_r: float
+    """√(RMSE_north² + RMSE_east²)."""
+    nssda_95: float
+    """Accuracy_r of NSSDA: 1.7308 RMSE_r."""
+    asprs_rmse: float
+    """RMSE_H of ASPRS (2023): with the σ of the check points' own survey."""
+
+
+def vertical_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> VerticalAccuracy:
+    """Accuracy of heights.
+
+    Parameters
+    ----------
+    error_m : (n,) surface minus survey; NaN where there is none.
+    survey_sigma_m : 1 σ of the check points' own heights, one value or (n,).
+
+    Raises
+    ------
+    ConfigError
+        where there is no error at all.
+
+    Notes
+    -----
+    ASPRS Positional Accuracy Standards, edition 2 (2023): RMSE_V = √(RMSE_V1² + RMSE_V2²), of the fit to the check
+    points and of their survey.
+    """
+    there = np.asarray(np.isfinite(error_m), dtype=bool)
+    error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
+    rmse = _rms(error)
+    deviation = float(error.std(ddof=1)) if error.size > 1 else float("nan")
+    return VerticalAccuracy(
+        error.size, float(error.mean()), float(np.abs(error).mean()), deviation, rmse,
+        float(np.abs(error).max()), NSSDA_VERTICAL * rmse, float(np.hypot(rmse, _rms(survey))),
+    )  # fmt: skip
+
+
+def horizontal_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> HorizontalAccuracy:
+    """Accuracy of places in the plane.
+
+    Parameters
+    ----------
+    error_m : (n, 2) north and east, surface minus survey; NaN where there is none.
+    survey_sigma_m : 1 σ of each coordinate of the check points' own survey, one value, (n, 1) or (n, 2).
+
+    Raises
+    ------
+    ConfigError
+        where there is no error at all.
+
+    Notes
+    -----
+    Accuracy_r of NSSDA holds for RMSE_north = RMSE_east; where the smaller is above 0.6 of the larger it errs by
+    little (FGDC-STD-007.3-1998, appendix 3-A, case 2). RMSE_H of ASPRS (2023) is composed as RMSE_V.
+    """
+    there = np.asarray(np.isfinite(error_m).all(axis=1), dtype=bool)
+    error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
+    north, east = _rms(error[:, 0]), _rms(error[:, 1])
+    rmse_r, of_survey = float(np.hypot(north, east)), float(np.hypot(_rms(survey[:, 0]), _rms(survey[:, 1])))
+    return HorizontalAccuracy(
+        len(error), float(error[:, 0].mean()), float(error[:, 1].mean()), float(np.hypot(*error.T).mean()),
+        north, east, rmse_r, NSSDA_HORIZONTAL * rmse_r, float(np.hypot(rmse_r, of_survey)),
+    )  # fmt: skip
+
+
+def asprs_three_dimensional(horizontal: HorizontalAccuracy, vertical: VerticalAccuracy) -> float:
+    """RMSE_3D of ASPRS (2023): √(RMSE_H² + RMSE_V²) (m)."""
+    return float(np.hypot(horizontal.asprs_rmse, vertical.asprs_rmse))
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """What each control point's survey says against the adjustment without it; accuracy None where not observed."""
+
+    vertical: VerticalAccuracy | None
+    horizontal: HorizontalAccuracy | None
+    normalised: Float64
+    """(c, 3) north, east, down over their σ: standard normal where all is as stated; NaN where not observed."""
+
+
+def leave_one_out(control: ControlErrors) -> LeaveOneOut:
+    """Accuracy by leaving out one control coordinate at a time, from the one adjustment that there is.
+
+    Surveys that the adjustment rejected are left out of the figures, not of `normalised`.
+    """
+    kept = np.where(control.weight > 0.0, control.left_out_m, np.nan)
+    # Down is the height's negative; errors are surface minus survey.
+    upright, level = kept[:, _DOWN], -kept[:, :_DOWN]
+    return LeaveOneOut(
+        vertical_accuracy(upright) if np.isfinite(upright).any() else None,
+        horizontal_accuracy(level) if np.isfinite(level).all(axis=1).any() else None,
+        control.left_out_m / np.where(control.left_out_sigma_m > 0.0, control.left_out_sigma_m, np.nan),
+    )
+
+
+@dataclass(frozen=True)
+class MeanCorrections:
+    """By how much each run was moved as a whole."""
+
+    mean: Float64
+    """(runs, 6) mean of the corrections over the run's time (m, rad), `COMPONENTS`."""
+    normalised: Float64
+    """(runs, 6) over the σ that the run's process has for it; NaN where a component is not corrected. Several σ, alike
+    in all runs, are no error of navigation: control and trajectories are of two datums or frames."""
+
+
+def mean_corrections(adjustment: Adjustment) -> MeanCorrections:
+    """The mean correction of each run, held against its prior.
+
+    Control that is wrong as a whole contradicts nothing but the prior, so no single point is rejected for it.
+
+    Notes
+    -----
+    The mean over a time T of a process with σ, τ has the variance 2 σ² τ/T (1 − τ/T (1 − e^(−T/τ))).
+    """
+    mean = np.array([v.mean(axis=0) for v in adjustment.values])
+    sigma = np.zeros(mean.shape)
+    for run, prior in enumerate(adjustment.priors):
+        span = max((prior.last_gps_ns - prior.first_gps_ns) / NS_PER_S, 1e-9) / prior.taus_s
+        # (T/τ − (1 − e^(−T/τ))) / (T/τ)², 1/2 for a short run.
+        share = np.where(span > 1e-4, (span + np.expm1(-span)) / span**2, 0.5)
+        sigma[run] = prior.sigmas * np.sqrt(2.0 * share)
+    return MeanCorrections(mean, mean / np.where(adjustment.active, sigma, np.nan))
+
+
+@dataclass(frozen=True)
+class Sections:
+    """Figures of s sections of a road."""
+
+    first_station_m: Float64
+    """(s,) where each begins."""
+    count: Int64
+    """(s,) differences that it holds; no section is empty."""
+    rms_before_m: Float64
+    """(s,) of the differences between passes before the adjustment."""
+    rms_after_m: Float64
+    """(s,) after it."""
+
+
+def relative_accuracy(station_m: Float64, before_m: Float64, after_m: Float64, length_m: float = 100.0) -> Sections:
+    """How well passes agree, by section of the road.
+
+    Parameters
+    ----------
+    station_m : (n,) where each difference was found, along the road.
+    before_m, after_m : (n,) difference of two passes before and after the adjustment; where some were withheld from
+        it, those say more.
+    length_m : of a section.
+    """
+    number = np.floor(station_m / length_m).astype(np.int64)
+    sections, own = np.unique(number, return_inverse=True)
+    count = np.bincount(own, minlength=sections.size)
+    before, after = (np.sqrt(np.bincount(own, v**2, minlength=sections.size) / count) for v in (before_m, after_m))
+    first = sections.astype(np.float64) * length_m
+    return Sections(first, count.astype(np.int64), before.astype(np.float64), after.astype(np.float64))
+
+
+def _there(error_m: Float64, there: npt.NDArray[np.bool_]) -> Float64:
+    if not there.any():
+        raise ConfigError("no check point has an error", expected="at least one with a height or a place")
+    return error_m[there]
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,272 @@
+"""How far one picture lies from another: the best correlation, whether it is the only one, and the shift with its σ.
+
+The shift is that of least squares on the pictures (Lucas and Kanade 1981), with the slopes of both. Its covariance is
+made of two sums: the information, from products of one picture's slopes with the other's, to which noise in the slopes
+adds nothing, and the scatter of the scores (slope times residual) of blocks of cells, which counts whatever the noise
+is, whether cells are correlated, and where it is larger (White 1980, clustered).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.pictures import BLUR_CELLS, Picture
+from roadscan.kernels.adjust.correlation import Laid, correlate, lay_upon
+from roadscan.model.tie_settings import TieSettings
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+UNLIKE: Final = "pictures are not alike"
+AT_EDGE: Final = "best shift at the edge of the search"
+AMBIGUOUS: Final = "another shift fits as well"
+FEATURELESS: Final = "no direction is known well enough"
+
+_SAMPLES: Final = 2500
+"""About so many cells of the first picture are correlated."""
+_STEP: Final = 2
+"""Shifts of the search, in cells: the pictures are smooth over more than that."""
+_LEAST_SHARE: Final = 0.25
+_LOBE_CELLS: Final = 4.0
+"""Correlations this near to the best one, along what is known of the shift, belong to it."""
+_ROUNDS: Final = 12
+_DONE_CELLS: Final = 0.01
+_COARSE: Final = 3
+"""Every so-manieth cell is enough until a step is this short."""
+_NEAR_CELLS: Final = 0.05
+_ASTRAY_CELLS: Final = 4.0
+_HUBER: Final = 3.0
+_BLOCK_CELLS: Final = 8
+_INDEPENDENT: Final = 4.0 * math.pi * (BLUR_CELLS**2 + 1.0 / 6.0)
+"""Cells that count as one independent value: area under the correlation of smoothed noise (bilinear splat too)."""
+_SHARP: Final = 9
+"""An edge that leaves the axes by some degrees crosses the grid of the readings often enough to lie anywhere in it."""
+_PRIOR_BLOCKS: Final = 4.0
+"""So many blocks is the noise of the whole picture worth beside the scatter of the blocks."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """What the second picture says of its shift against the first."""
+
+    value_m: Float64
+    """(2,) along, across: a place of the first lies there in the second."""
+    directions: Float64
+    """(d, 2) unit vectors (along, across), d = 0, 1 or 2, in which it is known; components of it are independent."""
+    sigma_m: Float64
+    """(d,) 1 σ."""
+    felt_m: Float64
+    """(2,) along, across, from the middle of the picture: where the slopes are that it was felt by."""
+    correlation: float
+    count: int
+    """Cells in common."""
+    why_not: str = ""
+    """Test that it failed; empty where it passed."""
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Sums at one shift; components in the order (row, column), cells."""
+
+    step: Float64
+    """(2,) to the solution."""
+    common: Float64
+    """(2, 2) information of slopes that both pictures have."""
+    mean: Float64
+    """(2, 2) information of the mean slopes."""
+    score: Float64
+    """(n, 2) of cells: slope times residual."""
+    cell: Int64
+    """(2, n) row and column of each."""
+    expected: Float64
+    """(2, 2) covariance of the sum of scores if the noise were the same everywhere."""
+    felt: Float64
+    """(2,) row and column."""
+    aligned: float
+    """Share, 0 to 1, of the slopes that stand along or across the axes of the place, beyond those of any texture."""
+    correlation: float
+
+    @property
+    def scores(self) -> Float64:
+        """(2, 2) covariance of the sum of scores, from blocks, with a few blocks' worth of what is expected."""
+        row, column = self.cell // _BLOCK_CELLS
+        _, number = np.unique(row * 4096 + column, return_inverse=True)
+        sums = np.stack([np.bincount(number, self.score[:, k]) for k in (0, 1)], axis=-1)
+        squares = np.einsum("bi,bi->b", sums, sums)
+        blocks = float(squares.sum() ** 2 / max(float(squares @ squares), 1e-300))
+        return np.asarray((blocks * sums.T @ sums + _PRIOR_BLOCKS * self.expected) / (blocks + _PRIOR_BLOCKS))
+
+
+def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
+    """The shift between two pictures of one place in cells of `settings.shift_cell_m`."""
+    first, second = one.value, other.value
+    reach = int(settings.search_m / settings.shift_cell_m) // _STEP
+    shifts = _STEP * np.arange(-reach, reach + 1)
+    every = max(1, math.ceil(len(first) / math.sqrt(_SAMPLES)))
+    least = int(_LEAST_SHARE * (len(first) / every) ** 2)
+    likeness = np.empty((shifts.size, shifts.size))
+    correlate(first, second, every, shifts, shifts, least, likeness)
+    if not np.isfinite(likeness).any():
+        return _nothing(UNLIKE, math.nan)
+    row, column = np.unravel_index(int(np.nanargmax(likeness)), likeness.shape)
+    best = float(likeness[row, column])
+    if best < settings.least_correlation:
+        return _nothing(UNLIKE, best)
+    start = np.array([shifts[row], shifts[column]], dtype=np.float64)
+    found = _refined(first, second, start)
+    if found is None:
+        return _nothing(FEATURELESS, best)
+    place, sums = found
+    shift = _known(place, sums, one.sampling_m2 + other.sampling_m2, len(first), settings)
+    why = _why_not(likeness, shifts, start, shift, settings)
+    return replace(shift, why_not=why)
+
+
+def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, _Equations] | None:
+    """The shift (row, column; cells) of least squares near a start and the sums there; None where there is none."""
+    place, edge = start.copy(), len(first)
+    laid = Laid(np.empty((edge, edge)), np.empty((edge, edge, 2)), np.empty((edge, edge, 2)))
+    found, coarse = None, True
+    for turn in range(_ROUNDS):
+        lay_upon(first, second, float(place[0]), float(place[1]), laid)
+        sums = _equations(first, laid, _COARSE if coarse else 1)
+        if sums is None:
+            return None
+        # A direction without information does not move.
+        place = place + np.clip(sums.step, -1.0, 1.0)
+        if np.abs(place - start).max() > _ASTRAY_CELLS:
+            return None
+        moved = float(np.abs(sums.step).max())
+        if not coarse:
+            found = place, sums
+            if moved < _DONE_CELLS:
+                break
+        coarse = coarse and moved > _NEAR_CELLS and turn < _ROUNDS // 2
+    return found
+
+
+def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
+    """Sums over each `every`-th cell that both saw; offset, tilts and contrast between the pictures are eliminated."""
+    row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
+    if row.size < 64:
+        return None
+    left = laid.left[row, column]
+    own, other = laid.first_slope[row, column][:, ::-1], laid.second_slope[row, column][:, ::-1]
+    there = first[row, column] - left
+    half = 0.5 * len(first)
+    nuisance = np.stack([np.ones(row.size), row / half - 1.0, column / half - 1.0, there], axis=-1)
+    left, weight, sigma = _weighed(nuisance, left)
+    weighted = nuisance * weight[:, None]
+    stacked = np.concatenate([own, other], axis=1)
+    part = np.linalg.lstsq(weighted.T @ nuisance, weighted.T @ stacked, rcond=1e-12)[0]
+    slopes = stacked - nuisance @ part
+    own, other = slopes[:, :2], slopes[:, 2:]
+    mean_slope = 0.5 * (own + other)
+    mean = (mean_slope * weight[:, None]).T @ mean_slope
+    common = (own * weight[:, None]).T @ other
+    score = mean_slope * (weight * left)[:, None]
+    values, vectors = np.linalg.eigh(mean)
+    known = values > 1e-4 * max(values[1], 1e-300)
+    step = vectors[:, known] @ ((vectors[:, known].T @ score.sum(axis=0)) / values[known])
+    energy = np.einsum("ni,ni->n", mean_slope, mean_slope)
+    felt = np.array([energy @ row, energy @ column]) / max(energy.sum(), 1e-300)
+    # cos 4θ = cos² 2θ − sin² 2θ; its odd power is sharp, and 0 in the mean over all directions.
+    double = np.stack([mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2, 2.0 * mean_slope[:, 0] * mean_slope[:, 1]])
+    along_axes = (double[0] ** 2 - double[1] ** 2) / np.maximum(energy, 1e-300) ** 2
+    aligned = float(np.clip((energy * along_axes**_SHARP).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
+    a, b = first[row, column], there
+    a, b = a - a.mean(), b - b.mean()
+    correlation = float(a @ b / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-300))
+    expected = sigma**2 * _INDEPENDENT * mean
+    return _Equations(
+        step, 0.5 * (common + common.T), mean, score, np.stack([row, column]), expected, felt, aligned, correlation
+    )
+
+
+def _weighed(nuisance: Float64, left: Float64) -> tuple[Float64, Float64, float]:
+    """Residuals without offset, tilts and contrast; Huber's weights (n,); 1 σ of the residuals."""
+    weight = np.ones(left.size)
+    for _ in range(2):
+        weighted = nuisance * weight[:, None]
+        left = left - nuisance @ np.linalg.lstsq(weighted.T @ nuisance, weighted.T @ left, rcond=1e-12)[0]
+        sigma = math.sqrt(float(weight @ left**2) / float(weight.sum()))
+        weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(left), 1e-300))
+    return left, weight, sigma
+
+
+def _known(place: Float64, sums: _Equations, sampling_m2: Float64, edge: int, settings: TieSettings) -> Shift:
+    """The shift in metres, and the directions in which it is known."""
+    cell = settings.shift_cell_m
+    directions, sigma = _directions(sums, settings.coherence)
+    common = sums.aligned * np.einsum("di,ij,dj->d", directions, sampling_m2, directions)
+    sigma = np.sqrt((sigma * cell) ** 2 + common + settings.shift_floor_m**2)
+    good = sigma <= settings.most_shift_sigma_m
+    felt = (sums.felt + 0.5 - 0.5 * edge) * cell
+    why = "" if good.any() else FEATURELESS
+    return Shift(place * cell, directions[good], sigma[good], felt, sums.correlation, len(sums.score), why)
+
+
+def _directions(sums: _Equations, coherence: float) -> tuple[Float64, Float64]:
+    """Unit vectors (d, 2) of independent components of the shift and their σ (d,), cells.
+
+    With information `common` and scores of covariance S, the shift's error is common⁻¹ · score. Where one direction
+    holds more noise than slopes in common, only the component that the other one tells remains.
+    """
+    values, scores = np.linalg.eigvalsh(sums.mean), sums.scores
+    if values[1] <= 0.0:
+        return np.zeros((0, 2)), np.zeros(0)
+    steady = sums.mean + 1e-9 * values[1] * np.eye(2)
+    lower = np.linalg.inv(np.linalg.cholesky(steady))
+    share, turn = np.linalg.eigh(lower @ sums.common @ lower.T)
+    kept = (lower.T @ turn)[:, (share >= coherence)]
+    if kept.shape[1] == 2:
+        inverse = np.linalg.inv(sums.common)
+        variance, vectors = np.linalg.eigh(inverse @ scores @ inverse)
+        return vectors.T, np.sqrt(np.maximum(variance, 0.0))
+    along = sums.common @ kept
+    length = np.linalg.norm(along, axis=0)
+    variance = np.einsum("id,ij,jd->d", kept, scores, kept)
+    return (along / length).T, np.sqrt(np.maximum(variance, 0.0)) / length
+
+
+def _why_not(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, settings: TieSettings) -> str:
+    """The test that a shift fails: known at all, inside the search, and the only one along what is known of it."""
+    if shift.why_not:
+        return shift.why_not
+    if (np.abs(shift.directions @ (shift.value_m / settings.shift_cell_m)) > shifts[-1] - _STEP).any():
+        return AT_EDGE
+    if np.abs(start).max() >= shifts[-1] and len(shift.directions) == 2:
+        return AT_EDGE
+    best = np.nanmax(likeness)
+    rows, columns = np.nonzero(np.nan_to_num(likeness, nan=-1.0) >= settings.rival_share * best)
+    for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
+        away = shift.directions @ (np.array([shifts[r], shifts[c]]) - start)
+        if np.linalg.norm(away) > _LOBE_CELLS and _is_summit(likeness, r, c):
+            return AMBIGUOUS
+    return ""
+
+
+def _is_summit(likeness: Float64, row: int, column: int) -> bool:
+    """Whether no neighbour correlates better."""
+    around = likeness[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    return bool(likeness[row, column] >= np.nanmax(around))
+
+
+def _nothing(why_not: str, correlation: float) -> Shift:
+    return Shift(np.full(2, np.nan), np.zeros((0, 2)), np.zeros(0), np.zeros(2), correlation, 0, why_not)
+
+
+def disagree(one: Shift, other: Shift, limit: float) -> bool:
+    """Whether two shifts of one pair differ by more than `limit` σ in a direction that both know."""
+    for (u, s), (v, t) in itertools.product(
+        zip(one.directions, one.sigma_m, strict=True), zip(other.directions, other.sigma_m, strict=True)
+    ):
+        if abs(float(u @ v)) > 0.9 and abs(float(u @ (one.value_m - other.value_m))) > limit * math.hypot(s, t):
+            return True
+    return False

@@ -1,0 +1,61 @@
+"""One tie: what two traverses say about one direction at one place, and why it does not count if it does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.patches import PassReadings
+
+Float64 = npt.NDArray[np.float64]
+
+HEIGHT: Final = "height_tie"
+SHIFT: Final = "shift_tie"
+PLANE: Final = "plane_tie"
+
+COUNTS: Final = ""
+FEW_CELLS: Final = "too few cells in common"
+TOO_FAR: Final = "farther apart than the bound"
+TWO_SURFACES: Final = "too few cells agree"
+SCATTERED: Final = "cells scatter"
+STEEP: Final = "too steep"
+SAME_PASS: Final = "heads of one pass"
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of a tie: a point of the road and the pose that saw it."""
+
+    readings: PassReadings
+    pose: int
+    """Row of the pose."""
+    point_m: Float64
+    """(3,) easting, northing, height as the recorded pose places it."""
+
+
+@dataclass(frozen=True)
+class Tie:
+    """A measurement along one direction: the second end minus the first."""
+
+    kind: str
+    ends: tuple[End, End]
+    direction_level: Float64
+    """(3,) unit vector, north, east, down."""
+    value_m: float
+    sigma_m: float
+    count: int
+    """Cells or returns that it comes from."""
+    correlation: float
+    """Of the two pictures; NaN where none was compared."""
+    why_not: str = COUNTS
+    """Empty: it counts."""
+    group: int = 0
+    """Ties of one group of a place stand or fall together."""
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is taken for the adjustment."""
+        return self.why_not == COUNTS

@@ -1,0 +1,168 @@
+"""All ties of a place, as observations of the adjustment and as rows of the table `ties`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.height_ties import height_tie
+from roadscan.adjust.observations import KINDS, Observations, partials
+from roadscan.adjust.patches import PassReadings, patch_of
+from roadscan.adjust.places import Place
+from roadscan.adjust.plane_ties import plane_ties
+from roadscan.adjust.shift_ties import KINDS_OF_PICTURES, Pictures, shift_ties
+from roadscan.adjust.tie import SAME_PASS, Tie
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.tie_settings import TieSettings
+
+Float64 = npt.NDArray[np.float64]
+
+_PARTNERS: Final = 2
+"""Traverses that each one is tied to: with all their pairs, many passes of a place would say the same many times."""
+_GROUPS: Final = 1 + KINDS_OF_PICTURES
+"""Groups of a pair: its height, and the shift of each kind of picture."""
+
+
+@dataclass(frozen=True)
+class Ties:
+    """Ties of one or many places, those too that do not count."""
+
+    observations: Observations
+    """(n) of all ties; `observed_m` NaN where nothing could be measured."""
+    columns: dict[str, npt.NDArray[Any]]
+    """(n,) columns of the table `ties`; runs are indices here, and what could not be measured is NaN or infinite."""
+
+    @property
+    def accepted(self) -> npt.NDArray[np.bool_]:
+        """(n,) ties that count."""
+        return np.asarray(self.columns["accepted"] == 1)
+
+    def counted(self) -> Observations:
+        """Observations of the ties that count, for the adjustment."""
+        return self.observations.chosen(self.accepted)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """All of them, in order; groups are numbered anew."""
+        if not parts:
+            return cls(Observations.none(), _columns([], Observations.none()))
+        observations = Observations.joined([p.observations for p in parts])
+        columns = {name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns}
+        return cls(observations, columns | {"group": observations.group})
+
+
+def ties_at(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> Ties:
+    """Ties between the traverses of a place.
+
+    Parameters
+    ----------
+    place : with a number that no other place has.
+    readings : of each traverse, in the order of the place's; one without a reading there makes no tie.
+    settings : cells, tests, what the σ are made of.
+
+    Returns
+    -------
+    One row a tie, also for those that do not count.
+    """
+    dense = [one for one in readings if not one.returns]
+    patches = [patch_of(place, one, settings.cell_m, settings.least_readings) for one in dense]
+    pictures = Pictures([p for p in patches if p is not None], settings)
+    found: list[Tie] = []
+    for number, (a, b) in enumerate(pairs_of(len(pictures.patches))):
+        found += [replace(tie, group=_GROUPS * number + tie.group) for tie in _of_pair(pictures, a, b)]
+    planes = plane_ties(place, [one for one in readings if one.returns], settings)
+    above = 1 + max((tie.group for tie in found), default=0)
+    return as_ties(place, [*shared(found), *(replace(tie, group=above + tie.group) for tie in planes)])
+
+
+def pairs_of(count: int) -> list[tuple[int, int]]:
+    """Pairs in a ring of so many traverses, first before second: each is tied to two others, and loops close."""
+    ring = [(k, (k + 1) % count) for k in range(count)] if count > _PARTNERS else [(0, 1)] * (count == _PARTNERS)
+    return sorted((min(pair), max(pair)) for pair in ring)
+
+
+def _of_pair(pictures: Pictures, a: int, b: int) -> list[Tie]:
+    """Ties of two patches; those of heads that passed together do not count for the poses."""
+    first, second = pictures.patches[a], pictures.patches[b]
+    height = height_tie(first, second, pictures.settings)
+    # Where not even the heights agree, what would be matched is no road.
+    found = [height, *(shift_ties(pictures, a, b) if height.counts else ())]
+    apart_s = abs(first.epoch_gps_ns - second.epoch_gps_ns) / NS_PER_S
+    if first.readings.run == second.readings.run and apart_s < pictures.settings.return_s:
+        return [replace(tie, why_not=tie.why_not or SAME_PASS) for tie in found]
+    return found
+
+
+def shared(ties: Sequence[Tie]) -> list[Tie]:
+    """The ties, those that count weakened where there are more than needed: q ties of m traverses say m − 1 things."""
+    out = list(ties)
+    for kind in KINDS:
+        counting = [k for k, tie in enumerate(out) if tie.kind == kind and tie.counts]
+        traverses = {id(end.readings) for k in counting for end in out[k].ends}
+        pairs = {(id(out[k].ends[0].readings), id(out[k].ends[1].readings)) for k in counting}
+        weaker = math.sqrt(max(len(pairs) / max(len(traverses) - 1, 1), 1.0))
+        for k in counting:
+            out[k] = replace(out[k], sigma_m=out[k].sigma_m * weaker)
+    return out
+
+
+def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
+    """Observations and columns of ties of one place."""
+    if not found:
+        return Ties.joined([])
+    n = len(found)
+    derivatives = np.zeros((n, 2, 6))
+    for k, tie in enumerate(found):
+        for side, end in enumerate(tie.ends):
+            pose = np.array([end.pose])
+            arm = end.readings.arm_body_m(end.point_m[None], pose)
+            sign = 1.0 - 2.0 * side
+            derivatives[k, side] = sign * partials(
+                tie.direction_level[None], end.readings.level_from_body[pose], arm
+            )[0]  # fmt: skip
+    observations = Observations(
+        np.array([KINDS.index(t.kind) for t in found], np.uint8),
+        np.array([[e.readings.run for e in t.ends] for t in found], np.int32),
+        np.array([[e.readings.epoch_gps_ns[e.pose] for e in t.ends] for t in found], np.int64),
+        derivatives,
+        np.array([t.value_m for t in found]),
+        np.array([t.sigma_m for t in found]),
+        np.array([t.group for t in found], np.int64),
+        np.full(n, place.number, np.int64),
+    )
+    return Ties(observations, _columns(found, observations))
+
+
+def _columns(found: Sequence[Tie], observations: Observations) -> dict[str, npt.NDArray[Any]]:
+    """Columns of the table, with runs as indices."""
+    point = np.array([t.ends[0].point_m for t in found]).reshape(-1, 3)
+    direction = np.array([t.direction_level for t in found]).reshape(-1, 3)
+    sensors = [[e.readings.sensor for e in t.ends] for t in found]
+    return {
+        "place": observations.place,
+        "group": observations.group,
+        "kind": np.array([t.kind for t in found], dtype=object),
+        "first_run": observations.run[:, 0],
+        "first_sensor": np.array([s[0] for s in sensors], dtype=object),
+        "first_epoch_gps_ns": observations.epoch_gps_ns[:, 0],
+        "second_run": observations.run[:, 1],
+        "second_sensor": np.array([s[1] for s in sensors], dtype=object),
+        "second_epoch_gps_ns": observations.epoch_gps_ns[:, 1],
+        "easting_m": point[:, 0],
+        "northing_m": point[:, 1],
+        "height_m": point[:, 2],
+        "direction_north": direction[:, 0],
+        "direction_east": direction[:, 1],
+        "direction_down": direction[:, 2],
+        "value_m": observations.observed_m,
+        "sigma_m": observations.sigma_m,
+        "count": np.array([t.count for t in found], np.int32),
+        "correlation": np.array([t.correlation for t in found], np.float64),
+        "accepted": np.array([t.counts for t in found], np.uint8),
+        "why_not": np.array([t.why_not for t in found], dtype=object),
+    }

@@ -1,0 +1,240 @@
+"""The unknowns of an adjustment, and its observations as rows of them.
+
+Unknowns are in units of their prior σ: corrections of each run's components at its knots, then the errors of the
+surveyed coordinates of control points (north, east, down), which all runs that saw a point share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.observations import COMPONENTS, FIXED, Observations
+from roadscan.adjust.process import RunPrior, knots_of, line_variance, precision_of
+from roadscan.adjust.sparse_normal import Rows
+from roadscan.model.errors import ConfigError
+from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_SIZE = len(COMPONENTS)
+_DOWN = 2
+_ALONG = 0.5
+"""A direction with so much of an axis tells of the σ of that coordinate; every direction has it of one or two."""
+HEIGHT_ALONE = np.arange(_SIZE) == _DOWN
+"""Components that a vertical adjustment corrects."""
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """c control points as the adjustment sees them; where each run is adjusted alone, one for each run that saw it."""
+
+    place: Int64
+    """(c,) number of the point."""
+    run: Int64
+    """(c,) run that it stands for, −1: all."""
+    sigma_m: Float64
+    """(c, 3) of its survey, north, east, down; 0 where no observation tells of the coordinate."""
+    of_observation: Int64
+    """(n,) point of each observation, −1: none."""
+
+    @classmethod
+    def of(cls, observations: Observations, *, each_pass: bool) -> ControlPoints:
+        """The points whose survey has a σ."""
+        moving = observations.run.max(axis=1, initial=FIXED)
+        seen = (observations.run == FIXED).any(axis=1) & (observations.survey_sigma_m > 0.0)
+        run = np.where(each_pass, moving, FIXED)
+        keys = np.stack([observations.place, run], axis=1)[seen]
+        points, own = np.unique(keys.reshape(-1, 2), axis=0, return_inverse=True)
+        index = np.full(observations.size, -1, np.int64)
+        index[seen] = own.ravel()
+        sigma = np.zeros((len(points), 3))
+        along = np.abs(directions_of(observations)[seen]) >= _ALONG
+        for axis in range(3):
+            which = along[:, axis]
+            np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
+        return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, index)
+
+
+def directions_of(observations: Observations) -> Float64:
+    """Direction (n, 3) of each observation, north-east-down: derivative by the position of its moving end."""
+    moving = np.where(observations.run[:, 0] != FIXED, 0, 1)
+    return np.asarray(observations.partials[np.arange(observations.size), moving, :3])
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Where each unknown stands."""
+
+    priors: tuple[RunPrior, ...]
+    knots: tuple[Int64, ...]
+    """Epochs of each run's knots."""
+    sigmas: Float64
+    """(runs, 6) stationary σ, 0 where a component is not estimated."""
+    control: ControlPoints
+
+    @classmethod
+    def of(
+        cls, priors: Sequence[RunPrior], control: ControlPoints, spacing_s: float, components: npt.NDArray[np.bool_]
+    ) -> Unknowns:
+        """Knots at most `spacing_s` apart; only some components are estimated."""
+        sigmas = np.array([p.sigmas for p in priors]).reshape(-1, _SIZE) * components
+        return cls(tuple(priors), tuple(knots_of(p, spacing_s) for p in priors), sigmas, control)
+
+    @cached_property
+    def first(self) -> Int64:
+        """(runs + 1,) the first unknown of each run; the last is that of the control points."""
+        sizes = [k.size * int((s > 0.0).sum()) for k, s in zip(self.knots, self.sigmas, strict=True)]
+        return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return int(self.first[-1]) + int((self.control.sigma_m > 0.0).sum())
+
+    @cached_property
+    def of_control(self) -> Int64:
+        """(c, 3) unknown of each coordinate of the control points, −1: none."""
+        there = self.control.sigma_m > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first[-1] + np.arange(int(there.sum()))
+        return numbers
+
+    def of_run(self, run: int) -> Int64:
+        """(k, 6) unknown of each knot and component of a run, −1: none."""
+        active = self.sigmas[run] > 0.0
+        numbers = np.full((self.knots[run].size, _SIZE), -1, np.int64)
+        count = self.knots[run].size * int(active.sum())
+        numbers[:, active] = self.first[run] + np.arange(count).reshape(self.knots[run].size, int(active.sum()))
+        return numbers
+
+    def intervals(self, run: int, epochs_gps_ns: Int64) -> tuple[Int64, Float64, Float64]:
+        """Knot before each epoch (n,), share of the way to the next, 0 to 1, and the step between them (s)."""
+        knots = self.knots[run]
+        if knots.size == 1:
+            return np.zeros(epochs_gps_ns.size, np.int64), np.zeros(epochs_gps_ns.size), np.zeros(epochs_gps_ns.size)
+        before = np.clip(np.searchsorted(knots, epochs_gps_ns, side="right") - 1, 0, knots.size - 2)
+        step = knots[before + 1] - knots[before]
+        share = np.clip((epochs_gps_ns - knots[before]) / step, 0.0, 1.0)
+        return before, share, step / NS_PER_S
+
+    def rows(self, observations: Observations, point: Int64) -> tuple[Rows, Float64]:
+        """Rows of the observations (m per unit of each unknown), and the variance (n, 6) that lines between knots add.
+
+        That variance, a share for each component, is exact for one observation; those of neighbouring ones are taken
+        as independent.
+
+        Parameters
+        ----------
+        point : (n,) control point of each observation, −1: none.
+        """
+        n = observations.size
+        unknown = np.full((n, 4 * _SIZE + 3), -1, np.int64)
+        derivative, variance = np.zeros((n, 4 * _SIZE + 3)), np.zeros((n, _SIZE))
+        for run in range(len(self.priors)):
+            numbers, sigma, taus = self.of_run(run), self.sigmas[run], self.priors[run].taus_s
+            for end in (0, 1):
+                here = np.flatnonzero(observations.run[:, end] == run)
+                before, share, step_s = self.intervals(run, observations.epoch_gps_ns[here, end])
+                scaled = observations.partials[here, end] * sigma
+                after = np.minimum(before + 1, len(numbers) - 1)
+                for side, (knot, weight) in enumerate(((before, 1.0 - share), (after, share))):
+                    at = slice((2 * end + side) * _SIZE, (2 * end + side + 1) * _SIZE)
+                    unknown[here, at], derivative[here, at] = numbers[knot], scaled * weight[:, None]
+                variance[here] += scaled**2 * line_variance(share[:, None], step_s[:, None], taus)
+        seen = point >= 0
+        unknown[seen, -3:] = self.of_control[point[seen]]
+        derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
+        return Rows.of(unknown, derivative), variance
+
+    def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
+        """Upper entries of the prior's inverse covariance: row, column, value, component (control: `len(COMPONENTS)`).
+
+        Those of control points are not among them: their survey is an observation, which may be wrong.
+        """
+        parts: list[tuple[Int64, Int64, Float64, Int64]] = []
+        for run, prior in enumerate(self.priors):
+            numbers = self.of_run(run)
+            for component in np.flatnonzero(self.sigmas[run] > 0.0):
+                diagonal, beside = precision_of(self.knots[run], prior.processes[component].tau_s)
+                own = numbers[:, component]
+                row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
+                value = np.concatenate([diagonal, beside])
+                parts.append((row, column, value, np.full(row.size, component, np.int64)))
+        if not parts:
+            empty = np.zeros(0, np.int64)
+            return empty, empty, np.zeros(0), empty
+        rows, columns, values, components = zip(*parts, strict=True)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values), np.concatenate(components)
+
+    def wanted_pairs(self) -> tuple[Int64, Int64]:
+        """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point."""
+        parts = [_pairs(self.of_control, self.of_control)]
+        for run in range(len(self.priors)):
+            numbers = self.of_run(run)
+            parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]
+        first, second = (np.concatenate(p) for p in zip(*parts, strict=True))
+        return np.minimum(first, second), np.maximum(first, second)
+
+    def check(self, observations: Observations) -> None:
+        """Refuse observations that no run explains.
+
+        Raises
+        ------
+        ConfigError
+            for an end of a run that is not among the priors, or at an epoch outside of its run, what is not a number,
+            and where there is nothing to correct.
+        """
+        if self.first[-1] == 0:
+            raise ConfigError(
+                "no component of any run is to be corrected",
+                expected="a process with σ above 0 for one component or more",
+            )
+        for end in (0, 1):
+            run = observations.run[:, end]
+            strange = np.flatnonzero((run < FIXED) | (run >= len(self.priors)))
+            if strange.size:
+                raise ConfigError(
+                    f"an observation of run number {run[strange[0]]}",
+                    expected=f"0 to {len(self.priors) - 1}, or {FIXED} for control",
+                    record=int(strange[0]),
+                )
+            for number, prior in enumerate(self.priors):
+                here = np.flatnonzero(run == number)
+                epoch = observations.epoch_gps_ns[here, end]
+                outside = here[(epoch < prior.first_gps_ns) | (epoch > prior.last_gps_ns)]
+                if outside.size:
+                    raise ConfigError(
+                        f"an observation of run '{prior.run}' at "
+                        f"{iso_from_gps_ns(int(observations.epoch_gps_ns[outside[0], end]))}",
+                        expected=f"{iso_from_gps_ns(prior.first_gps_ns)} to {iso_from_gps_ns(prior.last_gps_ns)}",
+                        record=int(outside[0]),
+                    )
+        _refuse_strange_values(observations)
+
+
+def _refuse_strange_values(observations: Observations) -> None:
+    """Refuse a σ that is not positive, and what is not a number."""
+    sound = np.isfinite(observations.observed_m) & np.isfinite(observations.partials).all(axis=(1, 2))
+    sound &= np.isfinite(observations.sigma_m) & (observations.sigma_m > 0.0)
+    sound &= np.isfinite(observations.survey_sigma_m) & (observations.survey_sigma_m >= 0.0)
+    bad = np.flatnonzero(~sound)
+    if bad.size:
+        raise ConfigError(
+            f"an observation of {observations.observed_m[bad[0]]:g} m with σ {observations.sigma_m[bad[0]]:g} m",
+            expected="finite numbers, σ above 0",
+            record=int(bad[0]),
+        )
+
+
+def _pairs(first: Int64, second: Int64) -> tuple[Int64, Int64]:
+    """All pairs of unknowns of the same row of two tables (k, a), without those that are −1."""
+    i = np.broadcast_to(first[:, :, None], (*first.shape, second.shape[1]))
+    j = np.broadcast_to(second[:, None, :], i.shape)
+    there = (i >= 0) & (j >= 0)
+    return i[there], j[there]

@@ -1,0 +1,84 @@
+"""How much each observation counts: Huber's weights first, then IGG III of residuals that leave their group out.
+
+Huber's function (1964) has one minimum, so the start does not matter, but a false observation keeps some pull. From
+there, IGG III (Yang 1994) takes away all of it from what lies beyond a limit. Its statistic is the residual of a
+prediction made without the observation over that prediction's σ, which holds as well for an observation that no
+longer counts: one that was rejected because of a false neighbour comes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.navigation.calibration.robust import length_limit
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+HUBER_LIMIT: Final = 1.5
+"""In units of σ: 95 % efficient or more where all is normal."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What the others say of each observation."""
+
+    residual: Float64
+    """(n,) observed minus predicted without it."""
+    variance: Float64
+    """(n,) of that prediction."""
+    statistic: Float64
+    """(n,) residual over its σ: standard normal where all is as stated."""
+    redundancy: Float64
+    """(n,) share of an error of the observation that its residual shows; 1 where it does not count."""
+
+
+def left_out(residual: Float64, variance: Float64, own: Float64, weight: Float64) -> LeftOut:
+    """Residuals without the observation itself, from those with it (Cook & Weisberg 1982, 2.2).
+
+    Parameters
+    ----------
+    residual : (n,) observed minus computed.
+    variance : (n,) of the computed value.
+    own : (n,) variance of the observation as stated.
+    weight : (n,) that it counts with, 0 to 1.
+    """
+    redundancy = np.maximum(1.0 - weight * variance / own, 1e-12)
+    without, predicted = residual / redundancy, variance / redundancy
+    return LeftOut(without, predicted, without / np.sqrt(own + predicted), redundancy)
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Observations that stand or fall together."""
+
+    of_row: Int64
+    """(n,) group of each, 0 to the last."""
+
+    def lengths(self, statistic: Float64) -> tuple[Float64, Int64]:
+        """Root of the summed squares of each row's group, and the group's rows."""
+        count = np.bincount(self.of_row)
+        total = np.bincount(self.of_row, statistic**2)
+        return np.sqrt(total)[self.of_row], count[self.of_row]
+
+    def huber(self, statistic: Float64) -> Float64:
+        """Huber's weights."""
+        length, rows = self.lengths(statistic)
+        return np.minimum(1.0, _limits(HUBER_LIMIT, rows) / np.maximum(length, 1e-300))
+
+    def igg_iii(self, statistic: Float64, whole: float, reject: float) -> Float64:
+        """Weights of IGG III: 1 up to `whole` σ, 0 from `reject` σ on."""
+        length, rows = self.lengths(statistic)
+        near, far = _limits(whole, rows), _limits(reject, rows)
+        slope = (far - np.minimum(length, far)) / (far - near)
+        return np.where(length <= near, 1.0, near / np.maximum(length, near) * slope**2)
+
+
+def _limits(limit: float, rows: Int64) -> Float64:
+    """Of each row: what the length of its group exceeds as rarely as one standard normal number exceeds `limit`."""
+    by_rows = np.array([length_limit(limit, max(int(n), 1)) for n in range(int(rows.max(initial=0)) + 1)])
+    return by_rows[rows]

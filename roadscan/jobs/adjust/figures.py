@@ -1,0 +1,148 @@
+"""What an adjustment says of its evidence and of accuracy, as rows of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.control import Sighting, moved_m
+from roadscan.adjust.places import Track
+from roadscan.adjust.publish import left_after
+from roadscan.adjust.quality import (
+    HorizontalAccuracy,
+    VerticalAccuracy,
+    horizontal_accuracy,
+    relative_accuracy,
+    vertical_accuracy,
+)
+from roadscan.jobs.adjust.solution import Evidence, Solution
+from roadscan.navigation.trajectory import Corrections
+
+Float64 = npt.NDArray[np.float64]
+Rows = list[dict[str, Any]]
+Held = Mapping[str, Corrections]
+
+
+def tie_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
+    """Of the table `tie_residuals`."""
+    ties = evidence.ties
+    after = left_after(ties.observations, held, evidence.runs)
+    names = ("place", "kind", "first_run", "second_run", "easting_m", "northing_m", "accepted", "sigma_m")
+    columns = {name: np.asarray(ties.columns[name]).tolist() for name in names}
+    columns |= {"before_m": ties.observations.observed_m.tolist(), "after_m": after.tolist()}
+    columns["weight"] = solution.tie_weight.tolist()
+    return _rows(columns)
+
+
+def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held) -> Rows:
+    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run."""
+    ties = evidence.ties
+    own = ties.accepted
+    observations = ties.observations.chosen(own)
+    after = left_after(observations, held, evidence.runs)
+    kinds = np.asarray(ties.columns["kind"])[own]
+    rows: Rows = []
+    for number in np.unique(observations.run[:, 0]).tolist():
+        track = next(t for t in tracks if t.run == number)
+        moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
+        station = np.concatenate([[0.0], np.cumsum(moved)])
+        since = (observations.epoch_gps_ns[:, 0] - track.epoch_gps_ns[0]).astype(np.float64)
+        at = np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station)
+        for kind in sorted(set(kinds.tolist())):
+            here = (observations.run[:, 0] == number) & (kinds == kind)
+            if not here.any():
+                continue
+            sections = relative_accuracy(at[here], observations.observed_m[here], after[here])
+            columns = {
+                "first_station_m": sections.first_station_m.tolist(),
+                "count": sections.count.tolist(),
+                "rms_before_m": sections.rms_before_m.tolist(),
+                "rms_after_m": sections.rms_after_m.tolist(),
+            }
+            rows += [{"run": evidence.runs[number], "kind": kind, **row} for row in _rows(columns)]
+    return rows
+
+
+def control_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
+    """Of the table `control_residuals`."""
+    return [_control_row(one, evidence, solution, held) for one in evidence.sightings]
+
+
+def _control_row(one: Sighting, evidence: Evidence, solution: Solution, held: Held) -> dict[str, Any]:
+    point, run = one.point, evidence.runs[one.run]
+    moved = moved_m(one, held.get(run))
+    height = point.height_m - one.height_m
+    east, north = point.easting_m - one.easting_m, point.northing_m - one.northing_m
+    own = solution.point(point.number, one.run) if point.role == "gcp" else None
+    numbers: dict[str, float] = {
+        "height_before_m": height,
+        "height_after_m": height - moved[2],
+        "sigma_height_m": float(np.hypot(one.sigma_height_m, point.sigma_height_m)),
+        "easting_before_m": east,
+        "easting_after_m": east - moved[0],
+        "northing_before_m": north,
+        "northing_after_m": north - moved[1],
+        "sigma_horizontal_m": float(np.hypot(np.sqrt(np.trace(one.covariance_m2) / 2), point.sigma_horizontal_m)),
+    }
+    if own is not None:
+        numbers |= {
+            "weight_height": own.weight_height,
+            "weight_horizontal": own.weight_horizontal,
+            "left_out_height_m": own.left_out_height_m,
+            "left_out_sigma_m": float(own.left_out_sigma_m[2]),
+        }
+    refused = own is not None and own.weight_height == 0.0
+    named: dict[str, Any] = {
+        "point": point.number, "name": point.name, "role": point.role, "run": run, "epoch_gps_ns": one.epoch_gps_ns,
+        "easting_m": point.easting_m, "northing_m": point.northing_m, "status": one.status,
+        "why_not": one.why_not or ("its height contradicts all other evidence" if refused else ""),
+    }  # fmt: skip
+    return named | {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
+
+
+def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
+    """Of the table `absolute_accuracy`, from rows of `control_residuals`."""
+    found: Rows = []
+    checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True) if row["role"] == "check"]
+    for poses, word in (("recorded", "before"), ("adjusted", "after")):
+        upright = [(row[f"height_{word}_m"], one.point.sigma_height_m) for row, one in checks]
+        known = np.array([[-value, sigma] for value, sigma in upright if value is not None]).reshape(-1, 2)
+        if len(known):
+            found.append(_accuracy("check", "height", poses, vertical_accuracy(known[:, 0], known[:, 1])))
+        level = [
+            [-row[f"northing_{word}_m"], -row[f"easting_{word}_m"], one.point.sigma_horizontal_m]
+            for row, one in checks
+            if row[f"northing_{word}_m"] is not None
+        ]
+        if level:
+            errors = np.array(level)
+            accuracy = horizontal_accuracy(errors[:, :2], errors[:, 2:])
+            found.append(_accuracy("check", "horizontal", poses, accuracy))
+    left = solution.left_out
+    if left is not None and left.vertical is not None:
+        found.append(_accuracy("left_out", "height", "adjusted", left.vertical))
+    if left is not None and left.horizontal is not None:
+        found.append(_accuracy("left_out", "horizontal", "adjusted", left.horizontal))
+    return found
+
+
+def _accuracy(
+    points: str, component: str, poses: str, figures: VerticalAccuracy | HorizontalAccuracy
+) -> dict[str, Any]:  # fmt: skip
+    named = {"points": points, "component": component, "poses": poses, "count": figures.count}
+    if isinstance(figures, VerticalAccuracy):
+        own = {"mean_m": figures.mean, "rmse_m": figures.rmse, "largest_m": figures.largest}
+    else:
+        own = {"mean_m": float(np.hypot(figures.mean_north, figures.mean_east)), "rmse_m": figures.rmse_r}
+    return {
+        **named, **own, "mean_absolute_m": figures.mean_absolute, "nssda_95_m": figures.nssda_95,
+        "asprs_rmse_m": figures.asprs_rmse,
+    }  # fmt: skip
+
+
+def _rows(columns: Mapping[str, list[Any]]) -> Rows:
+    names = list(columns)
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns.values(), strict=True)]

@@ -1,0 +1,58 @@
+"""Stage `adjust`: corrections of the poses, from passes that overlap and from ground control."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.jobs.adjust.adjustment import adjust_survey, is_current, withdraw
+from roadscan.jobs.adjust.outcome import FOLDER, TABLES, known_lines, known_notes
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.tiles.footprints import index_footprints
+from roadscan.model.errors import ConfigError, RoadscanError
+from roadscan.model.survey import Survey
+from roadscan.tables.schema import table_schema
+
+
+class Adjust(Stage):
+    """Evidence is a file some places or a point; corrections are a small table that navigation applies."""
+
+    name = "adjust"
+    title = "corrections of the poses, from passes that overlap and from ground control"
+    after = ("footprints",)
+
+    def run(self, session: Session) -> None:
+        """Adjust where evidence, settings or code are others than those of the last solution."""
+        if is_current(session.plan, session.manifest):
+            return
+        if session.survey.config.adjust.on:
+            adjust_survey(session)
+        else:
+            withdraw(session)
+        session.renew("plan")
+        # Corrections beyond what footprints leave room for make these anew, and nothing else does.
+        found = index_footprints(session.plan, session.manifest, session.compute, session.bar("footprints"))
+        session.renew("footprints")
+        session.failed(self.name, found)
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Whether the file of picked targets is there."""
+        picked = survey.config.adjust.targets.picked
+        file = None if picked is None else survey.resolve(picked)
+        if file is None or not survey.config.adjust.on or file.is_file():
+            return []
+        return [ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)]
+
+    def state(self, session: Session) -> StageState:
+        """Whether the corrections are those of the survey as it is, and what they are worth."""
+        due = int(not is_current(session.plan, session.manifest))
+        notes = known_notes(session.manifest)
+        if due and session.survey.config.adjust.on:
+            notes = [*notes, "the adjustment is due: it may make more tiles stale than these"]
+        lines = known_lines(session.manifest)
+        return StageState(1 - due, due, next_run={self.name: due}, notes=notes, lines=lines)
+
+    def folders(self) -> Sequence[str]:
+        """Evidence, tables of the outcome, pictures."""
+        locations = [table_schema(name).location for name in ("ties", "control_sightings", *TABLES)]
+        return [*(location for location in locations if location is not None), FOLDER]

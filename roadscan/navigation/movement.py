@@ -1,0 +1,77 @@
+"""How far corrections move poses, and how far they are allowed to before what rests on recorded poses is made anew."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.navigation.trajectory import Corrections
+
+_LEAST_SHIFT_M: Final = 0.05
+_LEAST_TURN_RAD: Final = 0.0005
+_STEP: Final = 4.0
+_MOST_STEPS: Final = 8
+
+
+class Allowance(NamedTuple):
+    """Corrections that bounds on recorded poses leave room for: none larger than this."""
+
+    shift_m: float
+    """Horizontally. A movement straight up or down changes no place on the map."""
+    turn_rad: float
+    """Angle of the small rotation."""
+
+    @property
+    def is_none(self) -> bool:
+        """True where the poses hold as they were recorded."""
+        return self.shift_m == 0.0 and self.turn_rad == 0.0
+
+    def moved_m(self, arm_m: float) -> float:
+        """How far a point may move on the ground that lies `arm_m` from the body's origin (m).
+
+        Between its knots the corrected trajectory is not the recorded one with a correction that is linear in time: it
+        is interpolated through corrected knots. With even knots that swings over by at most 3/8 of the largest
+        correction (cubic Hermite with slopes through five knots: |slope| ≤ 1.5 per knot, times u (1 − u) ≤ 1/4), with
+        uneven ones by more, where corrections change from one knot to the next by as much as they are. So twice the
+        correction is left room for.
+        """
+        return 2.0 * (self.shift_m + self.turn_rad * arm_m)
+
+
+NO_CORRECTION: Final = Allowance(0.0, 0.0)
+
+
+def allowance_for(corrections: Corrections | None) -> Allowance:
+    """The least allowance that covers corrections, in steps of four from 0.05 m and 0.5 mrad on.
+
+    The first step is left room for where there are none yet: most corrections to come stay within it.
+
+    Parameters
+    ----------
+    corrections : of one run; None where it has none.
+
+    Raises
+    ------
+    ValueError
+        where corrections are beyond all reason (819 m, 8 rad).
+    """
+    shift, turn = largest(corrections)
+    return Allowance(_step(shift, _LEAST_SHIFT_M), _step(turn, _LEAST_TURN_RAD))
+
+
+def largest(corrections: Corrections | None) -> tuple[float, float]:
+    """Largest horizontal shift (m) and turn (rad) of corrections."""
+    if corrections is None or corrections.epochs_gps_ns.size == 0:
+        return 0.0, 0.0
+    shift: npt.NDArray[np.float64] = np.hypot(*corrections.north_east_down_m[:, :2].T)
+    turn = np.linalg.norm(corrections.roll_pitch_heading_rad, axis=1)
+    return float(shift.max()), float(turn.max())
+
+
+def _step(value: float, least: float) -> float:
+    for number in range(_MOST_STEPS):
+        if value <= least * _STEP**number:
+            return least * _STEP**number
+    raise ValueError(f"a correction of {value:g}")

@@ -1,0 +1,97 @@
+"""Figures of accuracy against a published example, by hand, and against drawn errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roadscan.adjust.adjustment import AdjustmentSettings, ControlErrors, adjust
+from roadscan.adjust.observations import Observations
+from roadscan.adjust.process import GaussMarkov, RunPrior
+from roadscan.adjust.quality import (
+    asprs_three_dimensional,
+    horizontal_accuracy,
+    leave_one_out,
+    mean_corrections,
+    relative_accuracy,
+    vertical_accuracy,
+)
+from roadscan.model.errors import ConfigError
+
+
+def test_vertical_figures_by_hand() -> None:
+    found = vertical_accuracy(np.array([0.03, -0.01, 0.02, np.nan, -0.04]), 0.01)
+    assert found.count == 4
+    assert found.mean == pytest.approx(0.0)
+    assert found.mean_absolute == pytest.approx(0.025)
+    assert found.rmse == pytest.approx(np.sqrt(0.003 / 4))
+    assert found.standard_deviation == pytest.approx(np.sqrt(0.003 / 3))
+    assert found.largest == pytest.approx(0.04)
+    assert found.nssda_95 == pytest.approx(1.96 * np.sqrt(0.003 / 4))
+    assert found.asprs_rmse == pytest.approx(np.sqrt(0.003 / 4 + 0.0001))
+
+
+def test_95_of_100_normal_errors_lie_within_what_nssda_states() -> None:
+    rng = np.random.default_rng(1)
+    upright, level = 0.004 * rng.standard_normal(200_000), 0.01 * rng.standard_normal((200_000, 2))
+    assert np.mean(np.abs(upright) <= vertical_accuracy(upright).nssda_95) == pytest.approx(0.95, abs=0.002)
+    assert np.mean(np.hypot(*level.T) <= horizontal_accuracy(level).nssda_95) == pytest.approx(0.95, abs=0.002)
+    # Mean absolute and mean length of normal errors: σ √(2/π) and σ √(π/2).
+    assert vertical_accuracy(upright).mean_absolute == pytest.approx(0.004 * np.sqrt(2 / np.pi), rel=0.01)
+    assert horizontal_accuracy(level).mean_absolute == pytest.approx(0.01 * np.sqrt(np.pi / 2), rel=0.01)
+
+
+def test_horizontal_figures_by_hand() -> None:
+    found = horizontal_accuracy(np.array([[0.03, 0.04], [-0.03, 0.04], [np.nan, 0.0]]), 0.002)
+    assert (found.count, found.mean_north, found.mean_east) == (2, pytest.approx(0.0), pytest.approx(0.04))
+    assert (found.rmse_north, found.rmse_east, found.rmse_r) == pytest.approx((0.03, 0.04, 0.05))
+    assert found.mean_absolute == pytest.approx(0.05)
+    assert found.asprs_rmse == pytest.approx(np.sqrt(0.05**2 + 2 * 0.002**2))
+    vertical = vertical_accuracy(np.array([0.01, -0.01]))
+    assert asprs_three_dimensional(found, vertical) == pytest.approx(np.sqrt(0.0025 + 8e-6 + 1e-4))
+
+
+def test_no_check_point_is_no_figure() -> None:
+    with pytest.raises(ConfigError, match="no check point"):
+        vertical_accuracy(np.array([np.nan]))
+
+
+def test_leave_one_out_leaves_the_rejected_out_of_its_figures() -> None:
+    nan = np.nan
+    control = ControlErrors(
+        np.arange(3), np.full(3, -1), np.array([[0.0, 0.0, 0.002]] * 3), np.array([[nan, nan, 0.001]] * 3),
+        np.array([[nan, nan, 1.0], [nan, nan, 1.0], [nan, nan, 0.0]]),
+        np.array([[nan, nan, 0.003], [nan, nan, -0.005], [nan, nan, 0.05]]),
+        np.array([[nan, nan, 0.004], [nan, nan, 0.005], [nan, nan, 0.005]]),
+    )  # fmt: skip
+    found = leave_one_out(control)
+    assert found.horizontal is None
+    assert found.vertical is not None
+    # A point surveyed too low (down too large) has the surface above it.
+    assert (found.vertical.count, found.vertical.mean) == (2, pytest.approx(-0.001))
+    np.testing.assert_allclose(found.normalised[:, 2], [0.75, -1.0, 10.0])
+    assert np.isnan(found.normalised[:, :2]).all()
+
+
+def test_the_mean_of_a_process_has_the_spread_that_it_is_held_against() -> None:
+    """Drawn processes of three lengths as if they were corrections."""
+    rng = np.random.default_rng(9)
+    process = GaussMarkov(0.015, 60.0)
+    for seconds in (5, 60, 600):
+        times = np.linspace(0.0, seconds, 101)
+        root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 60.0) + 1e-12 * np.eye(101))
+        runs = [RunPrior(str(i), 0, seconds * 10**9, (process,) * 6) for i in range(200)]
+        nothing = adjust(Observations.none(), runs, AdjustmentSettings(knot_spacing_s=1e6))
+        drawn = replace(nothing, values=tuple(0.015 * root @ rng.standard_normal((101, 6)) for _ in runs))
+        assert np.std(mean_corrections(drawn).normalised) == pytest.approx(1.0, rel=0.08)
+
+
+def test_passes_agree_by_section() -> None:
+    station = np.array([-20.0, 5.0, 99.9, 100.0, 350.0])
+    found = relative_accuracy(station, np.array([0.02, 0.03, 0.04, 0.01, 0.05]), np.full(5, 0.001))
+    assert found.first_station_m.tolist() == [-100.0, 0.0, 100.0, 300.0]
+    assert found.count.tolist() == [1, 2, 1, 1]
+    np.testing.assert_allclose(found.rms_before_m, [0.02, np.sqrt(0.0025 / 2), 0.01, 0.05])
+    np.testing.assert_allclose(found.rms_after_m, 0.001)

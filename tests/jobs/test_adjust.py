@@ -1,0 +1,297 @@
+"""The adjustment through the pipeline: three passes over painted targets, with errors of centimetres in the poses."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stage_named
+from roadscan.jobs.status import survey_status
+from roadscan.jobs.tiles.cell_files import read_cells
+from roadscan.jobs.tiles.footprints import load_ranges, stale_footprints
+from roadscan.jobs.tiles.tile_plan import TILE, plan_tiles
+from roadscan.model.survey import Survey
+from roadscan.simulate import Scene, simulate, truth
+from roadscan.tables.held import held_path, read_held, write_held
+from roadscan.tables.manifest import Manifest
+from roadscan.tables.sql import query
+from roadscan.tables.store import Store
+
+from .conftest import Lines, Simulated, changed
+
+ROLES = ("gcp", "check", "gcp", "check", "gcp", "gcp")
+OFFSETS_M = (3.2, 0.6, 0.6, 3.2, 3.2, 0.6)
+TARGETS = [
+    {"station_m": 3.0 + 4.0 * k, "offset_m": offset, "role": role}
+    for k, (role, offset) in enumerate(zip(ROLES, OFFSETS_M, strict=True))
+]
+CIRCLES = {"adjust__targets": {"shape": "circle", "size_m": 0.30, "centre_m": 0.06, "search_m": 0.3}}
+NO_FILES: dict[str, object] = {"products__make": ["tile_table"]}
+OFF = {"on": False}
+
+
+def site() -> Scene:
+    return Scene.load("reference_site").changed(
+        road={"targets": TARGETS}, length_m=27.0, lidar=OFF, imu=OFF, gnss=OFF, encoder=OFF, camera=OFF,
+        profilers={"spacing_m": 0.02, "readings": 400, "head_imus": None},
+        passes=[{"lane": 2}, {"lane": 2, "offset_m": -0.6}, {"lane": 2, "offset_m": 0.4}],
+        noise={"position_m": 0.02, "attitude_deg": 0.005, "time_constant_s": 60.0, "control_m": 0.001},
+        vehicle={"standstill_s": 0.0}, roadside={"poles": [], "trees": []},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    return Simulated(simulate(site(), tmp_path_factory.mktemp("adjusted") / "survey").survey_file)
+
+
+@pytest.fixture(scope="module")
+def adjusted(raw: Simulated) -> Simulated:
+    """Run whole, into the store ``store``."""
+    raw.run(**CIRCLES, **NO_FILES)
+    return raw
+
+
+def adjust(one: Simulated, compute: Any = None, stages: Sequence[str] = ("adjust",), **changes: object) -> Session:
+    survey = changed(Survey.load(one.survey_file), {**CIRCLES, **NO_FILES, **changes})
+    session = Session(survey, one.store(), compute or Inline(), None, Lines())
+    run_stages(session, [stage_named(name) for name in stages])
+    return session
+
+
+def rows(store: Store, statement: str) -> list[dict[str, Any]]:
+    return query(store, statement).to_pylist()
+
+
+def corrections(store: Store) -> bytes:
+    return store.read_bytes(held_path("corrections"))
+
+
+def cell_errors(one: Simulated, store: Store) -> np.ndarray:
+    """Height of each cell with three readings or more minus the true height at its centre."""
+    true, grid = truth.load(one.survey_file.parent), plan_survey(Survey.load(one.survey_file), store).ground.grid
+    found = []
+    for record in Manifest(store).of(TILE).values():
+        if record.path:
+            cells = read_cells(store, record, grid.cells_per_edge)
+            box = grid.bounds(cells.tile)
+            place = (box.easting_min_m + (cells.column + 0.5) * grid.cell_m,
+                     box.northing_min_m + (cells.row + 0.5) * grid.cell_m)  # fmt: skip
+            error = cells.height_robust_m - true.height_m(*place)
+            found.append(error[(cells.count >= 3) & np.isfinite(error)])
+    return np.concatenate(found)
+
+
+def test_surface_and_check_points_come_to_the_truth(adjusted: Simulated) -> None:
+    recorded = Simulated(adjusted.survey_file)
+    recorded.run("store-recorded", adjust__on=False, **NO_FILES)
+    before, after = (np.abs(cell_errors(adjusted, adjusted.store(name))) for name in ("store-recorded", "store"))
+    assert np.mean(after) < 0.3 * np.mean(before)
+    assert np.mean(after) < 0.003
+    store = adjusted.store()
+    residuals = rows(store, "FROM control_residuals")
+    assert {row["status"] for row in residuals} == {"found"}
+    assert len(residuals) == 3 * len(TARGETS)
+    check = [row for row in residuals if row["role"] == "check"]
+    for name, bar in (("height", 0.004), ("easting", 0.012), ("northing", 0.012)):
+        was, now = (np.array([row[f"{name}_{word}_m"] for row in check]) for word in ("before", "after"))
+        assert np.sqrt(np.mean(now**2)) < min(bar, 0.7 * np.sqrt(np.mean(was**2)))
+    seams = rows(store, "FROM relative_accuracy WHERE kind = 'height_tie'")
+    assert min(row["rms_before_m"] for row in seams) > 0.003
+    assert max(row["rms_after_m"] for row in seams) < 0.001
+    assert rows(store, "SELECT count(*) AS n FROM absolute_accuracy WHERE points = 'check'")[0]["n"] == 4
+    sigma = rows(store, "SELECT max(sigma_down_m) AS s FROM tiles")[0]["s"]
+    assert 0.0003 < sigma < 0.005  # a fifth of the 0.02 m that the logs state
+    pictures = store.files("products/adjustment", ".png")
+    assert len(pictures) == 1 + len(residuals)
+
+
+def test_a_second_run_does_nothing_and_status_says_what_it_is_worth(adjusted: Simulated) -> None:
+    store = adjusted.store()
+    before = corrections(store)
+    run = adjusted.run(**CIRCLES, **NO_FILES)
+    assert run.raw_bytes_read == 0
+    assert not [line for line in run.reporter.lines if line.startswith("adjust: ") and "ties" in line]
+    assert corrections(store) == before
+    survey = changed(Survey.load(adjusted.survey_file), {**CIRCLES, **NO_FILES})
+    status = survey_status(Session(survey, store))
+    assert status.is_complete
+    assert any("check points, height: RMSE" in line for line in status.of("adjust").lines)
+
+
+class Shuffled:
+    """Runs tasks in another order, as if there were many workers."""
+
+    workers = 7
+
+    def __init__(self, fails_after: int = 10**9) -> None:
+        self.left = fails_after
+
+    def map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Done[Any, Any]]:
+        for task in reversed(list(tasks)):
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            yield Done(task, function(task), None)
+
+
+def test_workers_order_and_a_killed_run_change_no_bit(adjusted: Simulated, tmp_path: Path) -> None:
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    before = corrections(store)
+    store.remove(held_path("corrections"))
+    manifest = Manifest(store)
+    manifest.remove([r for name in ("ties", "control_sightings") for r in manifest.of(name).values()])
+    with pytest.raises(KeyboardInterrupt):
+        adjust(copy, Shuffled(2))
+    assert not store.exists(held_path("corrections"))
+    adjust(copy, Shuffled())
+    assert corrections(store) == before
+
+
+def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
+    adjusted: Simulated, tmp_path: Path
+) -> None:
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    session = adjust(copy, adjust__on=False)
+    assert not copy.store().exists(held_path("corrections"))
+    assert not rows(copy.store(), "SELECT * FROM outputs WHERE product = 'ties'")
+    assert stale_footprints(session.plan, session.manifest) == []
+    survey = changed(Survey.load(copy.survey_file), {**CIRCLES, **NO_FILES})
+    again = Session(survey, copy.store())
+    assert survey_status(again).of("adjust").stale == 1
+    assert survey_status(again).of("footprints").stale == 0
+
+
+def test_only_tiles_near_a_changed_knot_become_stale(adjusted: Simulated) -> None:
+    survey = changed(Survey.load(adjusted.survey_file), {**CIRCLES, "navigation__max_gap_s": 0.02})
+    store = adjusted.store()
+    whole = store.read_bytes(held_path("corrections"))
+    manifest, plan = Manifest(store), plan_survey(survey, store)
+    footprints = load_ranges(plan, manifest)
+    table = read_held(store, "corrections")
+    assert table is not None
+    moved = table.to_pylist()
+    last = [k for k, row in enumerate(moved) if row["run"] == "run-2"][-1]
+    moved[last]["down_m"] += 0.001
+    try:
+        write_held(store, "corrections", moved)
+        after = plan_survey(survey, store)
+    finally:
+        store.write_bytes(held_path("corrections"), whole)
+    assert stale_footprints(after, manifest) == stale_footprints(plan, manifest)
+    ends = moved[last - 1]["epoch_gps_ns"] - 70_000_000
+    run_2 = np.array([s.source.run == "run-2" for s in footprints.slices])[footprints.slice_index]
+    near = run_2 & (footprints.last_epoch_gps_ns > ends)
+    one, other = plan_tiles(footprints, plan), plan_tiles(footprints, after)
+    stale = {tile for tile, a, b in zip(one.ids, one.keys, other.keys, strict=True) if a != b}
+    expected = set(zip(footprints.tile_column[near].tolist(), footprints.tile_row[near].tolist(), strict=True))
+    assert stale == expected
+    assert 0 < len(stale) < len(one.keys)
+
+
+def with_control(one: Simulated, folder: Path, change: Callable[[dict[str, dict[str, str]]], None]) -> Simulated:
+    """A copy of the survey with its store, and other control points."""
+    copy = one.copy_with_store_to(folder)
+    file = copy.survey_file.parent / "control.csv"
+    with file.open(newline="") as stream:
+        points = {row["name"]: row for row in csv.DictReader(stream)}
+    change(points)
+    with file.open("w", newline="") as stream:
+        out = csv.DictWriter(stream, list(next(iter(points.values()))))
+        out.writeheader()
+        out.writerows(points.values())
+    return copy
+
+
+def raised(points: dict[str, dict[str, str]], name: str, by_m: float) -> None:
+    points[name]["height_m"] = f"{float(points[name]['height_m']) + by_m:.4f}"
+
+
+def test_a_control_point_that_is_wrong_by_50_mm_is_named_and_bends_nothing(adjusted: Simulated, tmp_path: Path) -> None:
+    before = rows(adjusted.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
+    copy = with_control(adjusted, tmp_path / "survey", lambda points: raised(points, "G003", 0.050))
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    notes = [line for line in run.reporter.lines if line.startswith("note: ")]
+    assert [line for line in notes if "1 control points contradict" in line and "G003 (+" in line]
+    after = rows(copy.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
+    change = [a["height_after_m"] - b["height_after_m"] for a, b in zip(after, before, strict=True)]
+    assert np.abs(change).max() < 0.001
+    weights = rows(copy.store(), "SELECT DISTINCT name, weight_height FROM control_residuals WHERE role = 'gcp'")
+    assert {row["name"] for row in weights if row["weight_height"] == 0.0} == {"G003"}
+
+
+def test_heights_that_were_exchanged_are_named(adjusted: Simulated, tmp_path: Path) -> None:
+    def exchange(points: dict[str, dict[str, str]]) -> None:
+        one, other = points["G001"], points["G006"]
+        one["height_m"], other["height_m"] = other["height_m"], one["height_m"]
+
+    copy = with_control(adjusted, tmp_path / "survey", exchange)
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    assert [line for line in run.reporter.lines if "the heights of G001 and G006 look exchanged" in line]
+
+
+def test_control_in_another_height_datum_is_named_and_not_used(adjusted: Simulated, tmp_path: Path) -> None:
+    def geoid(points: dict[str, dict[str, str]]) -> None:
+        for name in points:
+            raised(points, name, -45.3)
+
+    copy = with_control(adjusted, tmp_path / "survey", geoid)
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    assert [line for line in run.reporter.lines if "-45.3" in line and "another height datum or CRS" in line]
+    moved = rows(copy.store(), "SELECT max(abs(down_m)) AS most FROM corrections")[0]["most"]
+    assert moved < 0.1  # passes are still tied to one another
+
+
+def test_one_point_in_another_datum_and_one_elsewhere(adjusted: Simulated, tmp_path: Path) -> None:
+    def other(points: dict[str, dict[str, str]]) -> None:
+        raised(points, "G001", 45.3)
+
+    copy = with_control(adjusted, tmp_path / "survey", other)
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    assert [line for line in run.reporter.lines if "1 control points lie far above or below" in line and "G001" in line]
+
+
+@pytest.mark.parametrize("mode", ["each_pass", "vertical", "helmert"])
+def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Path, mode: str) -> None:
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    adjust(copy, adjust__mode=mode)
+    found = rows(copy.store(), "FROM absolute_accuracy WHERE points = 'check' AND component = 'height'")
+    rmse = {row["poses"]: row["rmse_m"] for row in found}
+    assert rmse["adjusted"] < rmse["recorded"]
+    if mode == "vertical":
+        level = rows(copy.store(), "SELECT max(abs(north_m) + abs(east_m) + abs(roll_rad)) AS most FROM corrections")
+        assert level[0]["most"] == 0.0
+
+
+def test_a_survey_without_overlap_and_control_is_told_so(raw: Simulated, tmp_path: Path) -> None:
+    copy = raw.copy_to(tmp_path / "survey")
+    survey = changed(Survey.load(copy.survey_file), {**CIRCLES, **NO_FILES, "control": []})
+    alone = survey.config.model_copy(update={"runs": survey.config.runs[:1], "passes": survey.config.passes[:1]})
+    session = Session(Survey(alone, survey.rig, survey.folder), copy.store(), Inline(), None, Lines())
+    run_stages(session, [stage_named(name) for name in ("ingest", "navigate", "footprints", "adjust")])
+    assert [line for line in session.reporter.lines if line.startswith("adjust: nothing to adjust")]
+    assert not copy.store().exists(held_path("corrections"))
+
+
+def test_corrections_of_another_program_stay(adjusted: Simulated, tmp_path: Path) -> None:
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    table = read_held(store, "corrections")
+    assert table is not None
+    own = [{**row, "written_by": None, "down_m": 0.01} for row in table.to_pylist() if row["run"] == "run-1"]
+    write_held(store, "corrections", own)
+    run = adjust(copy)
+    assert [line for line in run.reporter.lines if "run 'run-1' were corrected by another program" in line]
+    kept = rows(store, "SELECT DISTINCT down_m FROM corrections WHERE run = 'run-1'")
+    assert kept == [{"down_m": 0.01}]
+    assert rows(store, "SELECT DISTINCT run FROM corrections ORDER BY run") == [{"run": f"run-{k}"} for k in (1, 2, 3)]

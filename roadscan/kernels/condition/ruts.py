@@ -1,0 +1,113 @@
+"""Depth of ruts in cross-sections: below a stretched wire, below a straightedge, and below the level of water."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from roadscan.kernels.options import inlined, kernel
+
+
+@inlined
+def upper_hull(x, h, first, end, hull):
+    """Points of x[first:end], h[first:end] that a wire over them touches, ascending into hull; how many."""
+    count = 0
+    for k in range(first, end):
+        while count > 1:
+            a, b = hull[count - 2], hull[count - 1]
+            if (x[b] - x[a]) * (h[k] - h[a]) < (x[k] - x[a]) * (h[b] - h[a]):
+                break
+            count -= 1
+        hull[count] = k
+        count += 1
+    return count
+
+
+@kernel
+def stretched_wire(x, h, out):
+    """Ruts below a wire that is stretched over a cross-section from end to end, in its left and its right half.
+
+    Parameters
+    ----------
+    x : (m,) float64, ascending, m, 0 in the middle; h : (n, m) float64, heights, finite, m.
+    out : (n, 2, 5) float64, out, of the left and the right half: greatest depth, normal to the wire (m); width between
+        the places where the wire rests beside it (m); area between wire and road (m²); place of the greatest depth
+        (m); and the variance of the depth for heights of variance 1 that err apart.
+    """
+    m = x.size
+    hull = np.empty(m, np.int64)
+    for i in range(len(h)):
+        count = upper_hull(x, h[i], 0, m, hull)
+        out[i] = 0.0
+        for e in range(count - 1):
+            a, b = hull[e], hull[e + 1]
+            slope = (h[i, b] - h[i, a]) / (x[b] - x[a])
+            upright = 1.0 / math.sqrt(1.0 + slope * slope)
+            for k in range(a, b):
+                gap = (h[i, a] + slope * (x[k] - x[a]) - h[i, k]) * upright
+                after = (h[i, a] + slope * (x[k + 1] - x[a]) - h[i, k + 1]) * upright
+                half = 0 if x[k] + x[k + 1] < 0.0 else 1
+                out[i, half, 2] += 0.5 * (gap + after) * (x[k + 1] - x[k])
+                half = 0 if x[k] < 0.0 else 1
+                if gap > out[i, half, 0]:
+                    t = (x[k] - x[a]) / (x[b] - x[a])
+                    out[i, half, 0] = gap
+                    out[i, half, 1] = x[b] - x[a]
+                    out[i, half, 3] = x[k]
+                    out[i, half, 4] = 1.0 + t * t + (1.0 - t) * (1.0 - t)
+
+
+@kernel
+def straightedge(x, h, length, out):
+    """Greatest depth below a straightedge laid across the road wherever it finds room, in its left and right half.
+
+    The edge rests on the two points beside its own middle that it touches; where the road is narrower than the edge,
+    it lies over all of it.
+
+    Parameters
+    ----------
+    x : (m,) float64, ascending, m, 0 in the middle; h : (n, m) float64, heights, finite, m.
+    length : float64, of the edge, m; out : (n, 2) float64, out: depth in the left and the right half, m.
+    """
+    m = x.size
+    hull = np.empty(m, np.int64)
+    for i in range(len(h)):
+        out[i, 0], out[i, 1] = 0.0, 0.0
+        end = 0
+        for first in range(m):
+            while end < m and x[end] <= x[first] + length + 1e-9:
+                end += 1
+            count = upper_hull(x, h[i], first, end, hull)
+            middle = 0.5 * (x[first] + x[end - 1])
+            e = 0
+            while e < count - 2 and x[hull[e + 1]] < middle:
+                e += 1
+            if count > 1:
+                a, b = hull[e], hull[e + 1]
+                slope = (h[i, b] - h[i, a]) / (x[b] - x[a])
+                upright = 1.0 / math.sqrt(1.0 + slope * slope)
+                for k in range(a + 1, b):
+                    gap = (h[i, a] + slope * (x[k] - x[a]) - h[i, k]) * upright
+                    half = 0 if x[k] < 0.0 else 1
+                    out[i, half] = max(out[i, half], gap)
+            if end == m:
+                break
+
+
+@kernel
+def water(h, out):
+    """Depth of the water that stands in a cross-section before it runs off to a side.
+
+    h : (n, m) float64, heights, finite, m; out : (n, m) float64, out, m.
+    """
+    m = h.shape[1]
+    for i in range(len(h)):
+        top = h[i, 0]
+        for k in range(m):
+            top = max(top, h[i, k])
+            out[i, k] = top
+        top = h[i, m - 1]
+        for k in range(m - 1, -1, -1):
+            top = max(top, h[i, k])
+            out[i, k] = max(min(out[i, k], top) - h[i, k], 0.0)

@@ -99,7 +99,8 @@ def by_section(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str
     """Mean or greatest value of the cross-sections of each section, under names of their own.
 
     A section of which too few cross-sections have a value has none. The standard deviation of a mean takes the
-    cross-sections' noise as independent of one another; that of the greatest value is its own.
+    cross-sections' errors as alike, since neighbours share the vehicle's motion: it is their root mean square. That of
+    the greatest value is its own.
     """
     config = lane.config
     for from_m, to_m in lane.sections_m:
@@ -113,7 +114,7 @@ def by_section(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str
                 reason = f"{100 * share:.0f} % of the cross-sections were measured"
                 yield Value(name, "section", from_m, to_m, np.nan, np.nan, share, reason)
             elif how == "mean":
-                spread = float(np.sqrt(np.sum(sigma[known] ** 2)) / known.sum())
+                spread = float(np.sqrt(np.mean(sigma[known] ** 2)))
                 yield Value(name, "section", from_m, to_m, float(value[known].mean()), spread, share)
             else:
                 k = int(np.flatnonzero(known)[np.argmax(value[known])])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.condition.cracks_on_lane import CrackOnLane
 from roadscan.model.condition import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
@@ -88,5 +88,7 @@ class LaneData:
     config: SectionConfig
     curvature_per_m: Float64
     """(n,) curvature of the reference line at the cross-sections (1/m), positive to the right."""
-    cracks: tuple[Any, ...] = field(default=())
-    """Cracks near the lane."""
+    cracks: tuple[CrackOnLane, ...] | None = None
+    """Cracks near the lane; None where the survey has no table of cracks."""
+    sigma_roll_rad: float = 0.0
+    """Standard deviation of the vehicle's roll as the poses state it."""

@@ -94,6 +94,8 @@ class Lane:
     """What the width was taken from: stated, or default."""
     passes: tuple[int, ...]
     """Passes that drove it."""
+    sigma_roll_deg: float = 0.0
+    """Standard deviation of the roll of its drives' poses, as the logs state it; the greatest of all."""
 
     @property
     def last_m(self) -> int:
@@ -120,5 +122,5 @@ class Lane:
         end = min(int(np.ceil(to_m)) + 2 - self.first_m, len(self.offset_m))
         return Lane(
             self.road, self.name, self.sign, self.first_m + first, self.offset_m[first:end], self.width_m,
-            self.width_from, self.passes,
+            self.width_from, self.passes, self.sigma_roll_deg,
         )  # fmt: skip

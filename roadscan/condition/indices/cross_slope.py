@@ -1,7 +1,8 @@
 """Cross-slope and crown of the lane, grade and curvature of the road.
 
 Cross-slope is that of the straight line that fits a cross-section best; crown is how far the middle of the parabola
-that fits it best lies above the line through its ends.
+that fits it best lies above the line through its ends. The standard deviation of the cross-slope holds the noise of the
+readings and the roll of the poses, as their logs state it.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ class CrossSlope(ConditionIndex):
             about = x[own] - x[own].mean()
             square = about * about - np.mean(about * about)
             # Neighbouring heights share cells: about one in three is a measurement of its own.
-            sigma_slope[k] = 100.0 * noise * np.sqrt(3.0 / np.sum(about * about))
+            roll = np.tan(lane.sigma_roll_rad)
+            sigma_slope[k] = 100.0 * np.hypot(noise * np.sqrt(3.0 / np.sum(about * about)), roll)
             sigma_crown[k] = 1e3 * noise * np.sqrt(3.0 / np.sum(square * square)) * half * half
         return (
             PerCrossSection("cross_slope_percent", c.station_m, slope, sigma_slope, c.share),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ from roadscan.code_reach import code_digest
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.navigate.pose_sigma import usual_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
 from roadscan.jobs.products import product_context
 from roadscan.jobs.readings import TrajectorySource, read_groups
@@ -56,12 +58,13 @@ class Roads:
 def lines_key(plan: SurveyPlan, config: ConditionConfig) -> str:
     """Key of the two tables: ways of the passes, settings, layer and code."""
     drives = [[[f.digest for f in source.files], _stated(one)] for one, source in _driven(plan)]
+    accuracy = [f.digest for r in plan.records for f in r.tables.get("trajectory_accuracy", ())]
     layer = _layer_file(plan, config)
     files = [] if layer is None else [file_digest(file) for file in (layer, *sidecars(layer))]
     settings = {name: config.model_dump(mode="json")[name] for name in _LINE_SETTINGS}
     code = code_digest("roadscan.jobs.condition.lines:write_lines")
     context = product_context(plan)
-    return key_of(code, drives, files, settings, context.survey_id, context.map)
+    return key_of(code, drives, accuracy, files, settings, context.survey_id, context.map)
 
 
 def _stated(one: LanePass) -> list[object]:
@@ -86,11 +89,23 @@ def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[Out
         add_grid_folder(plan.ground.grids)
     drives = [Drive(one.pass_id, _path_m(plan, one, source), one.lane) for one, source in _driven(plan)]
     lines, lanes = find_roads(drives, stated_lines(plan, config), config)
+    lanes = _with_roll(plan, lanes)
     context = product_context(plan)
     return [
         _write_lines(plan.store, lines, config.reference, key, context),
         _write_lanes(plan.store, {line.road: line for line in lines}, lanes, key, context),
     ]
+
+
+def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
+    """The lanes with the standard deviation of the roll of their drives."""
+    settings = plan.survey.config.navigation.calibration
+    roll_deg = {
+        one.pass_id: math.degrees(float(usual_pose_sigma(plan.store, plan.records, source, settings)[3]))
+        for one, source in _driven(plan)
+    }
+    most = max(roll_deg.values(), default=0.0)
+    return [replace(lane, sigma_roll_deg=max((roll_deg[p] for p in lane.passes), default=most)) for lane in lanes]
 
 
 def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
@@ -178,6 +193,7 @@ def _write_lanes(
         "width_m": [lane.width_m for lane in lanes],
         "width_from": [lane.width_from for lane in lanes],
         "offset_mean_m": [float(np.mean(lane.offset_m)) for lane in lanes],
+        "sigma_roll_deg": [lane.sigma_roll_deg for lane in lanes],
         "passes": [" ".join(map(str, lane.passes)) for lane in lanes],
         "offset_m": [lane.offset_m for lane in lanes],
     }
@@ -231,6 +247,7 @@ def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roa
         Lane(
             row["road"], row["lane"], 1 if row["direction"] == "forward" else -1, row["station_from_m"],
             np.array(row["offset_m"]), row["width_m"], row["width_from"], tuple(map(int, row["passes"].split())),
+            row["sigma_roll_deg"],
         )
         for row in held.to_pylist()
     )  # fmt: skip

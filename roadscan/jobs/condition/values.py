@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -10,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 
 from roadscan.code_reach import code_digest, name_of
+from roadscan.condition.cracks_on_lane import PIECE_M, CrackOnLane, located
 from roadscan.condition.index import ConditionIndex, Value, condition_indices
 from roadscan.condition.lane_data import CrossSections, LaneData, Profile
 from roadscan.condition.road_line import Lane, RoadLine
@@ -21,6 +24,8 @@ from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.condition import SectionConfig
+from roadscan.products.base import ProductContext
+from roadscan.products.geo_table import read_geo_table
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
@@ -42,6 +47,8 @@ class Group:
     profiles: tuple[OutputRecord, ...]
     """Records of the stretches of profiles on its way, and before and behind it."""
     cross_sections: tuple[OutputRecord, ...]
+    cracks: OutputRecord | None
+    """Record of the table of cracks, where there is one."""
     indices: tuple[tuple[str, str], ...]
     """Names of the indices to compute, with the keys of their values."""
 
@@ -57,6 +64,7 @@ class GroupTask:
     store: Store
     config: SectionConfig
     cell_m: float
+    context: ProductContext
     group: Group
 
     @property
@@ -72,7 +80,8 @@ class GroupTask:
 def plan_groups(roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float) -> list[Group]:
     """All groups of sections, with all indices."""
     profiles, crossings = manifest.of(PROFILES), manifest.of(CROSS_SECTIONS)
-    indices = {name: index for name, index in condition_indices().items() if not index.needs_cracks}
+    indices, cracks = condition_indices(), manifest.get("cracks", "cracks.parquet")
+    of_cracks = None if cracks is None else cracks.digest
     entry = "roadscan.jobs.condition.values:values_of_group"
     codes = {name: code_digest(entry, name_of(type(one))) for name, one in indices.items()}
     lead = max((one.lead_m for one in indices.values()), default=0.0)
@@ -88,10 +97,20 @@ def plan_groups(roads: Roads, manifest: Manifest, config: SectionConfig, cell_m:
             )]  # fmt: skip
             read = tuple(profiles[u] for u in near if u in profiles)
             read_cross = tuple(crossings[u] for u in near if u in crossings)
-            shape = [lane.sign, lane.width_m, own, [(r.unit, r.digest) for r in (*read, *read_cross)], cell_m]
-            keys = tuple((name, key_of(codes[name], settings, shape)) for name in sorted(indices))
+            shape = [
+                lane.sign,
+                lane.width_m,
+                lane.sigma_roll_deg,
+                own,
+                [(r.unit, r.digest) for r in (*read, *read_cross)],
+                cell_m,
+            ]
+            keys = tuple(
+                (name, key_of(codes[name], settings, shape, of_cracks if indices[name].needs_cracks else None))
+                for name in sorted(indices)
+            )
             line = roads.lines[lane.road].stretch(own[0][0] - 20.0, own[-1][1] + 20.0)
-            found.append(Group(line, lane, number, own, read, read_cross, keys))
+            found.append(Group(line, lane, number, own, read, read_cross, cracks, keys))
     return found
 
 
@@ -180,7 +199,32 @@ def load_lane(task: GroupTask) -> LaneData:
         cross_sections=_within(cross, group.sections_m),
         config=task.config,
         curvature_per_m=group.line.curvature_per_m(_within(cross, group.sections_m).station_m),
+        cracks=_cracks(task),
+        sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
     )
+
+
+def _cracks(task: GroupTask) -> tuple[CrackOnLane, ...] | None:
+    """Cracks near the lane along the group; None where there is no table of cracks, or no index asks for it."""
+    group, known = task.group, condition_indices()
+    if group.cracks is None or not any(known[name].needs_cracks for name, _ in group.indices):
+        return None
+    table, shapes = read_geo_table(read_recorded(task.store, group.cracks), task.context)
+    from_m, to_m = group.sections_m[0][0], group.sections_m[-1][1]
+    station = np.unique(np.append(np.arange(from_m, to_m), to_m))
+    middle = shapely.LineString(group.line.places(station, group.lane.offsets(station))[:, :2])
+    found = []
+    for row, shape in zip(table.select(["type", "width_mean_m"]).to_pylist(), shapes, strict=True):
+        if middle.distance(shape) > group.lane.width_m:
+            continue
+        near = shapely.get_parts(shapely.segmentize(shape, PIECE_M))
+        ends = [shapely.get_coordinates(part) for part in near]
+        centre = np.concatenate([0.5 * (xy[1:] + xy[:-1]) for xy in ends])
+        length = np.concatenate([np.hypot(*np.diff(xy, axis=0).T) for xy in ends])
+        guess = float(station[0]) + middle.project(shape.centroid)
+        at, own = located(group.line, group.lane, centre, guess)
+        found.append(CrackOnLane(row["type"], row["width_mean_m"], at, own, length))
+    return tuple(found)
 
 
 def _within(cross: CrossSections, sections_m: Sequence[tuple[float, float]]) -> CrossSections:

@@ -10,6 +10,7 @@ from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.tasks import run_units
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
+from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 
@@ -35,11 +36,12 @@ class Condition(Stage):
         if not work.stretches:
             session.note("condition: no drive of 20 m or more lies on the tiles that hold cells")
         settings, grid = config.sections(), session.plan.ground.grid
+        context = product_context(session.plan)
         tasks = stretch_tasks(work.due_stretches, session.store, grid, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
         work = plan_condition(session) if tasks else work
-        values = [GroupTask(session.store, settings, grid.cell_m, one) for one in work.due_groups]
+        values = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in work.due_groups]
         bar = session.bar("values of condition")
         session.failed(self.name, run_units(values_of_group, values, session.manifest, session.compute, bar))
         work = plan_condition(session) if values else work

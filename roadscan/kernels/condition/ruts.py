@@ -60,10 +60,10 @@ def stretched_wire(x, h, out):
 
 @kernel
 def straightedge(x, h, length, out):
-    """Greatest depth below a straightedge laid across the road wherever it finds room, in its left and right half.
+    """Greatest depth below a straightedge laid across the road anywhere, in its left and its right half.
 
-    The edge rests on the two points beside its own middle that it touches; where the road is narrower than the edge,
-    it lies over all of it.
+    The edge rests on the two points beside its own middle that it touches; beyond the ends of the cross-section it
+    hangs in the air.
 
     Parameters
     ----------
@@ -74,25 +74,25 @@ def straightedge(x, h, length, out):
     hull = np.empty(m, np.int64)
     for i in range(len(h)):
         out[i, 0], out[i, 1] = 0.0, 0.0
-        end = 0
-        for first in range(m):
-            while end < m and x[end] <= x[first] + length + 1e-9:
+        first, end = 0, 0
+        for middle in range(m):
+            while x[first] < x[middle] - 0.5 * length - 1e-9:
+                first += 1
+            while end < m and x[end] <= x[middle] + 0.5 * length + 1e-9:
                 end += 1
             count = upper_hull(x, h[i], first, end, hull)
-            middle = 0.5 * (x[first] + x[end - 1])
             e = 0
-            while e < count - 2 and x[hull[e + 1]] < middle:
+            while e < count - 2 and hull[e + 1] < middle:
                 e += 1
-            if count > 1:
-                a, b = hull[e], hull[e + 1]
-                slope = (h[i, b] - h[i, a]) / (x[b] - x[a])
-                upright = 1.0 / math.sqrt(1.0 + slope * slope)
-                for k in range(a + 1, b):
-                    gap = (h[i, a] + slope * (x[k] - x[a]) - h[i, k]) * upright
-                    half = 0 if x[k] < 0.0 else 1
-                    out[i, half] = max(out[i, half], gap)
-            if end == m:
-                break
+            if count < 2:
+                continue
+            a, b = hull[e], hull[e + 1]
+            slope = (h[i, b] - h[i, a]) / (x[b] - x[a])
+            upright = 1.0 / math.sqrt(1.0 + slope * slope)
+            for k in range(a + 1, b):
+                gap = (h[i, a] + slope * (x[k] - x[a]) - h[i, k]) * upright
+                half = 0 if x[k] < 0.0 else 1
+                out[i, half] = max(out[i, half], gap)
 
 
 @kernel

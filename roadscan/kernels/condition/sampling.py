@@ -199,25 +199,25 @@ def residuals(found, count, base, surface, out):
 
 @kernel
 def sigma(found, count, size, away):
-    """Standard deviation of the height in the middle (m), from the noise of the cells' readings.
+    """Standard deviation of the height in the middle (m), from what the cells of the window say of their own errors.
 
-    The readings of all cells in the window have one variance; where no cell holds two, it is that of the cells about
-    the surface. size : terms of the surface; away : (count,) distances from it (m).
+    A cell's variance is that of its readings over their number (all readings of the window have one variance), or that
+    of the cells about the surface where this is more: a cell's readings need not lie around its middle.
+    size : terms of the surface; away : (count,) distances from it (m).
     """
     squares, freedom, spread, used = 0.0, 0.0, 0.0, 0.0
     for k in range(count):
         if found.weight[k] <= 0.0:
             continue
         used += 1.0
-        spread += away[k] * away[k] * found.readings[k]
+        spread += away[k] * away[k]
         if found.readings[k] > 1.0 and found.noise[k] >= 0.0:
             squares += found.noise[k]
             freedom += found.readings[k] - 1.0
-    if freedom < 10.0:
-        if used <= size:
-            return np.nan
-        squares, freedom = spread, used - size
-    variance = squares / freedom
+    if used <= size:
+        return np.nan
+    spread /= used - size
+    variance = squares / freedom if freedom >= 10.0 else 0.0
     normal, factor = np.zeros((TERMS, TERMS)), np.zeros((TERMS, TERMS))
     noise, terms, unit, row = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(TERMS), np.zeros(TERMS)
     for k in range(count):
@@ -225,10 +225,11 @@ def sigma(found, count, size, away):
         if w <= 0.0:
             continue
         fill_terms(found, k, terms)
+        own = max(variance / max(found.readings[k], 1.0), spread)
         for i in range(size):
             for j in range(i + 1):
                 normal[i, j] += w * terms[i] * terms[j]
-                noise[i, j] += w * w * terms[i] * terms[j] / max(found.readings[k], 1.0)
+                noise[i, j] += w * w * terms[i] * terms[j] * own
     if factorise(normal, size, factor) < size:
         return np.nan
     unit[0] = 1.0
@@ -237,7 +238,7 @@ def sigma(found, count, size, away):
     for i in range(size):
         for j in range(size):
             total += row[i] * row[j] * noise[max(i, j), min(i, j)]
-    return math.sqrt(total * variance)
+    return math.sqrt(total)
 
 
 @kernel

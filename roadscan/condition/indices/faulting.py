@@ -2,10 +2,12 @@
 
 A step is looked for at each height of a profile: straight lines are fitted to the heights from 0.1 to 0.6 m before and
 behind it, and its height is their difference there, positive where the road rises in the direction of travel. It counts
-where it is the greatest within half a metre, at least 2 mm high and four times its standard deviation, most of it
-happens within 0.2 m, and the other wheel path has one of half its height or more within 0.3 m: a joint crosses the
-lane, and unevenness of a metre does not. Source: the idea of AASHTO R 36 as public descriptions have it, a difference of heights on both
-sides of the joint (the text was not at hand, no compliance is claimed); joints that are level are not found.
+where it is the greatest within half a metre, at least 3 mm high and four times its standard deviation, most of it
+happens within 0.2 m, and the other wheel path has one of more than half its height within 0.3 m: a joint crosses the
+lane, and unevenness of a metre does not.
+
+Source: the idea of AASHTO R 36 as public descriptions have it, a difference of heights on both sides of the joint (the
+text was not at hand, no compliance is claimed). Joints that are level are not found.
 """
 
 from __future__ import annotations
@@ -27,10 +29,10 @@ Float64 = npt.NDArray[np.float64]
 _NEAR_M: Final = 0.1
 _FAR_M: Final = 0.6
 _APART_M: Final = 0.5
-_LEAST_M: Final = 0.002
-_SUDDEN: Final = 0.6
+_LEAST_M: Final = 0.003
+_SUDDEN: Final = 0.75
 _BESIDE_M: Final = 0.3
-_HALF: Final = 0.5
+_HALF: Final = 0.6
 _LEAD_M: Final = 2.0
 _MM: Final = 1e3
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
+from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
 from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
 from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, Stretch, due_stretches, plan_stretches
-from roadscan.jobs.condition.values import VALUES, Group, due_groups, plan_groups
+from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import TILE
@@ -16,7 +17,7 @@ from roadscan.model.condition import ConditionConfig
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import OutputRecord
 
-MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS)
+MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES)
 """Names of all outputs in the manifest."""
 
 
@@ -32,6 +33,7 @@ class ConditionWork:
     due_groups: Sequence[Group] = ()
     files: SectionFiles | None = None
     due_files: Sequence[str] = ()
+    due_pictures: Sequence[PictureTask] = ()
     gone: Sequence[OutputRecord] = field(default=())
     """Outputs that are no longer due."""
 
@@ -61,12 +63,15 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     stretches = plan_stretches(roads, tiles, grid, settings)
     groups = plan_groups(roads, manifest, settings, grid.cell_m)
     units = [one.unit(name) for one in groups for name, _ in one.indices]
+    tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
+    pictures = plan_pictures(tasks, manifest)
     files = plan_sections(session.store, manifest, roads, units, context)
     gone = [
         *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
         *manifest.beside({VALUES}, set(units)),
+        *manifest.beside({PICTURES}, {one.unit for one in pictures}),
     ]
     return ConditionWork(
         key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
-        due_files(files, manifest), gone,
+        due_files(files, manifest), due_pictures(pictures, manifest), gone,
     )  # fmt: skip

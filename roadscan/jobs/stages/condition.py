@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.condition.lines import write_lines
+from roadscan.jobs.condition.pictures import draw_picture
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.tasks import run_units
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
+from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
+
+_PICTURES = 20
+"""Pictures that a task draws."""
 
 
 class Condition(Stage):
@@ -47,6 +52,10 @@ class Condition(Stage):
         work = plan_condition(session) if values else work
         if work.files is not None and work.due_files:
             session.manifest.add(write_sections(work.files))
+        manifest, due = session.manifest, work.due_pictures
+        bar = session.bar("pictures of condition")
+        failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
+        session.failed(self.name, [(one.unit, reason) for one, reason in failed])
 
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""
@@ -58,11 +67,17 @@ class Condition(Stage):
         return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
 
     def _stale(self, work: ConditionWork) -> int:
-        return int(work.lines_due) + len(work.due_stretches) + work.values_due + len(work.due_files)
+        return (
+            int(work.lines_due)
+            + len(work.due_stretches)
+            + work.values_due
+            + len(work.due_files)
+            + len(work.due_pictures)
+        )
 
     def folders(self) -> Sequence[str]:
         """Tables of lines, lanes, profiles, cross-sections and values, and the section table."""
         return (
             "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
-            "tables/condition_values", "products/condition_sections",
+            "tables/condition_values", "products/condition_sections", "products/condition_pictures",
         )  # fmt: skip

@@ -25,6 +25,15 @@ def upper_hull(x, h, first, end, hull):
 
 
 @kernel
+def wire_places(x, h, out):
+    """Places on which a wire over one cross-section rests, into out (m,) int64; returns how many.
+
+    x, h : (m,) float64, ascending offsets and heights, finite, m.
+    """
+    return upper_hull(x, h, 0, x.size, out)
+
+
+@kernel
 def stretched_wire(x, h, out):
     """Ruts below a wire that is stretched over a cross-section from end to end, in its left and its right half.
 

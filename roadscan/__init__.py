@@ -1,6 +1,7 @@
 """roadscan: raw logs of a road survey in, survey-grade pavement surfaces out.
 
-Start with :func:`open_survey` (a survey file) or :func:`read_log` (one log, without a survey).
+Start with :func:`open_survey` (a survey file) or :func:`read_log` (one log, without a survey). Who has a profile of a
+road as arrays asks :func:`iri` and :func:`mpd`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from roadscan.arrays import write_profiles, write_returns, write_trajectory
+    from roadscan.condition.profile_files import read_profile, write_erd
+    from roadscan.condition.spectrum import road_spectrum
+    from roadscan.condition.straightedge import straightedge_mm
+    from roadscan.condition.tables import iri, localised_roughness, mpd
     from roadscan.door import LogTables, MadeProduct, OpenSurvey, open_survey, read_log
     from roadscan.model.errors import RoadscanError
 
@@ -20,8 +25,15 @@ __all__ = [
     "OpenSurvey",
     "RoadscanError",
     "__version__",
+    "iri",
+    "localised_roughness",
+    "mpd",
     "open_survey",
     "read_log",
+    "read_profile",
+    "road_spectrum",
+    "straightedge_mm",
+    "write_erd",
     "write_profiles",
     "write_returns",
     "write_trajectory",
@@ -29,6 +41,10 @@ __all__ = [
 
 _ELSEWHERE = {
     "RoadscanError": "roadscan.model.errors",
+    **dict.fromkeys(("iri", "localised_roughness", "mpd"), "roadscan.condition.tables"),
+    **dict.fromkeys(("read_profile", "write_erd"), "roadscan.condition.profile_files"),
+    "road_spectrum": "roadscan.condition.spectrum",
+    "straightedge_mm": "roadscan.condition.straightedge",
     **dict.fromkeys(("write_profiles", "write_returns", "write_trajectory"), "roadscan.arrays"),
 }
 

@@ -22,9 +22,10 @@ def test_the_examples_run(
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     examples = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), flags=re.MULTILINE | re.DOTALL)
-    assert len(examples) == 6
+    assert len(examples) == 7
     for example in examples:
         exec(compile(example, str(PAGE), "exec"), names)
     printed = capsys.readouterr().out
     assert "hillshade" in printed
     assert "scans" in printed
+    assert "hri_m_per_km" in printed

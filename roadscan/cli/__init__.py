@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from roadscan import __version__
-from roadscan.cli import cameras, estimates, exports, logs, queries, runs, simulations, state
+from roadscan.cli import cameras, estimates, exports, logs, profiles, queries, runs, simulations, state
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
@@ -58,6 +58,8 @@ app.command("classes")(exports.classes)
 app.command("formats")(logs.list_formats)
 app.command("inspect")(logs.inspect_files)
 app.command("init")(logs.first_survey)
+app.command("iri")(profiles.iri)
+app.command("mpd")(profiles.mpd)
 app.command("simulate")(simulations.simulate)
 app.command("scenes")(simulations.list_scenes)
 app.command("demo")(simulations.demo)

@@ -51,30 +51,6 @@ def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Floats:
     return found
 
 
-class RoughPlace(NamedTuple):
-    """A stretch whose rolling IRI stays above a threshold."""
-
-    from_m: float
-    """Its first sample (m)."""
-    to_m: float
-    """Its last sample (m)."""
-    peak_m: float
-    """Station of the greatest value (m)."""
-    peak_m_per_km: float
-    """Greatest rolling IRI (m/km)."""
-
-
-def rough_places(x_m: Floats, rolling_m_per_km: Floats, threshold_m_per_km: float) -> list[RoughPlace]:
-    """Stretches where the rolling IRI (n,) is above a threshold, in their order."""
-    above = np.concatenate([[False], rolling_m_per_km > threshold_m_per_km, [False]])
-    ends = np.flatnonzero(np.diff(above.astype(np.int8))).reshape(-1, 2)
-    found = []
-    for first, behind in ends:
-        peak = first + int(np.argmax(rolling_m_per_km[first:behind]))
-        found.append(RoughPlace(x_m[first], x_m[behind - 1], x_m[peak], rolling_m_per_km[peak]))
-    return found
-
-
 def mean_roughness_index(iri_left_m_per_km: Floats, iri_right_m_per_km: Floats) -> Floats:
     """MRI (m/km): the mean of the IRI of two wheel paths (AASHTO R 43, public descriptions)."""
     return 0.5 * (iri_left_m_per_km + iri_right_m_per_km)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import StateSpace, cont2discrete, lsim
+from scipy.signal import StateSpace, lsim
 
-from roadscan.condition.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri, rough_places
-from roadscan.condition.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
+from roadscan.condition.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri
+from roadscan.condition.quarter_car import SPEED_M_PER_S
 from roadscan.condition.ride import ride
 from roadscan.condition.segments import Segments, segments_of
-from roadscan.kernels.condition.quarter_car import roll
+from roadscan.condition.stretches import stretches_above
 from roadscan.model.errors import ProfileError
 
 K1, K2, C, MU = 653.0, 63.3, 6.0, 0.15
@@ -52,27 +51,6 @@ def test_published_segments_of_a_profile(recordings: Path) -> None:
     assert short.mean() == pytest.approx(3.30898, abs=1e-3) and short.size == 27
     long = iri_of(on, segments_of(x[0], x[0] + 500.0, 100.0)).iri_m_per_km[0]
     assert long == pytest.approx([3.29852, 2.44211, 3.55511, 4.08554, 2.70790], abs=1e-3)
-
-
-def test_against_scipy_step_by_step() -> None:
-    """`lsim` of the same equations, input held over each step, at two spacings and an irregular one."""
-    rng = np.random.default_rng(3)
-    irregular = np.concatenate([[0.0], np.cumsum(rng.uniform(0.02, 0.3, 800))])
-    for x in (np.arange(0, 60, 0.25), np.arange(0, 40, 0.05), irregular):
-        h = np.cumsum(rng.normal(0, 0.002, x.size))
-        response, measured = np.empty((1, x.size)), np.empty((1, x.size))
-        roll(x, h[None], GOLDEN_CAR, RULES, False, response, measured)
-        start = (np.interp(11.0, x, h) - h[0]) / 11.0
-        state, felt = np.array([start, 0.0, start, 0.0]), []
-        for a, b in pairwise(x):
-            ends = np.clip([0.5 * (a + b) - 0.125, 0.5 * (a + b) + 0.125], x[0], x[-1])
-            ends = np.array([a, b]) if b - a >= 0.25 else ends
-            slope = np.diff(np.interp(ends, x, h))[0] / np.diff(ends)[0]
-            step, push, *_ = cont2discrete((MOTION, ROAD, np.eye(4), np.zeros((4, 1))), (b - a) / SPEED_M_PER_S)
-            state = step @ state + push[:, 0] * slope
-            felt.append(abs(state[0] - state[2]) * (b - a))
-        assert response[0, 1:] == pytest.approx(np.cumsum(felt), rel=1e-9)
-        assert measured[0] == pytest.approx(x - x[0], abs=1e-9)
 
 
 def test_a_harmonic_road_settles_at_the_gain_of_the_car() -> None:
@@ -163,9 +141,9 @@ def test_rolling_iri_and_rough_places() -> None:
     there = Segments(x[k : k + 1] - 3.81, x[k : k + 1] + 3.81)
     assert rolling[k] == pytest.approx(iri_of(on, there).iri_m_per_km[0, 0])
     assert np.isnan(rolling[x < 3.8]).all() and np.isfinite(rolling[(x > 3.82) & (x < 96.1)]).all()
-    place = max(rough_places(x, rolling, 10.0), key=lambda one: one.peak_m_per_km)
+    place = max(stretches_above(x, rolling, 10.0), key=lambda one: one.peak)
     assert 55.0 < place.from_m < 60.0 < place.to_m < 68.0
-    assert place.peak_m_per_km == np.nanmax(rolling) == rolling[x == place.peak_m]
+    assert place.peak == np.nanmax(rolling) == rolling[x == place.peak_m]
     assert (rolling[(x >= place.from_m) & (x <= place.to_m)] > 10.0).all()
 
 

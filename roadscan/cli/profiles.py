@@ -1,0 +1,125 @@
+"""Commands for those who have only a profile: its roughness, its texture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from roadscan.cli.terminal import print_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from roadscan.condition.profile_files import ProfileFile
+
+ProfileArgument = Annotated[
+    Path, typer.Argument(metavar="FILE", help="ERD, or columns of text: a station and heights to a line.",
+                         show_default=False)
+]  # fmt: skip
+XUnit = Annotated[
+    str | None, typer.Option("--x-unit", help="Unit of stations, where the file does not say it: m, mm, ft …")
+]
+HeightUnit = Annotated[str | None, typer.Option("--height-unit", help="Unit of heights, likewise.")]
+Columns = Annotated[
+    str | None,
+    typer.Option(help="Columns of stations and heights by name or number, such as 2,3; of ERD, the channels."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def iri(
+    file: ProfileArgument,
+    segment: Annotated[float | None, typer.Option(help="Length of segments (m); one for all by default.")] = None,
+    stations: Annotated[
+        str | None, typer.Option(help="Ends of segments (m), such as 0,160.9,321.8, in place of a length.")
+    ] = None,
+    localised: Annotated[
+        float | None, typer.Option(help="List stretches whose rolling IRI over 7.62 m is above this (m/km), instead.")
+    ] = None,
+    x_unit: XUnit = None,
+    height_unit: HeightUnit = None,
+    columns: Columns = None,
+    as_json: AsJson = False,
+) -> None:
+    """IRI, and ride number, of longitudinal profiles in a file; of two wheel paths also their mean and half car."""
+    from roadscan.condition import tables
+    from roadscan.model.errors import RoadscanError
+
+    read = _read(file, x_unit, height_unit, columns)
+    try:
+        if localised is None:
+            found = tables.iri(
+                read.x_m, read.height_m, segment_m=segment, stations_m=_numbers(stations), names=read.names
+            )
+        else:
+            found = tables.localised_roughness(read.x_m, read.height_m, localised)
+    except RoadscanError as error:
+        raise error.at(file, error.record) from error
+    _show(found, read, file, as_json)
+
+
+def mpd(
+    file: ProfileArgument,
+    segment: Annotated[
+        float | None, typer.Option(help="Length that a row is for (m), a multiple of 0.1; one for all by default.")
+    ] = None,
+    from_m: Annotated[float | None, typer.Option("--from", help="Leave out what lies before this station (m).")] = None,
+    to_m: Annotated[float | None, typer.Option("--to", help="Leave out what lies behind this station (m).")] = None,
+    x_unit: XUnit = None,
+    height_unit: HeightUnit = None,
+    columns: Columns = None,
+    as_json: AsJson = False,
+) -> None:
+    """Mean profile depth, and RMS texture, of a texture profile in a file."""
+    from roadscan.condition import tables
+    from roadscan.model.errors import RoadscanError
+
+    read = _read(file, x_unit, height_unit, columns)
+    try:
+        found = tables.mpd(read.x_m, read.height_m, segment_m=segment, from_m=from_m, to_m=to_m)
+    except RoadscanError as error:
+        raise error.at(file, error.record) from error
+    _show(found, read, file, as_json)
+
+
+def _read(file: Path, x_unit: str | None, height_unit: str | None, columns: str | None) -> ProfileFile:
+    from roadscan.condition.profile_files import StatedUnits, read_profile
+
+    chosen = tuple(one.strip() for one in columns.split(",")) if columns else ()
+    read = read_profile(file, StatedUnits(x_unit, height_unit, chosen))
+    for line, text in read.rejects[:5]:
+        typer.echo(f"rejected: {file}, line {line}: {text}", err=True)
+    if len(read.rejects) > 5:
+        typer.echo(f"rejected: {len(read.rejects) - 5:,} more lines of {file}", err=True)
+    return read
+
+
+def _numbers(text: str | None) -> list[float] | None:
+    from roadscan.model.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        return [float(one) for one in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--stations {text}", expected="numbers with commas between them") from None
+
+
+def _show(found: pd.DataFrame, read: ProfileFile, file: Path, as_json: bool) -> None:
+    rows: list[dict[str, Any]] = json.loads(found.to_json(orient="records", double_precision=9))
+    if as_json:
+        told = {"file": str(file), "profiles": list(read.names), "rejected_lines": len(read.rejects), "rows": rows}
+        typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
+        return
+    print_table(tuple(found.columns), [tuple(_cell(name, row[name]) for name in found.columns) for row in rows])
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.2f}" if name == "measured_share" else f"{value:.3f}"
+    return str(value)

@@ -1,0 +1,34 @@
+"""Stretches of a road where a figure stays above a limit: localised roughness, bumps under a straightedge."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+
+class Stretch(NamedTuple):
+    """A stretch where a figure stays above a limit."""
+
+    from_m: float
+    """Its first sample (m)."""
+    to_m: float
+    """Its last sample (m)."""
+    peak_m: float
+    """Station of the greatest value (m)."""
+    peak: float
+    """The greatest value, in the unit of the figure."""
+
+
+def stretches_above(x_m: Floats, values: Floats, limit: float) -> list[Stretch]:
+    """Stretches where values (n,) at stations (n,) are above a limit, in their order; NaN is not above it."""
+    above = np.concatenate([[False], values > limit, [False]])
+    ends = np.flatnonzero(np.diff(above.astype(np.int8))).reshape(-1, 2)
+    found = []
+    for first, behind in ends:
+        peak = first + int(np.argmax(values[first:behind]))
+        found.append(Stretch(float(x_m[first]), float(x_m[behind - 1]), float(x_m[peak]), float(values[peak])))
+    return found

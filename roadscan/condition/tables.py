@@ -1,0 +1,174 @@
+"""Indices of profiles as tables, for Python and the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.iri import LOCAL_M, half_car_ride, iri_of, mean_roughness_index, rolling_iri
+from roadscan.condition.mpd import mean_profile_depths
+from roadscan.condition.profiles import heights_of, raise_fault, stations_of
+from roadscan.condition.ride import Ride, ride
+from roadscan.condition.ride_number import ride_number_of, ride_number_ride
+from roadscan.condition.rms_texture import rms_texture_mm
+from roadscan.condition.segments import Segments, segments_of
+from roadscan.condition.stretches import stretches_above
+from roadscan.condition.texture import TextureSettings, texture_segments
+from roadscan.model.errors import ProfileError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = npt.NDArray[np.float64]
+
+FLATTEST_M_PER_KM = 0.1
+"""No road has a lower IRI: what has one was measured in another unit, or is no road."""
+ROUGHEST_M_PER_KM = 30.0
+"""Nor a higher one: on the World Bank's scale, tracks with erosion gullies end at 20 m/km."""
+FLATTEST_MM = 0.02
+"""No road has a lower mean profile depth."""
+
+
+def iri(
+    x_m: npt.ArrayLike,
+    height_m: npt.ArrayLike,
+    *,
+    segment_m: float | None = None,
+    stations_m: Sequence[float] | None = None,
+    names: Sequence[str] = (),
+) -> pd.DataFrame:
+    """IRI and ride number of one profile, or of several that share their stations.
+
+    Parameters
+    ----------
+    x_m : (n,) stations, ascending, at any spacing up to a foot, regular or not (m).
+    height_m : (n,) or (profiles, n) heights; NaN where there is none (m).
+    segment_m : length of segments; one row for all by default (m).
+    stations_m : ends of segments, in place of a length (m).
+    names : of the profiles, for the columns; 1, 2 … by default.
+
+    Returns
+    -------
+    A row a segment: from_m, to_m, iri_m_per_km (of several profiles one column each, `iri_NAME_m_per_km`; of two also
+    mri_m_per_km, their mean, and hri_m_per_km, the half car), ride_number, measured_share (the least of the profiles)
+    and note. Values are NaN where less than half of a segment was measured. Notes: `start`, `gap`, `jump`, `short`
+    (see :meth:`roadscan.condition.ride.Ride.notes`), and `flat` or `wild`, an IRI so low or high that no road has it.
+
+    Raises
+    ------
+    ProfileError
+        where stations do not ascend, or a profile cannot be judged: too coarse, too short, or no road.
+    """
+    import pandas as pd
+
+    on, heights = _sound_ride(x_m, height_m)
+    parts = segments_of(on.x_m[0], on.x_m[-1], segment_m, stations_m)
+    found, shares = iri_of(on, parts)
+    columns: dict[str, npt.ArrayLike] = {"from_m": parts.from_m, "to_m": parts.to_m}
+    labels = list(names) or [str(k + 1) for k in range(len(heights))]
+    for label, values in zip(labels, found, strict=True):
+        columns["iri_m_per_km" if len(heights) == 1 else f"iri_{label}_m_per_km"] = values
+    if len(heights) == 2:
+        columns["mri_m_per_km"] = mean_roughness_index(found[0], found[1])
+        columns["hri_m_per_km"] = iri_of(half_car_ride(on.x_m, heights[0], heights[1]), parts).iri_m_per_km[0]
+    columns["ride_number"] = ride_number_of(ride_number_ride(on.x_m, heights), parts).ride_number
+    columns["measured_share"] = shares.min(axis=0)
+    columns["note"] = _joined(on, parts, segment_m, found)
+    return pd.DataFrame(columns)
+
+
+def localised_roughness(
+    x_m: npt.ArrayLike, height_m: npt.ArrayLike, limit_m_per_km: float, *, length_m: float = LOCAL_M
+) -> pd.DataFrame:
+    """Stretches where the rolling IRI of a profile is above a limit.
+
+    Parameters
+    ----------
+    x_m, height_m : as of :func:`iri`; the mean of the rolling IRI of several profiles is taken.
+    limit_m_per_km : the limit, such as 2.5 (m/km).
+    length_m : length of the rolling mean (m).
+
+    Returns
+    -------
+    A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km.
+    """
+    import pandas as pd
+
+    on, _ = _sound_ride(x_m, height_m)
+    found = stretches_above(on.x_m, rolling_iri(on, length_m).mean(axis=0), limit_m_per_km)
+    return pd.DataFrame(
+        [tuple(one) for one in found], columns=["from_m", "to_m", "peak_station_m", "peak_m_per_km"], dtype=float
+    )
+
+
+def mpd(
+    x_m: npt.ArrayLike,
+    height_m: npt.ArrayLike,
+    *,
+    segment_m: float | None = None,
+    from_m: float | None = None,
+    to_m: float | None = None,
+    settings: TextureSettings | None = None,
+) -> pd.DataFrame:
+    """Mean profile depth and RMS texture of a texture profile.
+
+    Parameters
+    ----------
+    x_m : (n,) stations, ascending, a sample each 0.5 mm or closer (m).
+    height_m : (n,) heights, positive upwards; NaN where there is none (m).
+    segment_m : length that a row is for, a multiple of 0.1 m; one row for all by default (m).
+    from_m, to_m : only what lies between.
+    settings : of the steps before the depth.
+
+    Returns
+    -------
+    A row a stretch: from_m, to_m, mpd_mm, stdev_mm (of the depths of its segments of 100 mm), rms_mm, valid_segments,
+    segments and note. Values are NaN where fewer than half of the segments are valid. Notes: `dropouts`, `spikes` and
+    `jump`, each with the number of segments that were left out for it, and `flat`, a depth that no road has.
+
+    Raises
+    ------
+    ProfileError
+        where stations do not ascend, or the profile is too coarse, too short or no texture.
+    """
+    import pandas as pd
+
+    if segment_m is not None and (segment_m < 0.1 or abs(segment_m / 0.1 - round(segment_m / 0.1)) > 1e-6):
+        raise ProfileError(f"stretches of {segment_m:g} m", expected="a multiple of the 0.1 m of a segment")
+    x = stations_of(x_m)
+    if heights_of(height_m, x.size).shape[0] != 1:
+        raise ProfileError("several profiles", expected="one texture profile")
+    segments = texture_segments(x, height_m, settings, from_m=from_m, to_m=to_m)
+    stretches = segments_of(segments[0].from_m, segments[-1].to_m, segment_m)
+    rows = []
+    for first, last, depth in zip(*stretches, mean_profile_depths(segments, stretches), strict=True):
+        inside = [one for one in segments if first - 1e-6 <= one.from_m < last - 1e-6]
+        words = [word for one in inside for word in one.note.split(", ") if word]
+        notes = [f"{word} {words.count(word)}" for word in ("dropouts", "spikes", "jump") if word in words]
+        notes += ["flat"] if depth.mpd_mm < FLATTEST_MM else []
+        rows.append((first, last, depth.mpd_mm, depth.stdev_mm, rms_texture_mm(inside), depth.valid, depth.segments,
+                     ", ".join(notes)))  # fmt: skip
+    names = ["from_m", "to_m", "mpd_mm", "stdev_mm", "rms_mm", "valid_segments", "segments", "note"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, Floats]:
+    """The golden car's ride on profiles none of which has a fault, and their heights (profiles, n)."""
+    on = ride(x_m, height_m)
+    for number, fault in enumerate(on.faults, 1):
+        raise_fault(fault and (f"profile {number}: {fault}" if len(on.faults) > 1 else fault))
+    return on, heights_of(height_m, on.x_m.size)
+
+
+def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -> list[str]:
+    """Notes of all profiles together, each word once."""
+    of_all = on.notes(parts, segment_m)
+    flat, wild = (found < FLATTEST_M_PER_KM).any(axis=0), (found > ROUGHEST_M_PER_KM).any(axis=0)
+    joined = []
+    for k in range(parts.from_m.size):
+        words = [word for word in ("start", "gap", "jump", "short") if any(word in notes[k] for notes in of_all)]
+        joined.append(", ".join(words + ["flat"] * bool(flat[k]) + ["wild"] * bool(wild[k])))
+    return joined

@@ -1,0 +1,137 @@
+"""`roadscan iri`, `roadscan mpd` and their functions in Python, on files as users have them."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+import roadscan as rs
+from roadscan.cli import app
+from roadscan.condition.profile_files import StatedUnits
+
+
+def told(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def refused(*words: str | Path) -> str:
+    outcome = told(*words)
+    assert outcome.exit_code != 0
+    return str(outcome.exception)
+
+
+@pytest.fixture
+def road() -> tuple[np.ndarray, np.ndarray]:
+    x = np.arange(1600) * 0.125
+    waves = ((0.004, 7.1, 0.3), (0.006, 11.3, 1.0), (0.01, 17.9, 2.0))
+    return x, np.asarray(sum(a * np.sin(2 * np.pi * x / wave + phase) for a, wave, phase in waves))
+
+
+def test_published_segments_by_the_command(recordings: Path) -> None:
+    file = recordings / "iri" / "profile_a.txt"
+    outcome = told("iri", file, "--x-unit", "m", "--height-unit", "m", "--segment", "100", "--json")
+    rows = json.loads(outcome.stdout)["rows"]
+    assert [row["iri_m_per_km"] for row in rows[:5]] == pytest.approx(
+        [3.29852, 2.44211, 3.55511, 4.08554, 2.70790], abs=1e-3
+    )
+    assert (rows[0]["note"], rows[-1]["note"], rows[-1]["to_m"]) == ("start", "short", 1022.0)
+    text = told("iri", file, "--x-unit", "m", "--height-unit", "m", "--stations", "478,578,778").stdout
+    assert text.splitlines()[0].split()[:3] == ["from_m", "to_m", "iri_m_per_km"]
+    assert text.splitlines()[2].split()[:3] == ["478.000", "578.000", "3.298"]
+    assert "--x-unit m" in refused("iri", file)
+    assert "one of m, cm" in refused("iri", file, "--x-unit", "m", "--height-unit", "furlong")
+
+
+def test_the_figures_of_captif_by_the_command(recordings: Path, tmp_path: Path) -> None:
+    file = tmp_path / "station_0.dat"
+    file.write_bytes(gzip.decompress((recordings / "texture" / "station_0.dat.gz").read_bytes()))
+    span = ("--columns", "2,3", "--from", "0.06232", "--to", "1.870388")
+    (row,) = json.loads(told("mpd", file, *span, "--json").stdout)["rows"]
+    assert row["mpd_mm"] == pytest.approx(3.277751, abs=1e-5) and row["stdev_mm"] == pytest.approx(0.853088, abs=1e-5)
+    assert (row["valid_segments"], row["segments"], row["note"]) == (17, 18, "dropouts 1")
+    assert "1,2" in refused("mpd", file)
+    assert len(told("mpd", file, *span, "--segment", "0.5").stdout.splitlines()) == 2 + 4
+    assert "multiple" in refused("mpd", file, *span, "--segment", "0.25")
+
+
+def test_erd_of_two_wheel_paths_there_and_back(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, left = road
+    right = np.roll(left, 40)
+    file = tmp_path / "road.erd"
+    rs.write_erd(file, x + 100.0, np.stack([left, right]), title="A road")
+    read = rs.read_profile(file)
+    assert read.names == ("LElev", "RElev")
+    assert read.x_m == pytest.approx(x + 100.0) and np.abs(read.height_m - [left, right]).max() < 6e-8
+    rows = json.loads(told("iri", file, "--segment", "50", "--json").stdout)["rows"]
+    table = rs.iri(x + 100.0, np.stack([left, right]), segment_m=50.0)
+    assert [row["mri_m_per_km"] for row in rows] == pytest.approx(table.mri_m_per_km.tolist(), abs=1e-4)
+    assert table.mri_m_per_km.to_numpy() == pytest.approx((table.iri_1_m_per_km + table.iri_2_m_per_km) / 2)
+    assert (table.hri_m_per_km < table.mri_m_per_km).all()
+    one = json.loads(told("iri", file, "--columns", "RElev", "--json").stdout)
+    assert one["profiles"] == ["RElev"] and "iri_m_per_km" in one["rows"][0]
+    for wrong, said in ((np.delete(x, 5), "even"), (x, "no height")):
+        heights = np.where(np.arange(wrong.size) == 7, np.nan, left[: wrong.size])
+        with pytest.raises(rs.RoadscanError, match=said):
+            rs.write_erd(file, wrong, heights)
+
+
+def test_units_of_text(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, h = road
+    named, feet = tmp_path / "named.csv", tmp_path / "feet.txt"
+    named.write_text("station_m,height_mm\n" + "\n".join(f"{a},{1e3 * b}" for a, b in zip(x, h, strict=True)))
+    feet.write_text("\n".join(f"{a / 0.3048} {b / 0.0254}" for a, b in zip(x, h, strict=True)))
+    whole = rs.iri(x, h).iri_m_per_km[0]
+    a, b = rs.read_profile(named), rs.read_profile(feet, StatedUnits("ft", "in"))
+    assert rs.iri(a.x_m, a.height_m).iri_m_per_km[0] == pytest.approx(whole, rel=1e-9)
+    assert rs.iri(b.x_m, b.height_m).iri_m_per_km[0] == pytest.approx(whole, rel=1e-6)
+    assert "--height-unit m" in refused("iri", named, "--height-unit", "m")  # it says mm itself
+    assert "rejected" in told("iri", _with(named, "spoilt\n")).stderr
+
+
+def _with(file: Path, line: str) -> Path:
+    file.write_text(file.read_text() + "\n" + line)
+    return file
+
+
+def test_what_is_no_profile(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, h = road
+    file = tmp_path / "p.ppf"
+    file.write_bytes(b"*\0\0\0\x01binary")
+    assert "PPF" in refused("iri", file)
+    assert "no such file" in refused("iri", tmp_path / "none")
+    unsorted = tmp_path / "unsorted.txt"
+    unsorted.write_text("x_m h_m\n0 1\n2 1\n1 1\n")
+    assert "record 4" in refused("iri", unsorted)
+    for height, said in ((1e3 * h, "millimetres"), (h[:80], "long")):
+        with pytest.raises(rs.RoadscanError, match=said):
+            rs.iri(x[: height.size], height)
+    with pytest.raises(rs.RoadscanError, match="profile 2"):
+        rs.iri(x, np.stack([h, 1e3 * h]))
+    assert rs.iri(x, 1e-3 * h).note[0] == "start, flat"
+    assert rs.iri(x, 12.0 * h).note[0] == "start, wild"
+    stepped = rs.iri(x, np.where(x > 100, h + 1.0, h), segment_m=50.0)
+    assert stepped.note.tolist() == ["start", "", "start, jump", "short"]
+    texture = np.arange(0.0, 1.0, 1e-4)
+    assert rs.mpd(texture, 1e-6 * np.sin(2 * np.pi * texture / 0.02)).note[0] == "flat"
+    with pytest.raises(rs.RoadscanError, match="several"):
+        rs.mpd(texture, np.zeros((2, texture.size)))
+
+
+def test_localised_roughness(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, h = road
+    h = h + 0.02 * np.exp(-(((x - 120.0) / 0.4) ** 2))
+    file = tmp_path / "bump.erd"
+    rs.write_erd(file, x, h)
+    limit = 1.3 * rs.iri(x, h).iri_m_per_km[0]
+    found = rs.localised_roughness(x, h, limit)
+    worst = found.loc[found.peak_m_per_km.idxmax()]
+    assert worst.from_m < 120.0 < worst.to_m and worst.peak_m_per_km > limit
+    rows = json.loads(told("iri", file, "--localised", str(limit), "--json").stdout)["rows"]
+    assert len(rows) == len(found) and rows[0]["from_m"] == pytest.approx(found.from_m[0], abs=0.13)
+    assert rs.localised_roughness(x, h, 1e3).empty

@@ -38,9 +38,9 @@ class DemoLane:
 
     def line(self) -> str:
         """The lane as text."""
-        roughness, left, right, slope = ((self.found[name], self.true[name]) for name in _SHOWN)
+        iri, left, right, slope = ((self.found[name], self.true[name]) for name in _SHOWN)
         return (
-            f"lane {self.lane:<9}IRI {roughness[0]:.2f} m/km (true {roughness[1]:.2f}), rut depth left {left[0]:.1f} mm "
+            f"lane {self.lane:<9}IRI {iri[0]:.2f} m/km (true {iri[1]:.2f}), rut depth left {left[0]:.1f} mm "
             f"(true {left[1]:.1f}), right {right[0]:.1f} mm (true {right[1]:.1f}), cross-slope {slope[0]:.2f} % "
             f"(true {slope[1]:.2f})"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,9 +66,7 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert error.size > 200
         assert abs(error.mean()) <= 0.3
         assert error.std() <= 1.0
-        wanted = (
-            f"SELECT value, station_from_m AS at FROM condition_values WHERE quantity = 'step_{side}_mm' ORDER BY at"
-        )
+        own = f"FROM condition_values WHERE quantity = 'step_{side}_mm'"
         found = query(session.store, f"SELECT value, station_from_m AS place {own} ORDER BY place")
         assert found["value"].to_pylist() == pytest.approx([-STEP_MM, STEP_MM], abs=0.5)
         assert found["place"].to_pylist() == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
@@ -118,6 +117,15 @@ def digests(session: Session) -> dict[str, str]:
     """Content of all values and of the section table."""
     own = ("condition_values", "condition_sections")
     return {r.unit: r.digest for r in session.manifest.all() if r.product in own}
+
+
+def test_the_ten_questions_have_answers(surveyed: RoughSurvey) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text(encoding="utf-8")
+    asked = re.findall(r"^```sql\n(.*?)^```\n\n```\n(.*?)\n", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(asked) == 10
+    store = surveyed.session("store").store
+    for statement, heading in asked:
+        assert query(store, statement).column_names == heading.split(), statement
 
 
 def test_a_second_run_does_nothing_and_stretches_change_no_bit(

@@ -17,11 +17,14 @@ from benchmarks.bench_lanes import RoughSurvey, driven, rough_scene, run
 from roadscan.code_reach import name_of
 from roadscan.condition.cell_table import cell_table
 from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_indices
+from roadscan.condition.indices.faulting import Faulting
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.survey_lane import survey_lane
 from roadscan.jobs.condition import stretches
-from roadscan.jobs.condition.against_truth import compared_values
+from roadscan.jobs.condition.against_truth import compared_values, true_lane
+from roadscan.jobs.condition.values import GroupTask, load_lane
 from roadscan.jobs.condition.work import MADE, plan_condition
+from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
 from roadscan.jobs.tiles.cell_files import read_cells
@@ -66,13 +69,26 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert error.size > 200
         assert abs(error.mean()) <= 0.3
         assert error.std() <= 1.0
-        own = f"FROM condition_values WHERE quantity = 'step_{side}_mm'"
-        found = query(session.store, f"SELECT value, station_from_m AS place {own} ORDER BY place")
-        assert found["value"].to_pylist() == pytest.approx([-STEP_MM, STEP_MM], abs=0.5)
-        assert found["place"].to_pylist() == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
     slope = held["section", "cross_slope_mean_percent"]
     assert np.nanmax(np.abs(slope[:, 0] - slope[:, 1])) <= 0.05
     assert held["section", "grade_percent"][:, 0] == pytest.approx(held["section", "grade_percent"][:, 1], abs=0.02)
+
+
+def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
+    session = surveyed.session("store", section_m=50.0)
+    config = session.survey.config.condition
+    assert config is not None
+    group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
+    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(session.plan), group))
+    true = true_lane(group, lane, surveyed.height_at)
+    for side in ("left", "right"):
+        found, right = (
+            [(v.from_m, v.value) for v in Faulting().values(one) if v.quantity == f"step_{side}_mm"]
+            for one in (lane, true)
+        )
+        assert [at for at, _ in found] == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
+        assert [height for _, height in found] == pytest.approx([height for _, height in right], abs=0.5)
+        assert [height for _, height in found] == pytest.approx([-STEP_MM, STEP_MM], abs=1.0)  # unevenness is in it
 
 
 def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> None:

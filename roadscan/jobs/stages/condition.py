@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from roadscan.jobs.condition.lines import write_lines
+from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
@@ -15,6 +15,8 @@ from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
 
 _PICTURES = 20
 """Pictures that a task draws."""
@@ -56,6 +58,14 @@ class Condition(Stage):
         bar = session.bar("pictures of condition")
         failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
         session.failed(self.name, [(one.unit, reason) for one, reason in failed])
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """The layer of reference lines is there and can be opened as stated."""
+        try:
+            check_layer(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
 
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""

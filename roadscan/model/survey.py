@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from roadscan.model.adjust import AdjustConfig
 from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
+from roadscan.model.condition import ConditionConfig
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
@@ -405,6 +406,8 @@ class SurveyConfig(Strict):
     """Tiles and cells."""
     surface: SurfaceConfig | None = None
     """Reconstruction of the road's surface; left out, there is none."""
+    condition: ConditionConfig | None = None
+    """The road's condition along its lanes; left out, none is computed."""
     products: ProductConfig = ProductConfig()
     """Products."""
 

@@ -1,1 +1,1 @@
-"""Kernels of condition: vehicles that roll over a profile, straightedges on it."""
+"""Kernels of condition: heights in the road's own frame, vehicles that roll over a profile, wires and straightedges."""

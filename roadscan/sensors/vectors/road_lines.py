@@ -131,6 +131,11 @@ class RoadLinesOptions(Strict):
     """Unit of the widths: m, mm, cm, km, ft or ft_us."""
     class_widths_m: dict[str, Annotated[float, Field(gt=0, le=_WIDEST_M, allow_inf_nan=False)]] = {}
     """Width of the roads of a class (m) by class, such as { S1100 = 22.0 }; stands above the table for TIGER/Line."""
+    measure_from_column: str | None = None
+    """Attribute with the measure (milepost) at a line's first vertex, in the layer's own unit; for the reference lines
+    of `[condition]`."""
+    measure_to_column: str | None = None
+    """Attribute with the measure at its last vertex."""
 
 
 class RoadLines(LogFormat):
@@ -275,6 +280,8 @@ class LineLayer:
             "class": _attribute(options.class_column, _KNOWN_CLASSES, names, path),
             "lanes": _attribute(options.lanes_column, _KNOWN_LANES, names, path),
             "width": _attribute(options.width_column, (), names, path),
+            "measure_from": _attribute(options.measure_from_column, (), names, path),
+            "measure_to": _attribute(options.measure_to_column, (), names, path),
         }
         crs = _layer_crs(info["crs"], stated_crs or (None if info["crs"] else default_crs), path)
         return cls(path, name, crs, str(info.get("geometry_name") or ""), columns, options)
@@ -392,6 +399,8 @@ class Lines:
     width_from: list[str | None]
     shapes: npt.NDArray[np.object_]
     """(n,) Shapely lines, easting and northing (m)."""
+    measures: Float64
+    """(n, 2) measures at the feature's ends, NaN where the layer states none or the feature has several parts."""
 
 
 def read_lines(layer: LineLayer, place: Place, *, need_widths: bool = True) -> Iterator[Lines | Reject]:
@@ -432,6 +441,7 @@ def _lines(
     if chosen.size:
         numbers = np.arange(feature.size) - np.searchsorted(feature, feature)
         rows = chosen.tolist()
+        whole = np.bincount(feature, minlength=batch.num_rows) == 1
         yield Lines(
             records=first + chosen,
             ids=[words.ids[i] or str(first + i) for i in rows],
@@ -442,6 +452,7 @@ def _lines(
             width_m=width[chosen],
             width_from=[origin[i] for i in rows],
             shapes=placed[kept],
+            measures=np.where(whole[:, None], words.measures, np.nan)[chosen],
         )
 
 
@@ -479,6 +490,8 @@ class _Words:
     classes: list[str]
     lanes: list[int | None]
     widths: Float64
+    measures: Float64
+    """(n, 2)"""
     damaged: Bool
     """True where bytes are no text."""
 
@@ -496,6 +509,7 @@ class _Words:
             classes=classes,
             lanes=[int(n) if 0 < n <= _MOST_LANES else None for n in lanes],
             widths=np.array([number_of(v) for v in values("width")], dtype=np.float64),
+            measures=np.column_stack([[number_of(v) for v in values(f"measure_{end}")] for end in ("from", "to")]),
             damaged=np.array(
                 [NO_TEXT in "".join(three) for three in zip(ids, names, classes, strict=True)], dtype=bool
             ),

@@ -1,0 +1,121 @@
+"""The contract of an index of condition, and the registry that finds indices by themselves.
+
+An index is one file of `roadscan/condition/indices/` (or an entry point of the group ``roadscan.condition_indices``)
+with one subclass of :class:`ConditionIndex`: its formula, its quantities, and how it is drawn.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.lane_data import LaneData
+from roadscan.plugins import found_kinds
+
+Float64 = npt.NDArray[np.float64]
+
+How: TypeAlias = Literal["mean", "max"]
+
+ENTRY_POINT_GROUP: Final = "roadscan.condition_indices"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A figure that an index gives."""
+
+    name: str
+    """With its unit, such as rut_depth_mm."""
+    unit: str
+    meaning: str
+
+
+class Value(NamedTuple):
+    """A value of a quantity."""
+
+    quantity: str
+    extent: Literal["cross_section", "section"]
+    from_m: float
+    to_m: float
+    value: float
+    """NaN where it cannot be told."""
+    sigma: float
+    """NaN where it is not known."""
+    share: float
+    reason: str = ""
+
+
+class ConditionIndex(ABC):
+    """An index of condition: values of sections of a lane, and of its cross-sections."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    quantities: ClassVar[tuple[Quantity, ...]]
+    drawn: ClassVar[tuple[str, ...]] = ()
+    """Quantities of sections that the strip chart shows, in one panel."""
+    needs_cracks: ClassVar[bool] = False
+    """True for an index of the survey's cracks."""
+    lead_m: ClassVar[float] = 0.0
+    """Way before and after a section that its values depend on."""
+
+    @abstractmethod
+    def values(self, lane: LaneData) -> Iterable[Value]:
+        """Values of all sections, and of cross-sections in them."""
+
+
+@functools.cache
+def condition_indices() -> dict[str, ConditionIndex]:
+    """All indices by name."""
+    found = found_kinds("roadscan.condition.indices", ConditionIndex, ENTRY_POINT_GROUP)
+    return {name: kind() for name, kind in found.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class PerCrossSection:
+    """A quantity of each cross-section, before it is summed up by section."""
+
+    quantity: str
+    station_m: Float64
+    value: Float64
+    sigma: Float64
+    share: Float64
+
+    def values(self) -> Iterable[Value]:
+        """Values of the cross-sections themselves."""
+        for station, value, sigma, share in zip(
+            self.station_m.tolist(), self.value.tolist(), self.sigma.tolist(), self.share.tolist(), strict=True
+        ):
+            reason = "" if math.isfinite(value) else "too little of the cross-section was measured"
+            yield Value(self.quantity, "cross_section", station, station, value, sigma, share, reason)
+
+
+def by_section(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str, How]]) -> Iterable[Value]:
+    """Mean or greatest value of the cross-sections of each section, under names of their own.
+
+    A section of which too few cross-sections have a value has none. The standard deviation of a mean takes the
+    cross-sections' errors as alike, since neighbours share the vehicle's motion: it is their root mean square. That of
+    the greatest value is its own.
+    """
+    config = lane.config
+    for from_m, to_m in lane.sections_m:
+        own = (held.station_m >= from_m - 1e-6) & (held.station_m < to_m - 1e-6)
+        value, sigma = held.value[own], held.sigma[own]
+        known = ~np.isnan(value)
+        due = max(1.0, (to_m - from_m) / config.cross_section_spacing_m)
+        share = min(1.0, float(known.sum()) / due)
+        for name, how in wanted:
+            if share < config.least_share or not known.any():
+                reason = f"{100 * share:.0f} % of the cross-sections were measured"
+                yield Value(name, "section", from_m, to_m, np.nan, np.nan, share, reason)
+            elif how == "mean":
+                spread = float(np.sqrt(np.mean(sigma[known] ** 2)))
+                yield Value(name, "section", from_m, to_m, float(value[known].mean()), spread, share)
+            else:
+                k = int(np.flatnonzero(known)[np.argmax(value[known])])
+                yield Value(name, "section", from_m, to_m, float(value[k]), float(sigma[k]), share)

@@ -1,0 +1,1 @@
+"""Indices of condition, a file each."""

@@ -1,0 +1,76 @@
+"""Rut depth below a stretched wire, with its width and area, and the depth of standing water.
+
+The wire is stretched over the cross-section from edge to edge of the lane, the upper convex hull of its heights. Left
+and right are the halves of the lane in the direction of travel. Source: the wire method as public descriptions of
+AASHTO R 48 and PP 69 have it (the texts were not at hand, no compliance is claimed).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
+from roadscan.condition.lane_data import LaneData
+from roadscan.condition.whole_sections import WholeSections
+from roadscan.kernels.condition.ruts import stretched_wire, water
+
+Float64 = npt.NDArray[np.float64]
+
+_MM: Final = 1e3
+_WATER: Final = (
+    Quantity("water_depth_mm", "mm", "Greatest depth of water that stands in a cross-section"),
+    Quantity("water_depth_max_mm", "mm", "The same, greatest of the section"),
+)
+
+
+def _of_side(side: str) -> tuple[Quantity, ...]:
+    half = f"of the {side} half of the lane"
+    return (
+        Quantity(f"rut_depth_{side}_mm", "mm", f"Greatest depth below the wire {half}"),
+        Quantity(f"rut_depth_mean_{side}_mm", "mm", f"The same {half}, mean over the section"),
+        Quantity(f"rut_depth_max_{side}_mm", "mm", f"The same {half}, greatest of the section"),
+        Quantity(f"rut_width_{side}_m", "m", f"Width over which the depth is more than a tenth of the greatest {half}"),
+        Quantity(f"rut_area_{side}_m2", "m²", f"Area between wire and road {half}"),
+    )
+
+
+class RutWire(ConditionIndex):
+    """Ruts below a wire over the whole lane."""
+
+    name: ClassVar[str] = "rut_wire"
+    title: ClassVar[str] = "rut depth below a stretched wire, rut width and area, water depth"
+    quantities: ClassVar[tuple[Quantity, ...]] = (*_of_side("left"), *_of_side("right"), *_WATER)
+    drawn: ClassVar[tuple[str, ...]] = ("rut_depth_mean_left_mm", "rut_depth_mean_right_mm")
+
+    def values(self, lane: LaneData) -> Iterator[Value]:
+        """Values of each cross-section; means and greatest values of sections."""
+        c, whole = lane.cross_sections, WholeSections.of(lane)
+        found = np.zeros((whole.rows.size, 2, 5))
+        stretched_wire(c.offset_m, whole.height_m, found)
+        n = c.station_m.size
+        unknown = np.full(n, np.nan)
+
+        def held(name: str, values: Float64, sigma: Float64) -> PerCrossSection:
+            return PerCrossSection(name, c.station_m, whole.spread(values, n), sigma, c.share)
+
+        for half, side in enumerate(("left", "right")):
+            sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(found[:, half, 4]), n)
+            depth = held(f"rut_depth_{side}_mm", _MM * found[:, half, 0], sigma)
+            yield from depth.values()
+            wanted: tuple[tuple[str, How], ...] = (
+                (f"rut_depth_mean_{side}_mm", "mean"),
+                (f"rut_depth_max_{side}_mm", "max"),
+            )
+            yield from by_section(depth, lane, wanted)
+            yield from held(f"rut_width_{side}_m", found[:, half, 1], unknown).values()
+            yield from held(f"rut_area_{side}_m2", found[:, half, 2], unknown).values()
+        standing = np.zeros_like(whole.height_m)
+        water(whole.height_m, standing)
+        sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(2.0), n)
+        deepest = held("water_depth_mm", _MM * standing.max(axis=1, initial=0.0), sigma)
+        yield from deepest.values()
+        yield from by_section(deepest, lane, (("water_depth_max_mm", "max"),))

@@ -1,0 +1,94 @@
+"""What the indices of condition are computed from: profiles and cross-sections of a lane, and its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.cracks_on_lane import CrackOnLane
+from roadscan.model.condition import SectionConfig
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Heights along a wheel path, in the direction of travel."""
+
+    station_m: Float64
+    """(n,) station along the reference line."""
+    place_m: Float64
+    """(n, 2) easting and northing."""
+    height_m: Float64
+    """(n,) height, NaN where it is not known."""
+    sigma_m: Float64
+    """(n,) standard deviation from the noise of the readings, NaN where it is not known."""
+
+    @cached_property
+    def distance_m(self) -> Float64:
+        """(n,) way along the path, from its first height."""
+        steps = np.hypot(*np.diff(self.place_m, axis=0).T)
+        way: Float64 = np.concatenate([np.zeros(min(len(self.station_m), 1)), np.cumsum(steps)])
+        return way
+
+    def between(self, from_m: float, to_m: float) -> Profile:
+        """Heights whose station lies in [from, to]; their way is counted anew."""
+        own = (self.station_m >= from_m - 1e-6) & (self.station_m <= to_m + 1e-6)
+        return Profile(self.station_m[own], self.place_m[own], self.height_m[own], self.sigma_m[own])
+
+
+@dataclass(frozen=True, eq=False)
+class CrossSections:
+    """Heights across a lane, from left to right in the direction of travel."""
+
+    station_m: Float64
+    """(n,) ascending."""
+    offset_m: Float64
+    """(m,) offset from the lane's middle, positive to the right in the direction of travel."""
+    height_m: npt.NDArray[np.float64]
+    """(n, m) heights, each cross-section's from a height of its own; NaN where not known."""
+    sigma_m: npt.NDArray[np.float64]
+    """(n, m) standard deviations from the noise of the readings, NaN where not known."""
+    base_m: Float64
+    """(n,) height that `height_m` counts from."""
+
+    def between(self, from_m: float, to_m: float) -> CrossSections:
+        """Cross-sections whose station lies in [from, to)."""
+        own = (self.station_m >= from_m - 1e-6) & (self.station_m < to_m - 1e-6)
+        return replace(
+            self, station_m=self.station_m[own], height_m=self.height_m[own], sigma_m=self.sigma_m[own],
+            base_m=self.base_m[own],
+        )  # fmt: skip
+
+    @property
+    def share(self) -> Float64:
+        """(n,) share of the heights of each that are known."""
+        shares: Float64 = np.mean(~np.isnan(self.height_m), axis=1)
+        return shares
+
+
+@dataclass(frozen=True, eq=False)
+class LaneData:
+    """A lane along some sections, with what lies before and after them."""
+
+    sign: int
+    """1 where the lane is driven along the reference line, −1 against it."""
+    width_m: float
+    cell_m: float
+    """Edge of the cells that the heights come from."""
+    sections_m: tuple[tuple[float, float], ...]
+    """Begin and end station of each section."""
+    profiles: Mapping[str, Profile]
+    """By wheel path: left and right."""
+    cross_sections: CrossSections
+    config: SectionConfig
+    curvature_per_m: Float64
+    """(n,) curvature of the reference line at the cross-sections (1/m), positive to the right."""
+    cracks: tuple[CrackOnLane, ...] | None = None
+    """Cracks near the lane; None where the survey has no table of cracks."""
+    sigma_roll_rad: float = 0.0
+    """Standard deviation of the vehicle's roll as the poses state it."""

@@ -1,0 +1,126 @@
+"""Reference lines of roads and the lanes along them: stations, offsets and places on the map.
+
+Station counts metres along the reference line from its start; offset is positive to the right of it. A lane has its own
+frame as well: left and right are those of its direction of travel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.condition.road_frame import place
+
+Float64 = npt.NDArray[np.float64]
+
+NODE_M: Final = 1.0
+"""Distance between the nodes of a line, and between those of a lane's middle (m)."""
+_AROUND: Final = 4
+"""Nodes beyond a stretch that its places depend on."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoadLine:
+    """A road's reference line."""
+
+    road: str
+    """Id of the road."""
+    nodes_m: Float64
+    """(k, 2) easting and northing of the line at whole metres of station."""
+    first_m: int = 0
+    """Station of the first node (m)."""
+    name: str | None = None
+    """Name of the route, where the layer has one."""
+    measure_from: float | None = None
+    """The layer's measure (milepost) at station 0, in its own unit."""
+    measure_per_m: float | None = None
+    """Its change per metre of station."""
+
+    @property
+    def length_m(self) -> float:
+        """From the first to the last node."""
+        return NODE_M * (len(self.nodes_m) - 1)
+
+    def stretch(self, from_m: float, to_m: float) -> RoadLine:
+        """The same line, as far as places between two stations depend on it."""
+        first = max(int(np.floor(from_m)) - _AROUND - self.first_m, 0)
+        end = min(int(np.ceil(to_m)) + _AROUND + 1 - self.first_m, len(self.nodes_m))
+        first = max(min(first, end - 2), 0)
+        return RoadLine(
+            self.road, self.nodes_m[first:end], self.first_m + first, self.name, self.measure_from, self.measure_per_m
+        )
+
+    def places(self, station_m: npt.ArrayLike, offset_m: npt.ArrayLike) -> Float64:
+        """(n, 4) easting, northing (m), and the direction of the line (east, north) at stations and offsets (n,)."""
+        station, offset = np.broadcast_arrays(np.asarray(station_m, np.float64), np.asarray(offset_m, np.float64))
+        out = np.empty((station.size, 4))
+        s, o = np.ascontiguousarray(station.ravel()), np.ascontiguousarray(offset.ravel())
+        place(self.nodes_m, self.first_m, s, o, out)
+        return out
+
+    def curvature_per_m(self, station_m: Float64, half_m: float = 10.0) -> Float64:
+        """(n,) curvature of the line (1/m), positive where it turns right: change of direction over 2 · `half_m`."""
+        before, after = self.places(station_m - half_m, 0.0), self.places(station_m + half_m, 0.0)
+        cross = before[:, 3] * after[:, 2] - before[:, 2] * after[:, 3]
+        dot = before[:, 2] * after[:, 2] + before[:, 3] * after[:, 3]
+        turned: Float64 = np.arctan2(cross, dot) / (2.0 * half_m)
+        return turned
+
+    def measures(self, station_m: Float64) -> Float64:
+        """(n,) the layer's measure at stations; NaN where it has none."""
+        if self.measure_from is None or self.measure_per_m is None:
+            return np.full(np.shape(station_m), np.nan)
+        return self.measure_from + self.measure_per_m * np.asarray(station_m, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """A lane along a reference line."""
+
+    road: str
+    name: str
+    sign: int
+    """1 where it is driven along the line, −1 against it."""
+    first_m: int
+    """Station of the first value of `offset_m` (m)."""
+    offset_m: Float64
+    """(k,) offset of the lane's middle from the reference line at whole metres of station, positive to the right."""
+    width_m: float
+    width_from: str
+    """What the width was taken from: stated, or default."""
+    passes: tuple[int, ...]
+    """Passes that drove it."""
+    sigma_roll_deg: float = 0.0
+    """Standard deviation of the roll of its drives' poses, as the logs state it; the greatest of all."""
+
+    @property
+    def last_m(self) -> int:
+        """Station of the last value of `offset_m` (m)."""
+        return self.first_m + len(self.offset_m) - 1
+
+    @property
+    def direction(self) -> str:
+        """Direction of travel: forward along the reference line, or backward."""
+        return "forward" if self.sign > 0 else "backward"
+
+    @cached_property
+    def _nodes(self) -> Float64:
+        return self.first_m + NODE_M * np.arange(len(self.offset_m), dtype=np.float64)
+
+    def offsets(self, station_m: Float64, own_m: npt.ArrayLike = 0.0) -> Float64:
+        """Offset from the reference line at stations, of places `own_m` to the right of the lane's middle as driven."""
+        found: Float64 = np.interp(station_m, self._nodes, self.offset_m) + self.sign * np.asarray(own_m, np.float64)
+        return found
+
+    def stretch(self, from_m: float, to_m: float) -> Lane:
+        """The same lane between two stations, a node more on each side."""
+        first = max(int(np.floor(from_m)) - 1 - self.first_m, 0)
+        end = min(int(np.ceil(to_m)) + 2 - self.first_m, len(self.offset_m))
+        return Lane(
+            self.road, self.name, self.sign, self.first_m + first, self.offset_m[first:end], self.width_m,
+            self.width_from, self.passes, self.sigma_roll_deg,
+        )  # fmt: skip

@@ -1,0 +1,131 @@
+"""Heights of a stretch of lane from cells: along its wheel paths, and across it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.kernels.condition.sampling import CellTable, sample
+from roadscan.model.condition import SectionConfig
+
+Float64 = npt.NDArray[np.float64]
+
+SIDES: Final = {"left": -1.0, "right": 1.0}
+"""Wheel paths, and the side of the lane's middle on which they lie, in the direction of travel."""
+_LEAST_CELLS: Final = 1.5
+"""Half of a window of a profile holds at least so many cells each way."""
+_LEAST_CELLS_ACROSS: Final = 2.0
+"""The same of a cross-section, whose surface may bend."""
+_CROSS_HALF_M: Final = 0.075
+"""Half of the way along the road over which a cross-section is smoothed (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathHeights:
+    """Heights along a wheel path."""
+
+    station_m: Float64
+    """(n,)"""
+    offset_m: Float64
+    """(n,) from the reference line, positive to the right."""
+    places: Float64
+    """(n, 4) easting, northing (m), direction."""
+    values: Float64
+    """(n, 3) height (m), its standard deviation (m), and the share of the ground around that holds cells."""
+
+
+@dataclass(frozen=True, eq=False)
+class CrossHeights:
+    """Heights of cross-sections."""
+
+    station_m: Float64
+    """(n,)"""
+    middle_offset_m: Float64
+    """(n,) offset of the lane's middle from the reference line, positive to the right."""
+    places: Float64
+    """(n, 4) easting, northing of the lane's middle (m), direction."""
+    offset_m: Float64
+    """(m,) offset from the lane's middle, positive to the right in the direction of travel."""
+    base_m: Float64
+    """(n,) height that the others count from."""
+    height_m: Float64
+    """(n, m)"""
+    sigma_m: Float64
+    """(n, m)"""
+
+
+@dataclass(frozen=True, eq=False)
+class LaneHeights:
+    """What was surveyed of a stretch."""
+
+    paths: Mapping[str, PathHeights]
+    cross: CrossHeights
+
+
+def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Half of the windows' extents along and across (m): of a profile's heights, and of a cross-section's."""
+    least, across = _LEAST_CELLS * cell_m, _LEAST_CELLS_ACROSS * cell_m
+    profile = max(config.profile_spacing_m, least), max(config.wheel_path_width_m / 2, least)
+    cross = max(_CROSS_HALF_M, across), max(1.5 * config.cross_section_step_m, across)
+    return profile, cross
+
+
+def reach_m(config: SectionConfig, cell_m: float) -> float:
+    """How far from its place a height depends on cells (m)."""
+    return max(math.hypot(*half) for half in windows_m(config, cell_m)) + cell_m
+
+
+def survey_lane(
+    table: CellTable, line: RoadLine, lane: Lane, between_m: tuple[float, float], config: SectionConfig
+) -> LaneHeights:
+    """Heights of a lane's wheel paths and cross-sections at stations in [from, to).
+
+    Parameters
+    ----------
+    table : cells of all tiles within reach; line, lane : at least as long as the stretch.
+    """
+    cell_m = float(table.cell[0])
+    profile, across = windows_m(config, cell_m)
+    station = _multiples(config.profile_spacing_m, between_m)
+    paths = {}
+    for name, side in SIDES.items():
+        offset = lane.offsets(station, side * config.wheel_paths_m)
+        places = line.places(station, offset)
+        values = np.empty((station.size, 3))
+        sample(table, places, *profile, False, values)
+        paths[name] = PathHeights(station, offset, places, values)
+    every = _multiples(config.cross_section_spacing_m, between_m)
+    return LaneHeights(paths, _cross_heights(table, line, lane, every, config, across))
+
+
+def _cross_heights(
+    table: CellTable, line: RoadLine, lane: Lane, station: Float64, config: SectionConfig, half_m: tuple[float, float]
+) -> CrossHeights:
+    count = 2 * int(lane.width_m / 2 / config.cross_section_step_m + 1e-6) + 1
+    own = config.cross_section_step_m * (np.arange(count, dtype=np.float64) - count // 2)
+    every = np.repeat(station, count)
+    places = line.places(every, lane.offsets(every, np.tile(own, station.size)))
+    values = np.empty((every.size, 3))
+    sample(table, places, *half_m, True, values)
+    height = values[:, 0].reshape(station.size, count)
+    known = ~np.isnan(height)
+    first = np.argmax(known, axis=1)
+    base = np.where(known.any(axis=1), height[np.arange(station.size), first], 0.0)
+    middle = lane.offsets(station)
+    return CrossHeights(
+        station, middle, line.places(station, middle), own, base, height - base[:, None],
+        values[:, 1].reshape(station.size, count),
+    )  # fmt: skip
+
+
+def _multiples(spacing_m: float, between_m: tuple[float, float]) -> Float64:
+    """Multiples of a spacing in [from, to)."""
+    first, end = (math.ceil(one / spacing_m - 1e-9) for one in between_m)
+    stations: Float64 = spacing_m * np.arange(first, end, dtype=np.float64)
+    return stations

@@ -1,0 +1,1 @@
+"""The road's condition: reference lines, stretches of lanes, values of indices, sections."""

@@ -1,0 +1,139 @@
+"""Pictures of condition: a strip chart of each lane and kilometre, and its cross-section with the deepest rut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from roadscan.code_reach import code_digest
+from roadscan.condition.index import condition_indices
+from roadscan.condition.lane_data import LaneData
+from roadscan.condition.whole_sections import WholeSections
+from roadscan.jobs.condition.values import VALUES, Group, GroupTask, load_lane
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.kernels.condition.ruts import wire_places
+from roadscan.products.pictures.condition import Crossing, Strip, draw_crossing, draw_strips
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import Store, file_digest
+
+PICTURES: Final = "condition_pictures"
+_DEPTHS: Final = ("rut_depth_left_mm", "rut_depth_right_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class PictureTask:
+    """A picture of a group. Sent to workers."""
+
+    task: GroupTask
+    kind: str
+    """strip or cross_section."""
+    values: tuple[OutputRecord, ...]
+    key: str
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+        group = self.task.group
+        return f"{group.lane.road}_{group.lane.name}_{group.number:05d}_{self.kind}.png"
+
+
+def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[PictureTask]:
+    """Both pictures of each group whose values are there."""
+    held = manifest.of(VALUES)
+    code = code_digest("roadscan.jobs.condition.pictures:draw_picture")
+    drawn = {name: one.drawn for name, one in condition_indices().items()}
+    found = []
+    for task in tasks:
+        group = task.group
+        values = tuple(held[u] for u in task.units if u in held)
+        shape = [group.sections_m, [(r.unit, r.digest) for r in values], drawn]
+        crossed = [(r.unit, r.digest) for r in group.cross_sections]
+        if values:
+            found.append(PictureTask(task, "strip", values, key_of(code, "strip", shape)))
+            found.append(PictureTask(task, "cross_section", values, key_of(code, "crossing", shape, crossed)))
+    return found
+
+
+def due_pictures(tasks: Sequence[PictureTask], manifest: Manifest) -> list[PictureTask]:
+    """Those that are missing or stale."""
+    return [t for t in tasks if not manifest.is_current(PICTURES, t.unit, t.key)]
+
+
+def draw_picture(one: PictureTask) -> OutputRecord:
+    """Draw and write a picture (runs on a worker)."""
+    store, group = one.task.store, one.task.group
+    values = _values(store, one.values)
+    target = f"products/{PICTURES}/{one.unit}"
+    with store.scratch() as folder:
+        path = folder / one.unit
+        drawn = _strip(path, group, values) if one.kind == "strip" else _crossing(path, one.task, values)
+        if not drawn:
+            return OutputRecord(PICTURES, one.unit, one.key, "", 0, "")
+        size, digest = path.stat().st_size, file_digest(path)
+        store.publish(path, target)
+    return OutputRecord(PICTURES, one.unit, one.key, target, size, digest)
+
+
+def _values(store: Store, records: Sequence[OutputRecord]) -> pa.Table:
+    schema = table_schema(VALUES).arrow()
+    parts = [store.parse_table(read_recorded(store, r), r.path).cast(schema) for r in records]
+    return pa.concat_tables([schema.empty_table(), *parts])
+
+
+def _strip(path: Path, group: Group, values: pa.Table) -> bool:
+    rows = values.filter(pc.equal(values["extent"], "section"))
+    panels = []
+    for index in condition_indices().values():
+        strips = [_of_quantity(rows, name) for name in index.drawn]
+        known = [s for s in strips if np.isfinite(s.value).any()]
+        if known:
+            panels.append(known)
+    span = group.sections_m[0][0], group.sections_m[-1][1]
+    draw_strips(path, _title(group), panels, span)
+    return True
+
+
+def _of_quantity(rows: pa.Table, name: str) -> Strip:
+    own = rows.filter(pc.equal(rows["quantity"], name)).sort_by("station_from_m")
+    unit = own["unit"][0].as_py() if own.num_rows else ""
+    return Strip(name, unit, *(own[c].to_numpy() for c in ("station_from_m", "station_to_m", "value")))
+
+
+def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
+    """The cross-section with the deepest rut; False where none is known."""
+    lane: LaneData = load_lane(task)
+    whole = WholeSections.of(lane)
+    if not whole.rows.size:
+        return False
+    depths = {name: _by_station(values, name, lane.cross_sections.station_m[whole.rows]) for name in _DEPTHS}
+    deepest = np.nan_to_num(np.maximum(*depths.values()))
+    k = int(np.argmax(deepest))
+    station = float(lane.cross_sections.station_m[whole.rows[k]])
+    x, height = lane.cross_sections.offset_m, whole.height_m[k]
+    wire = np.zeros(x.size, np.int64)
+    count = wire_places(x, height, wire)
+    told = {"left rut": float(depths[_DEPTHS[0]][k]), "right rut": float(depths[_DEPTHS[1]][k])}
+    draw_crossing(path, f"{_title(task.group)}, station {station:,.1f} m", Crossing(x, height, wire[:count], told))
+    return True
+
+
+def _by_station(values: pa.Table, name: str, station_m: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    own = values.filter(pc.equal(values["quantity"], name)).sort_by("station_from_m")
+    at, value = own["station_from_m"].to_numpy(), own["value"].to_numpy()
+    if not at.size:
+        return np.full(station_m.size, np.nan)
+    place = np.minimum(np.searchsorted(at, station_m - 1e-6), at.size - 1)
+    return np.where(np.abs(at[place] - station_m) < 1e-3, value[place], np.nan)
+
+
+def _title(group: Group) -> str:
+    named = f"{group.line.name} ({group.lane.road})" if group.line.name else group.lane.road
+    return f"{named}, lane {group.lane.name}, {group.lane.direction}"

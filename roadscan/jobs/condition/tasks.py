@@ -1,0 +1,60 @@
+"""Tasks that each make some files: their records are kept as they end, and a task that dies is tried once more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol, Self, TypeVar
+
+from roadscan.jobs.engine.compute import Compute, reason_of
+from roadscan.jobs.tiles.tiles import TaskResult
+from roadscan.tables.manifest import Manifest
+
+
+class Splittable(Protocol):
+    """A task over some units."""
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of its units."""
+
+    def singly(self) -> list[Self]:
+        """A task for each unit."""
+
+
+T = TypeVar("T", bound=Splittable)
+
+
+def run_units(
+    function: Callable[[T], TaskResult],
+    tasks: Sequence[T],
+    manifest: Manifest,
+    compute: Compute,
+    report: Callable[[int, int], None],
+) -> list[tuple[str, str]]:
+    """Do all tasks and keep their records; returns units that failed, with the reason."""
+    total = sum(len(task.units) for task in tasks)
+    failures: list[tuple[str, str]] = []
+    again: list[T] = []
+    finished = 0
+    report(0, total)
+
+    def rounds() -> Iterator[Sequence[T]]:
+        yield tasks
+        if again:
+            yield again
+
+    for some in rounds():
+        for done in compute.map(function, some):
+            if done.result is not None:
+                manifest.add_packed(done.result.records)
+                manifest.doubt_files(done.result.damaged)
+                failures += done.result.failures
+            elif len(done.task.units) > 1:
+                again += done.task.singly()
+                continue
+            else:
+                failures.append((done.task.units[0], reason_of(done.error)))
+            finished += len(done.task.units)
+            report(finished, total)
+    manifest.settle()
+    return failures

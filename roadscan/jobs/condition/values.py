@@ -1,0 +1,267 @@
+"""Values of the indices: profiles and cross-sections of a lane along some sections → table `condition_values`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from roadscan.code_reach import code_digest, name_of
+from roadscan.condition.cracks_on_lane import PIECE_M, CrackOnLane, located
+from roadscan.condition.index import ConditionIndex, Value, condition_indices
+from roadscan.condition.lane_data import CrossSections, LaneData, Profile
+from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, STRETCH_M, unit_of
+from roadscan.jobs.engine.compute import damaged_file, reason_of
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.tiles.tiles import TaskResult
+from roadscan.model.condition import SectionConfig
+from roadscan.products.base import ProductContext
+from roadscan.products.geo_table import read_geo_table
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import Store, bytes_digest
+from roadscan.tables.writer import parquet_bytes
+
+VALUES: Final = "condition_values"
+_GROUP_M: Final = 1000.0
+"""Sections are computed together over about this length; it changes no value."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Some sections of a lane, one after another; it holds no data."""
+
+    line: RoadLine
+    lane: Lane
+    number: int
+    sections_m: tuple[tuple[float, float], ...]
+    profiles: tuple[OutputRecord, ...]
+    """Records of the stretches of profiles on its way, and before and behind it."""
+    cross_sections: tuple[OutputRecord, ...]
+    cracks: OutputRecord | None
+    """Record of the table of cracks, where there is one."""
+    indices: tuple[tuple[str, str], ...]
+    """Names of the indices to compute, with the keys of their values."""
+
+    def unit(self, index: str) -> str:
+        """Name of an index's values in the manifest."""
+        return f"{index}/{self.lane.road}/{self.lane.name}/{self.number:05d}"
+
+
+@dataclass(frozen=True, eq=False)
+class GroupTask:
+    """Values of some indices of a group. Sent to workers."""
+
+    store: Store
+    config: SectionConfig
+    cell_m: float
+    context: ProductContext
+    group: Group
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of the indices' values."""
+        return tuple(self.group.unit(name) for name, _ in self.group.indices)
+
+    def singly(self) -> list[GroupTask]:
+        """A task for each index."""
+        return [replace(self, group=replace(self.group, indices=(one,))) for one in self.group.indices]
+
+
+def plan_groups(roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float) -> list[Group]:
+    """All groups of sections, with all indices."""
+    profiles, crossings = manifest.of(PROFILES), manifest.of(CROSS_SECTIONS)
+    indices, cracks = condition_indices(), manifest.get("cracks", "cracks.parquet")
+    of_cracks = None if cracks is None else cracks.digest
+    entry = "roadscan.jobs.condition.values:values_of_group"
+    codes = {name: code_digest(entry, name_of(type(one))) for name, one in indices.items()}
+    lead = max((one.lead_m for one in indices.values()), default=0.0)
+    settings = config.model_dump(mode="json")
+    many = max(1, round(_GROUP_M / config.section_m))
+    found: list[Group] = []
+    for lane in roads.lanes:
+        sections = sections_of(lane, config.section_m)
+        for number in sorted({k // many for k, _, _ in sections}):
+            own = tuple((a, b) for k, a, b in sections if k // many == number)
+            near = [unit_of(lane, k) for k in range(
+                max(int(own[0][0] - lead) // STRETCH_M, 0), int(own[-1][1] + lead) // STRETCH_M + 1
+            )]  # fmt: skip
+            read = tuple(profiles[u] for u in near if u in profiles)
+            read_cross = tuple(crossings[u] for u in near if u in crossings)
+            shape = [
+                lane.sign,
+                lane.width_m,
+                lane.sigma_roll_deg,
+                own,
+                [(r.unit, r.digest) for r in (*read, *read_cross)],
+                cell_m,
+            ]
+            keys = tuple(
+                (name, key_of(codes[name], settings, shape, of_cracks if indices[name].needs_cracks else None))
+                for name in sorted(indices)
+            )
+            line = roads.lines[lane.road].stretch(own[0][0] - 20.0, own[-1][1] + 20.0)
+            found.append(Group(line, lane, number, own, read, read_cross, cracks, keys))
+    return found
+
+
+def sections_of(lane: Lane, section_m: float) -> list[tuple[int, float, float]]:
+    """Number, begin and end of each section of a lane: multiples of the length, cut at the lane's ends."""
+    first, last = int(lane.first_m // section_m), int(np.ceil(lane.last_m / section_m))
+    cut = [(k, max(k * section_m, lane.first_m), min((k + 1) * section_m, lane.last_m)) for k in range(first, last)]
+    return [(k, float(a), float(b)) for k, a, b in cut if b - a > 0.5]
+
+
+def due_groups(groups: Sequence[Group], manifest: Manifest) -> list[Group]:
+    """Groups with the indices whose values are missing or stale."""
+    found = []
+    for one in groups:
+        due = tuple((name, key) for name, key in one.indices if not manifest.is_current(VALUES, one.unit(name), key))
+        if due:
+            found.append(replace(one, indices=due))
+    return found
+
+
+def values_of_group(task: GroupTask) -> TaskResult:
+    """Compute and write the values of some indices (runs on a worker)."""
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    damaged: set[str] = set()
+    known = condition_indices()
+    try:
+        lane = load_lane(task)
+    except Exception as error:  # noqa: BLE001  a damaged file costs these values
+        return TaskResult.of((), [(u, reason_of(error)) for u in task.units], {damaged_file(error)})
+    for name, key in task.group.indices:
+        try:
+            records.append(_write(task, known[name], key, lane))
+        except Exception as error:  # noqa: BLE001  one index's fault must not stop the others
+            failures.append((task.group.unit(name), reason_of(error)))
+            damaged.add(damaged_file(error))
+    return TaskResult.of(records, failures, damaged)
+
+
+def _write(task: GroupTask, index: ConditionIndex, key: str, lane: LaneData) -> OutputRecord:
+    schema, group = table_schema(VALUES), task.group
+    values = sorted(index.values(lane), key=lambda v: (v.from_m, v.quantity, v.to_m))
+    content = parquet_bytes(values_table(group.lane, index, values), schema)
+    target = f"{schema.location}/{group.unit(index.name)}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    return OutputRecord(VALUES, group.unit(index.name), key, target, len(content), bytes_digest(content))
+
+
+def values_table(lane: Lane, index: ConditionIndex, values: Sequence[Value]) -> pa.Table:
+    """Rows of ``schemas/condition_values.toml``."""
+    units = {q.name: q.unit for q in index.quantities}
+    n = len(values)
+
+    def number(name: str) -> pa.Array:
+        return pa.array(np.array([getattr(v, name) for v in values], np.float64), from_pandas=True)
+
+    columns = {
+        "road": pa.array([lane.road] * n, pa.string()),
+        "lane": pa.array([lane.name] * n, pa.string()),
+        "index": pa.array([index.name] * n, pa.string()),
+        "quantity": pa.array([v.quantity for v in values], pa.string()),
+        "unit": pa.array([units[v.quantity] for v in values], pa.string()),
+        "extent": pa.array([v.extent for v in values], pa.string()),
+        "station_from_m": number("from_m"),
+        "station_to_m": number("to_m"),
+        "value": number("value"),
+        "sigma": number("sigma"),
+        "share": number("share"),
+        "reason": pa.array([v.reason or None for v in values], pa.string()),
+    }
+    return pa.table(columns, schema=table_schema(VALUES).arrow())
+
+
+def load_lane(task: GroupTask) -> LaneData:
+    """Profiles and cross-sections of a group."""
+    group = task.group
+    profiles = _tables(task.store, group.profiles, table_schema(PROFILES).arrow())
+    crossings = _tables(task.store, group.cross_sections, table_schema(CROSS_SECTIONS).arrow())
+    cross = _cross_sections(crossings, task.config, group.lane.width_m)
+    return LaneData(
+        sign=group.lane.sign,
+        width_m=group.lane.width_m,
+        cell_m=task.cell_m,
+        sections_m=group.sections_m,
+        profiles={side: _profile(profiles, side, group.lane.sign) for side in ("left", "right")},
+        cross_sections=_within(cross, group.sections_m),
+        config=task.config,
+        curvature_per_m=group.line.curvature_per_m(_within(cross, group.sections_m).station_m),
+        cracks=_cracks(task),
+        sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
+    )
+
+
+def _cracks(task: GroupTask) -> tuple[CrackOnLane, ...] | None:
+    """Cracks near the lane along the group; None where there is no table of cracks, or no index asks for it."""
+    group, known = task.group, condition_indices()
+    if group.cracks is None or not any(known[name].needs_cracks for name, _ in group.indices):
+        return None
+    table, shapes = read_geo_table(read_recorded(task.store, group.cracks), task.context)
+    from_m, to_m = group.sections_m[0][0], group.sections_m[-1][1]
+    station = np.unique(np.append(np.arange(from_m, to_m), to_m))
+    middle = shapely.LineString(group.line.places(station, group.lane.offsets(station))[:, :2])
+    found = []
+    for row, shape in zip(table.select(["type", "width_mean_m"]).to_pylist(), shapes, strict=True):
+        if middle.distance(shape) > group.lane.width_m:
+            continue
+        near = shapely.get_parts(shapely.segmentize(shape, PIECE_M))
+        ends = [shapely.get_coordinates(part) for part in near]
+        centre = np.concatenate([0.5 * (xy[1:] + xy[:-1]) for xy in ends])
+        length = np.concatenate([np.hypot(*np.diff(xy, axis=0).T) for xy in ends])
+        guess = float(station[0]) + middle.project(shape.centroid)
+        at, own = located(group.line, group.lane, centre, guess)
+        found.append(CrackOnLane(row["type"], row["width_mean_m"], at, own, length))
+    return tuple(found)
+
+
+def _within(cross: CrossSections, sections_m: Sequence[tuple[float, float]]) -> CrossSections:
+    return cross.between(sections_m[0][0], sections_m[-1][1])
+
+
+def _tables(store: Store, records: Sequence[OutputRecord], schema: pa.Schema) -> pa.Table:
+    parts = [store.parse_table(read_recorded(store, r), r.path) for r in records]
+    return pa.concat_tables([schema.empty_table(), *(p.cast(schema) for p in parts)])
+
+
+def _profile(table: pa.Table, side: str, sign: int) -> Profile:
+    rows = table.filter(pc.equal(table["path"], side))
+    known: Mapping[str, npt.NDArray[Any]] = {
+        name: rows[name].to_numpy() for name in ("station_m", "easting_m", "northing_m", "height_m", "sigma_height_m")
+    }
+    order = np.argsort(known["station_m"], kind="stable")[:: 1 if sign > 0 else -1]
+    return Profile(
+        known["station_m"][order],
+        np.column_stack([known["easting_m"][order], known["northing_m"][order]]),
+        known["height_m"][order],
+        known["sigma_height_m"][order].astype(np.float64),
+    )
+
+
+def _cross_sections(table: pa.Table, config: SectionConfig, width_m: float) -> CrossSections:
+    order = np.argsort(table["station_m"].to_numpy(), kind="stable")
+    n = table.num_rows
+    count = 2 * int(width_m / 2 / config.cross_section_step_m + 1e-6) + 1
+    offset = config.cross_section_step_m * (np.arange(count, dtype=np.float64) - count // 2)
+
+    def lists(name: str) -> npt.NDArray[np.float64]:
+        flat = table[name].combine_chunks().flatten().to_numpy().astype(np.float64)
+        held: npt.NDArray[np.float64] = flat.reshape(n, count)[order]
+        return held
+
+    return CrossSections(
+        table["station_m"].to_numpy()[order], offset, lists("relative_height_m"), lists("sigma_height_m"),
+        table["height_m"].to_numpy()[order],
+    )  # fmt: skip

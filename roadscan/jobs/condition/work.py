@@ -1,0 +1,77 @@
+"""What the stage `condition` has to do: lines, stretches and values there are against those there should be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
+from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
+from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
+from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, Stretch, due_stretches, plan_stretches
+from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups, plan_groups
+from roadscan.jobs.products import product_context
+from roadscan.jobs.session import Session
+from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.model.condition import ConditionConfig
+from roadscan.model.ids import TileId
+from roadscan.tables.manifest import OutputRecord
+
+MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES)
+"""Names of all outputs in the manifest."""
+
+
+@dataclass(frozen=True)
+class ConditionWork:
+    """What there is to do, as far as that can be told before the parts before it are done."""
+
+    lines_key: str = ""
+    lines_due: bool = False
+    stretches: Sequence[Stretch] = ()
+    due_stretches: Sequence[Stretch] = ()
+    groups: Sequence[Group] = ()
+    due_groups: Sequence[Group] = ()
+    files: SectionFiles | None = None
+    due_files: Sequence[str] = ()
+    due_pictures: Sequence[PictureTask] = ()
+    gone: Sequence[OutputRecord] = field(default=())
+    """Outputs that are no longer due."""
+
+    @property
+    def values_due(self) -> int:
+        """How many indices of groups are due."""
+        return sum(len(one.indices) for one in self.due_groups)
+
+
+def plan_condition(session: Session) -> ConditionWork:
+    """Compare what there is with what there should be; what waits for the lines is not told yet."""
+    config, manifest = session.survey.config.condition, session.manifest
+    if config is None:
+        return ConditionWork(gone=manifest.beside(set(MADE), ()))
+    key = lines_key(session.plan, config)
+    if not current_lines(manifest, key):
+        return ConditionWork(lines_key=key, lines_due=True)
+    return _along_lines(session, config, key)
+
+
+def _along_lines(session: Session, config: ConditionConfig, key: str) -> ConditionWork:
+    plan, manifest = session.plan, session.manifest
+    context = product_context(plan)
+    roads: Roads = load_roads(session.store, manifest, context)
+    tiles = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    settings, grid = config.sections(), plan.ground.grid
+    stretches = plan_stretches(roads, tiles, grid, settings)
+    groups = plan_groups(roads, manifest, settings, grid.cell_m)
+    units = [one.unit(name) for one in groups for name, _ in one.indices]
+    tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
+    pictures = plan_pictures(tasks, manifest)
+    files = plan_sections(session.store, manifest, roads, units, context)
+    gone = [
+        *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
+        *manifest.beside({VALUES}, set(units)),
+        *manifest.beside({PICTURES}, {one.unit for one in pictures}),
+    ]
+    return ConditionWork(
+        key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
+        due_files(files, manifest), due_pictures(pictures, manifest), gone,
+    )  # fmt: skip

@@ -1,0 +1,93 @@
+"""Stage `condition`: cells along the lanes into profiles, cross-sections, values of indices and the section table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.jobs.condition.lines import check_layer, write_lines
+from roadscan.jobs.condition.pictures import draw_picture
+from roadscan.jobs.condition.sections import write_sections
+from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
+from roadscan.jobs.condition.tasks import run_units
+from roadscan.jobs.condition.values import GroupTask, values_of_group
+from roadscan.jobs.condition.work import ConditionWork, plan_condition
+from roadscan.jobs.engine.bundles import run_bundles
+from roadscan.jobs.products import product_context
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
+
+_PICTURES = 20
+"""Pictures that a task draws."""
+
+
+class Condition(Stage):
+    """The road's condition along its lanes, where the survey file has a section `[condition]`."""
+
+    name = "condition"
+    title = "the road's condition along its lanes: roughness, ruts, slopes, cracks, by section"
+    after = ("surfaces", "products")
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or stale."""
+        config = session.survey.config.condition
+        work = plan_condition(session)
+        if config is None:
+            session.manifest.remove(work.gone)
+            return
+        if work.lines_due:
+            session.manifest.add(write_lines(session.plan, config, work.lines_key))
+            work = plan_condition(session)
+        session.manifest.remove(work.gone)
+        if not work.stretches:
+            session.note("condition: no drive of 20 m or more lies on the tiles that hold cells")
+        settings, grid = config.sections(), session.plan.ground.grid
+        context = product_context(session.plan)
+        tasks = stretch_tasks(work.due_stretches, session.store, grid, settings)
+        bar = session.bar("profiles of lanes")
+        session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
+        work = plan_condition(session) if tasks else work
+        values = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in work.due_groups]
+        bar = session.bar("values of condition")
+        session.failed(self.name, run_units(values_of_group, values, session.manifest, session.compute, bar))
+        work = plan_condition(session) if values else work
+        if work.files is not None and work.due_files:
+            session.manifest.add(write_sections(work.files))
+        manifest, due = session.manifest, work.due_pictures
+        bar = session.bar("pictures of condition")
+        failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
+        session.failed(self.name, [(one.unit, reason) for one, reason in failed])
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """The layer of reference lines is there and can be opened as stated."""
+        try:
+            check_layer(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """Stretches and values that are there, and those that are due."""
+        if session.survey.config.condition is None:
+            return StageState()
+        work = plan_condition(session)
+        stale = self._stale(work)
+        current = len(work.stretches) + sum(len(g.indices) for g in work.groups) - stale
+        return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
+
+    def _stale(self, work: ConditionWork) -> int:
+        return (
+            int(work.lines_due)
+            + len(work.due_stretches)
+            + work.values_due
+            + len(work.due_files)
+            + len(work.due_pictures)
+        )
+
+    def folders(self) -> Sequence[str]:
+        """Tables of lines, lanes, profiles, cross-sections and values, and the section table."""
+        return (
+            "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
+            "tables/condition_values", "products/condition_sections", "products/condition_pictures",
+        )  # fmt: skip

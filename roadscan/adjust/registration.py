@@ -142,7 +142,8 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
         place = place + np.clip(sums.step, -1.0, 1.0)
         if np.abs(place - start).max() > _ASTRAY_CELLS:
             return None
-        moved = float(np.abs(sums.step).max())
+        # A direction that is hardly known need not come to rest.
+        moved = math.sqrt(float(sums.step @ sums.mean @ sums.step) / max(float(np.trace(sums.mean)), 1e-300))
         if not coarse:
             found = place, sums
             if moved < _DONE_CELLS:

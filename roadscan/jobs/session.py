@@ -116,6 +116,11 @@ class Session:
         for known in _IN_ORDER[_IN_ORDER.index(name) :]:
             self.__dict__.pop(known, None)
 
+    def replan(self, plan: SurveyPlan) -> None:
+        """Take a plan in place of the one that was found, and forget what follows from that."""
+        self.renew("plan")
+        self.__dict__["plan"] = plan
+
     def hear_of_damage(self) -> list[StoreError]:
         """Let damaged records be no error; returns the list that hears of them."""
         if self.damaged is None:

@@ -12,10 +12,11 @@ from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_heigh
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
-from roadscan.adjust.targets.settings import TARGETS
+from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.model.frames import rotation_from_rph
 from roadscan.navigation.trajectory import Corrections
 
+TARGETS = TargetSettings()
 SLOPE = (0.02, -0.03)
 """Rise of the road to the east and to the north."""
 POINT = ControlPoint(7, "G7", "gcp", "", 1000.0, 2000.0, 50.0, 0.003, 0.002, None)

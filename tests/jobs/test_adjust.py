@@ -261,6 +261,17 @@ def test_one_point_in_another_datum_and_one_elsewhere(adjusted: Simulated, tmp_p
     assert [line for line in run.reporter.lines if "1 control points lie far above or below" in line and "G001" in line]
 
 
+def test_control_in_another_crs_is_named(adjusted: Simulated, tmp_path: Path) -> None:
+    def elsewhere(points: dict[str, dict[str, str]]) -> None:
+        for row in points.values():
+            row["easting_m"] = f"{float(row['easting_m']) - 470_000.0:.4f}"
+
+    copy = with_control(adjusted, tmp_path / "survey", elsewhere)
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    assert [line for line in run.reporter.lines if "not one of the 6 control points lies where a pass drove" in line]
+    assert not rows(copy.store(), "SELECT * FROM outputs WHERE product = 'control_sightings'")
+
+
 @pytest.mark.parametrize("mode", ["each_pass", "vertical", "helmert"])
 def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Path, mode: str) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")

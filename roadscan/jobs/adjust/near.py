@@ -107,7 +107,7 @@ class NearReader:
         run = self._runs[traverse.run]
         parts = [
             part
-            for file in self._files.get((run, traverse.sensor), ())
+            for file in self._files.get((run, traverse.sensor), [])
             for group, (first, last) in zip(file.groups, file.spans, strict=True)
             if first <= traverse.last_gps_ns and last >= traverse.first_gps_ns
             for part in self._placed(file, group, traverse, circle)
@@ -140,7 +140,7 @@ class NearReader:
         return known
 
     def _joined(self, traverse: Traverse, run: str, parts: Sequence[PlacedReadings]) -> PassReadings:
-        files = self._files.get((run, traverse.sensor), ())
+        files = self._files.get((run, traverse.sensor), [])
         found = PlacedReadings.joined(parts)
         trajectory = self._placer.trajectory(files[0].source) if files else None
         steps, pose = np.unique(found.epoch_gps_ns // _POSE_STEP_NS, return_inverse=True)

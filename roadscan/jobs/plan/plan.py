@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -32,7 +32,6 @@ from roadscan.model.gpstime import iso_from_gps_ns, utc_from_gps_ns
 from roadscan.model.ids import LanePass, RunId, of_run
 from roadscan.model.rig import Mounting, Mountings, Rig, Sensor
 from roadscan.model.survey import Survey
-from roadscan.navigation.movement import NO_CORRECTION
 from roadscan.points.place import HeightLimits
 from roadscan.sensors.base import log_formats
 from roadscan.tables.logs import NAVIGATION, DataFile, LogRecord
@@ -81,6 +80,12 @@ class SurveyPlan:
         """What makes a run's tiles stale when its passes change: ids, and the spans that the survey file states."""
         stated = [(p.id, p.start, p.end) for p in self.survey.config.passes if p.run == run]
         return list(stated) or [p.pass_id for p in self.passes if p.run == run]
+
+    def corrected_anew(self) -> SurveyPlan:
+        """The same with the corrections that the table holds now."""
+        corrections = KnownCorrections.load(self.store)
+        sources = tuple((_with_room(source, corrections), files) for source, files in self.sources)
+        return replace(self, sources=sources, corrections=corrections)
 
     def slices(self) -> list[RawSlice]:
         """All data files, whole."""
@@ -225,11 +230,15 @@ def _sources(
             source = ReadingSource(
                 record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
                 *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal),
-                NO_CORRECTION if trajectory is None else corrections.allowance(record.run),
             )  # fmt: skip
-            found.append((source, files))
+            found.append((_with_room(source, corrections), files))
     check_road(survey.config.segmentation, [source for source, _ in found])
     return found
+
+
+def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingSource:
+    """A source whose footprints leave room for the corrections of its poses."""
+    return source if source.trajectory is None else replace(source, allowance=corrections.allowance(source.run))
 
 
 def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:

@@ -29,7 +29,7 @@ class Adjust(Stage):
             adjust_survey(session)
         else:
             withdraw(session)
-        session.renew("plan")
+        session.replan(session.plan.corrected_anew())
         # Corrections beyond what footprints leave room for make these anew, and nothing else does.
         found = index_footprints(session.plan, session.manifest, session.compute, session.bar("footprints"))
         session.renew("footprints")

@@ -108,6 +108,7 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     own = table[table["lane"] == "2"].reset_index(drop=True)
     assert own["name"].unique().tolist() == ["Test road"]
     assert own["station_from_m"].tolist()[1:] == [50.0, 100.0, 150.0]
+    assert own["measure_from"].tolist()[1:] == pytest.approx([12.05, 12.10, 12.15], abs=1e-3)
     assert own["rut_depth_mean_left_mm"][1] == pytest.approx(12.0, abs=1.0)
     assert own["rut_depth_mean_right_mm"][1] == pytest.approx(25.0, abs=1.5)
     assert own["joints"].tolist()[1] == 2

@@ -108,6 +108,7 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     own = table[table["lane"] == "2"].reset_index(drop=True)
     assert own["name"].unique().tolist() == ["Test road"]
     assert own["station_from_m"].tolist()[1:] == [50.0, 100.0, 150.0]
+    assert own["measure_from"].tolist()[1:] == pytest.approx([12.05, 12.10, 12.15], abs=1e-3)
     assert own["rut_depth_mean_left_mm"][1] == pytest.approx(12.0, abs=1.0)
     assert own["rut_depth_mean_right_mm"][1] == pytest.approx(25.0, abs=1.5)
     assert own["joints"].tolist()[1] == 2
@@ -274,6 +275,27 @@ def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) ->
     assert own["crack_moderate_severity_m"].tolist() == pytest.approx([0.0, 0.0, 3.5, 0.0], rel=0.03)
     wanted = [0.0, 100 * 20 / 200, 100 * 2 / 200, 0.0]  # of 100 pieces of 0.5 m in each of two wheel paths
     assert own["cracked_wheel_path_percent"].tolist() == pytest.approx(wanted, abs=0.6)
+
+
+def test_heights_of_the_reconstructed_surface(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    session = again(surveyed, tmp_path)
+    values = session.survey.config.model_dump() | {"surface": {"method": "cells", "sigma_m": 0.0005, "smooth": False}}
+    values["rig"] = session.survey.rig.model_dump()
+    values["condition"]["heights"] = "surface"
+    with_surface = Session(type(session.survey).parse(values, folder=session.survey.folder), session.store)
+    (error,) = stage_named("condition").check(with_surface.survey)
+    assert "does not make the product" in str(error)
+    values["products"] = {"make": ["surface"]}
+    with_surface = Session(type(session.survey).parse(values, folder=session.survey.folder), session.store)
+    assert stage_named("condition").check(with_surface.survey) == []
+    stage_named("surfaces").run(with_surface)
+    stage_named("condition").run(with_surface)
+    assert with_surface.failures == []
+    held = driven(list(compared_values(with_surface, surveyed.height_at)), ("2",))
+    iri = held["section", "mri_m_per_km"]
+    known = iri[np.isfinite(iri[:, 0])]
+    assert len(known) >= 3
+    assert (np.abs(known[:, 0] - known[:, 1]) <= np.maximum(0.02 * known[:, 1], 0.03)).all()
 
 
 def test_a_layer_that_is_not_there_is_told_before_the_run(surveyed: RoughSurvey) -> None:

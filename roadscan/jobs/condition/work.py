@@ -8,7 +8,14 @@ from dataclasses import dataclass, field
 from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
 from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
 from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
-from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, Stretch, due_stretches, plan_stretches
+from roadscan.jobs.condition.stretches import (
+    CROSS_SECTIONS,
+    PROFILES,
+    SURFACE_FILES,
+    Stretch,
+    due_stretches,
+    plan_stretches,
+)
 from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
@@ -58,7 +65,8 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     plan, manifest = session.plan, session.manifest
     context = product_context(plan)
     roads: Roads = load_roads(session.store, manifest, context)
-    tiles = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    made = manifest.of(TILE if config.heights == "cells" else SURFACE_FILES)
+    tiles = {TileId.parse(unit): r for unit, r in made.items() if r.path}
     settings, grid = config.sections(), plan.ground.grid
     stretches = plan_stretches(roads, tiles, grid, settings)
     groups = plan_groups(roads, manifest, settings, grid.cell_m)

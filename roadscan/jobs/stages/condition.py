@@ -8,6 +8,7 @@ from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
+from roadscan.jobs.condition.surface_cells import check_surface_cells
 from roadscan.jobs.condition.tasks import run_units
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
@@ -44,7 +45,7 @@ class Condition(Stage):
             session.note("condition: no drive of 20 m or more lies on the tiles that hold cells")
         settings, grid = config.sections(), session.plan.ground.grid
         context = product_context(session.plan)
-        tasks = stretch_tasks(work.due_stretches, session.store, grid, settings)
+        tasks = stretch_tasks(work.due_stretches, session.store, context, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
         work = plan_condition(session) if tasks else work
@@ -60,9 +61,10 @@ class Condition(Stage):
         session.failed(self.name, [(one.unit, reason) for one, reason in failed])
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """The layer of reference lines is there and can be opened as stated."""
+        """The layer of reference lines can be opened as stated; there is a surface where its heights are asked for."""
         try:
             check_layer(survey)
+            check_surface_cells(survey)
         except RoadscanError as error:
             return [error]
         return []

@@ -1,0 +1,196 @@
+"""Roughness regions of a section of road, after Kumar, Lewis and McElhinney.
+
+The steps are those of "An automated algorithm for detecting road roughness from mobile laser scanning data": road
+surface, rotation by the mean heading, first level of the point-thinning pyramid, intensity raster by natural neighbours,
+8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters by density and by the deviation
+of heights, rotation back. Beyond the paper: heights are judged against the section's road surface, so that a grade
+counts nothing; thresholds are taken from cells on that surface, so that vehicles do not move them; a region has to be
+dimmer than the road around it; and a region's roughness is measured against the surface of that road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.condition.roughness_regions.intensity import three_classes
+from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
+from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
+from roadscan.condition.roughness_regions.severity import Severity, severity
+from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
+from roadscan.model.roughness_regions import RoughnessRegionsConfig
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A dim cluster and its measures; the outline is its convex hull."""
+
+    outline: shapely.Polygon
+    """In the frame of the section; on the map once it is rotated back."""
+    fate: str
+    area_m2: float
+    """Of the hull."""
+    dim_area_m2: float
+    """Of the dim cells."""
+    readings: float
+    density_per_m2: float
+    height_sigma_m: float
+    """Root mean square of the points' heights above the section's road surface."""
+    severity: Severity
+
+
+@dataclass(frozen=True, eq=False)
+class SectionRegions:
+    """What was found in a section."""
+
+    clusters: tuple[Region, ...]
+    """All dim clusters of at least the least area, with their fates, from dim cells nearest to the section's start."""
+    small: int
+    """Dim clusters below the least area."""
+    dim_below: float
+    """Threshold t₁ as an intensity; NaN without one."""
+    bright_above: float
+    """Threshold t₂ as an intensity; NaN without one."""
+    thresholds: tuple[int, int] | None
+    """t₁ and t₂ on the 8-bit scale."""
+    measured_m2: float
+    """Ground of the raster that was measured."""
+    readings: float
+    raster: IntensityRaster | None
+    """The closed raster."""
+    origin_m: tuple[float, float]
+    """Easting and northing about which the section was rotated."""
+    heading_rad: float
+
+    @property
+    def regions(self) -> list[Region]:
+        """Those that are reported."""
+        return [one for one in self.clusters if one.fate == "reported"]
+
+
+def find_regions(
+    points: RoadPoints,
+    origin_m: tuple[float, float],
+    heading_rad: float,
+    settings: RoughnessRegionsConfig,
+    road: shapely.Geometry | None = None,
+) -> SectionRegions:
+    """The roughness regions of a section.
+
+    Parameters
+    ----------
+    points : of the section, on the map (m), intensity on any scale that begins at 0.
+    origin_m : easting and northing of a place in the section; raster cells are counted from it.
+    heading_rad : mean heading of the vehicle, clockwise from north.
+    road : polygons of the road's surface on the map; points outside are left out. None: all points are on the road.
+    """
+    if road is not None and len(points):
+        points = points.take(shapely.contains_xy(road, points.x_m, points.y_m))
+    turned = points.rotated(origin_m, heading_rad)
+    thinned = pyramid(turned, settings.cell_m, 1)[1]
+    raster = intensity_raster(thinned, settings.cell_m, settings.largest_gap_m, settings.clip_share)
+    surface = road_below(thinned.x_m, thinned.y_m, thinned.height_m)
+    nothing = SectionRegions(
+        (), 0, np.nan, np.nan, None, 0.0, float(turned.readings.sum()), None, origin_m, heading_rad
+    )
+    if raster is None or surface is None:
+        return nothing
+    raster = replace(raster, values=closed(raster.values, raster.measured, settings.closing_cells))
+    measured_m2 = float(raster.measured.sum()) * settings.cell_m**2
+    on_road = raster.measured & ~_off_surface(raster, thinned, surface, settings.largest_height_sigma_m)
+    thresholds = three_classes(raster.values[on_road])
+    if thresholds is None:
+        return replace(nothing, raster=raster, measured_m2=measured_m2)
+    dim = raster.measured & (raster.values <= thresholds[0])
+    many, small = _clusters(dim, settings.least_area_m2 / settings.cell_m**2)
+    judged = (_judged(one, raster, turned, surface, settings) for one in many)
+    return replace(
+        nothing,
+        clusters=tuple(_back(one, origin_m, heading_rad) for one in judged),
+        small=small,
+        dim_below=raster.intensity(thresholds[0]),
+        bright_above=raster.intensity(thresholds[1]),
+        thresholds=thresholds,
+        measured_m2=measured_m2,
+        raster=raster,
+    )
+
+
+def _off_surface(
+    raster: IntensityRaster, thinned: RoadPoints, surface: RoadSurface, limit_m: float
+) -> npt.NDArray[np.bool_]:
+    """(rows, columns) cells with a thinned point off the road's surface, and their neighbours."""
+    above = np.abs(surface.residuals_m(thinned.x_m, thinned.y_m, thinned.height_m)) > limit_m
+    mask = np.zeros(raster.values.shape, np.uint8)
+    x, y = thinned.x_m[above], thinned.y_m[above]
+    column, row = (
+        np.floor(v / raster.cell_m + 1e-9) - round(c / raster.cell_m)
+        for v, c in zip((x, y), raster.corner_m, strict=True)
+    )
+    inside = [np.clip(v.astype(np.int64), 0, n - 1) for v, n in zip((row, column), mask.shape, strict=True)]
+    mask[inside[0], inside[1]] = 1
+    return cv2.dilate(mask, np.ones((5, 5), np.uint8)).astype(bool)
+
+
+def _clusters(dim: npt.NDArray[np.bool_], least_cells: float) -> tuple[list[tuple[Float64, int]], int]:
+    """Corners (n, 2) of the cells of each cluster in cells, with their number, and how many clusters are too small."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(dim.astype(np.uint8), connectivity=8)
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= least_cells]
+    found = []
+    for k in large:
+        left, top, width, height = (int(v) for v in stats[k, :4])
+        rows, columns = np.nonzero(label[top : top + height, left : left + width] == k)
+        corners = [np.column_stack([columns + left + a, rows + top + b]) for a in (0.0, 1.0) for b in (0.0, 1.0)]
+        found.append((np.concatenate(corners), rows.size))
+    return found, count - 1 - len(large)
+
+
+def _judged(
+    cluster: tuple[Float64, int],
+    raster: IntensityRaster,
+    points: RoadPoints,
+    surface: RoadSurface,
+    settings: RoughnessRegionsConfig,
+) -> Region:
+    corners, cells = cluster
+    hull = shapely.convex_hull(shapely.MultiPoint(np.array(raster.corner_m) + raster.cell_m * corners))
+    near = points.take(_within(points, hull.buffer(settings.around_m)))
+    inside = shapely.contains_xy(hull, near.x_m, near.y_m)
+    own = near.take(inside)
+    above = surface.residuals_m(own.x_m, own.y_m, own.height_m)
+    readings = float(own.readings.sum())
+    sigma = float(np.sqrt(np.sum(own.readings * above * above) / readings)) if readings else np.nan
+    measured = severity(own, near.take(~inside))
+    density = readings / hull.area
+    fate = next(_fates(density, sigma, measured.contrast, settings), "reported")
+    return Region(hull, fate, float(hull.area), cells * raster.cell_m**2, readings, density, sigma, measured)
+
+
+def _fates(density: float, sigma_m: float, contrast: float, settings: RoughnessRegionsConfig) -> Iterator[str]:
+    if density < settings.least_density_per_m2:
+        yield "sparse"
+    if not sigma_m <= settings.largest_height_sigma_m:
+        yield "off_the_surface"
+    if settings.least_contrast > 0.0 and not contrast >= settings.least_contrast:
+        yield "no_contrast"
+
+
+def _within(points: RoadPoints, shape: shapely.Polygon) -> npt.NDArray[np.bool_]:
+    """(n,) which points lie in a polygon."""
+    west, south, east, north = shape.bounds
+    inside = (points.x_m >= west) & (points.x_m <= east) & (points.y_m >= south) & (points.y_m <= north)
+    rows = np.flatnonzero(inside)
+    inside[rows] = shapely.contains_xy(shape, points.x_m[rows], points.y_m[rows])
+    return inside
+
+
+def _back(one: Region, origin_m: tuple[float, float], heading_rad: float) -> Region:
+    outline = shapely.transform(one.outline, lambda xy: rotated_back(xy, origin_m, heading_rad))
+    return replace(one, outline=shapely.orient_polygons(outline))

@@ -10,6 +10,9 @@ from roadscan.model.strict import Strict
 class RoughnessRegionsConfig(Strict):
     """How dim regions of the road's surface are found, and which of them are reported."""
 
+    sensor_height_m: float | None = Field(default=None, ge=0.3, le=10.0)
+    """Height of the lidar above the road (m), where its intensities fall with range and incidence: they are normalised as
+    for beams from this height above the middle of the nearest driven lane. Left out, they are taken as they are."""
     cell_m: float = Field(default=0.06, ge=0.01, le=0.5)
     """Edge of the cells of the intensity raster (m): about the points' distance from one another."""
     section_m: float = Field(default=10.0, ge=5.0, le=20.0)
@@ -30,7 +33,8 @@ class RoughnessRegionsConfig(Strict):
     largest_height_sigma_m: float = Field(default=0.2, gt=0.0)
     """Regions whose points lie farther than this from the section's road surface, as root mean square, are left out
     (t_sd, m): vehicles."""
-    least_contrast: float = Field(default=0.1, ge=0.0, le=1.0)
-    """Share by which a region's median intensity has to be lower than that of the road around it; 0 takes every region."""
+    least_contrast: float = Field(default=0.15, ge=0.0, le=1.0)
+    """Share by which a region's median intensity has to be lower than that of the road around it; 0 takes every
+    region."""
     around_m: float = Field(default=0.5, ge=0.1, le=5.0)
     """Width of the ring of road around a region that its intensity and its heights are compared with (m)."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 Float64 = npt.NDArray[np.float64]
 
-_STEEPEST_RAD = np.radians(80.0)
+_STEEPEST_RAD: Final = np.radians(80.0)
 """Beyond it the cosine is held, lest glancing returns outshine all others."""
 
 

@@ -24,6 +24,8 @@ class IntensityRaster:
 
     values: npt.NDArray[np.uint8]
     """(rows, columns) 8-bit intensities, closed; 0 where not measured."""
+    local_mean: Float64
+    """(rows, columns) mean intensity of all points, thinned or not, of the 3 × 3 cells around; NaN without any."""
     measured: npt.NDArray[np.bool_]
     """(rows, columns)"""
     corner_m: tuple[float, float]
@@ -40,13 +42,13 @@ class IntensityRaster:
 
 
 def intensity_raster(
-    thinned: RoadPoints, cell_m: float, largest_gap_m: float, clip_share: float
+    points: RoadPoints, thinned: RoadPoints, cell_m: float, largest_gap_m: float, clip_share: float
 ) -> IntensityRaster | None:
     """The raster of thinned points, by natural neighbours, on an 8-bit scale; None where no cell has a value.
 
     Parameters
     ----------
-    thinned : first level of the pyramid, rotated; cell_m : edge of a cell.
+    points : rotated, all; thinned : first level of their pyramid; cell_m : edge of a cell.
     largest_gap_m : cells farther from every point are not measured.
     clip_share : share of the cells that the scale clips at each end.
     """
@@ -70,7 +72,28 @@ def intensity_raster(
     dimmest, brightest = float(known[clipped]), float(known[known.size - 1 - clipped])
     scale = _BRIGHTEST / (brightest - dimmest) if brightest > dimmest else 0.0
     grey = np.clip(np.rint((np.where(measured, found, dimmest) - dimmest) * scale), 0, _BRIGHTEST).astype(np.uint8)
-    return IntensityRaster(grey, measured, corner, cell_m, dimmest, brightest)
+    return IntensityRaster(
+        grey, _local_mean(points, corner, cell_m, (rows, columns)), measured, corner, cell_m, dimmest, brightest
+    )
+
+
+def _local_mean(points: RoadPoints, corner_m: tuple[float, float], cell_m: float, shape: tuple[int, int]) -> Float64:
+    """(rows, columns) means of the points of 3 × 3 cells."""
+    at = [np.floor((v - c) / cell_m).astype(np.int64) for v, c in zip((points.x_m, points.y_m), corner_m, strict=True)]
+    cell = np.clip(at[1], 0, shape[0] - 1) * shape[1] + np.clip(at[0], 0, shape[1] - 1)
+    sums = [
+        cv2.boxFilter(
+            np.bincount(cell, weights, shape[0] * shape[1]).reshape(shape),
+            -1,
+            (3, 3),
+            None,
+            (-1, -1),
+            False,
+            cv2.BORDER_CONSTANT,
+        )
+        for weights in (points.readings * points.intensity, points.readings)
+    ]
+    return np.divide(sums[0], sums[1], out=np.full(shape, np.nan), where=sums[1] > 0.5)
 
 
 def closed(grey: npt.NDArray[np.uint8], measured: npt.NDArray[np.bool_], edge_cells: int) -> npt.NDArray[np.uint8]:

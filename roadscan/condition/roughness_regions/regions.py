@@ -5,27 +5,47 @@ surface, rotation by the mean heading, first level of the point-thinning pyramid
 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters by density and by the deviation
 of heights, rotation back. Beyond the paper: heights are judged against the section's road surface, so that a grade
 counts nothing; thresholds are taken from cells on that surface, so that vehicles do not move them; a region has to be
-dimmer than the road around it; and a region's roughness is measured against the surface of that road.
+dimmer than the road around it, and its edge runs where the intensity is halfway between both; a cluster that is no
+dimmer is the road itself, and its cells are parted again, so that a small patch is found on a road without another;
+and a region's roughness is measured against the surface of the road around it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.condition.roughness_regions.clusters import Cluster, clusters_of
 from roadscan.condition.roughness_regions.intensity import three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
-from roadscan.condition.roughness_regions.severity import Severity, severity
+from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
 from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
 from roadscan.model.roughness_regions import RoughnessRegionsConfig
 
 Float64 = npt.NDArray[np.float64]
+
+
+NO_CONTRAST: Final = "no_contrast"
+_ROUNDS: Final = 8
+"""How often cells that turn out to be the road itself are parted again."""
+_NONE: Final = np.empty(0, np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """What the clusters of a section are judged by."""
+
+    raster: IntensityRaster
+    points: RoadPoints
+    thinned: RoadPoints
+    surface: RoadSurface
+    settings: RoughnessRegionsConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +55,7 @@ class Region:
     outline: shapely.Polygon
     """In the frame of the section; on the map once it is rotated back."""
     fate: str
+    """reported, small, sparse, off_the_surface or no_contrast."""
     area_m2: float
     """Of the hull."""
     dim_area_m2: float
@@ -95,7 +116,7 @@ def find_regions(
         points = points.take(shapely.contains_xy(road, points.x_m, points.y_m))
     turned = points.rotated(origin_m, heading_rad)
     thinned = pyramid(turned, settings.cell_m, 1)[1]
-    raster = intensity_raster(thinned, settings.cell_m, settings.largest_gap_m, settings.clip_share)
+    raster = intensity_raster(turned, thinned, settings.cell_m, settings.largest_gap_m, settings.clip_share)
     surface = road_below(thinned.x_m, thinned.y_m, thinned.height_m)
     nothing = SectionRegions(
         (), 0, np.nan, np.nan, None, 0.0, float(turned.readings.sum()), None, origin_m, heading_rad
@@ -108,12 +129,20 @@ def find_regions(
     thresholds = three_classes(raster.values[on_road])
     if thresholds is None:
         return replace(nothing, raster=raster, measured_m2=measured_m2)
-    dim = raster.measured & (raster.values <= thresholds[0])
-    many, small = _clusters(dim, settings.least_area_m2 / settings.cell_m**2)
-    judged = (_judged(one, raster, turned, surface, settings) for one in many)
+    clusters, small = clusters_of(raster, thresholds[0], settings.least_area_m2)
+    section = Section(raster, turned, thinned, surface, settings)
+    found: list[Region] = []
+    for _ in range(_ROUNDS):
+        judged = [_judged(one, section) for one in clusters]
+        found += [one for one in judged if one.fate != NO_CONTRAST]
+        road_cells = [one for one, of in zip(clusters, judged, strict=True) if of.fate == NO_CONTRAST]
+        deeper = three_classes(np.concatenate([raster.values[one.rows, one.columns] for one in road_cells] or [_NONE]))
+        if deeper is None:
+            break
+        clusters, _ = clusters_of(raster, deeper[0], settings.least_area_m2, road_cells)
     return replace(
         nothing,
-        clusters=tuple(_back(one, origin_m, heading_rad) for one in judged),
+        clusters=tuple(_back(one, origin_m, heading_rad) for one in found),
         small=small,
         dim_below=raster.intensity(thresholds[0]),
         bright_above=raster.intensity(thresholds[1]),
@@ -139,47 +168,36 @@ def _off_surface(
     return cv2.dilate(mask, np.ones((5, 5), np.uint8)).astype(bool)
 
 
-def _clusters(dim: npt.NDArray[np.bool_], least_cells: float) -> tuple[list[tuple[Float64, int]], int]:
-    """Corners (n, 2) of the cells of each cluster in cells, with their number, and how many clusters are too small."""
-    count, label, stats, _ = cv2.connectedComponentsWithStats(dim.astype(np.uint8), connectivity=8)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= least_cells]
-    found = []
-    for k in large:
-        left, top, width, height = (int(v) for v in stats[k, :4])
-        rows, columns = np.nonzero(label[top : top + height, left : left + width] == k)
-        corners = [np.column_stack([columns + left + a, rows + top + b]) for a in (0.0, 1.0) for b in (0.0, 1.0)]
-        found.append((np.concatenate(corners), rows.size))
-    return found, count - 1 - len(large)
-
-
-def _judged(
-    cluster: tuple[Float64, int],
-    raster: IntensityRaster,
-    points: RoadPoints,
-    surface: RoadSurface,
-    settings: RoughnessRegionsConfig,
-) -> Region:
-    corners, cells = cluster
-    hull = shapely.convex_hull(shapely.MultiPoint(np.array(raster.corner_m) + raster.cell_m * corners))
-    near = points.take(_within(points, hull.buffer(settings.around_m)))
+def _judged(cluster: Cluster, section: Section) -> Region:
+    raster, settings, thinned = section.raster, section.settings, section.thinned
+    hull = cluster.hull(raster)
+    near = thinned.take(_within(thinned, hull.buffer(settings.around_m)))
     inside = shapely.contains_xy(hull, near.x_m, near.y_m)
-    own = near.take(inside)
-    above = surface.residuals_m(own.x_m, own.y_m, own.height_m)
+    dim, beside = near.intensity[inside], near.intensity[~inside]
+    contrast = 1.0 - float(np.median(dim) / np.median(beside)) if dim.size and beside.size else np.nan
+    if contrast < settings.least_contrast:
+        return Region(hull, NO_CONTRAST, float(hull.area), cluster.area_m2(raster), np.nan, np.nan, np.nan, UNKNOWN)
+    if dim.size and beside.size:
+        half = 0.5 * float(np.median(dim) + np.median(beside))
+        cluster = cluster.at_half(raster, half)
+        hull = cluster.hull(raster, half)
+    points = section.points.take(_within(section.points, hull.buffer(settings.around_m)))
+    inside = shapely.contains_xy(hull, points.x_m, points.y_m)
+    own, around = points.take(inside), points.take(~inside)
+    above = section.surface.residuals_m(own.x_m, own.y_m, own.height_m)
     readings = float(own.readings.sum())
     sigma = float(np.sqrt(np.sum(own.readings * above * above) / readings)) if readings else np.nan
-    measured = severity(own, near.take(~inside))
-    density = readings / hull.area
-    fate = next(_fates(density, sigma, measured.contrast, settings), "reported")
-    return Region(hull, fate, float(hull.area), cells * raster.cell_m**2, readings, density, sigma, measured)
-
-
-def _fates(density: float, sigma_m: float, contrast: float, settings: RoughnessRegionsConfig) -> Iterator[str]:
-    if density < settings.least_density_per_m2:
-        yield "sparse"
-    if not sigma_m <= settings.largest_height_sigma_m:
-        yield "off_the_surface"
-    if settings.least_contrast > 0.0 and not contrast >= settings.least_contrast:
-        yield "no_contrast"
+    density, measured, fate = readings / float(hull.area), UNKNOWN, "reported"
+    if hull.area < settings.least_area_m2:
+        fate = "small"
+    elif density < settings.least_density_per_m2 or not readings:
+        fate = "sparse"
+    elif sigma > settings.largest_height_sigma_m:
+        fate = "off_the_surface"
+    else:
+        measured = severity(own, around)
+        fate = NO_CONTRAST if measured.contrast < settings.least_contrast else fate
+    return Region(hull, fate, float(hull.area), cluster.area_m2(raster), readings, density, sigma, measured)
 
 
 def _within(points: RoadPoints, shape: shapely.Polygon) -> npt.NDArray[np.bool_]:

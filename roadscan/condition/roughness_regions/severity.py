@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ class Severity(NamedTuple):
     """The same of the road around, by the median of its absolute residuals: what noise and texture amount to."""
 
 
+UNKNOWN: Final = Severity(*5 * (float("nan"),))
+
+
 def severity(own: RoadPoints, around: RoadPoints) -> Severity:
     """Measures of a region's points against those of the road around it.
 
@@ -33,7 +36,7 @@ def severity(own: RoadPoints, around: RoadPoints) -> Severity:
     """
     lacking = float("nan")
     if not len(own):
-        return Severity(lacking, lacking, lacking, lacking, lacking)
+        return UNKNOWN
     intensity = float(np.median(own.intensity))
     beside = float(np.median(around.intensity)) if len(around) else 0.0
     contrast = 1.0 - intensity / beside if beside > 0.0 else lacking

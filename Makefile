@@ -50,8 +50,9 @@ docs-check: $(VENV)/.installed-dev  ## Fail where a generated page is out of dat
 pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/model -n0" narrows them.
 	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
 
-nightly: $(VENV)/.installed-dev  ## What takes too long for every change: core tests on a processor without AVX-512.
+nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.
 	$(BIN)/python -m pytest -q -n 2 -m nightly $(PYTEST_ARGS)
+
 test-library: export ROADSCAN_CODECS := library
 test-library: pytest  ## Tests with libraries in place of the own codecs.
 

@@ -1,23 +1,27 @@
 """A Dask scheduler with its workers in processes of their own, whose memory and tasks are watched.
 
-``python -m benchmarks.scheduler WORKERS``: prints its address, and at the end the most tasks it held.
+``python -m benchmarks.scheduler WORKERS``: is told its credentials on standard input, prints its address, and runs
+until that input ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import pickle
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import dask
 import psutil
-from distributed import Client, LocalCluster
+from distributed import Client, Security
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.engine.on_dask import QUIET_CLIENT, QUIET_CLUSTER
+from roadscan.jobs.engine.embedded import QUIET_CLUSTER, closed_cluster
+from roadscan.jobs.engine.on_dask import QUIET_CLIENT
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]
@@ -76,8 +80,11 @@ def running_scheduler(workers: int) -> Iterator[tuple[Any, Watched]]:
     command = [sys.executable, "-m", "benchmarks.scheduler", str(workers)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
+            security = Security.temporary()
+            process.stdin.write(f"{pickle.dumps(security).hex()}\n")  # type: ignore[union-attr]
+            process.stdin.flush()  # type: ignore[union-attr]
             address = process.stdout.readline().strip()  # type: ignore[union-attr]
-            with dask.config.set(QUIET_CLIENT), Client(address, timeout="60s") as client:
+            with dask.config.set(QUIET_CLIENT), Client(address, security=security, timeout="60s") as client:
                 client.wait_for_workers(workers, timeout=60)
                 yield client, Watched(client, process.pid)
         finally:
@@ -86,11 +93,11 @@ def running_scheduler(workers: int) -> Iterator[tuple[Any, Watched]]:
 
 def main() -> None:
     """Run until the standard input ends."""
+    security = pickle.loads(bytes.fromhex(sys.stdin.readline()))
     with (
-        dask.config.set(QUIET_CLUSTER),
-        LocalCluster(
-            n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=":0", silence_logs="ERROR"
-        ) as cluster,
+        tempfile.TemporaryDirectory() as folder,
+        dask.config.set(QUIET_CLUSTER | {"temporary-directory": folder}),
+        closed_cluster(int(sys.argv[1]), security) as cluster,
     ):
         cluster.scheduler.add_plugin(Held(cluster.scheduler))
         print(cluster.scheduler_address, flush=True)

@@ -66,8 +66,6 @@ class Mistake:
     command: tuple[str, ...] = ("run", "SURVEY.toml", "--workers", "0")
     denied: str = ""
     """File that must not be read."""
-    reads: bool = False
-    """True where the mistake shows only when the logs have been read, before anything is computed from them."""
 
 
 def write_survey(folder: Path, mistake: Mistake) -> Path:
@@ -90,9 +88,9 @@ def write_poses(path: Path, first_s: float) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def write_scans(path: Path, first_s: float) -> None:
+def write_scans(path: Path, first_s: float, step_ns: int = 10_000_000) -> None:
     """30 profiles of 40 readings within 0.3 s."""
-    epochs = np.round(first_s * 1e9).astype(np.int64) + np.arange(30) * 10_000_000
+    epochs = np.round(first_s * 1e9).astype(np.int64) + np.arange(30) * step_ns
     ranges = pa.FixedSizeListArray.from_arrays(np.full(30 * 40, 20_000, np.uint16), 40)
     geometry = {"kind": "cartesian", "readings": 40, "first": -2.0, "step": 0.1, "range_step_m": 1e-4}
     rows = pa.table({"epoch_gps_ns": epochs, "range": ranges})
@@ -154,6 +152,19 @@ def _cut(path: Path) -> None:
 def _sbet_log(clock: str) -> tuple[str, str]:
     old = SURVEY[SURVEY.index('path = "poses.csv"') : SURVEY.index('\n\n[[runs.logs]]\npath = "scans')]
     return old, f'path = "poses.sbet"\nformat = "sbet"\ncrs = "EPSG:4937"\nclock = {clock}'
+
+
+def _with_accuracy(name: str) -> tuple[str, str]:
+    old, new = _sbet_log('{ system = "gps_week_seconds", week = 2417 }')
+    return old, f'{new}\noptions = {{ accuracy = "{name}" }}'
+
+
+def _late_accuracy(folder: Path) -> None:
+    """An SBET, and σ of 1 cm and 1′ an hour later."""
+    _sbet(folder)
+    at = FIRST_GPS_S % _WEEK_S + 3600
+    records = [[at + k / 20, *[0.01] * 6, *[1.0] * 3] for k in range(20)]
+    (folder / "accuracy.out").write_bytes(b"".join(struct.pack("<10d", *record) for record in records))
 
 
 def _map(settings: str) -> tuple[str, str]:
@@ -250,29 +261,42 @@ MISTAKES: Final = (
         "Correct `week`.",
         _sbet_log('{ system = "gps_week_seconds", week = 2416 }'),
         _sbet,
-        reads=True,
     ),
     Mistake("A number is none", "State the number.", _clock('system = "gps", offset_s = nan')),
     Mistake("The clock's unit is wrong", "Correct `unit`.", _clock('system = "gps", unit = "ms"')),
-    Mistake("GPS time is stated as Unix time", "Correct `system`.", _clock('system = "unix_utc"'), reads=True),
+    Mistake("GPS time is stated as Unix time", "Correct `system`.", _clock('system = "unix_utc"')),
     Mistake(
         "UTC is stated as GPS time, both counted from 1970: 18 leap seconds",
         "Correct `system`.",
         _clock('system = "unix_gps"'),
         lambda f: write_poses(f / "poses.csv", FIRST_GPS_S + 315_964_800 - 18),
-        reads=True,
     ),
     Mistake(
         "The readings are of another hour",
         "Correct the clock, or take the log of this run.",
         make=_scans_of(FIRST_GPS_S + 3600.2),
-        reads=True,
     ),
     Mistake(
         "The readings are of another year",
         "Take the log of this run.",
         make=_scans_of(FIRST_GPS_S - 365 * 86_400 + 5000),
-        reads=True,
+    ),
+    Mistake(
+        "All profiles carry one stamp",
+        "See to what stamps them.",
+        make=lambda f: write_scans(f / "scans.parquet", FIRST_GPS_S + 0.2, step_ns=0),
+    ),
+    Mistake("An SBET is named as its own accuracy", "Name its SMRMSG.", _with_accuracy("poses.sbet"), _sbet),
+    Mistake(
+        "The accuracy file is of another hour",
+        "Name that of the same mission.",
+        _with_accuracy("accuracy.out"),
+        _late_accuracy,
+    ),
+    Mistake(
+        "A lever arm is stated in millimetres",
+        "State it in metres.",
+        ("lever_arm_body_m = [0.0, 0.0, 0.0]", "lever_arm_body_m = [-1200.0, 0.0, -1850.0]"),
     ),
     Mistake("A log names a sensor that the rig does not have", "Correct the name.", ('sensor = "p', 'sensor = "q')),
     Mistake("The sensor's kind does not fit its log", "Correct `kind`.", ('kind = "profiler"', 'kind = "camera"')),

@@ -115,10 +115,19 @@ class OpenSurvey:
         return survey_status(self.session)
 
     def verify(self) -> list[str]:
-        """The faults of all files that the store should hold; each is read and compared with its record."""
+        """The faults of all files that the store should hold, each of which is read and compared with its record; and
+        the ingested rows that are lost.
+        """
         from roadscan.jobs.status import verify_store
+        from roadscan.tables.salvage import read_lost
 
-        return verify_store(self.store)
+        return verify_store(self.store) + [f"lost: {one.told}" for one in read_lost(self.store)]
+
+    def report(self) -> str:
+        """The report page as HTML; it needs nothing beside it."""
+        from roadscan.jobs.report.page import report_page
+
+        return report_page(self.session)
 
     def connect(self) -> duckdb.DuckDBPyConnection:
         """A DuckDB connection in which each table of the survey is a view; the caller closes it."""

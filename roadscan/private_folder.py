@@ -1,4 +1,4 @@
-"""Folders of code that is run as the user: the cache of compiled kernels."""
+"""Folders of code that is run as the user: the cache of compiled kernels, and what workers load."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 import os
 import stat
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 try:
     import grp
@@ -20,7 +20,19 @@ class UnsafeFolderError(RuntimeError):
     """Others could put code into a folder, which this process would run."""
 
 
-def check_private(folder: Path) -> None:
+class Code(NamedTuple):
+    """What lies in a folder, and what chooses another."""
+
+    what: str
+    """As an error names it."""
+    variable: str
+    """Environment variable that names another place."""
+
+
+KERNELS = Code("the cache of compiled code", "NUMBA_CACHE_DIR")
+
+
+def check_private(folder: Path, code: Code = KERNELS) -> None:
     """Refuse a folder that others may write to, as OpenSSH does with keys.
 
     The folder, all above it and the files in it have to belong to this user or to root, and nobody else may write to
@@ -34,35 +46,35 @@ def check_private(folder: Path) -> None:
     if not hasattr(os, "getuid") or not folder.exists():
         return
     real = folder.resolve()
-    _check_place(real, real.stat(), sticky=False)
-    _check_above(real.parent)
+    _check_place(real, real.stat(), code, sticky=False)
+    _check_above(real.parent, code)
     with os.scandir(real) as entries:
         for entry in entries:
             with contextlib.suppress(FileNotFoundError):  # Numba replaces files by rename
-                _check_place(Path(entry.path), entry.stat(follow_symlinks=False), sticky=False)
+                _check_place(Path(entry.path), entry.stat(follow_symlinks=False), code, sticky=False)
 
 
 @functools.cache
-def _check_above(folder: Path) -> None:
+def _check_above(folder: Path, code: Code) -> None:
     for place in (folder, *folder.parents):
-        _check_place(place, place.stat(), sticky=True)
+        _check_place(place, place.stat(), code, sticky=True)
 
 
-def _check_place(place: Path, found: os.stat_result, *, sticky: bool) -> None:
+def _check_place(place: Path, found: os.stat_result, code: Code, *, sticky: bool) -> None:
     if found.st_uid not in (0, os.getuid()):
-        _refuse(place, f"belongs to another user (number {found.st_uid})")
+        _refuse(place, code, f"belongs to another user (number {found.st_uid})")
     if stat.S_ISLNK(found.st_mode) or (sticky and found.st_mode & stat.S_ISVTX):
         return
     if found.st_mode & stat.S_IWOTH:
-        _refuse(place, "can be written by every user")
+        _refuse(place, code, "can be written by every user")
     if found.st_mode & stat.S_IWGRP and not _is_private(found.st_gid):
-        _refuse(place, f"can be written by others of its group (number {found.st_gid})")
+        _refuse(place, code, f"can be written by others of its group (number {found.st_gid})")
 
 
-def _refuse(place: Path, reason: str) -> NoReturn:
+def _refuse(place: Path, code: Code, reason: str) -> NoReturn:
     raise UnsafeFolderError(
-        f"{place}: the cache of compiled code {reason}; expected a place where you alone can write, since what lies "
-        f"there is run as you; `chmod go-w {place}` if it is yours, remove what is not, or set NUMBA_CACHE_DIR to a "
+        f"{place}: {code.what} {reason}; expected a place where you alone can write, since what lies "
+        f"there is run as you; `chmod go-w {place}` if it is yours, remove what is not, or set {code.variable} to a "
         "folder of your own"
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from roadscan.cli.arguments import AsJson, Scheduler, SurveyFile, Workers
+from roadscan.cli.arguments import AsJson, Dashboard, Scheduler, SurveyFile, Workers
 
 _FOLDER = Path(__file__).resolve().parents[1] / "jobs" / "stages"
 _GROUP = "roadscan.stages"
@@ -43,11 +43,16 @@ def _stage_command(word: str) -> Any:
         return None
 
     def run(
-        survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+        survey_file: SurveyFile,
+        workers: Workers = None,
+        scheduler: Scheduler = None,
+        dashboard: Dashboard = False,
+        as_json: AsJson = False,
     ) -> None:
-        from roadscan.cli.survey import run_and_sum_up
+        from roadscan.cli.survey import Where, run_and_sum_up
 
-        run_and_sum_up(survey_file, (stage,), workers if stage.uses_workers else 0, scheduler, as_json)
+        where = Where(workers if stage.uses_workers else 0, scheduler, dashboard)
+        run_and_sum_up(survey_file, (stage,), where, as_json)
 
     one = typer.Typer(add_completion=False)
     one.command(word, help=f"{stage.title[0].upper()}{stage.title[1:]}.")(run)

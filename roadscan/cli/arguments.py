@@ -118,4 +118,11 @@ Workers = Annotated[
     int | None, typer.Option(help="Worker processes of the embedded cluster; 0 computes in this process.")
 ]
 Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler, in place of the embedded cluster.")]
+Dashboard = Annotated[
+    bool,
+    typer.Option(
+        "--dashboard",
+        help="Serve Dask's dashboard of the embedded cluster; every user of this machine can look at it.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object, and nothing else.")]

@@ -13,19 +13,20 @@ from typing import Any, NoReturn
 
 import typer
 
+from roadscan.model import stopping
+from roadscan.model.stopping import Stopped
+
 _SIGNALS = ("SIGINT", "SIGTERM")
 _NAMES = {"SIGINT": "Ctrl-C (SIGINT)", "SIGTERM": "the signal SIGTERM"}
 _AGAIN_S = 0.05
 """When a request is repeated that Python could not hand on."""
 _PATIENCE_S = 3.0
 """So long, what is begun may be tidied up; who asks once more after that is obeyed at once."""
-_asked: list[tuple[int, float]] = []
-"""Number of the signal that came, and when (s, monotonic)."""
 
 
 def ending_well(command: Callable[[], Any]) -> None:
     """Run a command; an error that the user can mend, or a request to stop, ends it with one line and no traceback."""
-    from roadscan.model.errors import RoadscanError, Stopped, in_words
+    from roadscan.model.errors import RoadscanError, in_words
     from roadscan.private_folder import UnsafeFolderError
 
     _listen()
@@ -34,13 +35,14 @@ def ending_well(command: Callable[[], Any]) -> None:
     except BrokenPipeError:  # who reads has seen enough, as `head` does
         _leave(1)
     except (RoadscanError, UnsafeFolderError) as error:
+        _leave_if_asked()
         _fail(str(error))
     except OSError as error:
         _leave_if_asked()
         _fail(str(in_words(error)))
     except Stopped as stop:
         _leave_stopped(stop.number, getattr(stop, "__notes__", ()))
-    except Exception:
+    except (Exception, SystemExit):
         _leave_if_asked()
         raise
 
@@ -60,9 +62,10 @@ def _listen() -> None:
 
     def unraisable(what: Any) -> None:
         """A request that came while Python ran what may raise nothing (a finalizer) is made again soon."""
-        if _asked and issubclass(what.exc_type, _stopped()):
-            number, _ = _asked.pop()
-            threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number)).start()
+        asked = stopping.request()
+        if asked is not None and issubclass(what.exc_type, Stopped):
+            stopping.forget()
+            threading.Timer(_AGAIN_S, os.kill, (os.getpid(), asked.number)).start()
         else:
             told(what)
 
@@ -70,24 +73,18 @@ def _listen() -> None:
 
 
 def _stop(number: int, _frame: FrameType | None) -> None:
-    if _asked:
-        if time.monotonic() - _asked[0][1] > _PATIENCE_S:
-            _leave_stopped(number, ())
-        return
-    _asked.append((number, time.monotonic()))
-    raise _stopped()(number)
-
-
-def _stopped() -> type[BaseException]:
-    from roadscan.model.errors import Stopped
-
-    return Stopped
+    asked = stopping.request()
+    if asked is None:
+        stopping.stop(number)
+    if time.monotonic() - asked.at_s > _PATIENCE_S:
+        _leave_stopped(number, ())
 
 
 def _leave_if_asked() -> None:
     """A library may turn the request into an error of its own."""
-    if _asked:
-        _leave_stopped(_asked[0][0], ())
+    asked = stopping.request()
+    if asked is not None:
+        _leave_stopped(asked.number, ())
 
 
 def _leave_stopped(number: int, notes: Any) -> NoReturn:

@@ -30,6 +30,7 @@ def export(
     """Ingested readings as files of other programs: PSI containers or an OpenCRG grid."""
     from roadscan.jobs.export.export_opencrg import CrgSettings, export_opencrg
     from roadscan.jobs.export.export_psi import PsiSettings, export_psi
+    from roadscan.model.counted import counted
     from roadscan.model.errors import ConfigError
     from roadscan.model.survey import Survey
     from roadscan.tables.store import Store
@@ -45,7 +46,7 @@ def export(
         raise ConfigError(f"--format {format_}", expected="psi or opencrg")
     for note in written.notes:
         typer.echo(note)
-    typer.echo(f"{len(written.files):,} files in {out}")
+    typer.echo(f"{counted(len(written.files), 'file')} in {out}")
 
 
 def classes(

@@ -86,9 +86,10 @@ def first_survey(
     ),
 ) -> None:
     """Look through a folder of logs and write a first survey file for you to complete."""
-    from roadscan.inspect.first_survey import find_logs
+    from roadscan.inspect.first_survey import find_logs, need_folder
     from roadscan.inspect.first_survey_text import refuse_to_overwrite, write_first_survey
 
+    need_folder(folder)
     refuse_to_overwrite(out)
     with looking(folder) as progress:
         found = find_logs(folder, progress)

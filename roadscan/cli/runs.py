@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadscan.cli.arguments import USUAL, AsJson, Scheduler, SurveyFile, Workers, surveys_for
+from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, surveys_for
 from roadscan.cli.state import found_status, print_status
-from roadscan.cli.survey import run_and_sum_up, run_survey, stages_named, sum_up
+from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named, sum_up
 from roadscan.cli.terminal import print_table
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def run(
     survey_file: SurveyFile,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
     as_json: AsJson = False,
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
@@ -33,21 +34,28 @@ def run(
     if flow or os.environ.get("PREFECT_API_URL"):
         from flows.conduct import require_api
         from flows.survey import survey
+        from roadscan.model.errors import ConfigError
 
+        if dashboard:
+            raise ConfigError("--dashboard of a flow run", expected="a run without Prefect", change="leave one out")
         require_api()
         survey(str(survey_file), workers, scheduler)
         sum_up(survey_file, as_json)
         return
     from roadscan.jobs.stage import stages
 
-    run_and_sum_up(survey_file, stages(), workers, scheduler, as_json)
+    run_and_sum_up(survey_file, stages(), Where(workers, scheduler, dashboard), as_json)
 
 
 def ingest(
-    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
+    as_json: AsJson = False,
 ) -> None:
     """Raw logs into tables."""
-    run_and_sum_up(survey_file, stages_named("ingest"), workers, scheduler, as_json)
+    run_and_sum_up(survey_file, stages_named("ingest"), Where(workers, scheduler, dashboard), as_json)
 
 
 def navigate(survey_file: SurveyFile) -> None:
@@ -55,28 +63,38 @@ def navigate(survey_file: SurveyFile) -> None:
     from roadscan.jobs.ingest.ingest import survey_records
     from roadscan.jobs.navigate.navigate import plan_trajectories
 
-    run = run_survey(survey_file, stages_named("navigate"), 0, None)
+    run = run_survey(survey_file, stages_named("navigate"), Where(0))
     if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
         typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
 
-def footprints(survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None) -> None:
+def footprints(
+    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, dashboard: Dashboard = False
+) -> None:
     """Which raw block touches which tile."""
-    run_survey(survey_file, stages_named("footprints"), workers, scheduler)
+    run_survey(survey_file, stages_named("footprints"), Where(workers, scheduler, dashboard))
 
 
 def tile(
-    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
+    as_json: AsJson = False,
 ) -> None:
     """Readings into points, cells and tile files."""
-    run_and_sum_up(survey_file, stages_named("tiles"), workers, scheduler, as_json)
+    run_and_sum_up(survey_file, stages_named("tiles"), Where(workers, scheduler, dashboard), as_json)
 
 
 def surfaces(
-    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, as_json: AsJson = False
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
+    as_json: AsJson = False,
 ) -> None:
     """Cells or points of tiles into the reconstructed surface and its files (section `surface` of the survey file)."""
-    run_and_sum_up(survey_file, stages_named("surfaces"), workers, scheduler, as_json)
+    run_and_sum_up(survey_file, stages_named("surfaces"), Where(workers, scheduler, dashboard), as_json)
 
 
 def make_products(
@@ -90,11 +108,12 @@ def make_products(
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
     as_json: AsJson = False,
 ) -> None:
     """Mosaics, pictures and tables over all tiles; without a survey file, list the products there are."""
     if survey_file is not None:
-        run_and_sum_up(survey_file, stages_named("products"), workers, scheduler, as_json)
+        run_and_sum_up(survey_file, stages_named("products"), Where(workers, scheduler, dashboard), as_json)
         return
     from roadscan.products.base import SurfaceProduct, TileProduct, products
 
@@ -119,6 +138,7 @@ def reprocess(
     span: Annotated[str | None, typer.Option(help="START/END in UTC, such as 2026-05-04T09:30:00Z/….")] = None,
     workers: Workers = 0,
     scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
     as_json: AsJson = False,
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
@@ -127,7 +147,9 @@ def reprocess(
 
     if not (tiles or bbox or span):
         raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
-    done = run_and_sum_up(survey_file, stages(), workers, scheduler, as_json, selected(tiles, bbox, span))
+    done = run_and_sum_up(
+        survey_file, stages(), Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span)
+    )
     typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings", err=as_json)
 
 

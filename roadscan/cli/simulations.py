@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from roadscan.cli.arguments import AsJson, Workers, scenes_for
-from roadscan.cli.survey import run_survey, sum_up
+from roadscan.cli.survey import Where, run_survey, sum_up
 from roadscan.cli.terminal import print_table
 
 
@@ -62,7 +62,7 @@ def demo(
     from roadscan.jobs.stage import stages
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
-    run_survey(survey_file, stages(), workers, None)
+    run_survey(survey_file, stages(), Where(workers))
     compared = summarise(survey_file)
     sum_up(survey_file, as_json, {"height_error_m": compared.height_error()})
     for line in () if as_json else compared.lines():

@@ -27,11 +27,17 @@ def verify(
     repair: Annotated[
         bool, typer.Option("--repair", help="Read the logs of damaged tables again, or say what is lost.")
     ] = False,
+    accept_losses: Annotated[
+        bool, typer.Option("--accept-losses", help="Accept that rows whose logs are gone are lost; they stay listed.")
+    ] = False,
 ) -> None:
-    """Read every file the store should hold, and say which are missing or damaged."""
-    from roadscan.jobs.repair import lost_rows, repair_store
+    """Read every file the store should hold, and say which are missing or damaged, and which rows are lost."""
+    from roadscan.jobs.repair import accept_losses as accept
+    from roadscan.jobs.repair import repair_store
     from roadscan.jobs.session import Session
     from roadscan.jobs.status import verify_store
+    from roadscan.model.counted import counted
+    from roadscan.tables.salvage import read_lost
 
     session, reporter = Session.open(survey_file), new_reporter()
     told: list[str] = []
@@ -41,12 +47,17 @@ def verify(
     else:
         faults = verify_store(session.store, lambda d, t: reporter.progress("verify", d, t))
     reporter.close()
-    for line in [*told, *(f"lost: {lost}" for lost in lost_rows(session.store))]:
+    if accept_losses:
+        accept(session.store)
+    lost = read_lost(session.store)
+    for line in [*told, *(f"lost: {one.told}" for one in lost), *faults]:
         typer.echo(line)
-    for fault in faults:
-        typer.echo(fault)
-    typer.echo("every file is whole" if not faults else f"{len(faults)} files are not whole")
-    raise typer.Exit(1 if faults else 0)
+    rows = sum(one.rows for one in lost)
+    gone = f"; {counted(rows, 'row')} {'is' if rows == 1 else 'are'} lost" if lost else ""
+    are = "is" if len(faults) == 1 else "are"
+    whole = f"{counted(len(faults), 'file')} {are} not whole" if faults else "every file is whole"
+    typer.echo(f"{whole}{gone}")
+    raise typer.Exit(1 if faults or any(not one.accepted for one in lost) else 0)
 
 
 def found_status(survey_file: Path) -> Status:
@@ -85,6 +96,8 @@ def print_status(found: Status, survey_file: Path) -> None:
         typer.echo(f"tiles looked at that hold no reading: {empty:,}")
     for record in found.damaged:
         typer.echo(f"damaged: {record}")
+    for lost in found.lost:
+        typer.echo(f"lost: {lost.told}")
     for note in found.notes:
         typer.echo(f"note: {note}")
     for cause in found.would_fail:

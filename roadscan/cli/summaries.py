@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from roadscan.model.counted import counted
+
 if TYPE_CHECKING:
     from roadscan.jobs.summary import LogSummary, Spread, SurveySummary, TilesSummary
     from roadscan.model.survey import Survey
@@ -26,8 +28,10 @@ def print_summary(survey: Survey, store: Store, *, as_json: bool = False, beside
     if as_json:
         typer.echo(json.dumps(found.as_json() | (beside or {}), indent=2, ensure_ascii=False))
         return
-    for head, text in _lines(found):
-        typer.echo(f"{head:<{_WIDTH}}{text}")
+    lines = list(_lines(found))
+    width = max(_WIDTH, *(len(head) + 2 for head, _ in lines))
+    for head, text in lines:
+        typer.echo(f"{head:<{width}}{text}")
 
 
 def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
@@ -41,7 +45,7 @@ def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
     if found.tiles is not None:
         yield from _of_tiles(found.tiles)
     for product, files in found.files.items():
-        yield product, f"{_count(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
+        yield product, f"{counted(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
     for failure in found.failures:
         yield "failed", f"{failure['stage']} {failure['unit']}: {failure['reason']}"
     if not found.failures:
@@ -49,7 +53,7 @@ def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
 
 
 def _of_logs(logs: LogSummary) -> Iterator[tuple[str, str]]:
-    yield "logs", f"{logs.logs:,} with {_count(logs.rows, 'row')}; rejected {_count(logs.rejected, 'record')}"
+    yield "logs", f"{logs.logs:,} with {counted(logs.rows, 'row')}; rejected {counted(logs.rejected, 'record')}"
     for number, (reason, count) in enumerate(logs.reject_reasons.items()):
         if number == _MOST_REASONS:
             yield "", f"… and {len(logs.reject_reasons) - number:,} more reasons (table rejects)"
@@ -63,7 +67,7 @@ def _of_tiles(tiles: TilesSummary) -> Iterator[tuple[str, str]]:
     if tiles.overlap_area_m2 is not None:
         share = tiles.overlap_area_m2 / tiles.area_m2 if tiles.area_m2 else 0.0
         overlap = f"{tiles.overlap_area_m2:,.1f} m² seen by two or more passes ({share:.0%})"
-    yield "area", f"{tiles.area_m2:,.1f} m² in {_count(tiles.cells, 'cell')}"
+    yield "area", f"{tiles.area_m2:,.1f} m² in {counted(tiles.cells, 'cell')}"
     yield "overlap", overlap
     if tiles.sigma_horizontal_m is not None:
         yield "σ of poses", f"horizontal {_spread(tiles.sigma_horizontal_m)} (the largest in each tile)"
@@ -75,10 +79,6 @@ def _of_tiles(tiles: TilesSummary) -> Iterator[tuple[str, str]]:
 
 def _spread(values: Spread) -> str:
     return f"median {values.median * 1e3:.2f} mm, largest {values.largest * 1e3:.2f} mm"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number:,} {word}{'' if number == 1 else 's'}"
 
 
 def _size(size: int) -> str:

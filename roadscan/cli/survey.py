@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from roadscan.cli.summaries import print_summary
 from roadscan.cli.terminal import new_reporter
@@ -15,6 +15,17 @@ if TYPE_CHECKING:
     from roadscan.tables.store import Store
 
 
+class Where(NamedTuple):
+    """Where tasks run."""
+
+    workers: int | None
+    """Processes of the embedded cluster; None: one a core, 0: none."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler that runs elsewhere."""
+    dashboard: bool = False
+    """Whether the embedded cluster serves Dask's dashboard."""
+
+
 def stages_named(name: str) -> tuple[Stage, ...]:
     """The stage of this name, as the stages of a run."""
     from roadscan.jobs.stage import stages
@@ -23,11 +34,7 @@ def stages_named(name: str) -> tuple[Stage, ...]:
 
 
 def run_survey(
-    survey_file: Path,
-    stages: tuple[Stage, ...],
-    workers: int | None,
-    scheduler: str | None,
-    selection: Selection | None = None,
+    survey_file: Path, stages: tuple[Stage, ...], where: Where, selection: Selection | None = None
 ) -> Session:
     """The run of these stages, when it is done.
 
@@ -40,12 +47,16 @@ def run_survey(
     from roadscan.jobs.preflight import preflight
     from roadscan.jobs.run import run_stages
     from roadscan.jobs.session import Session
-    from roadscan.model.errors import Stopped
+    from roadscan.model.stopping import Stopped
 
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter
     preflight(run.survey, run.store, stages[-1].name, selection).begin(reporter.line)
-    with compute_on(workers, scheduler) as run.compute:
+
+    def at(address: str) -> None:
+        reporter.line(f"dashboard: {address}")
+
+    with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
         try:
             run_stages(run, stages)
         except Stopped as stop:
@@ -59,8 +70,7 @@ def run_survey(
 def run_and_sum_up(
     survey_file: Path,
     stages: tuple[Stage, ...],
-    workers: int | None,
-    scheduler: str | None,
+    where: Where,
     as_json: bool,
     selection: Selection | None = None,
 ) -> Session:
@@ -68,7 +78,7 @@ def run_and_sum_up(
     from roadscan.model.errors import RunError
 
     try:
-        run = run_survey(survey_file, stages, workers, scheduler, selection)
+        run = run_survey(survey_file, stages, where, selection)
     except RunError:
         sum_up(survey_file, as_json)
         raise

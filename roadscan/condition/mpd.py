@@ -56,6 +56,6 @@ def mean_profile_depths(segments: Sequence[TextureSegment], stretches: Segments)
     found = []
     for first, last in zip(stretches.from_m, stretches.to_m, strict=True):
         # A segment of 100 mm that begins on a border, but for rounding, begins behind it.
-        inside = np.flatnonzero((begin >= first - 1e-6) & (begin < last - 1e-6))
+        inside = np.flatnonzero((begin >= first - 1e-6) & (begin < last - 1e-6)).tolist()
         found.append(mean_profile_depth([segments[k] for k in inside]))
     return found

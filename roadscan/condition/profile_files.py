@@ -126,7 +126,7 @@ def _of_erd(text: str, stated: StatedUnits) -> ProfileFile:
     chosen = _chosen(stated.columns, read.names) if stated.columns else range(len(read.names))
     scale_x = _scale(read.x_unit, stated.x, "--x-unit", "stations")
     scale = [_scale(read.units[k], stated.height, "--height-unit", f"channel {read.names[k]}") for k in chosen]
-    x = scale_x * (read.start + read.step * np.arange(read.values.shape[1]))
+    x: Floats = np.asarray(scale_x * (read.start + read.step * np.arange(read.values.shape[1])), np.float64)
     heights = np.stack([size * read.values[k] for size, k in zip(scale, chosen, strict=True)])
     return ProfileFile(x, heights, tuple(read.names[k] for k in chosen), ())
 

@@ -53,8 +53,8 @@ class Ride:
     def notes(self, segments: Segments, nominal_m: float | None = None) -> list[list[str]]:
         """What to know of each profile's segments, as words with commas between them; empty where there is nothing.
 
-        `start`: the car begins in it, so its first 11 m depend on how it begins. `gap`: heights are missing. `jump`: a
-        step that no road has was left out. `short`: less than `nominal_m` long.
+        `start`: the car begins in it, so its first 11 m depend on how it begins. `gap`: more than a foot was not
+        measured. `jump`: a step that no road has was left out. `short`: less than `nominal_m` long.
         """
         return [[self._note(row, k, segments, nominal_m) for k in range(segments.from_m.size)]
                 for row in range(len(self.faults))]  # fmt: skip
@@ -66,9 +66,12 @@ class Ride:
     def _note(self, row: int, k: int, segments: Segments, nominal_m: float | None) -> str:
         begin, end, broken = segments.from_m[k], segments.to_m[k], self.breaks[row]
         starts = (self.x_m[:1], broken.gap_to_m, broken.jump_m)
+        ends = Segments(segments.from_m[k : k + 1], segments.to_m[k : k + 1])
+        missing_m = end - begin - float(self._over(self.measured_m[row], ends)[0])
         told: dict[Literal["start", "gap", "jump", "short"], bool] = {
             "start": any(bool(((at + RULES.start_m > begin) & (at < end)).any()) for at in starts),
-            "gap": bool(((broken.gap_from_m < end) & (broken.gap_to_m > begin)).any()),
+            "gap": bool(((broken.gap_from_m < end) & (broken.gap_to_m > begin)).any())
+            or missing_m > RULES.longest_step_m,
             "jump": bool(((broken.jump_m >= begin) & (broken.jump_m <= end)).any()),
             "short": nominal_m is not None and bool(end - begin < nominal_m * (1.0 - 1e-6)),
         }

@@ -84,7 +84,7 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
     length = min(window_m, longest)
     samples = int(length / step + 1e-6)
     total, weight = np.zeros(samples // 2 + 1), 0.0
-    frequency = np.fft.rfftfreq(samples, step)
+    frequency: Floats = np.asarray(np.fft.rfftfreq(samples, step), np.float64)
     for xs, hs in pieces:
         even = np.arange(xs[0], xs[-1] + 1e-9, step)
         if even.size >= samples:

@@ -166,7 +166,8 @@ def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, Floa
 def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -> list[str]:
     """Notes of all profiles together, each word once."""
     of_all = on.notes(parts, segment_m)
-    flat, wild = (found < FLATTEST_M_PER_KM).any(axis=0), (found > ROUGHEST_M_PER_KM).any(axis=0)
+    flat = np.atleast_1d((found < FLATTEST_M_PER_KM).any(axis=0))
+    wild = np.atleast_1d((found > ROUGHEST_M_PER_KM).any(axis=0))
     joined = []
     for k in range(parts.from_m.size):
         words = [word for word in ("start", "gap", "jump", "short") if any(word in notes[k] for notes in of_all)]

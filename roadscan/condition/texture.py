@@ -166,7 +166,7 @@ def _resample(along_mm: Floats, height_mm: Floats, step_mm: float) -> tuple[Floa
     last = np.maximum(np.ceil(along_mm / step_mm), 1.0).astype(np.int64)
     count = np.bincount(last)[1:]
     total = np.bincount(last, weights=height_mm)[1:]
-    place_mm = step_mm * np.arange(1, count.size + 1)
+    place_mm: Floats = np.asarray(step_mm * np.arange(1, count.size + 1), np.float64)
     mean = np.full(count.size, np.nan)
     mean[count > 0] = total[count > 0] / count[count > 0]
     return place_mm, _bridged(place_mm, mean), count > 0
@@ -175,7 +175,10 @@ def _resample(along_mm: Floats, height_mm: Floats, step_mm: float) -> tuple[Floa
 def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
     """Samples on both sides of a step that is too steep."""
     steep = np.abs(np.diff(height_mm)) >= settings.spike_ratio * settings.resampled_mm
-    return np.concatenate([[False], steep]) | np.concatenate([steep, [False]])
+    spike = np.zeros(height_mm.size, np.bool_)
+    spike[1:] |= steep
+    spike[:-1] |= steep
+    return spike
 
 
 def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
@@ -189,4 +192,4 @@ def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
 
 def _segment_of(place_mm: Floats) -> npt.NDArray[np.int64]:
     """Number of the segment of each place; one on a border belongs to the segment before it."""
-    return np.maximum(np.ceil(np.round(place_mm / SEGMENT_MM, 9)) - 1, 0).astype(np.int64)
+    return np.asarray(np.maximum(np.ceil(np.round(place_mm / SEGMENT_MM, 9)) - 1, 0), np.int64)

@@ -174,7 +174,7 @@ def _cut(path: Path, stated: Stated) -> FormatError | None:
         return None
     words = kind_of(path).words
     return FormatError(
-        f"{words} that is cut off: its end is missing, where such a file says what it holds",
+        f"{words} that is cut off: its end is missing",
         change="fetch it again from where it was recorded",
         file=path,
     )

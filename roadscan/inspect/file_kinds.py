@@ -21,6 +21,7 @@ from typing import IO, Any, Final, cast
 
 import pyarrow as pa
 
+from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError
 from roadscan.model.rig import Rig
 from roadscan.model.survey import Survey
@@ -83,6 +84,16 @@ _MAGICS: Final[tuple[tuple[int, bytes, str], ...]] = (
 _TAIL_BYTES: Final = (1 << 16) + 22
 _ENDS: Final = ((b"PAR1", b"PAR1", 4), (b"ARROW1", b"ARROW1", 6), (b"PK\x03\x04", b"PK\x05\x06", _TAIL_BYTES))
 """First bytes, what the end of such a file holds, and within how many bytes (a zip's comment may follow it)."""
+_LEAST: Final = ((b"LASF", 227), (b"ASTM-E57", 48))
+"""First bytes of files, and the size of their headers (LAS 1.4 R15, table 1; ASTM E2807-11, table 1)."""
+_CAPTURES: Final = {
+    b"\xd4\xc3\xb2\xa1": "<",
+    b"\x4d\x3c\xb2\xa1": "<",
+    b"\xa1\xb2\xc3\xd4": ">",
+    b"\xa1\xb2\x3c\x4d": ">",
+}
+"""First bytes of network captures, and their order of bytes (libpcap)."""
+_CAPTURE_HEADER, _PACKET_HEADER = 24, 16
 _WRAPPERS: Final = {
     "gzip": b"\x1f\x8b",
     "bzip2": b"BZh",
@@ -136,15 +147,32 @@ def head_of(path: Path) -> bytes:
 
 
 def is_cut_off(path: Path) -> bool:
-    """True for a Parquet or Arrow file, or a zip archive, without its end, which says what it holds."""
+    """True for a Parquet or Arrow file, or a zip archive, without its end, which says what it holds; and for a file of
+    a known kind that ends inside its header, or a capture that ends inside its first packet.
+    """
     try:
         with path.open("rb") as stream:
-            head = stream.read(8)
+            head = stream.read(_CAPTURE_HEADER + _PACKET_HEADER)
             stream.seek(max(0, stream.seek(0, 2) - _TAIL_BYTES))
-            tail = stream.read()
+            tail, size = stream.read(), stream.tell()
     except OSError:
         return False
-    return any(head.startswith(magic) and end not in tail[-reach:] for magic, end, reach in _ENDS)
+    if any(head.startswith(magic) and size < least for magic, least in _LEAST):
+        return True
+    return _ends_in_a_packet(head, size) or any(
+        head.startswith(magic) and end not in tail[-reach:] for magic, end, reach in _ENDS
+    )
+
+
+def _ends_in_a_packet(head: bytes, size: int) -> bool:
+    """Whether a network capture has not one whole packet, though one was begun."""
+    order = _CAPTURES.get(head[:4])
+    if order is None or size <= _CAPTURE_HEADER:
+        return order is not None and size < _CAPTURE_HEADER
+    if size < _CAPTURE_HEADER + _PACKET_HEADER:
+        return True
+    (kept,) = struct.unpack_from(f"{order}I", head, _CAPTURE_HEADER + 8)
+    return bool(_CAPTURE_HEADER + _PACKET_HEADER + kept > size)
 
 
 def kind_of(path: Path) -> FileKind:
@@ -452,7 +480,7 @@ def _crs_name(text: str) -> str:
 def _listed(names: list[str]) -> str:
     shown = ", ".join(names[:_MEMBERS_SHOWN])
     more = len(names) - _MEMBERS_SHOWN
-    return f"{len(names):,} files: {shown}" + (f" and {more:,} more" if more > 0 else "")
+    return f"{counted(len(names), 'file')}: {shown}" + (f" and {more:,} more" if more > 0 else "")
 
 
 def _filled(details: dict[str, str]) -> dict[str, str]:

@@ -154,6 +154,12 @@ class FoundFolder:
         return {log.sensor: log for log in reversed(self.logs) if log.sensor}
 
 
+def need_folder(folder: Path) -> None:
+    """ConfigError where `folder` is none."""
+    if not folder.is_dir():
+        raise ConfigError("there is no such folder", expected="a folder of logs", file=folder)
+
+
 def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> FoundFolder:
     """Look through a folder, recursively, and order what is found.
 
@@ -166,8 +172,7 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
     ConfigError
         if `folder` is none.
     """
-    if not folder.is_dir():
-        raise ConfigError("there is no such folder", expected="a folder of logs", file=folder)
+    need_folder(folder)
     found = FoundFolder(folder.resolve())
     logs: list[FoundLog] = []
     for path in _candidates(found.folder):

@@ -22,6 +22,7 @@ from roadscan.inspect.diagnosis import cannot_be_opened, diagnose, formats_of, i
 from roadscan.inspect.file_kinds import FileKind, is_cut_off, kind_of, wrapper_of
 from roadscan.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
+from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.sensors.base import LogFormat, Rows, format_named
@@ -297,6 +298,8 @@ def _look_inside(
     inner.error = inner.error.replace(str(inside), str(found.path))
     inner.refusals = {name: text.replace(str(inside), str(found.path)) for name, text in inner.refusals.items()}
     inner.wrappers = (wrapper, *inner.wrappers)
+    if inner.log is not None and not fault:
+        fault = f"a run reads such a log unpacked only: unpack the {wrapper} file first"
     if fault and not inside.stat().st_size:
         return dataclasses.replace(inner, what=f"a {wrapper} file", kind=None, error=f"{found.path}: {fault}")
     if fault:
@@ -343,7 +346,7 @@ def _size(log_format: LogFormat | None, path: Path) -> tuple[int, int]:
 def _folder_words(path: Path) -> str:
     kinds = Counter(p.suffix.lower() or "without suffix" for p in path.rglob("*") if p.is_file())
     listed = ", ".join(f"{count:,} {suffix}" for suffix, count in kinds.most_common(8))
-    return f"a folder of {kinds.total():,} files" + (f" ({listed})" if listed else "")
+    return f"a folder of {counted(kinds.total(), 'file')}" + (f" ({listed})" if listed else "")
 
 
 # --- JSON -------------------------------------------------------------------------------------------

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.jobs.condition.against_truth import compared_values
 from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.survey import Survey
@@ -19,6 +22,28 @@ from roadscan.tables.manifest import Manifest
 from roadscan.tables.store import Store
 
 Float64 = npt.NDArray[np.float64]
+
+
+_SHOWN: Final = ("mri_m_per_km", "rut_depth_mean_left_mm", "rut_depth_mean_right_mm", "cross_slope_mean_percent")
+
+
+@dataclass(frozen=True)
+class DemoLane:
+    """Condition of a lane, mean over its sections, beside what the true surface gives at the same places."""
+
+    lane: str
+    found: dict[str, float]
+    """By quantity."""
+    true: dict[str, float]
+
+    def line(self) -> str:
+        """The lane as text."""
+        iri, left, right, slope = ((self.found[name], self.true[name]) for name in _SHOWN)
+        return (
+            f"lane {self.lane:<9}IRI {iri[0]:.2f} m/km (true {iri[1]:.2f}), rut depth left {left[0]:.1f} mm "
+            f"(true {left[1]:.1f}), right {right[0]:.1f} mm (true {right[1]:.1f}), cross-slope {slope[0]:.2f} % "
+            f"(true {slope[1]:.2f})"
+        )
 
 
 @dataclass(frozen=True)
@@ -34,6 +59,8 @@ class DemoSummary:
     """(n,) robust height of each compared cell minus the true height at its centre."""
     products: Path
     """Folder with the products."""
+    lanes: tuple[DemoLane, ...] = ()
+    """Condition of the lanes, where it was computed."""
 
     def height_error(self) -> dict[str, float]:
         """Median of the errors, 1.4826 times the median distance from it, and what 95 % stay below (m)."""
@@ -55,6 +82,7 @@ class DemoSummary:
             f"area          {self.area_m2:,.1f} m² in {self.cells:,} cells",
             f"height error  median {error['median'] * 1e3:+.2f} mm, 1.4826 MAD {error['robust_std'] * 1e3:.2f} mm, "
             f"95 % within {error['percentile_95'] * 1e3:.2f} mm ({compared})",
+            *(lane.line() for lane in self.lanes),
             f"files         {self.products}",
         ]
 
@@ -73,7 +101,10 @@ def prepare_demo(folder: Path, report: Callable[[str], None], scene: str = "demo
         report(f"raw logs are there: {folder}")
         return survey_file
     report(f"simulating the scene '{scene}' into {folder}")
-    return simulate(Scene.load(scene), folder, progress=report).survey_file
+    simulate(Scene.load(scene), folder, progress=report)
+    with survey_file.open("a", encoding="utf-8") as file:
+        file.write("\n[condition]\n")
+    return survey_file
 
 
 def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
@@ -106,7 +137,21 @@ def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
         area_m2=count * grid.cell_m**2,
         height_error_m=np.concatenate(errors),
         products=Path(store.path("products")),
+        lanes=tuple(_lanes(Session(survey, store), true)),
     )
+
+
+def _lanes(session: Session, true: truth.Truth) -> Iterator[DemoLane]:
+    """Condition of each lane beside its truth."""
+    held: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for one in compared_values(session, lambda e, n: true.surface.height_m(e, n, texture=False)):
+        pair = one.found.value, one.true.value
+        if one.found.quantity in _SHOWN and np.isfinite(pair).all():
+            held.setdefault(one.lane, {}).setdefault(one.found.quantity, []).append(pair)
+    for lane, values in sorted(held.items()):
+        means = {name: np.mean(pairs, axis=0).tolist() for name, pairs in values.items()}
+        if means.keys() == set(_SHOWN):
+            yield DemoLane(lane, {n: m[0] for n, m in means.items()}, {n: m[1] for n, m in means.items()})
 
 
 def _readings(store: Store) -> int:

@@ -19,9 +19,11 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from roadscan.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
-from roadscan.jobs.ingest.overlap import no_row
+from roadscan.jobs.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
+from roadscan.jobs.ingest.one_stamp import one_stamp_logs
+from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.jobs.ingest.planned_logs import CONTROL_RUN, grid_folder, log_source
-from roadscan.jobs.ingest.sources import remembered_formats
+from roadscan.jobs.ingest.sources import listed_name, remembered_formats
 from roadscan.jobs.navigate.clocks import check_clocks
 from roadscan.jobs.plan.centre_line import CentreLines, load_buffer
 from roadscan.jobs.plan.road import looks_across
@@ -45,6 +47,7 @@ from roadscan.model.rig import SensorKind
 from roadscan.model.survey import ControlConfig, LogConfig, Survey
 from roadscan.products.base import ProductContext
 from roadscan.sensors.base import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
+from roadscan.tables.logs import read_log_records
 from roadscan.tables.store import Store
 from roadscan.tiles.grid import TileGrid
 
@@ -117,7 +120,7 @@ class Asked:
     @cached_property
     def logs(self) -> list[CheckedLog]:
         """Logs of the survey file with their headers."""
-        moved = remembered_formats(self.store)
+        moved = remembered_formats(self.store, self.survey.folder)
         listed: list[tuple[str, LogConfig | ControlConfig]] = [
             (run.id, log) for run in self.survey.config.runs for log in run.logs
         ]
@@ -138,6 +141,26 @@ class Asked:
             for one in self.beginnings
             if frame is not None and one.place is not None
         ]
+
+    @cached_property
+    def times(self) -> list[LookedAt]:
+        """When the logs of runs that are not ingested were recorded, as far as a first look tells."""
+        held = {(record.run, record.path) for record in read_log_records(self.store, damaged=[])}
+        due = {log.run for log in self.logs if (log.run, str(log.config.path)) not in held}
+        found: list[LookedAt] = []
+        for log in self.logs:
+            if log.run not in due or log.format is None or log.source is None or log.header is None:
+                continue
+            sensor = getattr(log.config, "sensor", None) or log.format.yields[0]
+            seen = look_at(log.run, sensor, log.format, log.source, log.header)
+            if seen is not None:
+                found.append(named(seen, str(log.config.path)))
+        return found
+
+    @cached_property
+    def time_faults(self) -> list[Fault]:
+        """Logs that cannot meet the poses of their run, and those whose clock stood still."""
+        return [*never_meeting(self.survey, self.times), *one_stamp_logs([t.record for t in self.times if t.ends])]
 
     def yields(self, run: str) -> set[str]:
         """Tables that the logs of a run fill."""
@@ -188,6 +211,28 @@ def check_kinds(asked: Asked) -> Iterator[RoadscanError]:
                 change="name another sensor, or correct its kind in the rig file",
                 file=log.path,
             )
+
+
+def check_lever_arms(asked: Asked) -> Iterator[RoadscanError]:
+    """Sensors sit on the vehicle."""
+    most_m = asked.survey.config.checks.lever_arm_max_m
+    for name, sensor in asked.survey.rig.sensors.items():
+        if max(map(abs, sensor.lever_arm_body_m)) > most_m:
+            stated = ", ".join(f"{component:g}" for component in sensor.lever_arm_body_m)
+            yield ConfigError(
+                f"the lever arm of sensor '{name}' is [{stated}] m",
+                expected=f"components of at most {most_m:g} m (checks.lever_arm_max_m)",
+                change="state lever_arm_body_m in metres; of a vehicle that is as long, raise checks.lever_arm_max_m",
+            )
+
+
+def check_times(asked: Asked) -> Iterator[RoadscanError]:
+    """A log of readings is left that meets the poses of its run, and whose clock did not stand still."""
+    found = asked.time_faults
+    faulty = {key for fault in found for key in fault.keys}
+    readings = [log for log in asked.logs if {*_PLACED, "cloud"} & set(log.yields)]
+    if readings and all(key_of_look(log.run, log.path) in faulty for log in readings):
+        yield NothingPlacedError.of(found)
 
 
 def check_datums(asked: Asked) -> Iterator[RoadscanError]:
@@ -352,11 +397,13 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_logs),
     ("ingest", check_positions),
     ("ingest", check_kinds),
+    ("ingest", check_lever_arms),
     ("ingest", check_datums),
     ("ingest", check_area),
     ("ingest", check_scale),
     ("ingest", check_products),
     ("ingest", check_passes),
+    ("ingest", check_times),
     ("navigate", check_motion_clocks),
     ("footprints", check_poses),
     ("footprints", check_segmentation),
@@ -372,6 +419,8 @@ class Preflight:
 
     causes: tuple[RoadscanError, ...]
     notes: tuple[str, ...]
+    failing: tuple[str, ...] = ()
+    """Logs that would fail while others go on, and why."""
 
     def begin(self, report: Callable[[str], None]) -> None:
         """Let a run begin: report the notes; raise the only cause, or one error that lists them all, a line each."""
@@ -395,7 +444,8 @@ def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Sel
     due = set(names[: names.index(last_stage) + 1] if last_stage else names)
     found = [cause for stage, check in CHECKS if stage in due for cause in check(asked)]
     found += [cause for stage in stages() if stage.name in due for cause in stage.check(survey)]
-    return Preflight(tuple(_grouped(found)), tuple(_notes(asked)))
+    failing = () if found else tuple(": ".join(fault.told) for fault in asked.time_faults)
+    return Preflight(tuple(_grouped(found)), tuple(_notes(asked)), failing)
 
 
 _NAMED: Final = 3
@@ -507,8 +557,8 @@ def _map_words(asked: Asked) -> str:
 def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved: dict[str, str]) -> CheckedLog:
     """Open a log as far as its header."""
     path = survey.resolve(config.path)
-    if not is_there(path) and str(path) in moved:
-        return CheckedLog(run, config, path, format_named(config.format or moved[str(path)]))
+    if not is_there(path) and (known := moved.get(listed_name(path, survey.folder))) is not None:
+        return CheckedLog(run, config, path, format_named(config.format or known))
     format_: LogFormat | None = None
     source: LogSource | None = None
     try:

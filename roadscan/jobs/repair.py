@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 from roadscan.jobs.ingest.ingest import IngestTask, read_log, record_of, with_span
 from roadscan.jobs.ingest.planned_logs import PlannedLog, grid_folder, plan_logs
@@ -24,8 +23,6 @@ from roadscan.tables.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.tables.sql_files import stamp_of
 from roadscan.tables.store import Store
 from roadscan.tables.verified import note_verified
-
-_AGAIN: Final = "put the log back and repeat `roadscan verify --repair`"
 
 
 @dataclass
@@ -50,7 +47,9 @@ class _Broken:
 
     record: LogRecord
     files: dict[str, DataFile]
-    """The damaged files by path, as they were recorded when they were whole."""
+    """Files that are damaged, or that lost rows before, by path, as they were recorded when they were whole."""
+    damaged: frozenset[str]
+    """Those of them that are damaged as they are now."""
 
 
 def repair_store(survey: Survey, store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> Repair:
@@ -69,9 +68,10 @@ def repair_store(survey: Survey, store: Store, report: Callable[[int, int], None
     return done
 
 
-def lost_rows(store: Store) -> list[str]:
-    """In words, what earlier repairs could not bring back."""
-    return [f"{lost}; {_AGAIN}" for lost in read_lost(store)]
+def accept_losses(store: Store) -> None:
+    """Keep that the user goes on without the rows that are lost; they stay listed."""
+    with store.lock():
+        write_lost(store, [replace(lost, accepted=True) for lost in read_lost(store)])
 
 
 def _broken(records: Iterable[LogRecord], faults: Mapping[str, str], lost: Sequence[Lost]) -> list[_Broken]:
@@ -80,7 +80,7 @@ def _broken(records: Iterable[LogRecord], faults: Mapping[str, str], lost: Seque
         files = {f.path: f for own in record.tables.values() for f in own if f.path in faults}
         files |= {one.file.path: one.file for one in lost if one.log == record.key}
         if files:
-            found.append(_Broken(record, files))
+            found.append(_Broken(record, files, frozenset(files.keys() & faults.keys())))
     return found
 
 
@@ -94,7 +94,7 @@ def _mend_logs(
     for one in broken:
         try:
             log = _log_of(one.record, planned, [u.path for u in unplanned])
-            _check_whole(store, log)
+            _check_whole(survey, store, log)
             task = IngestTask(store, with_span(log, spans.get(log.run)), (), grid_folder(survey))
             done.lines += _read_again(task, one)
             done.lost = [lost for lost in done.lost if lost.log != one.record.key]
@@ -139,13 +139,13 @@ def _log_of(record: LogRecord, planned: Sequence[PlannedLog], unplanned: Sequenc
     raise RoadscanError(f"the survey file lists its log {record.path} no more", change="list it again, or leave it")
 
 
-def _check_whole(store: Store, log: PlannedLog) -> None:
+def _check_whole(survey: Survey, store: Store, log: PlannedLog) -> None:
     """_LostLogError where the log's bytes are not those that were read before."""
     path, companions = log.source.path, log.format.companions(log.source.path, log.source.options)
     if not path.exists():
         raise _LostLogError(f"the raw log {log.config.path} is gone")
     try:
-        whole = is_unchanged(store, path, log.format, companions)
+        whole = is_unchanged(store, survey.folder, path, log.format, companions)
     except OSError as error:
         raise _LostLogError(f"the raw log {log.config.path} cannot be read ({error.strerror or error})") from error
     if not whole:
@@ -204,12 +204,13 @@ def _kept_aside(store: Store, path: str) -> str:
 
 def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[str]:
     """Keep what is sound of a log's damaged files; what is not is lost, and listed."""
-    known = {one.file.path for one in done.lost}
+    known = {one.file.path: one for one in done.lost}
     lines: list[str] = []
     files = {f.path: f for own in broken.record.tables.values() for f in own}
-    for path, file in broken.files.items():
-        if path in known:  # told before, and its log is still gone
+    for path, whole in broken.files.items():
+        if path not in broken.damaged:  # told before, and its log is still gone
             continue
+        file, before = files[path], known.get(path)
         table = path.split("/")[1]
         with store.scratch() as folder:
             kept, rows, spans = salvaged(store, table, file, folder / Path(path).name)
@@ -221,8 +222,12 @@ def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[s
                 store.publish(folder / Path(path).name, path, lasting=True)
                 files[path] = kept
         if rows:
-            done.lost.append(Lost(broken.record.key, table, file, rows, spans, aside))
-            lines.append(f"{done.lost[-1]}: {why}; the next run makes anew what they touch, without them; {_AGAIN}")
+            now = Lost(broken.record.key, table, whole, rows, spans, aside)
+            if before is not None:
+                done.lost.remove(before)
+                now = replace(now, rows=before.rows + rows, spans=(*before.spans, *spans))
+            done.lost.append(now)
+            lines.append(f"{now}: {why}; the next run makes anew what they touch, without them")
         else:
             lines.append(f"{path}: mended, only what stands beside its rows was damaged{_told_aside(aside)}")
     tables = {t: tuple(files[f.path] for f in own if f.path in files) for t, own in broken.record.tables.items()}

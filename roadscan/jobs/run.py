@@ -12,6 +12,7 @@ from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, stages
 from roadscan.jobs.tiles.selection import SelectionError
+from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError, RunError
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import begin_changes, end_changes, write_failures
@@ -65,18 +66,28 @@ def run_stage(session: Session, stage: Stage) -> None:
         session.failed(stage.name, [("as a whole", error)])
 
 
+def _removed_words(paths: Sequence[str]) -> str:
+    folders = dict.fromkeys(path.rpartition("/")[0] for path in paths)
+    return f"removed {counted(len(paths), 'file')} that a stopped run left without a record, in {', '.join(folders)}"
+
+
 def close_run(session: Session, done: Sequence[Stage]) -> None:
     """Keep the list of failures for `roadscan status`, and raise if there are any.
 
     A whole run without failures has a record for every file that is due: what a run before it left without one is
     removed.
     """
-    if {stage.name for stage in done}.issuperset(stage.name for stage in stages()):
+    whole = {stage.name for stage in done}.issuperset(stage.name for stage in stages())
+    if whole:
         session.manifest.compact()
         if session.selection is None and not session.failures:
             folders = [folder for stage in stages() for folder in stage.folders()]
-            end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            removed = end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            if removed:
+                session.note(_removed_words(removed))
     write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
+    if whole:
+        _report(session)
     if session.store.is_folder:
         logs = read_log_records(session.store, damaged=[])
         note_written(session.store, session.began_ns, recorded_files(session.store, logs, session.manifest))
@@ -84,6 +95,18 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
         more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
         raise RunError(
-            f"{len(session.failures)} units failed: {listed}{more}",
+            f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
         )
+
+
+def _report(session: Session) -> None:
+    """Write the report; what keeps it from being made costs nothing else."""
+    from roadscan.jobs.report.page import keep_report
+
+    try:
+        path = keep_report(session)
+    except RoadscanError as error:
+        session.note(f"the report could not be written: {error}")
+    else:
+        session.reporter.line(f"report: {session.store.path(path)}")

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.jobs.ingest.overlap import NothingPlacedError
-from roadscan.jobs.ingest.planned_logs import PlannedLog
+from roadscan.jobs.ingest.planned_logs import PlannedLog, UnplannedLog
 from roadscan.jobs.ingest.sources import damaged_sources
 from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.plan.plan import NothingToPlaceError
@@ -26,6 +26,7 @@ from roadscan.products.base import products
 from roadscan.tables.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
 from roadscan.tables.mend import fault_of
+from roadscan.tables.salvage import Lost, read_lost
 from roadscan.tables.sql_files import Stamp, stamp_of
 from roadscan.tables.store import Store
 from roadscan.tables.verified import held_faults, note_verified
@@ -51,6 +52,8 @@ class Status:
     """What the checks before a run note of the survey."""
     damaged: list[str] = field(default_factory=list)
     """Records of the store that are damaged; the next run mends them."""
+    lost: list[Lost] = field(default_factory=list)
+    """Ingested rows that the store holds no more, and that could not be read again."""
     note: str = ""
     """Why nothing can be said of tiles."""
     would_fail: list[str] = field(default_factory=list)
@@ -60,9 +63,10 @@ class Status:
 
     @property
     def is_complete(self) -> bool:
-        """True if nothing is missing, stale or failed."""
+        """True if nothing is missing, stale or failed, and no rows are lost but those that the user gave up."""
+        lost = any(not one.accepted for one in self.lost)
         due = any(state.stale or state.hides_rest for state in self.stages.values())
-        return not (due or self.failures or self.damaged or self.note or self.would_fail)
+        return not (due or self.failures or self.damaged or self.note or self.would_fail or lost)
 
     @property
     def notes(self) -> list[str]:
@@ -83,7 +87,7 @@ def survey_status(session: Session) -> Status:
     """Look at everything the manifest says; reads no readings."""
     store, damaged = session.store, session.hear_of_damage()
     found = preflight(session.survey, store)
-    causes = [str(cause) for cause in found.causes]
+    causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
     planned, unplanned = session.logs
     unsaid = [u for u in unplanned if not causes]  # else it is said there, once for a cause
@@ -91,7 +95,9 @@ def survey_status(session: Session) -> Status:
     manifest = session.manifest
     records = {r.key: r for r in read_log_records(store, damaged=damaged)}
     status.damaged = list(map(str, damaged))
+    status.lost = read_lost(store)
     status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
+    status.logs += [_unplanned_state(one) for one in unplanned]
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, session.logs)}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
@@ -126,6 +132,12 @@ def _log_state(store: Store, log: PlannedLog, record: LogRecord | None) -> dict[
         "state": "ingested" if record else "damaged" if has_log(store, log.key) else "waiting",
         "bytes": log.bytes,
     }
+
+
+def _unplanned_state(log: UnplannedLog) -> dict[str, Any]:
+    """Of a log that cannot be planned: a file of it is missing, or its settings are wrong."""
+    unknown = dict.fromkeys(("rows", "rejected", "bytes"), 0)
+    return {"run": log.run, "sensor": "", "path": log.path, "format": "", "state": "cannot be read", **unknown}
 
 
 @dataclass

@@ -171,19 +171,6 @@ class RunError(RoadscanError):
     """Some units of a run failed; the rest is finished and kept."""
 
 
-class Stopped(BaseException):
-    """The program was asked to end (Ctrl-C, or a signal of the system); raised at the place that it had reached.
-
-    Parameters
-    ----------
-    number : the signal's.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-        super().__init__(number)
-
-
 def in_words(error: OSError) -> RoadscanError:
     """The error of a file, as one that a user can mend: which file, what is wrong with it, and what to change."""
     if error.filename is None:  # libraries say in their own words which file it is

@@ -72,7 +72,15 @@ def load_toml(path: str | Path) -> dict[str, Any]:
     A line that begins with :data:`OPEN_QUESTION` is a fault: the file is not completed.
     """
     try:
-        text = Path(path).read_bytes().decode("utf-8")
+        content = Path(path).read_bytes()
+        if b"\0" in content:
+            raise ConfigError(
+                "the file is no text",
+                expected="a file in TOML, such as the SURVEY.toml that `roadscan init` writes",
+                change="see what it holds with `roadscan inspect`",
+                file=path,
+            )
+        text = content.decode("utf-8")
         values = tomllib.loads(text)
     except FileNotFoundError as error:
         raise ConfigError("the file does not exist", file=path) from error
@@ -81,7 +89,12 @@ def load_toml(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         reason = in_words(error)
         raise ConfigError(f"the file cannot be read: {reason.arrived}", change=reason.change, file=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ConfigError(
+            f"not valid TOML: line {line} holds a byte that is no text in UTF-8", change="save it as UTF-8", file=path
+        ) from error
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"not valid TOML: {error}", file=path) from error
     _refuse_open_questions(text, path)
     return values
@@ -107,7 +120,7 @@ def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError)
     for fault in faults:
         if _is_beside(fault, faults):
             continue
-        place, holder = _walk(model, fault["loc"])
+        place, holder = _walk(model, fault["loc"][:-1] if _is_too_short(fault) else fault["loc"])
         if fault["type"] in _OF_TAGS:
             place.append(fault["ctx"]["discriminator"].strip("'"))
         where = _place(place, values)
@@ -115,9 +128,18 @@ def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError)
     return [_sentence(where, got, expected) for (where, got), expected in told.items()]
 
 
+def _is_too_short(fault: Any) -> bool:
+    """A list of fixed length lacks its end."""
+    return fault["type"] == "missing" and isinstance(fault["loc"][-1], int)
+
+
 def _is_beside(fault: Any, faults: Sequence[Any]) -> bool:
-    """A table where a text could stand too: only the table's own faults help."""
+    """A table where a text could stand too: only the table's own faults help. Of places that a list lacks, the last one
+    says how long it has to be.
+    """
     above = fault["loc"][:-1]
+    if _is_too_short(fault):
+        return any(_is_too_short(f) and f["loc"][:-1] == above and f["loc"][-1] > fault["loc"][-1] for f in faults)
     others = (f for f in faults if f is not fault and f["loc"][: len(above)] == above)
     return isinstance(fault["input"], dict) and fault["type"] not in _OF_TABLES and any(others)
 
@@ -206,6 +228,8 @@ def _expected(fault: Any, holder: type[BaseModel] | None, where: str) -> str:
             return f"unknown key {where}{nearest(str(fault['loc'][-1]), known)}, expected one of: " + ", ".join(
                 sorted(known)
             )
+        case "missing" if _is_too_short(fault):
+            return f"{_EXPECTED}a list of {fault['loc'][-1] + 1} ({len(fault['input'])} given)"
         case "missing" | "union_tag_not_found":
             return f"key {where} is missing"
         case "union_tag_invalid":

@@ -356,11 +356,14 @@ class ProductConfig(Strict):
 
 
 class ChecksConfig(Strict):
-    """When a run warns of what it lost; a log that gives nothing at all always fails."""
+    """When a run warns of what it lost, and what it refuses; a log that gives nothing at all always fails."""
 
     lost_share: float = Field(default=0.1, ge=0, le=1)
-    """Share of a log's records that are rejected, or of the readings that have no pose, above which `roadscan run` and
+    """Share of a log's records that are rejected, or of its readings that have no pose, above which `roadscan run` and
     `roadscan status` say so."""
+    lever_arm_max_m: float = Field(default=10.0, gt=0)
+    """Longest component of a sensor's `lever_arm_body_m` (m). A longer one is refused: it was most likely stated in
+    millimetres. State more for a longer vehicle."""
 
 
 class SurveyConfig(Strict):

@@ -280,6 +280,10 @@ class LogFormat(ABC):
         A damaged record becomes a :class:`Reject`; only a fault of the whole log raises.
         """
 
+    def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream the log's last records, where they can be found in a moment; nothing where they cannot."""
+        return iter(())
+
 
 @functools.cache
 def log_formats() -> dict[str, LogFormat]:

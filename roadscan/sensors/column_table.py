@@ -41,6 +41,9 @@ class ColumnTable(Protocol):
     def parts(self, rows: int, columns: Sequence[str]) -> Iterator[tuple[int, pa.RecordBatch | Lost]]:
         """(number of the first row, at most `rows` rows of `columns`, or what was lost)."""
 
+    def ending(self, column: str) -> pa.RecordBatch | None:
+        """The last rows of one column; None where they cannot be read."""
+
 
 class _Parquet:
     def __init__(self, file: Path) -> None:
@@ -69,6 +72,16 @@ class _Parquet:
                 yield first + done, Lost(f"row group is damaged: {reason or 'rows are missing'}", max(1, count - done))
             first += max(count, done)
 
+    def ending(self, column: str) -> pa.RecordBatch | None:
+        last = self._file.metadata.num_row_groups - 1
+        if last < 0 or ParquetPages(self._path).fault(last, [column]):
+            return None
+        try:
+            (batch,) = self._file.read_row_group(last, [column], use_threads=False).combine_chunks().to_batches()
+        except UNREADABLE:
+            return None
+        return batch
+
 
 class _Arrow:
     def __init__(self, file: Path) -> None:
@@ -92,6 +105,11 @@ class _Arrow:
         unlisted = unlisted_batches(self._path, mapped.reader.num_record_batches)
         if unlisted:
             yield first, Lost(unlisted_reason(unlisted), unlisted)
+
+    def ending(self, column: str) -> pa.RecordBatch | None:
+        reader = MappedBatches(self._path, [self.schema.names.index(column)]).reader
+        batch = _batch(reader, reader.num_record_batches - 1) if reader.num_record_batches else None
+        return batch if isinstance(batch, pa.RecordBatch) else None
 
 
 def _joined(reader: pa.ipc.RecordBatchFileReader, rows: int) -> Iterator[pa.RecordBatch | Lost]:

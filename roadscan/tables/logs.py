@@ -79,6 +79,11 @@ def log_folder(table: str, run: str, sensor: str, key: str) -> str:
     return f"tables/{table}/run={run}/sensor={sensor}/log={key}"
 
 
+def log_of(path: str) -> str:
+    """Key of the log whose rows lie in a file below its folder."""
+    return path.partition("/log=")[2].partition("/")[0]
+
+
 def record_path(key: str) -> str:
     """File of a log's record, relative to the survey's root."""
     return f"{_FOLDER}/{key}.json"

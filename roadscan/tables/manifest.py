@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
@@ -19,6 +20,7 @@ __all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_fai
 _FOLDER: Final = "manifest/outputs"
 _FAILURES: Final = "manifest/failures.json"
 _CHANGING: Final = "manifest/changing"
+_OLDER: Final = b"older files, too"
 _DAMAGED: Final = "damaged"
 """Key of outputs whose files are not as recorded."""
 _MOST_PARTS: Final = 256
@@ -141,7 +143,7 @@ class Manifest:
         """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
         known = [(product, u) for u in units if u in self._of(product)]
         if known:
-            begin_changes(self._store)
+            begin_changes(self._store, older=True)
             self._forget(known)
 
     def doubt(self, records: Iterable[OutputRecord]) -> None:
@@ -291,26 +293,40 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
     return content
 
 
-def begin_changes(store: Store) -> bool:
+def begin_changes(store: Store, *, older: bool = False) -> bool:
     """Note that files may lie in the store from now on that no record names; True where that was noted before.
 
     A run that is killed leaves files that it had not recorded yet. With other settings the next one would make others,
-    and those would stay.
+    and those would stay. `older` says that files which lie there already lost their record, too.
     """
-    if store.exists(_CHANGING):
-        return True
-    store.write_bytes(_CHANGING, b"")
-    return False
+    before = store.exists(_CHANGING)
+    if not before or (older and not store.read_bytes(_CHANGING)):
+        store.write_bytes(_CHANGING, _OLDER if older else b"")
+    return before
 
 
-def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> None:
-    """Remove the files below some folders that no record names, once all that is due has one."""
+def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> list[str]:
+    """Remove the files below some folders that no record names, once all that is due has one; returns their paths.
+
+    What lay there before the run that was killed began is nothing of its making, and stays.
+    """
     listed = set(manifest.table().column("path").to_pylist())
-    for folder in folders:
-        for path in store.files(folder):
-            if path not in listed:
-                store.remove(path)
+    began = 0 if store.exists(_CHANGING) and store.read_bytes(_CHANGING) else _changed_ns(store, _CHANGING)
+    removed = [
+        path
+        for folder in folders
+        for path in store.files(folder)
+        if path not in listed and _changed_ns(store, path) >= began
+    ]
+    for path in removed:
+        store.remove(path)
     store.remove(_CHANGING)
+    return removed
+
+
+def _changed_ns(store: Store, path: str) -> int:
+    """When a file was written (Unix ns), 0 where the store is no folder."""
+    return Path(store.path(path)).stat().st_mtime_ns if store.is_folder and store.exists(path) else 0
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:

@@ -86,7 +86,7 @@ def _mend_manifest(store: Store, report: Report) -> None:
         fault = parts[one].fault
         if fault is not None and not isinstance(fault, DamagedError):
             raise fault  # may be readable tomorrow
-    begin_changes(store)  # files that only it named lie there without a record now
+    begin_changes(store, older=True)  # files that only it named lie there without a record now
     rows, _ = latest(pa.concat_tables([part.table for part in parts]), forgotten=True)
     doubtful = _doubtful(rows, parts[damaged[-1] + 1 :])
     with store.scratch() as folder:

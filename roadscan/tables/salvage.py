@@ -38,11 +38,21 @@ class Lost:
     """First and last epoch (GPS ns) of each part that is lost; empty for tables without epochs."""
     aside: str
     """Where the damaged file is kept; empty where it was missing."""
+    accepted: bool = False
+    """True once the user said that the store goes on without them."""
 
     def __str__(self) -> str:
         """What is lost, in words."""
         kept = f"; the damaged file is kept ({self.aside})" if self.aside else ""
-        return f"{self.file.path}: {self.rows:,} of {self.file.rows:,} rows are lost{_between(self.spans)}{kept}"
+        agreed = " (accepted)" if self.accepted else ""
+        rows = f"{self.rows:,} of {self.file.rows:,} rows are lost{agreed}"
+        return f"{self.file.path}: {rows}{_between(self.spans)}{kept}"
+
+    @property
+    def told(self) -> str:
+        """The same, with what can be done about it."""
+        accept = "" if self.accepted else ", or accept that they are gone: `roadscan verify --accept-losses`"
+        return f"{self}; put the log back and repeat `roadscan verify --repair`{accept}"
 
 
 def _between(spans: Sequence[tuple[int, int]]) -> str:

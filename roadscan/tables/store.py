@@ -50,7 +50,7 @@ _MAKE_ROOM: Final = (
     "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
 )
 
-MADE_AGAIN: Final = "`roadscan verify` finds all such files, and the next run makes them again"
+MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
 """What mends a damaged product."""
 
 _T = TypeVar("_T")

@@ -124,6 +124,17 @@ def test_gaps_jumps_and_notes() -> None:
     assert iri[9] == pytest.approx(usual[9], rel=0.01)
 
 
+def test_what_lies_beyond_the_ends_or_between_near_gaps_is_told() -> None:
+    x = np.arange(0.0, 100.0, 0.1)
+    h = np.where(((x > 40.0) & (x < 41.0)) | ((x > 51.0) & (x < 52.0)), np.nan, smooth(x))
+    on = ride(x, h)
+    parts = segments_of(0.0, 130.0, stations_m=[-30.0, 10.0, 30.0, 42.0, 50.0, 90.0, 130.0])
+    iri, share = (values[0] for values in iri_of(on, parts))
+    assert on.notes(parts)[0] == ["start, gap", "start", "start, gap", "start, gap", "start, gap", "gap"]
+    assert np.isnan(iri).tolist() == [True, False, False, True, False, True]
+    assert share == pytest.approx([0.25, 1.0, 10 / 12, 0.0, 0.95, 0.2475], abs=0.01)
+
+
 def test_a_gap_costs_nothing_far_behind_it() -> None:
     x = np.arange(0.0, 300.0, 0.1)
     h = smooth(x)

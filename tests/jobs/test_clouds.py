@@ -61,7 +61,7 @@ def test_what_else_is_in_a_block_changes_no_tile(tmp_path: Path) -> None:
 def test_a_height_that_is_none_is_counted_and_left_out(tmp_path: Path, height: float) -> None:
     write_cloud(tmp_path / "good.las", 6, np.array([1.0, 2.0]), 200_000_000.0)
     write_cloud(tmp_path / "bad.las", 6, np.array([3.0]), 200_000_001.0, height)
-    with pytest.raises(RunError, match=r"1 units failed: footprints bad\.las: not one of the 1 readings.*heights"):
+    with pytest.raises(RunError, match=r"1 unit failed: footprints bad\.las: not one of the 1 readings.*heights"):
         run(tmp_path, ["good.las", "bad.las"], 8)
     store = Store(str(tmp_path / "store-8"), "cloud")
     (path,) = store.files("tiles/las")

@@ -138,7 +138,7 @@ def test_damaged_files_are_found_and_made_again(made: tuple[Simulated, dict[str,
         run_stages(other, [stage for stage in stages() if stage.name == "products"])
     for product, path in (("mosaic/height", cells), ("kilometre/height", overviews)):
         assert any(unit.startswith(product) and path in reason for _, unit, reason in other.failures)
-    assert "`roadscan verify` finds all such files, and the next run makes them again" in str(raised.value)
+    assert "run `roadscan verify`, which finds all such files; the next run then makes them again" in str(raised.value)
 
     for _ in range(2):  # what is not whole stays listed until it is made again
         faults = verify_store(store)

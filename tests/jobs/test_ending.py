@@ -82,6 +82,44 @@ def test_a_signal_to_the_whole_group_ends_a_run_with_one_line(
     assert verify_store(copy.store()) == []
 
 
+INTERRUPTED_WRITER = """
+import os, signal, sys
+import laspy
+from roadscan.cli import main
+
+class Interrupting:
+    def __init__(self, stream):
+        self._stream = stream
+    def write(self, content):
+        if not asked and "lazrs" in sys._getframe(1).f_code.co_filename:
+            asked.append(True)
+            os.kill(os.getpid(), signal.SIGINT)
+        return self._stream.write(content)
+    def __getattr__(self, name):
+        return getattr(self._stream, name)
+
+asked, opened = [], laspy.open
+laspy.open = lambda place, *words, **settings: opened(
+    Interrupting(place) if "w" in words else place, *words, **settings
+)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.argv = ["roadscan", "run", sys.argv[1], "--workers", "0"]
+main()
+"""
+"""The command line, with Ctrl-C as soon as the LAZ library, in Rust, calls back to write."""
+
+
+def test_a_signal_that_a_library_makes_an_error_of_its_own_of_ends_a_run(tiny: Simulated, tmp_path: Path) -> None:
+    copy = tiny.copy_to(tmp_path / "survey")
+    copy.survey_file.write_text(copy.survey_file.read_text() + '\n[products]\nmake = ["las"]\n')
+    command = [sys.executable, "-c", INTERRUPTED_WRITER, str(copy.survey_file)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, check=False)
+    assert done.returncode == 128 + signal.SIGINT, done.stderr
+    assert done.stderr.splitlines()[-1].startswith("roadscan: stopped: Ctrl-C (SIGINT); in the stage tiles, 0 of ")
+    assert "failed" not in done.stderr
+    assert done.stdout == ""
+
+
 def test_a_reader_that_has_seen_enough_ends_a_command_without_a_word() -> None:
     command = [*ROADSCAN, "formats"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=REPOSITORY) as one:

@@ -247,7 +247,7 @@ def test_the_command(survey: Survey, tmp_path: Path) -> None:
     common = ["export", file, "--run", run, "--sensor", sensor, "--out"]
     done = CliRunner().invoke(app, [*common, str(tmp_path / "crg"), "--format", "opencrg", "--u-step", "0.1"])
     assert done.exit_code == 0, done.output
-    assert "1 files in" in done.output
+    assert "1 file in" in done.output
     done = CliRunner().invoke(app, [*common, str(tmp_path / "psi"), "--format", "psi", "--length", "10"])
     assert done.exit_code == 0, done.output
     assert len(list((tmp_path / "psi").iterdir())) >= 3

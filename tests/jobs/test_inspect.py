@@ -385,7 +385,7 @@ def _npy() -> bytes:
     [
         ("a.png", _png(), "a PNG picture", "640 × 480 pixels"),
         ("a.jpg", _jpeg(), "a JPEG picture", "1,920 × 1,080 pixels"),
-        ("a.zip", _zip(), "a zip archive", "1 files: a.txt"),
+        ("a.zip", _zip(), "a zip archive", "1 file: a.txt"),
         ("a.npy", _npy()[:5_000], "a NumPy array", "the file ends early"),
         ("a.csv", b"x_m,iri\n1,2\n3,4\n", "text, 2 columns named x_m, iri", "lines: 3"),
         ("a.txt", b"Dear reader, this is a letter\nand no table.\n", "text", "lines: 2"),
@@ -436,7 +436,7 @@ def test_rasters_and_tables(tmp_path: Path) -> None:
 def test_folders_and_missing_files(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("x")
     found = inspect(tmp_path)
-    assert found.what == "a folder of 1 files (1 .txt)"
+    assert found.what == "a folder of 1 file (1 .txt)"
     assert not found.readable
     assert "there is no such file" in inspect(tmp_path / "none").error
 

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from roadscan.jobs.engine import on_dask
-from roadscan.jobs.engine.on_dask import OnDask, embedded
+from roadscan.jobs.engine import embedded as own_cluster
+from roadscan.jobs.engine.embedded import embedded
+from roadscan.jobs.engine.on_dask import OnDask
 from roadscan.model.errors import RoadscanError
 
 DEADLY = 7
@@ -44,7 +45,7 @@ def test_a_result_that_cannot_be_sent_is_its_tasks_error(cluster: OnDask, made: 
 
 
 def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(on_dask, "_LOST_S", 0.5)
+    monkeypatch.setattr(own_cluster, "_LOST_S", 0.5)
     with embedded(1) as alone:
         dask_cluster = alone._client.cluster
         (nanny,) = dask_cluster.workers.values()

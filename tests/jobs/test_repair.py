@@ -228,15 +228,20 @@ def test_what_a_lost_log_costs_is_said_and_brought_back(finished: Simulated, tmp
     lost = file.rows
     assert f"{file.path}: {lost:,} of {file.rows:,} rows are lost, " in words, words
     assert ("is gone" if fate == "gone" else "holds other bytes now") in words and "put the log back" in words
-    assert code == 0 and store.files("damaged/tables")
+    assert code == 1 and store.files("damaged/tables")
+    assert words.splitlines()[-1] == f"every file is whole; {lost:,} rows are lost"
     (left,) = query(store, f"SELECT count(*) AS n FROM scans WHERE log = '{record.key}'").to_pylist()
     assert left["n"] == sum(f.rows for f in record.tables["scans"]) - lost
     assert say("sql", "--survey", copy.survey_file, "SELECT count(*) FROM scans")[0] == 0
-    code, words = say("verify", copy.survey_file)
-    assert code == 0 and f"lost: {file.path}" in words
+    for command in ("verify", "status"):
+        code, words = say(command, copy.survey_file)
+        assert code == 1 and f"lost: {file.path}" in words and "`roadscan verify --accept-losses`" in words
     if fate == "gone":
         copy.run()  # what they touched is made anew, without them
         assert outputs(store) != made
+    for command in (("verify", "--accept-losses"), ("verify",), *([("status",)] if fate == "gone" else [])):
+        code, words = say(*command, copy.survey_file)
+        assert code == 0 and f"lost: {file.path}: {lost:,} of {lost:,} rows are lost (accepted)" in words, words
     raw.write_bytes(raw_bytes)
     os.utime(raw, ns=(raw_stat.st_atime_ns, raw_stat.st_mtime_ns))
     code, words = say("verify", "--repair", copy.survey_file)

@@ -165,7 +165,7 @@ class Writer:
         if values.size:
             low, high = values.min().tobytes(), values.max().tobytes()
             statistics |= {5: binary(high), 6: binary(low)}
-        return chunk(kind, (field.name,), pages.PLAIN, len(column), at, size, {12: struct(statistics)})
+        return chunk(kind, (field.name,), pages.PLAIN, len(column), Page(at, size), {12: struct(statistics)})
 
     def _lists(self, field: pa.Field, column: pa.Array) -> Value:
         values = column.flatten().to_numpy()
@@ -176,7 +176,7 @@ class Writer:
         count = values.size + column.null_count
         at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
         path = (field.name, "list", "element")
-        return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, at, size, {})
+        return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, Page(at, size), {})
 
     def compressed(
         self, field: pa.Field, encoding: int, content: npt.NDArray[np.uint8], count: int, more: dict[int, Value]
@@ -185,7 +185,7 @@ class Writer:
         packed = np.frombuffer(self._codec.compress(content), np.uint8)
         at, size = self.page(b"", packed, count, encoding, content.size)
         raw = size - packed.size + content.size
-        return chunk(KINDS[field.type], (field.name,), encoding, count, at, size, more, codec=_LZ4_RAW, raw=raw)
+        return chunk(KINDS[field.type], (field.name,), encoding, count, Page(at, size, raw), more)
 
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
         """Write a page, of `raw` bytes before it was compressed; returns where it starts, and its whole size."""
@@ -208,21 +208,21 @@ def _whole(column: pa.ChunkedArray) -> pa.Array:
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
-def chunk(
-    kind: Kind,
-    path: tuple[str, ...],
-    encoding: int,
-    count: int,
-    at: int,
-    size: int,
-    more: dict[int, Value],
-    *,
-    codec: int = _UNCOMPRESSED,
-    raw: int | None = None,
-) -> Value:
-    """What the footer says of a column chunk of one page; `raw` are its bytes before it was compressed."""
-    start, length = i64(at), i64(size)
-    before = length if raw is None else i64(raw)
+class Page(NamedTuple):
+    """Where the one page of a column chunk lies in the file."""
+
+    at: int
+    """Its first byte."""
+    size: int
+    """Bytes that it has there."""
+    raw: int | None = None
+    """Bytes that it had before it was compressed; None where it was not."""
+
+
+def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]) -> Value:
+    """What the footer says of a column chunk of one page."""
+    start, length = i64(page.at), i64(page.size)
+    before, codec = (length, _UNCOMPRESSED) if page.raw is None else (i64(page.raw), _LZ4_RAW)
     metadata = _about(kind, path, encoding, codec) | {5: i64(count), 6: before, 7: length, 9: start}
     return struct({2: start, 3: struct(metadata | more)})
 

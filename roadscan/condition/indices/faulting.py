@@ -1,8 +1,8 @@
 """Faulting: steps in the wheel paths, as at joints and transverse cracks.
 
-A step is looked for at each height of a profile: straight lines are fitted to the heights from 0.1 to 0.6 m before and
+A step is looked for at each height of a profile: straight lines are fitted to the heights from 0.1 to 0.5 m before and
 behind it, and its height is their difference there, positive where the road rises in the direction of travel. It counts
-where it is the greatest within half a metre, at least 3 mm high and four times its standard deviation, most of it
+where it is the greatest within half a metre, at least 3 mm high and three times its standard deviation, most of it
 happens within 0.2 m, and the other wheel path has one of more than half its height within 0.3 m: a joint crosses the
 lane, and unevenness of a metre does not.
 
@@ -27,7 +27,7 @@ from roadscan.kernels.condition.steps import step_heights
 Float64 = npt.NDArray[np.float64]
 
 _NEAR_M: Final = 0.1
-_FAR_M: Final = 0.6
+_FAR_M: Final = 0.5
 _APART_M: Final = 0.5
 _LEAST_M: Final = 0.003
 _SUDDEN: Final = 0.75
@@ -110,7 +110,7 @@ class _Side:
         """Station (m), height and standard deviation (mm) of each step that the other wheel path has as well."""
         height, sigma, sudden = self.found.T
         size, station = np.abs(height), self.profile.station_m
-        fits = (size >= _LEAST_M) & (size >= 4.0 * sigma) & (sudden * height >= _SUDDEN * size * size) & self.inside
+        fits = (size >= _LEAST_M) & (size >= 3.0 * sigma) & (sudden * height >= _SUDDEN * size * size) & self.inside
         for k in np.flatnonzero(fits).tolist():
             near = np.abs(station - station[k]) <= _APART_M
             beside = other.found[np.abs(other.profile.station_m - station[k]) <= _BESIDE_M, 0]

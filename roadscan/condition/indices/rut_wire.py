@@ -33,7 +33,7 @@ def _of_side(side: str) -> tuple[Quantity, ...]:
         Quantity(f"rut_depth_{side}_mm", "mm", f"Greatest depth below the wire {half}"),
         Quantity(f"rut_depth_mean_{side}_mm", "mm", f"The same {half}, mean over the section"),
         Quantity(f"rut_depth_max_{side}_mm", "mm", f"The same {half}, greatest of the section"),
-        Quantity(f"rut_width_{side}_m", "m", f"Width of the rut with the greatest depth {half}"),
+        Quantity(f"rut_width_{side}_m", "m", f"Width over which the depth is more than a tenth of the greatest {half}"),
         Quantity(f"rut_area_{side}_m2", "m²", f"Area between wire and road {half}"),
     )
 

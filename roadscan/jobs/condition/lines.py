@@ -25,7 +25,7 @@ from roadscan.jobs.readings import TrajectorySource, read_groups
 from roadscan.model.condition import ConditionConfig
 from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError
-from roadscan.model.ids import LanePass
+from roadscan.model.ids import LanePass, PassId
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table, write_geo_table
 from roadscan.sensors.base import Reject
@@ -105,7 +105,9 @@ def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
         for one, source in _driven(plan)
     }
     most = max(roll_deg.values(), default=0.0)
-    return [replace(lane, sigma_roll_deg=max((roll_deg[p] for p in lane.passes), default=most)) for lane in lanes]
+    return [
+        replace(lane, sigma_roll_deg=max((roll_deg[PassId(p)] for p in lane.passes), default=most)) for lane in lanes
+    ]
 
 
 def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from roadscan.model.errors import DamagedError, RoadscanError
+from roadscan.model.stopping import stop_if_asked
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,7 +28,14 @@ class Done(Generic[T, R]):
 
 
 def reason_of(error: Exception | None) -> str:
-    """Why a task gave nothing, for the list of failures."""
+    """Why a task gave nothing, for the list of failures.
+
+    Raises
+    ------
+    Stopped
+        where the program was asked to end, and a library made an error of its own of that.
+    """
+    stop_if_asked()
     if error is None:
         return "the worker gave no result"
     return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
@@ -93,4 +101,5 @@ class Inline:
             try:
                 yield Done(task, function(task), None)
             except Exception as error:  # noqa: BLE001  one unit's fault must not stop the others
+                stop_if_asked()
                 yield Done(task, None, error)

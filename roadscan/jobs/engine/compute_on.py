@@ -18,10 +18,17 @@ if TYPE_CHECKING:
 class WhenNeeded:
     """Opens the cluster at the first task: a run with nothing to do starts none."""
 
-    def __init__(self, stack: contextlib.ExitStack, workers: int | None, scheduler: str | None) -> None:
+    def __init__(
+        self,
+        stack: contextlib.ExitStack,
+        workers: int | None,
+        scheduler: str | None,
+        dashboard: Callable[[str], None] | None,
+    ) -> None:
         self._stack = stack
         self._workers = workers
         self._scheduler = scheduler
+        self._dashboard = dashboard
         self._opened: OnDask | None = None
 
     @property
@@ -39,33 +46,42 @@ class WhenNeeded:
 
     def _open(self) -> OnDask:
         if self._opened is None:
-            from roadscan.jobs.engine.on_dask import connected, embedded  # slow to import
+            from roadscan.jobs.engine.embedded import embedded  # slow to import
+            from roadscan.jobs.engine.on_dask import connected
 
             scheduler = self._scheduler
-            cluster = embedded(self._workers) if scheduler is None else connected(scheduler)
+            cluster = embedded(self._workers, self._dashboard) if scheduler is None else connected(scheduler)
             self._opened = self._stack.enter_context(cluster)
         return self._opened
 
 
 @contextlib.contextmanager
-def compute_on(workers: int | None = None, scheduler: str | None = None) -> Iterator[Compute]:
+def compute_on(
+    workers: int | None = None, scheduler: str | None = None, dashboard: Callable[[str], None] | None = None
+) -> Iterator[Compute]:
     """Compute on `scheduler` (an address) or on an embedded cluster of `workers` processes.
 
     Parameters
     ----------
     workers : number of worker processes; 0 computes in this process; None takes one a core.
-    scheduler : address such as ``tcp://host:8786``.
+    scheduler : address such as ``tls://host:8786``.
+    dashboard : hears the address of the embedded cluster's dashboard when it opens; None: there is none.
 
     Raises
     ------
     ConfigError
-        for a negative number of workers: nobody would do the tasks.
+        for a negative number of workers: nobody would do the tasks; for a dashboard without an embedded cluster.
     """
     if workers is not None and workers < 0:
         raise ConfigError(f"{workers} workers", expected="0 (compute in this process) or more")
+    if dashboard is not None and (scheduler is not None or workers == 0):
+        where = "this process computes" if scheduler is None else f"the scheduler {scheduler} has its own"
+        raise ConfigError(
+            f"a dashboard is asked for, and {where}", expected="an embedded cluster", change="leave it out"
+        )
     if scheduler is None and workers == 0:
         yield Inline()
         return
     logging.getLogger("distributed").setLevel(logging.ERROR)  # a run says itself what failed and why
     with contextlib.ExitStack() as stack:
-        yield WhenNeeded(stack, workers, scheduler)
+        yield WhenNeeded(stack, workers, scheduler, dashboard)

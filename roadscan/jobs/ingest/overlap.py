@@ -13,6 +13,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from roadscan.model.counted import counted
 from roadscan.model.errors import FormatError, RunError, TimeSystemError
 from roadscan.model.gpstime import (
     ADJUSTED_OFFSET_S,
@@ -38,6 +39,8 @@ Clocks = Mapping[tuple[str, str], ClockCorrection]
 
 MEASURED: Final = ("scans", "returns", "images", "imu", "encoder", "gnss", "trajectory_accuracy")
 """Tables whose rows belong to the time that the vehicle drove. Clouds have been placed by another program."""
+DRIVEN: Final = {"trajectory": "the poses", "gnss": "the GNSS positions"}
+"""Tables that say when a run was driven, in words; the first that a run has counts."""
 _MOST_HOURS: Final = 14
 """No time zone is farther from UTC."""
 _REASONS: Final = 3
@@ -197,7 +200,7 @@ class _Driven:
 
 def _driven(records: Sequence[LogRecord]) -> _Driven | None:
     computed = [r for r in records if r.sensor == NAVIGATION]
-    for table, words in (("trajectory", "the poses"), ("gnss", "the GNSS positions")):
+    for table, words in DRIVEN.items():
         own = [r for r in (computed or records) if r.tables.get(table)]
         spans = [span for r in own for file in r.tables[table] for span in file.group_spans]
         if spans:
@@ -285,7 +288,7 @@ def _changes(clock: ClockConfig | None, own: Span, other: Span) -> Iterator[tupl
     days = round(missing_s / 86_400)
     if clock is not None and clock.date is not None and days:
         date = utc_from_gps_ns(own[0] + days * 86_400 * NS_PER_S).date()
-        yield days * 86_400, f"clock.date = {date.isoformat()} ({_count_words(abs(days), 'day')} {_sense(days)})"
+        yield days * 86_400, f"clock.date = {date.isoformat()} ({counted(abs(days), 'day')} {_sense(days)})"
 
 
 def _other_systems(clock: ClockConfig, first_s: int) -> Iterator[tuple[int, str]]:
@@ -301,7 +304,7 @@ def _other_systems(clock: ClockConfig, first_s: int) -> Iterator[tuple[int, str]
 def _other_week(clock: ClockConfig, own: Span, weeks: int) -> Iterator[tuple[int, str]]:
     if clock.system is not TimeSystem.GPS_WEEK or not weeks:
         return
-    why = f"{_count_words(abs(weeks), 'week')} {_sense(weeks)}"
+    why = f"{counted(abs(weeks), 'week')} {_sense(weeks)}"
     if abs(weeks) == WEEKS_A_ROLLOVER:
         why += ": a receiver that counts weeks modulo 1024"
     if clock.week is not None:
@@ -326,10 +329,6 @@ def _slips(first_s: int, missing_s: float) -> Iterator[tuple[int, str]]:
 
 def _sense(amount: float) -> str:
     return "later" if amount > 0 else "earlier"
-
-
-def _count_words(number: int, what: str) -> str:
-    return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
 def _amount(shift_s: int) -> str:

@@ -72,7 +72,7 @@ def plan_logs(survey: Survey, store: Store) -> Logs:
     listed += [(CONTROL_RUN, control) for control in survey.config.control]
     planned: list[PlannedLog] = []
     unplanned: list[UnplannedLog] = []
-    with open_sources(store) as sources:
+    with open_sources(store, survey.folder) as sources:
         opened = [_open_log(survey, config, sources) for _, config in listed]
         for (run, config), log in zip(listed, opened, strict=True):
             try:

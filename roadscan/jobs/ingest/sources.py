@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
@@ -20,18 +20,27 @@ from roadscan.tables.store import Store, digest_holds, file_digest
 _SOURCES: Final = "manifest/sources.json"
 _COPY: Final = "manifest/sources_copy.json"
 
+_NEAR: Final = 2
+"""So many folders above the survey file's a log is still near."""
+
 Known = list[Any]
 """Size (bytes), time of the last change (ns) and digest of a file."""
 
 
 class Sources:
-    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered."""
+    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered.
 
-    def __init__(self, store: Store, threads: ThreadPoolExecutor) -> None:
+    Logs are known by their paths from the survey file's folder, where they lie below it or near it: survey, store and
+    logs may move together.
+    """
+
+    def __init__(self, store: Store, folder: Path, threads: ThreadPoolExecutor) -> None:
         self._store = store
+        self._folder = folder
         self._threads = threads
         known, self._is_whole = _remembered(store)
-        self._before, self._forgotten = known or {}, known is None
+        self._kept, self._forgotten = known or {}, known is None
+        self._before = _renamed(self._kept, folder)
         self._now: dict[str, Any] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
@@ -45,14 +54,14 @@ class Sources:
             )
         cannot = cannot_be_opened(path)
         if cannot is not None:
-            if is_there(path) or str(path) not in self._before:
+            if is_there(path) or self._name(path) not in self._before:
                 raise cannot
-            stated = stated or str(self._before[str(path)]["format"])
+            stated = stated or str(self._before[self._name(path)]["format"])
         return format_named(stated) if stated else claimed_format(path)
 
     def begin(self, path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Future[Known]]:
         """Start to fingerprint a log's files and companions, by their names: hashing runs in threads."""
-        before = self._before.get(str(path), {"files": {}})["files"]
+        before = self._before.get(self._name(path), {"files": {}})["files"]
         if path.exists():
             named = _named(path, format_, companions)
             missing = next((file for file in named.values() if not file.exists()), None)
@@ -68,7 +77,7 @@ class Sources:
         of :func:`stamp_of`.
         """
         files = {name: future.result() for name, future in begun.items()}
-        self._now[str(path)] = {"format": format_.name, "files": files}
+        self._now[self._name(path)] = {"format": format_.name, "files": files}
         combined = hashlib.blake2b(digest_size=16)
         for name, (_, _, digest) in files.items():
             combined.update(f"{name}\0{digest}\n".encode())
@@ -81,17 +90,20 @@ class Sources:
         Who may only read the store can ask it all the same, and learns it each time.
         """
         known = {**self._before, **self._now}
-        if known and (known != self._before or not self._is_whole):
+        if known and (known != self._kept or not self._is_whole):
             with contextlib.suppress(StoreError):
                 self._store.write_bytes(_COPY, seal(known), lasting=False)
                 self._store.write_bytes(_SOURCES, seal(known))
 
+    def _name(self, path: Path) -> str:
+        return listed_name(path, self._folder)
+
 
 @contextlib.contextmanager
-def open_sources(store: Store) -> Iterator[Sources]:
+def open_sources(store: Store, folder: Path) -> Iterator[Sources]:
     """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end."""
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        sources = Sources(store, threads)
+        sources = Sources(store, folder, threads)
         try:
             yield sources
         except BaseException:
@@ -100,10 +112,25 @@ def open_sources(store: Store) -> Iterator[Sources]:
         sources.save()
 
 
-def remembered_formats(store: Store) -> dict[str, str]:
-    """Names of the formats of logs that the store knows, by their absolute paths: such a log may have moved away."""
+def listed_name(path: Path, folder: Path) -> str:
+    """What the list calls a log: its path from the survey file's folder where it is near, else its absolute path."""
+    try:
+        name = Path(os.path.relpath(path, folder))
+    except ValueError:  # on another drive
+        return str(path)
+    return str(path) if name.parts[: _NEAR + 1] == ("..",) * (_NEAR + 1) else name.as_posix()
+
+
+def _renamed(known: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What is known of logs by the names that they have now: older lists hold absolute paths alone."""
+    named = {listed_name(Path(path), folder): of for path, of in known.items() if Path(path).is_absolute()}
+    return named | {path: of for path, of in known.items() if not Path(path).is_absolute()}
+
+
+def remembered_formats(store: Store, folder: Path) -> dict[str, str]:
+    """Names of the formats of logs that the store knows, by :func:`listed_name`: such a log may have moved away."""
     known, _ = _remembered(store)
-    return {path: str(of["format"]) for path, of in (known or {}).items()}
+    return {path: str(of["format"]) for path, of in _renamed(known or {}, folder).items()}
 
 
 def stamp_of(path: Path, format_: LogFormat, companions: list[Path]) -> str:
@@ -128,7 +155,7 @@ def _named(path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, 
     return named | {f"beside:{file.name}": file for file in companions if file not in named.values()}
 
 
-def is_unchanged(store: Store, path: Path, format_: LogFormat, companions: list[Path]) -> bool:
+def is_unchanged(store: Store, folder: Path, path: Path, format_: LogFormat, companions: list[Path]) -> bool:
     """True if a log's files still hold the bytes that they were fingerprinted with; reads all of them.
 
     Raises
@@ -137,7 +164,7 @@ def is_unchanged(store: Store, path: Path, format_: LogFormat, companions: list[
         A file cannot be read.
     """
     known, _ = _remembered(store)
-    files = (known or {}).get(str(path), {"files": {}})["files"]
+    files = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
     named = _named(path, format_, companions)
     return named.keys() == files.keys() and all(digest_holds(file, files[name][2]) for name, file in named.items())
 

@@ -41,12 +41,12 @@ class Drives:
         if self.grids is not None:
             add_grid_folder(self.grids)
         steps = [LaneDirections(np.zeros((0, 2)), np.zeros(0))]
-        steps += [LaneDirections.of_path(self._path_m(store, one)) for one in self.trajectories]
+        steps += [LaneDirections.of_path(self.path_m(store, one)) for one in self.trajectories]
         return LaneDirections(
             np.concatenate([s.place_m for s in steps]), np.concatenate([s.azimuth_rad for s in steps])
         )
 
-    def _path_m(self, store: Store, one: TrajectorySource) -> npt.NDArray[np.float64]:
+    def path_m(self, store: Store, one: TrajectorySource) -> npt.NDArray[np.float64]:
         """(n, 2) easting and northing of every pose that lies in another cube of :data:`STEP_M` than the one before."""
         parts = [np.zeros((0, 3)), *_positions(store, one)]
         world = np.concatenate(parts)

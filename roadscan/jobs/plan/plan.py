@@ -13,6 +13,7 @@ import numpy as np
 from roadscan.code_reach import code_digest
 from roadscan.jobs.engine.fingerprint import grid_digest, key_of
 from roadscan.jobs.ingest.ingest import DATA_TABLES
+from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs
 from roadscan.jobs.navigate.clocks import load_clocks
 from roadscan.jobs.navigate.navigate import records_with_trajectories
@@ -119,7 +120,7 @@ def plan_survey(
     )
     known = load_mountings(store) if calibrated is None else calibrated
     clocks = load_clocks(store)
-    apart = tuple(apart_logs(survey, records, clocks, estimated=True))
+    apart = (*apart_logs(survey, records, clocks, estimated=True), *one_stamp_logs(records))
     sources = tuple(_sources(survey, store, _without(records, apart), ground, known))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)

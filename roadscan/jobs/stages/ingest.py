@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.ingest.ingest import DATA_TABLES, ingest, survey_records
+from roadscan.jobs.ingest.one_stamp import one_stamp_logs, one_stamp_notes
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs, can_be_placed, empty_logs, reject_notes
 from roadscan.jobs.products import wanted_products
 from roadscan.jobs.session import Session
@@ -31,11 +32,12 @@ class Ingest(Stage):
             session.renew("records")
         records = survey_records(session.survey, session.store, session.logs)
         faults = [*_empty(session, records), *apart_logs(session.survey, records, {}, estimated=False)]
+        faults += one_stamp_logs(records)
         has_readings = any(r.tables.get(table) for r in records for table in DATA_TABLES)
         if faults and has_readings and not can_be_placed(records, faults, DATA_TABLES):
             raise NothingPlacedError.of(faults)
         session.failed(self.name, [fault.told for fault in faults])
-        for note in reject_notes(records, session.survey.config.checks.lost_share):
+        for note in _notes(session, records):
             session.note(note)
 
     def state(self, session: Session) -> StageState:
@@ -44,7 +46,7 @@ class Ingest(Stage):
         waiting = [log for log in planned if not has_log(session.store, log.key)]
         if not waiting and not unplanned:
             records = survey_records(session.survey, session.store, session.logs)
-            notes = reject_notes(records, session.survey.config.checks.lost_share)
+            notes = _notes(session, records)
             return StageState(len(planned), notes=notes, faults=[fault.told for fault in _empty(session, records)])
         most = session.survey.config.tiles.max_block_readings
         doing = {
@@ -53,6 +55,11 @@ class Ingest(Stage):
             "worker_memory_bytes_at_most": WORKER_BASE_BYTES + BYTES_PER_READING * most,
         }
         return StageState(len(planned) - len(waiting), len(waiting) + len(unplanned), next_run=doing, hides_rest=True)
+
+
+def _notes(session: Session, records: Sequence[LogRecord]) -> list[str]:
+    share = session.survey.config.checks.lost_share
+    return [*reject_notes(records, share), *one_stamp_notes(records, share)]
 
 
 def _empty(session: Session, records: Sequence[LogRecord]) -> list[Fault]:

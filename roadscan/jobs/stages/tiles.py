@@ -11,7 +11,7 @@ from roadscan.jobs.stages.footprints import faults_of_plan
 from roadscan.jobs.surfaces.surface_colours import check_colours
 from roadscan.jobs.tile_work import memory_of, plan_tile_work
 from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
-from roadscan.jobs.tiles.tile_fates import fate_words, lost_notes, told
+from roadscan.jobs.tiles.tile_fates import fate_words, lost_notes, of_all, told_by_log
 from roadscan.jobs.tiles.tile_files import tile_file_names
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.jobs.tiles.tiles import compute_tiles, run_tasks
@@ -59,12 +59,15 @@ class Tiles(Stage):
         manifest = session.manifest
         session.failed(self.name, faults_of_plan(session))
         computed = [manifest.get(TILE, str(tile)) for tile in chosen]
-        fates = told([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
+        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
         if manifest.without_file(TILE) and not manifest.files().get(TILE):
-            why = fate_words(fates) or "all lie off the centre lines of filters.centre_line, or outside all passes"
+            why = (
+                fate_words(of_all(logs)) or "all lie off the centre lines of filters.centre_line, or outside all passes"
+            )
             reason = f"no tile holds a reading: {why}; check the settings that leave them out"
             session.failed(self.name, [("as a whole", reason)])
-        for note in lost_notes(fates, session.survey.config.checks.lost_share) if chosen else ():
+        share = session.survey.config.checks.lost_share
+        for note in lost_notes(logs, session.records, share) if chosen else ():
             session.note(note)
 
     def state(self, session: Session) -> StageState:
@@ -80,8 +83,8 @@ class Tiles(Stage):
             "worker_memory_bytes": memory_of(tasks),
         }
         empty = len(session.manifest.without_file(TILE) - stale)
-        readings = told([*session.manifest.of(FOOTPRINTS).values(), *session.manifest.of(TILE).values()])
-        notes = lost_notes(readings, session.survey.config.checks.lost_share)
+        logs = told_by_log([*session.manifest.of(FOOTPRINTS).values(), *session.manifest.of(TILE).values()])
+        notes = lost_notes(logs, session.records, session.survey.config.checks.lost_share)
         return StageState(current, len(stale), empty, next_run=doing, notes=notes)
 
     def folders(self) -> Sequence[str]:

@@ -143,7 +143,7 @@ class _Stretch:
                 owner = owners[start - first]
                 if owner is not None and (index, start) not in self._told:
                     self._told.update((index, g) for g in range(start, k))
-                    self._fates.add(owner, counting.fates - before)
+                    self._fates.add(owner, one.file, counting.fates - before)
                 start = k
 
     def _counting_of(self, one: RawSlice) -> Counting:

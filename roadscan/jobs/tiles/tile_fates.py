@@ -12,35 +12,63 @@ import numpy.typing as npt
 from roadscan.kernels.georeferencing.readings import KEPT, OUTSIDE
 from roadscan.model.ids import TileId
 from roadscan.points.place import COUNTED_FATES, FATE_NAMES
+from roadscan.tables.logs import LogRecord, log_of
 from roadscan.tables.manifest import OutputRecord
+
+_MOST_NOTES: Final = 10
+"""Logs that are named."""
 
 
 class Fates:
-    """Readings by fate of the row groups of a task, by the tile that tells them."""
+    """Readings by fate of the row groups of a task, by the tile that tells them and by log."""
 
     def __init__(self) -> None:
-        self._counts: dict[TileId, npt.NDArray[np.int64]] = defaultdict(lambda: np.zeros(COUNTED_FATES, np.int64))
+        self._counts: dict[TileId, dict[str, npt.NDArray[np.int64]]] = defaultdict(
+            lambda: defaultdict(lambda: np.zeros(COUNTED_FATES, np.int64))
+        )
 
-    def add(self, tile: TileId, fates: npt.NDArray[np.int64]) -> None:
-        """Count (11,) readings by fate; those that were placed outside the task's tiles are kept ones, too."""
-        self._counts[tile] += fates
+    def add(self, tile: TileId, file: str, fates: npt.NDArray[np.int64]) -> None:
+        """Count (11,) readings of a log's file by fate; those placed outside the task's tiles are kept ones, too."""
+        self._counts[tile][log_of(file)] += fates
 
-    def of(self, tile: TileId) -> dict[str, int]:
-        """Figures for the tile's record."""
-        if tile not in self._counts:
-            return {}
-        counts = self._counts[tile].copy()
-        counts[KEPT] += counts[OUTSIDE]
-        counts[OUTSIDE] = 0
-        return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
+    def of(self, tile: TileId) -> dict[str, dict[str, int]]:
+        """Figures for the tile's record: by the key of the log."""
+        return {log: _counts(fates) for log, fates in sorted(self._counts.get(tile, {}).items())}
+
+
+def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
+    counts = fates.copy()
+    counts[KEPT] += counts[OUTSIDE]
+    counts[OUTSIDE] = 0
+    return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
+
+
+def told_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
+    """Readings by fate over the records of tiles and footprints, by the key of their log.
+
+    Footprints tell of clouds, which are placed for these, and of row groups that touch no tile. Tiles of older versions
+    do not say which log it was; theirs stand under "".
+    """
+    logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
+    for record in records:
+        figures: dict[str, Any] = record.figures().get("fates", {})
+        is_by_log = all(isinstance(own, dict) for own in figures.values())
+        for log, fates in figures.items() if is_by_log else ((log_of(record.unit), figures),):
+            for name, count in fates.items():
+                logs[log][name] += count
+    return {log: {name: count for name, count in fates.items() if count} for log, fates in sorted(logs.items())}
 
 
 def told(records: Iterable[OutputRecord]) -> dict[str, int]:
-    """Readings by fate over the records of tiles (and of the footprints of clouds, which are placed for these)."""
+    """The same of all logs together."""
+    return of_all(told_by_log(records))
+
+
+def of_all(logs: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
+    """Readings by fate, of all logs together."""
     totals = dict.fromkeys(FATE_NAMES, 0)
-    for record in records:
-        figures: dict[str, Any] = record.figures()
-        for name, count in figures.get("fates", {}).items():
+    for fates in logs.values():
+        for name, count in fates.items():
             totals[name] += count
     return {name: count for name, count in totals.items() if count}
 
@@ -62,9 +90,21 @@ def fate_words(fates: Mapping[str, int]) -> str:
     return "; ".join(f"{count:,} {FATE_WORDS.get(name, f'are {name}')}" for name, count in lost)
 
 
-def lost_notes(fates: Mapping[str, int], share: float) -> list[str]:
-    """What to say where more than a share of the readings has no pose."""
-    readings, lost = sum(fates.values()), fates.get("no_pose", 0)
-    if not readings or lost <= share * readings:
-        return []
-    return [f"{lost:,} of {readings:,} readings ({lost / readings:.0%}) {FATE_WORDS['no_pose']}"]
+def lost_notes(logs: Mapping[str, Mapping[str, int]], records: Iterable[LogRecord], share: float) -> list[str]:
+    """What to say of each log of which more than a share of the readings has no pose.
+
+    Parameters
+    ----------
+    logs : readings by fate, by the key of their log.
+    records : of the logs.
+    """
+    found: list[str] = []
+    for record in records:
+        fates = logs.get(record.key, {})
+        readings, lost = sum(fates.values()), fates.get("no_pose", 0)
+        if readings and lost > share * readings:
+            found.append(
+                f"{record.path}: {lost:,} of {readings:,} readings ({lost / readings:.0%}) {FATE_WORDS['no_pose']}"
+            )
+    more = len(found) - _MOST_NOTES
+    return found if more <= 0 else [*found[:_MOST_NOTES], f"of {more:,} more logs, too, as many readings have no pose"]

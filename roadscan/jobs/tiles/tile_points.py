@@ -55,7 +55,7 @@ def load_tiles(task: TileTask, fates: Fates) -> Iterator[LoadedTile]:
         for owner, piece in _by_owner(one, [owners.get((number, k)) for k in range(len(one.groups))]):
             for _, placed in placer.place(piece, Window(*box)):
                 if owner is not None and one.source.table != "cloud":
-                    fates.add(owner, placed.fates)
+                    fates.add(owner, one.file, placed.fates)
                 if placed.epoch_gps_ns.size:
                     passes = passes_of(placed.epoch_gps_ns, own)
                     parts.add(one.source, placed, passes, placer.trajectory(one.source))

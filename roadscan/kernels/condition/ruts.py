@@ -34,37 +34,62 @@ def wire_places(x, h, out):
 
 
 @kernel
+def gaps(x, h, hull, out):
+    """Depth of a cross-section below a wire over it, normal to the wire, into out (m,) float64 (m); contacts in hull.
+
+    Returns how many contacts there are.
+    """
+    count = upper_hull(x, h, 0, x.size, hull)
+    for e in range(count - 1):
+        a, b = hull[e], hull[e + 1]
+        slope = (h[b] - h[a]) / (x[b] - x[a])
+        upright = 1.0 / math.sqrt(1.0 + slope * slope)
+        for k in range(a, b + 1):
+            out[k] = (h[a] + slope * (x[k] - x[a]) - h[k]) * upright
+    return count
+
+
+@kernel
 def stretched_wire(x, h, out):
     """Ruts below a wire that is stretched over a cross-section from end to end, in its left and its right half.
 
     Parameters
     ----------
     x : (m,) float64, ascending, m, 0 in the middle; h : (n, m) float64, heights, finite, m.
-    out : (n, 2, 5) float64, out, of the left and the right half: greatest depth, normal to the wire (m); width between
-        the places where the wire rests beside it (m); area between wire and road (m²); place of the greatest depth
+    out : (n, 2, 5) float64, out, of the left and the right half: greatest depth, normal to the wire (m); width over
+        which the depth is more than a tenth of that (m); area between wire and road (m²); place of the greatest depth
         (m); and the variance of the depth for heights of variance 1 that err apart.
     """
     m = x.size
-    hull = np.empty(m, np.int64)
+    hull, gap = np.empty(m, np.int64), np.zeros(m)
     for i in range(len(h)):
-        count = upper_hull(x, h[i], 0, m, hull)
+        count = gaps(x, h[i], hull, gap)
         out[i] = 0.0
-        for e in range(count - 1):
-            a, b = hull[e], hull[e + 1]
-            slope = (h[i, b] - h[i, a]) / (x[b] - x[a])
-            upright = 1.0 / math.sqrt(1.0 + slope * slope)
-            for k in range(a, b):
-                gap = (h[i, a] + slope * (x[k] - x[a]) - h[i, k]) * upright
-                after = (h[i, a] + slope * (x[k + 1] - x[a]) - h[i, k + 1]) * upright
-                half = 0 if x[k] + x[k + 1] < 0.0 else 1
-                out[i, half, 2] += 0.5 * (gap + after) * (x[k + 1] - x[k])
-                half = 0 if x[k] < 0.0 else 1
-                if gap > out[i, half, 0]:
-                    t = (x[k] - x[a]) / (x[b] - x[a])
-                    out[i, half, 0] = gap
-                    out[i, half, 1] = x[b] - x[a]
-                    out[i, half, 3] = x[k]
-                    out[i, half, 4] = 1.0 + t * t + (1.0 - t) * (1.0 - t)
+        for k in range(m - 1):
+            half = 0 if x[k] + x[k + 1] < 0.0 else 1
+            out[i, half, 2] += 0.5 * (gap[k] + gap[k + 1]) * (x[k + 1] - x[k])
+        e = 0
+        for k in range(m):
+            while e < count - 2 and hull[e + 1] <= k:
+                e += 1
+            half = 0 if x[k] < 0.0 else 1
+            if gap[k] > out[i, half, 0]:
+                t = (x[k] - x[hull[e]]) / (x[hull[e + 1]] - x[hull[e]])
+                out[i, half, 0] = gap[k]
+                out[i, half, 1] = width(x, gap, k)
+                out[i, half, 3] = x[k]
+                out[i, half, 4] = 1.0 + t * t + (1.0 - t) * (1.0 - t)
+
+
+@inlined
+def width(x, gap, deepest):
+    """Extent around a place over which the depth is more than a tenth of that there (m)."""
+    first, last = deepest, deepest
+    while first > 0 and gap[first - 1] > 0.1 * gap[deepest]:
+        first -= 1
+    while last < x.size - 1 and gap[last + 1] > 0.1 * gap[deepest]:
+        last += 1
+    return x[last] - x[first]
 
 
 @kernel

@@ -20,6 +20,8 @@ OUTLIER = 3.0 * 1.4826
 """Cells this many median distances from the first surface are left out of the second."""
 LEAST_SCALE_M = 0.0005
 """Median distances count as at least this (m)."""
+GROSS_M = 0.01
+"""The same before there is a surface: cells count from the window's median height (m)."""
 TERMS = 4
 
 
@@ -268,11 +270,14 @@ def sample(table, places, half_along, half_across, bend, out):
         out[i, 2] = min(count / window, 1.0)
         if count < 3 or not central(found, count):
             continue
-        base = found.height[0]
+        base = np.median(found.height[:count])
+        for k in range(count):
+            away[k] = found.height[k] - base
+        leave_out(found, count, away, GROSS_M)
         if fit(found, count, wanted, base, surface) < 3:
             continue
         residuals(found, count, base, surface, away)
-        leave_out(found, count, away)
+        leave_out(found, count, away, LEAST_SCALE_M)
         size = fit(found, count, wanted, base, surface)
         if size < 3:
             continue
@@ -293,9 +298,9 @@ def central(found, count):
 
 
 @inlined
-def leave_out(found, count, away):
-    """Take the weight of cells that lie far from the surface."""
-    scale = max(np.median(np.abs(away[:count])), LEAST_SCALE_M)
+def leave_out(found, count, away, least):
+    """Take the weight of cells that lie far from the surface; median distances count as at least `least` (m)."""
+    scale = max(np.median(np.abs(away[:count])), least)
     for k in range(count):
         if abs(away[k]) > OUTLIER * scale:
             found.weight[k] = 0.0

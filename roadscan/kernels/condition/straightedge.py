@@ -21,7 +21,7 @@ def roll_wheel(xs, hs, radius_m, out):
         highest, k = hs[i], first
         while k < xs.size and xs[k] <= xs[i] + radius_m:
             u = xs[k] - xs[i]
-            highest = max(highest, hs[k] + np.sqrt(radius_m * radius_m - u * u) - radius_m)
+            highest = max(highest, hs[k] + np.sqrt(max(radius_m * radius_m - u * u, 0.0)) - radius_m)
             k += 1
         out[i] = highest
 

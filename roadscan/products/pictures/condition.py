@@ -50,7 +50,7 @@ def _draw_panel(axes: Axes, strips: Sequence[Strip]) -> None:
     for strip, colour in zip(strips, _COLOURS, strict=False):
         x = np.column_stack([strip.from_m, strip.to_m, strip.to_m]).ravel()
         y = np.column_stack([strip.value, strip.value, np.full(strip.value.size, np.nan)]).ravel()
-        axes.plot(x, y, color=colour, linewidth=1.8, label=strip.quantity.rsplit("_", strip.unit.count("/") + 1)[0])
+        axes.plot(x, y, color=colour, linewidth=1.8, label=_without_unit(strip.quantity))
         known = strip.value[np.isfinite(strip.value)]
         greatest = max(greatest, float(known.max()) if known.size else 0.0)
         lacking = np.flatnonzero(np.isnan(strip.value))
@@ -62,6 +62,13 @@ def _draw_panel(axes: Axes, strips: Sequence[Strip]) -> None:
     axes.tick_params(labelsize=7)
     axes.grid(color="#e6e6e6", linewidth=0.6)
     axes.legend(fontsize=7, loc="upper right", ncols=4, frameon=False)
+
+
+def _without_unit(quantity: str) -> str:
+    """Name of a quantity as the legend shows it: the axis tells the unit."""
+    for unit in ("_m_per_km", "_percent", "_mm", "_m"):
+        quantity = quantity.removesuffix(unit)
+    return quantity.replace("_", " ")
 
 
 @dataclass(frozen=True, eq=False)

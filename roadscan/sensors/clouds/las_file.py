@@ -79,7 +79,14 @@ class Head:
         size = path.stat().st_size
         with path.open("rb") as stream:
             block = stream.read(_HEADER_1_4_BYTES)
-            if block[:4] != b"LASF" or len(block) < _OLDEST_HEADER_BYTES:
+            if block[:4] == b"LASF" and len(block) < _OLDEST_HEADER_BYTES:
+                raise FormatError(
+                    f"the file is cut off: it ends inside its header, after {len(block)} bytes",
+                    expected=f"a LAS header block of at least {_OLDEST_HEADER_BYTES} bytes",
+                    change="fetch it again from where it was recorded",
+                    file=path,
+                )
+            if block[:4] != b"LASF":
                 raise FormatError("the file is not LAS", expected="a LAS header block", file=path)
             encoding, major, minor = struct.unpack_from("<H16xBB", block, 6)
             head_bytes, offset, records, code, record_bytes, claimed = struct.unpack_from("<HIIBHI", block, 94)

@@ -124,6 +124,24 @@ class Scans(LogFormat):
                 else:
                     yield Reject(part.reason, first, -1, max(part.records, 1), name)
 
+    def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Epochs of the last profiles, after one of the first, from which the GPS week is counted."""
+        files = self.files(source.path)
+        epochs = EpochReader(_clock(source, files), source.path)
+        try:
+            first, last = open_table(files[0]), open_table(files[-1])
+            stamp = EPOCH if EPOCH in first.schema.names else _STAMP
+            ends = [next((part for _, part in first.parts(1, [stamp])), None), last.ending(stamp)]
+        except (*UNREADABLE, FormatError):
+            return
+        batches = [batch for batch in ends if isinstance(batch, pa.RecordBatch)]
+        for batch in batches if len(batches) == len(ends) else ():
+            sieve = Sieve(batch.num_rows)
+            stamps = column_stamps(batch.column(stamp), sieve, is_epoch=stamp == EPOCH)
+            found = epochs.epochs(stamps, sieve, np.arange(batch.num_rows)) if sieve.good.any() else np.empty(0)
+            if sieve.good.any():
+                yield Rows("scans", pa.RecordBatch.from_pydict({EPOCH: pa.array(found[sieve.kept])}))
+
 
 def _parts(file: Path, rows: int) -> Iterator[tuple[int, pa.RecordBatch | Lost]]:
     try:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import BinaryIO, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.text_table import head_of
 from roadscan.sensors.trajectories.poses import (
     HEIGHT_MAX_M,
     HEIGHT_MIN_M,
@@ -25,7 +27,8 @@ from roadscan.sensors.trajectories.poses import (
     check_rph,
     ned_from_rph,
 )
-from roadscan.sensors.trajectories.smrmsg import CLOCK_EXAMPLE, CarriedAccuracy
+from roadscan.sensors.trajectories.smrmsg import CLOCK_EXAMPLE, CarriedAccuracy, Smrmsg
+from roadscan.sensors.trajectories.smrmsg import RECORD_BYTES as ACCURACY_BYTES
 
 Float64 = npt.NDArray[np.float64]
 
@@ -102,6 +105,7 @@ class Sbet(LogFormat):
         """Check clock, CRS, heights and the accuracy file's name, and that there is a record."""
         source.need_file()
         _reader(source, _accuracy(source))
+        _check_accuracy(source)
         if source.path.stat().st_size < RECORD_BYTES:
             raise FormatError(
                 f"the file has {source.path.stat().st_size} bytes",
@@ -112,33 +116,44 @@ class Sbet(LogFormat):
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a truncated last record is rejected."""
-        accuracy = _accuracy(source)
-        reader = _reader(source, accuracy)
-        for first, fields in _chunks(source.path):
-            if isinstance(fields, Reject):
-                yield fields
-                continue
-            time, latitude, longitude, height, roll, pitch, platform_heading, wander = fields
-            with np.errstate(invalid="ignore", over="ignore"):
-                heading = platform_heading - wander
-            sieve = Sieve(time.size)
-            check_rph(roll, pitch, heading, sieve)
-            with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
-                attitude = ned_from_rph(roll, pitch, heading)
-            records = np.arange(first, first + time.size, dtype=np.int64)
-            raw = RawPoses(
-                records=records,
-                offsets=records * RECORD_BYTES,
-                stamps=time,
-                position=np.stack([longitude, latitude, height]),
-                attitude=attitude,
-                sigmas={},
-            )
-            yield from reader.items(raw, sieve)
-            if accuracy is not None:
-                yield from accuracy.rejects()
+        yield from _items(source, _accuracy(source), _chunks(source.path))
+
+    def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Poses of the first chunk of records, from which the GPS week is counted, and of the last."""
+        records = source.path.stat().st_size // RECORD_BYTES
+        last = _chunks(source.path, max(0, records - CHUNK_RECORDS))
+        return _items(source, None, itertools.chain(itertools.islice(_chunks(source.path), 1), last))
+
+
+def _items(
+    source: LogSource, accuracy: CarriedAccuracy | None, chunks: Iterator[tuple[int, Float64 | Reject]]
+) -> Iterator[Item]:
+    reader = _reader(source, accuracy)
+    for first, fields in chunks:
+        if isinstance(fields, Reject):
+            yield fields
+            continue
+        time, latitude, longitude, height, roll, pitch, platform_heading, wander = fields
+        with np.errstate(invalid="ignore", over="ignore"):
+            heading = platform_heading - wander
+        sieve = Sieve(time.size)
+        check_rph(roll, pitch, heading, sieve)
+        with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
+            attitude = ned_from_rph(roll, pitch, heading)
+        records = np.arange(first, first + time.size, dtype=np.int64)
+        raw = RawPoses(
+            records=records,
+            offsets=records * RECORD_BYTES,
+            stamps=time,
+            position=np.stack([longitude, latitude, height]),
+            attitude=attitude,
+            sigmas={},
+        )
+        yield from reader.items(raw, sieve)
         if accuracy is not None:
-            yield from accuracy.finish()
+            yield from accuracy.rejects()
+    if accuracy is not None:
+        yield from accuracy.finish()
 
 
 def _reader(source: LogSource, accuracy: CarriedAccuracy | None) -> PoseReader:
@@ -152,6 +167,46 @@ def _accuracy(source: LogSource) -> CarriedAccuracy | None:
         return None
     clock = source.need_clock(**CLOCK_EXAMPLE)
     return CarriedAccuracy(beside(source.path, named), named.as_posix(), clock, _first_second(source.path, clock))
+
+
+def _check_accuracy(source: LogSource) -> None:
+    """Refuse an accuracy file that is none, or that is of another time than the poses."""
+    named = options_of(source, SbetOptions).accuracy
+    if named is None:
+        return
+    file, change = beside(source.path, named), "check options.accuracy of the SBET log"
+    if Sbet().sniff(file) and not Smrmsg().sniff(file):
+        expected = f"the SMRMSG file of the same mission, with records of {ACCURACY_BYTES} bytes"
+        raise FormatError("the accuracy file is an SBET trajectory itself", expected=expected, change=change, file=file)
+    poses, accuracy = _ends(source.path, RECORD_BYTES), _ends(file, ACCURACY_BYTES)
+    weeks = (-WEEK_S, 0, WEEK_S)  # either may count on past the week's end
+    if poses and accuracy and not any(poses[0] <= accuracy[1] + w and accuracy[0] + w <= poses[1] for w in weeks):
+        count = source.path.stat().st_size // RECORD_BYTES
+        raise FormatError(
+            f"no record lies within the time of the trajectory's {count} poses: they last from second {poses[0]:.0f} "
+            f"to {poses[1]:.0f} of the week, the accuracy file from {accuracy[0]:.0f} to {accuracy[1]:.0f}",
+            expected="the SMRMSG file of the same mission",
+            change=change,
+            file=file,
+        )
+
+
+def _ends(path: Path, record_bytes: int) -> tuple[float, float] | None:
+    """First and last stamp (s) of a file of records, None where these do not tell: it is packed, or damaged."""
+    if not path.is_file() or path.stat().st_size < record_bytes:
+        return None  # who reads it tells of that
+    with path.open("rb") as stream:
+        if stream.read(8) != head_of(path, 8):
+            return None
+        last = path.stat().st_size // record_bytes - 1
+        found = [_stamp(stream, number * record_bytes) for number in (0, last)]
+    first, last_s = found[0], found[1] + WEEK_S if found[1] < found[0] else found[1]
+    return (first, last_s) if all(0 <= stamp < 2 * WEEK_S for stamp in (first, last_s)) else None
+
+
+def _stamp(stream: BinaryIO, offset: int) -> float:
+    stream.seek(offset)
+    return float(np.frombuffer(stream.read(8), dtype="<f8")[0])
 
 
 def _first_second(path: Path, clock: Clock) -> float | None:
@@ -176,11 +231,11 @@ def _placement(source: LogSource) -> GeodeticPlacement:
     return GeodeticPlacement(crs, source.height, source.geoid, source.path)
 
 
-def _chunks(path: Path) -> Iterator[tuple[int, Float64 | Reject]]:
-    """Used fields (8, n) of chunks of records, each with the number of its first record."""
-    first = 0
+def _chunks(path: Path, first: int = 0) -> Iterator[tuple[int, Float64 | Reject]]:
+    """Used fields (8, n) of chunks of records from record `first` on, each with the number of its first record."""
     buffer = np.empty((CHUNK_RECORDS, FIELDS), dtype="<f8")  # read into again and again: fresh pages cost time
     with path.open("rb") as stream:
+        stream.seek(first * RECORD_BYTES)
         while size := stream.readinto(buffer.data.cast("B")):
             whole, rest = divmod(size, RECORD_BYTES)
             if whole:

@@ -1,0 +1,1 @@
+"""Painted control targets in the intensity of one pass, and the height of any control point."""

@@ -1,0 +1,104 @@
+"""What a section of the report consists of: paragraphs, tables, figures of a picture. The template makes HTML of it.
+
+All text is escaped by the template: names and messages come from logs and survey files.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Final
+
+MOST_ROWS: Final = 60
+"""A longer table is cut, and says so."""
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A sentence or more."""
+
+    kind: ClassVar[str] = "paragraph"
+    text: str
+    is_warning: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts; columns after the first are numbers where `numbers` says so."""
+
+    kind: ClassVar[str] = "table"
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    full_table: str = ""
+    """Name of the SQL table that holds all rows, where the page may show some of them only."""
+    numbers: bool = True
+
+    @property
+    def shown(self) -> Sequence[Sequence[str]]:
+        """Rows that the page shows."""
+        return self.rows[:MOST_ROWS]
+
+    @property
+    def left_out(self) -> int:
+        """Rows that it does not show."""
+        return max(len(self.rows) - MOST_ROWS, 0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture, held in the page itself."""
+
+    kind: ClassVar[str] = "picture"
+    content: bytes
+    """PNG or JPEG."""
+    caption: str
+    width_mm: float = 170.0
+    """Width on paper, at most."""
+
+    @property
+    def address(self) -> str:
+        """The picture as a data address."""
+        kind = "jpeg" if self.content[:2] == b"\xff\xd8" else "png"
+        return f"data:image/{kind};base64,{base64.b64encode(self.content).decode('ascii')}"
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a map."""
+
+    points: str
+    """Pairs of coordinates as SVG writes them."""
+    colour: str
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A map as vector graphics; easting to the right, northing up."""
+
+    kind: ClassVar[str] = "drawing"
+    width: float
+    height: float
+    lines: Sequence[Line]
+    squares: Sequence[tuple[float, float, float, str]] = ()
+    """Left, top, edge and colour of squares behind the lines."""
+    marks: Sequence[tuple[float, float, str, str]] = ()
+    """Left, top, text and colour of marks with a name."""
+    scale_bar: tuple[float, str] = (0.0, "")
+    """Length in the units of the drawing, and what it stands for."""
+    legend: Sequence[tuple[str, str]] = ()
+    """Colour and text."""
+    caption: str = ""
+
+
+Block = Paragraph | Table | Picture | Drawing
+
+
+@dataclass(frozen=True)
+class Part:
+    """A section as the page shows it."""
+
+    name: str
+    title: str
+    blocks: Sequence[Block] = field(default_factory=tuple)

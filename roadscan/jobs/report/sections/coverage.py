@@ -1,0 +1,124 @@
+"""Section of the report: a map of what was driven and which tiles hold readings, and the passes."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import cycle
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.jobs.plan.drives import Drives
+from roadscan.jobs.plan.plan import NothingToPlaceError
+from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
+from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.sections.recorded import seconds_of
+from roadscan.jobs.session import Session
+from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.ids import TileId
+from roadscan.tables.manifest import OutputRecord
+
+RUN_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+"""Okabe and Ito (2008): told apart by all eyes."""
+_ONE_PASS: Final = "#cfd6dd"
+_OVERLAPPED: Final = "#9fb4c7"
+_WIDTH: Final = 1000.0
+_MARGIN: Final = 40.0
+_HIGHEST: Final = 900.0
+_MOST_SQUARES: Final = 4000
+_MOST_POINTS: Final = 1500
+
+Float64 = npt.NDArray[np.float64]
+
+
+class Coverage(Section):
+    """Where the runs went and what they saw."""
+
+    name = "coverage"
+    title = "Passes and coverage"
+    position = 110
+
+    def blocks(self, session: Session) -> Iterator[Block]:
+        """A map of runs over tiles; a row a pass."""
+        try:
+            plan = session.plan
+        except NothingToPlaceError:
+            return
+        drives = Drives.of(plan)
+        paths = {one.run: path for one in drives.trajectories if len(path := drives.path_m(session.store, one)) > 1}
+        tiles = [r for r in session.manifest.of(TILE).values() if r.path]
+        if paths or tiles:
+            yield _drawing(paths, tiles, session.survey.config.tiles.size_m)
+        yield Table(
+            ("pass", "run", "lane", "direction", "from", "seconds"),
+            [
+                (
+                    str(p.pass_id), p.run, p.lane or "–", p.direction or "–", seconds_of(p.start_gps_ns),
+                    f"{(p.end_gps_ns - p.start_gps_ns) / NS_PER_S:,.1f}",
+                )
+                for p in plan.passes
+            ],
+        )  # fmt: skip
+
+
+def _drawing(paths: dict[str, Float64], tiles: Sequence[OutputRecord], size_m: float) -> Drawing:
+    corners = _corners(tiles, size_m)
+    every = np.concatenate([*paths.values(), corners, corners + size_m])
+    low, high = every.min(axis=0), every.max(axis=0)
+    extent = np.maximum(high - low, 1.0)
+    scale = min((_WIDTH - 2 * _MARGIN) / extent[0], (_HIGHEST - 2 * _MARGIN) / extent[1])
+    height = extent[1] * scale + 2 * _MARGIN
+
+    def on_page(places_m: Float64) -> Float64:
+        return np.stack(
+            [_MARGIN + (places_m[:, 0] - low[0]) * scale, height - _MARGIN - (places_m[:, 1] - low[1]) * scale], -1
+        )
+
+    colours = dict(zip(sorted(paths), cycle(RUN_COLOURS), strict=False))
+    lines = [Line(_points(on_page(paths[run])), colours[run]) for run in sorted(paths)]
+    squares, edge_m = _squares(tiles, size_m)
+    placed = on_page(np.array([[s[0], s[1] + edge_m] for s in squares]).reshape(-1, 2))
+    bar_m = 10.0 ** math.floor(math.log10(max(extent.max() / 4, 1.0)))
+    legend = [(colours[run], f"run {run}") for run in sorted(paths)]
+    legend += [(_ONE_PASS, "tiles with readings"), (_OVERLAPPED, "most of it seen by two passes or more")]
+    return Drawing(
+        _WIDTH, height, lines,
+        squares=[(x, y, edge_m * scale, s[2]) for (x, y), s in zip(placed.tolist(), squares, strict=True)],
+        scale_bar=(bar_m * scale, f"{bar_m / 1000:g} km" if bar_m >= 1000 else f"{bar_m:g} m"), legend=legend,
+        caption="Runs over the tiles that hold readings, in the coordinates of the map.",
+    )  # fmt: skip
+
+
+def _corners(tiles: Sequence[OutputRecord], size_m: float) -> Float64:
+    ids = [TileId.parse(r.unit) for r in tiles]
+    return np.array([(t.column * size_m, t.row * size_m) for t in ids]).reshape(-1, 2)
+
+
+def _squares(tiles: Sequence[OutputRecord], size_m: float) -> tuple[list[tuple[float, float, str]], float]:
+    """West and south edge and colour of squares, and their edge (m): tiles, or squares of them where they are many."""
+    together = 1
+    while True:
+        cells: dict[tuple[int, int], list[dict[str, Any]]] = defaultdict(list)
+        for record in tiles:
+            tile = TileId.parse(record.unit)
+            cells[tile.column // together, tile.row // together].append(record.figures())
+        if len(cells) <= _MOST_SQUARES:
+            break
+        together *= 2
+    edge_m = size_m * together
+    return [(c * edge_m, r * edge_m, _colour(held)) for (c, r), held in sorted(cells.items())], edge_m
+
+
+def _colour(held: Sequence[dict[str, Any]]) -> str:
+    overlapped = sum(figures.get("overlapped_cells") or 0 for figures in held)
+    return _OVERLAPPED if overlapped > 0.5 * sum(figures["cells"] for figures in held) else _ONE_PASS
+
+
+def _points(places: Float64) -> str:
+    step = max(1, math.ceil(len(places) / _MOST_POINTS))
+    kept = np.concatenate([places[::step], places[-1:]])
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in kept.tolist())

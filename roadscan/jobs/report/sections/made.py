@@ -1,0 +1,112 @@
+"""Section of the report: the files that the survey has, with a small picture of each raster and each picture."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from PIL import Image
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+
+from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
+from roadscan.jobs.report.section import Section
+from roadscan.jobs.session import Session
+from roadscan.jobs.summary import survey_summary
+from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.store import Store
+
+_EDGE: Final = 900
+"""Longer edge of a small picture (pixels)."""
+_MOST_BYTES: Final = 512_000_000
+"""A file of an object store that is larger is not fetched for a small picture."""
+_MOST_OF_A_PRODUCT: Final = 4
+_SUFFIXES: Final = (".tif", ".png", ".jpg")
+
+UInt8 = npt.NDArray[np.uint8]
+
+
+class Made(Section):
+    """Products: how many files, how large, where; what they look like."""
+
+    name = "products"
+    title = "Products"
+    position = 900
+
+    def blocks(self, session: Session) -> Iterator[Block]:
+        """A row a product, then small pictures of the first rasters and pictures of each survey product."""
+        files = survey_summary(session.survey, session.store).files
+        files.pop("report", None)
+        if not files:
+            return
+        root = session.store.root.rstrip("/") + "/"
+        rows = [
+            (name, f"{one.files:,}", f"{one.bytes / 1e6:,.1f} MB", one.folder.removeprefix(root))
+            for name, one in files.items()
+        ]
+        yield Table(("product", "files", "size", "folder"), rows, numbers=False)
+        for record in _shown(session):
+            try:
+                small = _small_picture(session.store, record)
+            except (RasterioError, OSError, ValueError) as error:
+                yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
+                continue
+            if small is not None:
+                yield Picture(small, f"{record.product}: {record.path}")
+
+
+def _shown(session: Session) -> Iterator[OutputRecord]:
+    """The first rasters and pictures of each product over many tiles, by path."""
+    counts: Counter[str] = Counter()
+    for record in sorted(session.manifest.all(), key=lambda r: r.path):
+        if not record.path.startswith("products/") or not record.path.endswith(_SUFFIXES):
+            continue
+        counts[record.product] += 1
+        if counts[record.product] <= _MOST_OF_A_PRODUCT:
+            yield record
+
+
+def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
+    if record.bytes > _MOST_BYTES and not store.is_folder:
+        return None
+    if not record.path.endswith(".tif"):
+        picture = Image.open(io.BytesIO(store.read_bytes(record.path)))
+        picture.thumbnail((_EDGE, _EDGE))
+        return _png(picture)
+    if store.is_folder:
+        return _png(_reduced(store.path(record.path)))
+    with MemoryFile(store.read_bytes(record.path)) as held:
+        return _png(_reduced(held.name))
+
+
+def _reduced(path: str) -> Image.Image:
+    with rasterio.open(path) as file:
+        share = min(1.0, _EDGE / max(file.width, file.height))
+        shape = (max(1, round(file.height * share)), max(1, round(file.width * share)))
+        bands = file.read(
+            indexes=[1, 2, 3] if file.count >= 3 else [1], out_shape=shape, masked=True, resampling=Resampling.average
+        )
+    grey = np.stack([_stretched(band) for band in bands], axis=-1)
+    return Image.fromarray(grey if grey.shape[-1] == 3 else grey[:, :, 0])
+
+
+def _png(picture: Image.Image) -> bytes:
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+def _stretched(band: Any) -> UInt8:
+    """Eight bits; numbers that are no bytes are stretched from their 2nd to their 98th percentile. White: no value."""
+    values = np.ma.filled(band.astype(np.float64), np.nan)
+    there = values[np.isfinite(values)]
+    if band.dtype != np.uint8 and there.size:
+        low, high = np.percentile(there, [2, 98])
+        values = np.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255
+    return np.nan_to_num(values, nan=255.0).round().astype(np.uint8)

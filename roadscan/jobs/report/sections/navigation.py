@@ -1,0 +1,41 @@
+"""Section of the report: computed trajectories, estimated clocks and calibrated mountings, with their pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from roadscan.jobs.navigate.navigate import known_keys
+from roadscan.jobs.navigation_status import NavigationStatus, navigation_status
+from roadscan.jobs.report.blocks import Block, Paragraph, Picture
+from roadscan.jobs.report.section import Section
+from roadscan.jobs.session import Session
+from roadscan.tables.logs import read_log_records
+
+
+class Navigation(Section):
+    """What was computed of poses, clocks and mountings."""
+
+    name = "navigation"
+    title = "Trajectories, clocks and mountings"
+    position = 200
+
+    def blocks(self, session: Session) -> Iterator[Block]:
+        """A line for each of them, doubts, and the recorded pictures."""
+        store = session.store
+        listed = set(known_keys(session.survey, store, session.logs))
+        records = {r.key: r for r in read_log_records(store, damaged=[])}
+        found = navigation_status(session.survey, store, [r for k, r in records.items() if k in listed], records)
+        for doubt in found.doubts:
+            yield Paragraph(doubt, is_warning=True)
+        for line in found.lines():
+            yield Paragraph(line)
+        for path, caption in _pictures(found).items():
+            if store.exists(path):
+                yield Picture(store.read_bytes(path), caption)
+
+
+def _pictures(found: NavigationStatus) -> dict[str, str]:
+    """Captions by path: one picture may show several estimates."""
+    shown = {one["picture"]: f"Trajectory of run '{one['run']}'" for one in found.trajectories if one["picture"]}
+    shown |= {one["picture"]: f"Clock of {one['run']}/{one['sensor']}" for one in found.clocks if one["picture"]}
+    return shown | {one["picture"]: "Calibration of the mountings" for one in found.mountings if one["picture"]}

@@ -1,0 +1,65 @@
+"""The request to end the program (Ctrl-C, or a signal of the system), remembered until the program ends.
+
+It is raised as :class:`Stopped`, but a library that was just calling back may hand on an error of its own instead
+(lazrs does). So whoever catches any error asks :func:`stop_if_asked` before it goes on.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import NoReturn
+
+
+class Stopped(BaseException):
+    """The program was asked to end (Ctrl-C, or a signal of the system); raised at the place that it had reached.
+
+    Parameters
+    ----------
+    number : the signal's.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(number)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A signal that asks the program to end."""
+
+    number: int
+    """The signal's."""
+    at_s: float
+    """When it came (s, monotonic)."""
+
+
+_requests: list[Request] = []
+
+
+def request() -> Request | None:
+    """The request that came, if any."""
+    return _requests[0] if _requests else None
+
+
+def stop(number: int) -> NoReturn:
+    """Remember the request and raise it."""
+    _requests.append(Request(number, time.monotonic()))
+    raise Stopped(number)
+
+
+def forget() -> None:
+    """Forget the request: it is about to be made again."""
+    _requests.clear()
+
+
+def stop_if_asked() -> None:
+    """Raise the request again where one came.
+
+    Raises
+    ------
+    Stopped
+        in place of what a library made of it.
+    """
+    if _requests:
+        raise Stopped(_requests[0].number) from None

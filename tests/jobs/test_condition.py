@@ -1,0 +1,247 @@
+"""The stage `condition` on a simulated road: values beside the truth, keys, and what is said where data lack."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import geopandas
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks.bench_lanes import RoughSurvey, driven, rough_scene, run
+from roadscan.code_reach import name_of
+from roadscan.condition.cell_table import cell_table
+from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_indices
+from roadscan.condition.indices.faulting import Faulting
+from roadscan.condition.lane_data import LaneData
+from roadscan.condition.survey_lane import survey_lane
+from roadscan.jobs.condition import stretches
+from roadscan.jobs.condition.against_truth import compared_values, true_lane
+from roadscan.jobs.condition.values import GroupTask, load_lane
+from roadscan.jobs.condition.work import MADE, plan_condition
+from roadscan.jobs.products import product_context
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stage_named
+from roadscan.jobs.tiles.cell_files import read_cells
+from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.tables.sql import query
+
+STEP_MM = 5.0
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory) -> RoughSurvey:
+    """160 m of lane 2 at 80 km/h, with ruts of 12 and 25 mm and a slab that is sunk by 5 mm, run once."""
+    slab = {"station_m": 60.0, "offset_m": 1.75, "length_m": 12.0, "width_m": 3.5, "height_m": -1e-3 * STEP_MM}
+    scene = rough_scene(
+        2.0, 160.0, passes=[{"lane": 2, "speed_m_per_s": 22.2}], road={"patches": [slab]},
+        profilers={"spacing_m": 0.05, "readings": 200},
+    )  # fmt: skip
+    made = RoughSurvey.made(scene, tmp_path_factory.mktemp("rough") / "survey")
+    run(made.session("store", section_m=50.0))
+    return made
+
+
+def again(surveyed: RoughSurvey, folder: Path) -> Session:
+    """A session on a copy of the store."""
+    copy = folder / "survey"
+    shutil.copytree(surveyed.file.parent, copy)
+    return RoughSurvey(copy / surveyed.file.name).session("store", section_m=50.0)
+
+
+def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
+    session = surveyed.session("store", section_m=50.0)
+    held = driven(list(compared_values(session, surveyed.height_at)), ("2",))
+    for side in ("left", "right"):
+        iri = held["section", f"iri_{side}_m_per_km"]
+        known = iri[np.isfinite(iri[:, 0])]
+        assert len(known) >= 3
+        error = np.abs(known[:, 0] - known[:, 1])
+        assert (error <= np.maximum(0.02 * known[:, 1], 0.03)).all()
+        assert (error <= 4.0 * known[:, 2]).all()
+        rut = held["cross_section", f"rut_depth_{side}_mm"]
+        error = (rut[:, 0] - rut[:, 1])[np.isfinite(rut[:, 0])]
+        assert error.size > 200
+        assert abs(error.mean()) <= 0.3
+        assert error.std() <= 1.0
+    slope = held["section", "cross_slope_mean_percent"]
+    assert np.nanmax(np.abs(slope[:, 0] - slope[:, 1])) <= 0.05
+    assert held["section", "grade_percent"][:, 0] == pytest.approx(held["section", "grade_percent"][:, 1], abs=0.02)
+
+
+def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
+    session = surveyed.session("store", section_m=50.0)
+    config = session.survey.config.condition
+    assert config is not None
+    group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
+    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(session.plan), group))
+    true = true_lane(group, lane, surveyed.height_at)
+    for side in ("left", "right"):
+        found, right = (
+            [(v.from_m, v.value) for v in Faulting().values(one) if v.quantity == f"step_{side}_mm"]
+            for one in (lane, true)
+        )
+        assert [at for at, _ in found] == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
+        assert [height for _, height in found] == pytest.approx([height for _, height in right], abs=0.5)
+        assert [height for _, height in found] == pytest.approx([-STEP_MM, STEP_MM], abs=1.0)  # unevenness is in it
+
+
+def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> None:
+    folder = surveyed.file.parent / "store" / "survey=rough" / "products" / "condition_sections"
+    table = geopandas.read_parquet(folder / "condition_sections.parquet")
+    text = pd.read_csv(folder / "condition_sections.csv")
+    layer = geopandas.read_file(folder / "condition_sections.gpkg")
+    assert len(table) == len(text) == len(layer) == 2 * 4  # the stated lane 1 was not driven
+    assert table.crs.to_epsg() == layer.crs.to_epsg() == 32632
+    own = table[table["lane"] == "2"].reset_index(drop=True)
+    assert own["name"].unique().tolist() == ["Test road"]
+    assert own["station_from_m"].tolist()[1:] == [50.0, 100.0, 150.0]
+    assert own["rut_depth_mean_left_mm"][1] == pytest.approx(12.0, abs=1.0)
+    assert own["rut_depth_mean_right_mm"][1] == pytest.approx(25.0, abs=1.5)
+    assert own["joints"].tolist()[1] == 2
+    assert own.length[1] == pytest.approx(50.0, rel=0.02)
+    np.testing.assert_allclose(own["mri_m_per_km"][:3], text[text["lane"] == 2]["mri_m_per_km"][:3])
+    other = table[table["lane"] == "1"]
+    assert other["mri_m_per_km"].isna().all()
+    assert other["reason"].str.contains("of the wheel path were measured").tolist() == [True, True, True, False]
+    assert "m long; roughness takes 20 m or more" in other["reason"].iloc[3]
+    assert own["reason"].str.contains("mpd_mean_mm: heights of the wheel paths are 50 mm apart").all()
+    assert own["reason"].str.contains("there is no table of cracks").all()
+    assert own["reason"].str.contains("the profile begins in it").tolist() == [True, False, False, False]
+    assert own["share_measured"].iloc[1] == 1.0
+
+
+def test_sql_sees_the_tables(surveyed: RoughSurvey) -> None:
+    store = surveyed.session("store").store
+    worst = query(store, "SELECT lane, max(mri_m_per_km) AS worst FROM condition_sections GROUP BY lane ORDER BY lane")
+    assert worst["lane"].to_pylist() == ["1", "2"]
+    paths = query(
+        store, "SELECT path, count(*) AS n FROM profiles_longitudinal WHERE lane = '2' GROUP BY path ORDER BY path"
+    )
+    assert paths["path"].to_pylist() == ["left", "right"]
+    crossings = query(store, "SELECT count(*) FROM cross_sections WHERE lane = '2'")[0][0].as_py()
+    assert paths["n"].to_pylist() == pytest.approx([10 * crossings] * 2, abs=10)
+    assert query(store, "SELECT DISTINCT direction FROM lanes")[0].to_pylist() == ["forward"]
+
+
+def digests(session: Session) -> dict[str, str]:
+    """Content of all values and of the section table."""
+    own = ("condition_values", "condition_sections")
+    return {r.unit: r.digest for r in session.manifest.all() if r.product in own}
+
+
+def test_the_ten_questions_have_answers(surveyed: RoughSurvey) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text(encoding="utf-8")
+    asked = re.findall(r"^```sql\n(.*?)^```\n\n```\n(.*?)\n", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(asked) == 10
+    store = surveyed.session("store").store
+    for statement, heading in asked:
+        assert query(store, statement).column_names == heading.split(), statement
+
+
+def test_a_second_run_does_nothing_and_stretches_change_no_bit(
+    surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = again(surveyed, tmp_path)
+    stage = stage_named("condition")
+    assert stage.state(session).stale == 0
+    before = {
+        r.unit: r.digest for r in session.manifest.all() if r.product in ("condition_values", "condition_sections")
+    }
+    session.manifest.remove([r for name in MADE for r in session.manifest.of(name).values()])
+    assert stage.state(session).stale == 1  # what waits for the lines is not known yet
+    monkeypatch.setattr(stretches, "STRETCH_M", 20)
+    monkeypatch.setattr("roadscan.jobs.condition.values.STRETCH_M", 20)
+    stage.run(session)
+    assert session.failures == []
+    after = {
+        r.unit: r.digest for r in session.manifest.all() if r.product in ("condition_values", "condition_sections")
+    }
+    assert after == before
+
+
+def test_heights_do_not_depend_on_the_stretch(surveyed: RoughSurvey) -> None:
+    session = surveyed.session("store", section_m=50.0)
+    config = session.survey.config.condition
+    assert config is not None
+    one = next(s for s in plan_condition(session).stretches if s.unit.startswith("A1/2/") and s.from_m == 50.0)
+    edge = session.plan.ground.grid.cells_per_edge
+    table = cell_table([read_cells(session.store, r, edge) for r in one.cells], 0.05)
+    whole = survey_lane(table, one.line, one.lane, (one.from_m, one.to_m), config.sections())
+    part = survey_lane(table, one.line, one.lane, (61.3, 72.0), config.sections())
+    own = (whole.paths["left"].station_m > 61.29) & (whole.paths["left"].station_m < 71.99)
+    np.testing.assert_array_equal(whole.paths["left"].values[own], part.paths["left"].values)
+
+
+def test_only_what_depends_on_a_tile_is_computed_again(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    session = again(surveyed, tmp_path)
+    work = plan_condition(session)
+    first = next(s for s in work.stretches if s.unit == "A1/2/000000")
+    place = first.line.places(np.array([30.0]), first.lane.offsets(np.array([30.0])))[0]
+    record = session.manifest.of(TILE)[str(session.plan.ground.grid.tile_at(place[0], place[1]))]
+    session.manifest.add([record._replace(digest="another")])
+    due = {s.unit for s in plan_condition(session).due_stretches}
+    assert first.unit in due
+    assert due <= {"A1/1/000000", "A1/2/000000"}
+    session.manifest.remove([record])  # a hole in the road
+    stage = stage_named("condition")
+    stage.run(session)
+    assert session.failures == []
+    rows = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    broken = rows[(rows["lane"] == "2") & (rows["station_from_m"] < 50.0)].iloc[0]
+    assert np.isnan(broken["mri_m_per_km"])
+    assert "gaps wider than 0.5 m" in broken["reason"] or "were measured" in broken["reason"]
+    assert stage.state(session).stale == 0
+
+
+class Highest(ConditionIndex):
+    """An index of another package."""
+
+    name: ClassVar[str] = "highest"
+    title: ClassVar[str] = "highest height of a section"
+    quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("highest_m", "m", "Highest height of a wheel path"),)
+
+    def values(self, lane: LaneData) -> Iterator[Value]:
+        """The left path's."""
+        for a, b in lane.sections_m:
+            height = lane.profiles["left"].between(a, b).height_m
+            known = height[~np.isnan(height)]
+            yield Value("highest_m", "section", a, b, float(known.max()) if known.size else np.nan, np.nan, 1.0)
+
+
+def test_a_new_index_leaves_the_others_current(
+    surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = again(surveyed, tmp_path)
+    known = {**condition_indices(), "highest": Highest()}
+    for module in ("values", "pictures"):
+        monkeypatch.setattr(f"roadscan.jobs.condition.{module}.condition_indices", lambda: known)
+    monkeypatch.setattr("roadscan.jobs.condition.values.name_of", entry_of)
+    work = plan_condition(session)
+    assert not work.due_stretches
+    assert {name for one in work.due_groups for name, _ in one.indices} == {"highest"}
+    stage_named("condition").run(session)
+    rows = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    assert rows["highest_m"].notna().sum() == 4
+    assert stage_named("condition").state(session).stale == 0
+
+
+def entry_of(kind: type) -> str:
+    """Code of an index; that of this test's is the contract."""
+    return "roadscan.condition.index:ConditionIndex" if kind is Highest else name_of(kind)
+
+
+def test_without_its_section_there_is_no_condition(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    session = again(surveyed, tmp_path)
+    values = session.survey.config.model_dump()
+    values["condition"] = None
+    values["rig"] = session.survey.rig.model_dump()
+    bare = Session(type(session.survey).parse(values, folder=session.survey.folder), session.store)
+    stage_named("condition").run(bare)
+    assert not any(bare.manifest.of(name) for name in MADE)
+    assert not session.store.files("tables/profiles_longitudinal")

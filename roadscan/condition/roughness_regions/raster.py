@@ -70,7 +70,8 @@ def intensity_raster(
     known = np.sort(found[measured])
     clipped = int(clip_share * (known.size - 1))
     dimmest, brightest = float(known[clipped]), float(known[known.size - 1 - clipped])
-    scale = _BRIGHTEST / (brightest - dimmest) if brightest > dimmest else 0.0
+    # Equal intensities differ by what weighing leaves of their last digits.
+    scale = _BRIGHTEST / (brightest - dimmest) if brightest - dimmest > 1e-9 * abs(brightest) else 0.0
     grey = np.clip(np.rint((np.where(measured, found, dimmest) - dimmest) * scale), 0, _BRIGHTEST).astype(np.uint8)
     return IntensityRaster(
         grey, _local_mean(points, corner, cell_m, (rows, columns)), measured, corner, cell_m, dimmest, brightest

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from roadscan.model.strict import Strict
@@ -11,8 +13,10 @@ class RoughnessRegionsConfig(Strict):
     """How dim regions of the road's surface are found, and which of them are reported."""
 
     sensor_height_m: float | None = Field(default=None, ge=0.3, le=10.0)
-    """Height of the lidar above the road (m), where its intensities fall with range and incidence: they are normalised as
-    for beams from this height above the middle of the nearest driven lane. Left out, they are taken as they are."""
+    """Height of the lidar above the road (m), where its intensities fall with range and incidence: they are normalised
+    as for beams from this height above the middle of the nearest lane. Left out, they are taken as they are."""
+    road: Literal["lanes", "all"] = "lanes"
+    """What is looked at of a section: its lanes, or all that has cells."""
     cell_m: float = Field(default=0.06, ge=0.01, le=0.5)
     """Edge of the cells of the intensity raster (m): about the points' distance from one another."""
     section_m: float = Field(default=10.0, ge=5.0, le=20.0)

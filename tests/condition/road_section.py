@@ -68,7 +68,7 @@ class Section:
         return (5.0 / reach) ** 2 * (2.2 / reach)
 
     def _park(self, car, xyz, grey, rng):
-        """A car: no road below it nor in its shadow to the right; a roof, a bonnet, and the side that faces the road."""
+        """A car: no road below it nor in its shadow to the right; a roof, a bonnet, and its left side."""
         x0, y0, paint = car
         x, y = xyz[:, 0], xyz[:, 1]
         below = (x > x0) & (x < x0 + 4.5) & (y > y0) & (y < y0 + 1.8)

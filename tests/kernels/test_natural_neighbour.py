@@ -1,4 +1,4 @@
-"""Triangulation and natural neighbours, against Qhull, areas of Voronoi polygons by GEOS, and fields known by formula."""
+"""Triangulation and natural neighbours, against Qhull, areas of Voronoi polygons by GEOS, and fields by formula."""
 
 from __future__ import annotations
 

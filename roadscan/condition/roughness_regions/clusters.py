@@ -53,7 +53,10 @@ class Cluster:
             yield np.column_stack([self.columns[last] + 0.5 + way * side[1], self.rows[last] + 0.5 + way * side[0]])
 
     def at_half(self, raster: IntensityRaster, intensity: float) -> Cluster:
-        """The cluster with its edge where the local mean has an intensity, at most two cells out; itself if none is left."""
+        """The cluster with its edge where the local mean has an intensity, at most three cells out.
+
+        It stays as it is if none is left.
+        """
         top, left = max(int(self.rows.min()) - _EDGE_CELLS, 0), max(int(self.columns.min()) - _EDGE_CELLS, 0)
         bottom, right = int(self.rows.max()) + _EDGE_CELLS + 1, int(self.columns.max()) + _EDGE_CELLS + 1
         values = raster.local_mean[top:bottom, left:right]

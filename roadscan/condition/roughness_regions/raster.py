@@ -36,6 +36,15 @@ class IntensityRaster:
     brightest: float
     """Intensity that 255 stands for."""
 
+    def cells_at(self, x_m: Float64, y_m: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Rows and columns (n,) of the cells at places, held inside the raster."""
+        rows, columns = self.values.shape
+        column, row = (
+            np.floor(v / self.cell_m).astype(np.int64) - round(c / self.cell_m)
+            for v, c in zip((x_m, y_m), self.corner_m, strict=True)
+        )
+        return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+
     def intensity(self, value: float) -> float:
         """The intensity that an 8-bit value stands for."""
         return self.dimmest + (self.brightest - self.dimmest) * value / _BRIGHTEST
@@ -94,7 +103,8 @@ def _local_mean(points: RoadPoints, corner_m: tuple[float, float], cell_m: float
         )
         for weights in (points.readings * points.intensity, points.readings)
     ]
-    return np.divide(sums[0], sums[1], out=np.full(shape, np.nan), where=sums[1] > 0.5)
+    means: Float64 = np.divide(sums[0], sums[1], out=np.full(shape, np.nan), where=sums[1] > 0.5)
+    return means
 
 
 def closed(grey: npt.NDArray[np.uint8], measured: npt.NDArray[np.bool_], edge_cells: int) -> npt.NDArray[np.uint8]:

@@ -1,8 +1,8 @@
 """Roughness regions of a section of road, after Kumar, Lewis and McElhinney.
 
 The steps are those of "An automated algorithm for detecting road roughness from mobile laser scanning data": road
-surface, rotation by the mean heading, first level of the point-thinning pyramid, intensity raster by natural neighbours,
-8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters by density and by the deviation
+surface, rotation by the mean heading, first level of the point-thinning pyramid, intensity raster by natural
+neighbours, 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters by density and by the deviation
 of heights, rotation back. Beyond the paper: heights are judged against the section's road surface, so that a grade
 counts nothing; thresholds are taken from cells on that surface, so that vehicles do not move them; a region has to be
 dimmer than the road around it, and its edge runs where the intensity is halfway between both; a cluster that is no
@@ -95,6 +95,17 @@ class SectionRegions:
         """Those that are reported."""
         return [one for one in self.clusters if one.fate == "reported"]
 
+    def local_outlines(self) -> list[Float64]:
+        """Corners (k, 2) of their outlines in the frame of the raster (m)."""
+        corners = [shapely.get_coordinates(one.outline) for one in self.regions]
+        ones = np.ones(1)
+        return [
+            np.column_stack([t.x_m, t.y_m])
+            for t in (
+                RoadPoints(c[:, 0], c[:, 1], ones, ones, ones).rotated(self.origin_m, self.heading_rad) for c in corners
+            )
+        ]
+
 
 def find_regions(
     points: RoadPoints,
@@ -159,13 +170,10 @@ def _off_surface(
     above = np.abs(surface.residuals_m(thinned.x_m, thinned.y_m, thinned.height_m)) > limit_m
     mask = np.zeros(raster.values.shape, np.uint8)
     x, y = thinned.x_m[above], thinned.y_m[above]
-    column, row = (
-        np.floor(v / raster.cell_m + 1e-9) - round(c / raster.cell_m)
-        for v, c in zip((x, y), raster.corner_m, strict=True)
-    )
-    inside = [np.clip(v.astype(np.int64), 0, n - 1) for v, n in zip((row, column), mask.shape, strict=True)]
-    mask[inside[0], inside[1]] = 1
-    return cv2.dilate(mask, np.ones((5, 5), np.uint8)).astype(bool)
+    row, column = raster.cells_at(x, y)
+    mask[row, column] = 1
+    near: npt.NDArray[np.bool_] = cv2.dilate(mask, np.ones((5, 5), np.uint8)).astype(bool)
+    return near
 
 
 def _judged(cluster: Cluster, section: Section) -> Region:
@@ -203,9 +211,9 @@ def _judged(cluster: Cluster, section: Section) -> Region:
 def _within(points: RoadPoints, shape: shapely.Polygon) -> npt.NDArray[np.bool_]:
     """(n,) which points lie in a polygon."""
     west, south, east, north = shape.bounds
-    inside = (points.x_m >= west) & (points.x_m <= east) & (points.y_m >= south) & (points.y_m <= north)
-    rows = np.flatnonzero(inside)
-    inside[rows] = shapely.contains_xy(shape, points.x_m[rows], points.y_m[rows])
+    box = (points.x_m >= west) & (points.x_m <= east) & (points.y_m >= south) & (points.y_m <= north)
+    inside: npt.NDArray[np.bool_] = np.zeros(len(points), bool)
+    inside[box] = shapely.contains_xy(shape, points.x_m[box], points.y_m[box])
     return inside
 
 

@@ -57,7 +57,7 @@ def holds(mesh, t, p):
     """Whether the circle of a triangle holds point p; that of one beyond the hull is the half-plane outside."""
     beyond = mesh.x.size
     a, b, c = mesh.triangles[t, 0], mesh.triangles[t, 1], mesh.triangles[t, 2]
-    if c != beyond and b != beyond and a != beyond:
+    if beyond not in (a, b, c):
         return in_circle(mesh.x, mesh.y, a, b, c, p) > 0
     if a == beyond:
         a, b = b, c

@@ -36,7 +36,7 @@ def circle_centres(mesh, count, centres):
     beyond = mesh.x.size
     for t in range(count):
         a, b, c = mesh.triangles[t, 0], mesh.triangles[t, 1], mesh.triangles[t, 2]
-        if a == beyond or b == beyond or c == beyond:
+        if beyond in (a, b, c):
             centres[t, 0], centres[t, 1] = np.inf, np.inf
             continue
         centres[t, 0], centres[t, 1] = circle_centre(

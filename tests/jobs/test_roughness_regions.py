@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import geopandas
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 
@@ -43,16 +45,56 @@ def opened(made: RoughSurvey) -> Session:
 
 
 def read(session: Session) -> geopandas.GeoDataFrame:
-    import pandas as pd
-
     files = [r.path for r in session.manifest.of("roughness_regions").values() if r.path]
     parts = [geopandas.read_parquet(Path(str(session.store.root)) / f) for f in sorted(files)]
     return geopandas.GeoDataFrame(pd.concat(parts, ignore_index=True))
 
 
-def test_patches_are_in_the_table(surveyed: RoughSurvey) -> None:
+def test_regions_are_the_patches_that_were_laid(surveyed: RoughSurvey) -> None:
+    """The last patch lies on the border of two sections, which cut it in two."""
     session = opened(surveyed)
-    assert session.manifest.of("roughness_regions")
     table = read(session)
     assert table.crs.to_epsg() == 32632
-    print(table.drop(columns="outline").T.to_string())
+    true = [shapely.box(s + LEAD_M - a / 2, o - b / 2, s + LEAD_M + a / 2, o + b / 2) for s, o, a, b in PATCHES]
+    assert table["station_m"].tolist() == pytest.approx([32.0, 39.88, 40.62, 53.0], abs=0.08)
+    assert table["offset_m"].tolist() == pytest.approx([1.2, 1.75, 1.75, 2.4], abs=0.05)
+    areas = table["area_m2"].to_numpy()
+    laid = [true[0].area, true[2].area, true[1].area]
+    assert [areas[0], areas[1] + areas[2], areas[3]] == pytest.approx(laid, rel=0.1)
+    assert (table["contrast"] > 0.4).all()
+    assert np.allclose(table.geometry.area, areas, rtol=1e-9)
+
+
+def test_tables_and_picture(surveyed: RoughSurvey) -> None:
+    session = opened(surveyed)
+    sections = query(session.store, "SELECT * FROM roughness_sections ORDER BY station_from_m").to_pandas()
+    assert sections["regions"].sum() == 4
+    assert (sections["least_density_per_m2"] == SETTINGS["least_density_per_m2"]).all()
+    measured = sections[sections["measured_m2"] > 1.0]
+    assert (measured["dim_below"] < measured["bright_above"]).all()
+    assert query(session.store, "SELECT count(*) FROM roughness_regions WHERE contrast > 0.4")[0][0].as_py() == 4
+    pictures = [r.path for r in session.manifest.of("roughness_pictures").values() if r.path]
+    assert len(pictures) == 1
+    assert stage_named("condition").state(session).stale == 0
+
+
+def test_the_pieces_change_no_bit_and_settings_make_them_due(
+    surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "survey"
+    shutil.copytree(surveyed.file.parent, copy)
+    session = opened(RoughSurvey(copy / surveyed.file.name))
+    before = read(session)
+    other = RoughSurvey(copy / surveyed.file.name).session(
+        "store", section_m=50.0, roughness_regions={**SETTINGS, "least_contrast": 0.9}
+    )
+    assert len(plan_condition(other).due_pieces) == len(plan_condition(session).pieces) == 1
+    monkeypatch.setattr(roughness_regions, "_PIECE_SECTIONS", 2)
+    assert len(plan_condition(session).due_pieces) > 1
+    stage_named("condition").run(session)
+    assert session.failures == []
+    after = read(session).sort_values("station_m", ignore_index=True)
+    assert after.to_wkb().equals(before.to_wkb())
+    bare = RoughSurvey(copy / surveyed.file.name).session("store", section_m=50.0)
+    stage_named("condition").run(bare)
+    assert not bare.manifest.of("roughness_regions")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -90,9 +91,7 @@ def plan_pieces(
         last_m = line.first_m + line.length_m
         for number in range(math.floor(line.first_m / long_m), math.ceil(last_m / long_m)):
             ends = [number * long_m + k * settings.section_m for k in range(_PIECE_SECTIONS + 1)]
-            sections = tuple(
-                (a, b) for a, b in zip(ends[:-1], ends[1:], strict=True) if b > line.first_m and a < last_m
-            )
+            sections = tuple((a, b) for a, b in itertools.pairwise(ends) if b > line.first_m and a < last_m)
             part = line.stretch(sections[0][0] - 20.0, sections[-1][1] + 20.0)
             lanes = tuple(
                 lane.stretch(sections[0][0], sections[-1][1])

@@ -1,9 +1,9 @@
 """Roughness regions of a section of road, after Kumar and Angelats (2017).
 
 The steps are those of "An automated road roughness detection from mobile laser scanning data" (ISPRS Archives
-XLII-1/W1, section 2): road surface, rotation by the mean heading, first level of the point-thinning pyramid, intensity raster by natural
-neighbours, 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters by density and by
-the deviation of heights, rotation back.
+XLII-1/W1, section 2): road surface, rotation by the mean heading, first level of the point-thinning pyramid, intensity
+raster by natural neighbours, 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters
+by density and by the deviation of heights, rotation back.
 
 Beyond the paper: heights are judged against the section's road surface, so that a grade counts nothing; thresholds are
 taken from cells on that surface, so that vehicles do not move them; a region has to be dimmer than the road around it,

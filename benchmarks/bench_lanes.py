@@ -83,10 +83,11 @@ class RoughSurvey:
         station = np.arange(-10.0, scene.length_m + 10.0, 0.5)
         east, north, _ = surface.place(station, 0.0)
         line = {"type": "LineString", "coordinates": np.column_stack([east, north]).tolist()}
+        named = {"id": "A1", "name": "Test road", "from_km": 12.0, "to_km": 12.0 + (scene.length_m + 20.0) / 1000}
         layer = {
             "type": "FeatureCollection",
             "crs": {"type": "name", "properties": {"name": scene.map.crs}},
-            "features": [{"type": "Feature", "properties": {"id": "A1", "name": "Test road"}, "geometry": line}],
+            "features": [{"type": "Feature", "properties": named, "geometry": line}],
         }
         (folder / "line.geojson").write_text(json.dumps(layer))
         return cls(file)
@@ -100,7 +101,8 @@ class RoughSurvey:
         ]
         kept = [run for run in values["runs"] if runs is None or run["id"] in runs]
         passes = [p for p in values["passes"] if runs is None or p["run"] in runs]
-        stated = {"reference": "layer", "layer": "line.geojson", "lanes": lanes} | condition
+        measures = {"measure_from_column": "from_km", "measure_to_column": "to_km"}
+        stated = {"reference": "layer", "layer": "line.geojson", "layer_options": measures, "lanes": lanes} | condition
         made = values | {"runs": kept, "passes": passes, "condition": stated, "products": {"make": []}}
         survey = Survey.parse(made, folder=self.file.parent)
         return Session(survey, Store(str(self.file.parent / store), survey.config.id))

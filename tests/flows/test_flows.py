@@ -82,7 +82,7 @@ def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurve
     assert run.name == "city/SURVEY.toml"
     ids = FlowRunFilter(id=FlowRunFilterId(any_=[run.id]))
     tasks = sorted(client.read_task_runs(flow_run_filter=ids), key=lambda t: t.expected_start_time)
-    assert [t.name for t in tasks] == ["ingest", "navigate", "footprints", "tiles", "surfaces", "products"]
+    assert [t.name for t in tasks] == ["ingest", "navigate", "footprints", "tiles", "surfaces", "products", "condition"]
 
     clouds = files(survey_file, "tiles/las").values()
     assert sum(laspy.read(cloud).header.point_count for cloud in clouds) == simulated.readings

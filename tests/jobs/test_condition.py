@@ -11,7 +11,9 @@ from typing import ClassVar
 import geopandas
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
+import shapely
 
 from benchmarks.bench_lanes import RoughSurvey, driven, rough_scene, run
 from roadscan.code_reach import name_of
@@ -29,7 +31,11 @@ from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.products.distress.cracks import COLUMNS as CRACKS
+from roadscan.products.geo_table import write_geo_table
+from roadscan.tables.manifest import OutputRecord
 from roadscan.tables.sql import query
+from roadscan.tables.store import bytes_digest
 
 STEP_MM = 5.0
 
@@ -87,7 +93,8 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
             for one in (lane, true)
         )
         assert [at for at, _ in found] == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
-        assert [height for _, height in found] == pytest.approx([height for _, height in right], abs=0.5)
+        beside = [min(right, key=lambda one, at=at: abs(one[0] - at))[1] for at, _ in found]
+        assert [height for _, height in found] == pytest.approx(beside, abs=0.5)
         assert [height for _, height in found] == pytest.approx([-STEP_MM, STEP_MM], abs=1.0)  # unevenness is in it
 
 
@@ -101,6 +108,7 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     own = table[table["lane"] == "2"].reset_index(drop=True)
     assert own["name"].unique().tolist() == ["Test road"]
     assert own["station_from_m"].tolist()[1:] == [50.0, 100.0, 150.0]
+    assert own["measure_from"].tolist()[1:] == pytest.approx([12.05, 12.10, 12.15], abs=1e-3)
     assert own["rut_depth_mean_left_mm"][1] == pytest.approx(12.0, abs=1.0)
     assert own["rut_depth_mean_right_mm"][1] == pytest.approx(25.0, abs=1.5)
     assert own["joints"].tolist()[1] == 2
@@ -234,6 +242,67 @@ def test_a_new_index_leaves_the_others_current(
 def entry_of(kind: type) -> str:
     """Code of an index; that of this test's is the contract."""
     return "roadscan.condition.index:ConditionIndex" if kind is Highest else name_of(kind)
+
+
+def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    session = again(surveyed, tmp_path)
+    group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
+    along, across = np.arange(60.0, 70.1, 0.5), np.arange(-3.0, 3.1, 0.5)
+    places = [
+        group.line.places(along, group.lane.offsets(along, 0.85))[:, :2],  # in the right wheel path
+        group.line.places(np.full(across.size, 120.25), group.lane.offsets(np.full(across.size, 120.25), across))[
+            :, :2
+        ],
+    ]
+    lines = np.array([shapely.MultiLineString([line]) for line in places], object)
+    rows = [{f.name: "" if f.type == "string" else 0 for f in CRACKS} for _ in lines]
+    rows[0] |= {"type": "longitudinal", "width_mean_m": 0.004}
+    rows[1] |= {"type": "transverse", "width_mean_m": 0.010}
+    context, file = product_context(session.plan), tmp_path / "cracks.parquet"
+    write_geo_table(file, pa.Table.from_pylist(rows, CRACKS), "line", lines, ["MultiLineString"], context)
+    session.store.publish(file, "products/cracks/cracks.parquet")
+    content = session.store.read_bytes("products/cracks/cracks.parquet")
+    record = OutputRecord(
+        "cracks", "cracks.parquet", "k", "products/cracks/cracks.parquet", len(content), bytes_digest(content)
+    )
+    session.manifest.add([record])
+    assert {name for g in plan_condition(session).due_groups for name, _ in g.indices} == {"cracking"}
+    stage_named("condition").run(session)
+    table = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    own = table[table["lane"] == "2"]
+    assert own["crack_longitudinal_m"].tolist() == pytest.approx([0.0, 10.0, 0.0, 0.0], rel=0.01)
+    assert own["crack_transverse_m"].tolist() == pytest.approx([0.0, 0.0, 3.5, 0.0], rel=0.03)  # as wide as the lane
+    assert own["crack_moderate_severity_m"].tolist() == pytest.approx([0.0, 0.0, 3.5, 0.0], rel=0.03)
+    wanted = [0.0, 100 * 20 / 200, 100 * 2 / 200, 0.0]  # of 100 pieces of 0.5 m in each of two wheel paths
+    assert own["cracked_wheel_path_percent"].tolist() == pytest.approx(wanted, abs=0.6)
+
+
+def test_heights_of_the_reconstructed_surface(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    session = again(surveyed, tmp_path)
+    values = session.survey.config.model_dump() | {"surface": {"method": "cells", "sigma_m": 0.0005, "smooth": False}}
+    values["rig"] = session.survey.rig.model_dump()
+    values["condition"]["heights"] = "surface"
+    with_surface = Session(type(session.survey).parse(values, folder=session.survey.folder), session.store)
+    (error,) = stage_named("condition").check(with_surface.survey)
+    assert "does not make the product" in str(error)
+    values["products"] = {"make": ["surface"]}
+    with_surface = Session(type(session.survey).parse(values, folder=session.survey.folder), session.store)
+    assert stage_named("condition").check(with_surface.survey) == []
+    stage_named("surfaces").run(with_surface)
+    stage_named("condition").run(with_surface)
+    assert with_surface.failures == []
+    held = driven(list(compared_values(with_surface, surveyed.height_at)), ("2",))
+    iri = held["section", "mri_m_per_km"]
+    known = iri[np.isfinite(iri[:, 0])]
+    assert len(known) >= 3
+    assert (np.abs(known[:, 0] - known[:, 1]) <= np.maximum(0.02 * known[:, 1], 0.03)).all()
+
+
+def test_a_layer_that_is_not_there_is_told_before_the_run(surveyed: RoughSurvey) -> None:
+    session = surveyed.session("store", layer="lines.gpkg")
+    (error,) = stage_named("condition").check(session.survey)
+    assert "the layer does not exist" in str(error)
+    assert stage_named("condition").check(surveyed.session("store").survey) == []
 
 
 def test_without_its_section_there_is_no_condition(surveyed: RoughSurvey, tmp_path: Path) -> None:

@@ -73,6 +73,14 @@ def test_heights_of_a_plane_are_exact_whatever_cells_lack_and_across_tiles() -> 
     np.testing.assert_array_equal(heights(cell_table(tiles[::-1], CELL_M), places), found)
 
 
+def test_of_a_dense_window_some_rows_and_columns_tell_the_same() -> None:
+    table = cell_table([tile(c, r, lambda e, n: 2.0 + 0.03 * e - 0.05 * n) for c in (0, 1) for r in (0, 1)], CELL_M)
+    out = np.empty((1, 3))
+    sample(table, np.array([[1.02, 0.97, 0.8, 0.6]]), 0.7, 0.7, False, out)  # 784 cells
+    assert out[0, 0] == pytest.approx(2.0 + 0.03 * 1.02 - 0.05 * 0.97, abs=1e-9)
+    assert out[0, 2] == pytest.approx(1.0, abs=0.05)
+
+
 def test_a_surface_that_bends_keeps_the_bottom_of_a_rut_and_an_outlier_is_left_out() -> None:
     def rut(e: np.ndarray, n: np.ndarray) -> np.ndarray:
         return 10.0 + 0.6 * (e - 0.5) ** 2

@@ -26,6 +26,7 @@ from roadscan.model.condition import ConditionConfig
 from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import LanePass, PassId
+from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table, write_geo_table
 from roadscan.sensors.base import Reject
@@ -108,6 +109,21 @@ def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
     return [
         replace(lane, sigma_roll_deg=max((roll_deg[PassId(p)] for p in lane.passes), default=most)) for lane in lanes
     ]
+
+
+def check_layer(survey: Survey) -> None:
+    """Open the layer of reference lines, where the survey file states one.
+
+    Raises
+    ------
+    FormatError, ConfigError, CrsError
+        if it does not exist, cannot be read as stated, or cannot be brought into the map.
+    """
+    config = survey.config.condition
+    if config is not None and config.layer is not None:
+        path = survey.resolve(config.layer)
+        layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
+        place_in_map(layer.crs, survey.config.map.frame(), path)
 
 
 def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:

@@ -20,12 +20,14 @@ from roadscan.condition.cell_table import cell_table
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
 from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.surface_cells import read_surface
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.condition import SectionConfig
 from roadscan.model.ids import TileId
+from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
@@ -34,6 +36,8 @@ from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import Bounds, TileGrid
 
 PROFILES: Final = "profiles_longitudinal"
+SURFACE_FILES: Final = "surface"
+"""Product whose files hold the reconstructed surface."""
 CROSS_SECTIONS: Final = "cross_sections"
 STRETCH_M: Final = 50
 """Length of a stretch; changes no height."""
@@ -71,6 +75,7 @@ class StretchTask:
     store: Store
     grid: TileGrid
     config: SectionConfig
+    context: ProductContext
     stretches: tuple[Stretch, ...]
 
     @property
@@ -127,11 +132,13 @@ def due_stretches(stretches: Sequence[Stretch], manifest: Manifest) -> list[Stre
     return [s for s in stretches if not all(manifest.is_current(n, s.unit, s.key) for n in (CROSS_SECTIONS, PROFILES))]
 
 
-def stretch_tasks(due: Sequence[Stretch], store: Store, grid: TileGrid, config: SectionConfig) -> list[StretchTask]:
+def stretch_tasks(
+    due: Sequence[Stretch], store: Store, context: ProductContext, config: SectionConfig
+) -> list[StretchTask]:
     """Tasks of neighbouring stretches of a lane."""
     tasks: list[StretchTask] = []
     for _, own in itertools.groupby(due, key=lambda s: (s.lane.road, s.lane.name)):
-        tasks += [StretchTask(store, grid, config, some) for some in _batches(list(own))]
+        tasks += [StretchTask(store, context.grid, config, context, some) for some in _batches(list(own))]
     return tasks
 
 
@@ -142,7 +149,7 @@ def _batches(own: Sequence[Stretch]) -> Iterator[tuple[Stretch, ...]]:
 
 def survey_stretches(task: StretchTask) -> TaskResult:
     """Write profiles and cross-sections of the stretches of a task (runs on a worker)."""
-    tiles = _Tiles(task.store, task.grid)
+    tiles = _Tiles(task.store, task.context)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     damaged: set[str] = set()
@@ -160,15 +167,21 @@ def survey_stretches(task: StretchTask) -> TaskResult:
 class _Tiles:
     """Cells of the tiles of some stretches, the last ones kept."""
 
-    def __init__(self, store: Store, grid: TileGrid) -> None:
-        self._store, self._grid = store, grid
+    def __init__(self, store: Store, context: ProductContext) -> None:
+        self._store, self._context = store, context
         self._kept: dict[str, TileCells] = {}
 
     def read(self, record: OutputRecord) -> TileCells:
         """Cells of a tile."""
         cells = self._kept.pop(record.unit, None)
         if cells is None:
-            cells = read_cells(self._store, record, self._grid.cells_per_edge)
+            edge = self._context.grid.cells_per_edge
+            of_surface = record.product == SURFACE_FILES
+            cells = (
+                read_surface(self._store, record, edge, self._context)
+                if of_surface
+                else read_cells(self._store, record, edge)
+            )
         self._kept[record.unit] = cells
         while len(self._kept) > _TILES_KEPT:
             del self._kept[next(iter(self._kept))]

@@ -16,7 +16,14 @@ from roadscan.jobs.condition.roughness_regions import (
     plan_pieces,
 )
 from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
-from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, Stretch, due_stretches, plan_stretches
+from roadscan.jobs.condition.stretches import (
+    CROSS_SECTIONS,
+    PROFILES,
+    SURFACE_FILES,
+    Stretch,
+    due_stretches,
+    plan_stretches,
+)
 from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
@@ -69,7 +76,8 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     plan, manifest = session.plan, session.manifest
     context = product_context(plan)
     roads: Roads = load_roads(session.store, manifest, context)
-    tiles = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    made = manifest.of(TILE if config.heights == "cells" else SURFACE_FILES)
+    tiles = {TileId.parse(unit): r for unit, r in made.items() if r.path}
     settings, grid = config.sections(), plan.ground.grid
     stretches = plan_stretches(roads, tiles, grid, settings)
     groups = plan_groups(roads, manifest, settings, grid.cell_m)
@@ -77,7 +85,8 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
     pictures = plan_pictures(tasks, manifest)
     files = plan_sections(session.store, manifest, roads, units, context)
-    pieces = plan_pieces(roads, tiles, grid, config.roughness_regions)
+    measured = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    pieces = plan_pieces(roads, measured, grid, config.roughness_regions)
     gone = [
         *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
         *manifest.beside({VALUES}, set(units)),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from roadscan.jobs.condition.lines import write_lines
+from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
 from roadscan.jobs.condition.roughness_regions import PieceTask, regions_of_pieces
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
+from roadscan.jobs.condition.surface_cells import check_surface_cells
 from roadscan.jobs.condition.tasks import run_units
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
@@ -16,6 +17,8 @@ from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
 
 _PICTURES = 20
 """Pictures that a task draws."""
@@ -43,7 +46,7 @@ class Condition(Stage):
             session.note("condition: no drive of 20 m or more lies on the tiles that hold cells")
         settings, grid = config.sections(), session.plan.ground.grid
         context = product_context(session.plan)
-        tasks = stretch_tasks(work.due_stretches, session.store, grid, settings)
+        tasks = stretch_tasks(work.due_stretches, session.store, context, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
         work = plan_condition(session) if tasks else work
@@ -67,6 +70,15 @@ class Condition(Stage):
         tasks = [PieceTask(session.store, grid, context, config.roughness_regions, (one,)) for one in work.due_pieces]
         bar = session.bar("roughness regions")
         session.failed(self.name, run_units(regions_of_pieces, tasks, session.manifest, session.compute, bar))
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """The layer of reference lines can be opened as stated; there is a surface where its heights are asked for."""
+        try:
+            check_layer(survey)
+            check_surface_cells(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
 
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""

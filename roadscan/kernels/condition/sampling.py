@@ -16,6 +16,8 @@ from roadscan.kernels.options import inlined, kernel
 
 MOST_CELLS = 4096
 """Cells of a window that are looked at; of a denser window those of its first rows."""
+ENOUGH_CELLS = 100.0
+"""Of a window of four times as many cells and more, one in two rows and columns is looked at, and so on."""
 OUTLIER = 3.0 * 1.4826
 """Cells this many median distances from the first surface are left out of the second."""
 LEAST_SCALE_M = 0.0005
@@ -72,11 +74,12 @@ def first_from(column, low, high, wanted):
 
 
 @kernel
-def gather(table, place, half_along, half_across, found):
+def gather(table, place, half_along, half_across, stride, found):
     """Cells within a window that lies along a direction; returns how many.
 
     place : (4,) float64, easting, northing (m), and the unit vector of the direction.
-    half_along, half_across : float64, half of the window's extents (m); found : Cells, out.
+    half_along, half_across : float64, half of the window's extents (m).
+    stride : int64, of rows and columns of the map one in so many is looked at; found : Cells, out.
     """
     x, y, ux, uy = place[0], place[1], place[2], place[3]
     reach_x = abs(ux) * half_along + abs(uy) * half_across
@@ -87,6 +90,8 @@ def gather(table, place, half_along, half_across, found):
     column_0 = math.ceil((x - reach_x) / east - 0.5)
     column_1 = math.floor((x + reach_x) / east - 0.5)
     for row in range(math.ceil((y - reach_y) / north - 0.5), math.floor((y + reach_y) / north - 0.5) + 1):
+        if row % stride != 0:
+            continue
         tile_row = row // edge_y
         r = tile_row - table.first[0]
         if r < 0 or r >= table.slot.shape[0]:
@@ -104,7 +109,8 @@ def gather(table, place, half_along, half_across, found):
             while k < end and base + table.column[k] <= column_1:
                 dx = (base + table.column[k] + 0.5) * east - x
                 s, o = dx * ux + dy * uy, dx * uy - dy * ux
-                if abs(s) < half_along and abs(o) < half_across and count < MOST_CELLS:
+                wanted = (base + table.column[k]) % stride == 0
+                if wanted and abs(s) < half_along and abs(o) < half_across and count < MOST_CELLS:
                     found.along[count] = s / half_along
                     found.across[count] = o / half_across
                     found.height[count] = table.height[k]
@@ -264,10 +270,11 @@ def sample(table, places, half_along, half_across, bend, out):
     surface, away = np.zeros(TERMS), np.empty(MOST_CELLS)
     wanted = 4 if bend else 3
     window = 4.0 * half_along * half_across / (table.cell[0] * table.cell[1])
+    stride = max(int(math.sqrt(window / ENOUGH_CELLS)), 1)
     for i in range(len(places)):
         out[i, 0], out[i, 1], out[i, 2] = np.nan, np.nan, 0.0
-        count = gather(table, places[i], half_along, half_across, found)
-        out[i, 2] = min(count / window, 1.0)
+        count = gather(table, places[i], half_along, half_across, stride, found)
+        out[i, 2] = min(count * stride * stride / window, 1.0)
         if count < 3 or not central(found, count):
             continue
         base = np.median(found.height[:count])

@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.roughness_regions import RoughnessRegionsConfig
 from roadscan.model.strict import NAME_PATTERN, Strict
 
 
@@ -74,6 +75,9 @@ class ConditionConfig(SectionConfig):
     """Length over which the reference lines are smoothed (m)."""
     lane_smoothing_m: float = Field(default=100.0, ge=2.0, le=1000.0)
     """Length over which the middle of a driven lane is smoothed (m)."""
+
+    roughness_regions: RoughnessRegionsConfig | None = None
+    """Dim regions of the road's surface (utility cuts, patches, worn places), section by section; left out, none."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

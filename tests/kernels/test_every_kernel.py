@@ -37,6 +37,8 @@ THROUGH_ITS_CALLER = {
     "road.carriageway.mark_off_road": "tests/points/test_segmentation.py",
     "road.segmentation.fitted": "tests/points/test_segmentation.py",
     "road.segmentation.segment_profiles": "tests/points/test_segmentation.py",
+    "surface.delaunay.in_circle": "tests/kernels/test_natural_neighbour.py",
+    "surface.delaunay.turn": "tests/kernels/test_natural_neighbour.py",
     "surface.clough_tocher.control_points": "tests/surfaces/test_detailed.py",
     "surface.clough_tocher.cross_slopes": "tests/surfaces/test_detailed.py",
     "surface.patch_grid.evaluate": "tests/surfaces/test_detailed.py",

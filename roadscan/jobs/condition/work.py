@@ -7,6 +7,14 @@ from dataclasses import dataclass, field
 
 from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
 from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
+from roadscan.jobs.condition.roughness_regions import (
+    REGION_PICTURES,
+    REGION_SECTIONS,
+    REGIONS,
+    Piece,
+    due_pieces,
+    plan_pieces,
+)
 from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
 from roadscan.jobs.condition.stretches import (
     CROSS_SECTIONS,
@@ -24,7 +32,7 @@ from roadscan.model.condition import ConditionConfig
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import OutputRecord
 
-MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES)
+MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES, REGIONS, REGION_SECTIONS, REGION_PICTURES)
 """Names of all outputs in the manifest."""
 
 
@@ -41,6 +49,9 @@ class ConditionWork:
     files: SectionFiles | None = None
     due_files: Sequence[str] = ()
     due_pictures: Sequence[PictureTask] = ()
+    pieces: Sequence[Piece] = ()
+    """Of roads, to be looked through for roughness regions."""
+    due_pieces: Sequence[Piece] = ()
     gone: Sequence[OutputRecord] = field(default=())
     """Outputs that are no longer due."""
 
@@ -74,12 +85,16 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
     pictures = plan_pictures(tasks, manifest)
     files = plan_sections(session.store, manifest, roads, units, context)
+    measured = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    pieces = plan_pieces(roads, measured, grid, config.roughness_regions)
     gone = [
         *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
         *manifest.beside({VALUES}, set(units)),
         *manifest.beside({PICTURES}, {one.unit for one in pictures}),
+        *manifest.beside({REGIONS, REGION_SECTIONS, REGION_PICTURES}, {one.unit for one in pieces}),
     ]
     return ConditionWork(
         key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
-        due_files(files, manifest), due_pictures(pictures, manifest), gone,
+        due_files(files, manifest), due_pictures(pictures, manifest), pieces, due_pieces(pieces, manifest),
+        gone,
     )  # fmt: skip

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
+from roadscan.jobs.condition.roughness_regions import PieceTask, regions_of_pieces
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.surface_cells import check_surface_cells
@@ -49,6 +50,7 @@ class Condition(Stage):
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
         work = plan_condition(session) if tasks else work
+        self._look_for_regions(session, work)
         values = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in work.due_groups]
         bar = session.bar("values of condition")
         session.failed(self.name, run_units(values_of_group, values, session.manifest, session.compute, bar))
@@ -59,6 +61,15 @@ class Condition(Stage):
         bar = session.bar("pictures of condition")
         failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
         session.failed(self.name, [(one.unit, reason) for one, reason in failed])
+
+    def _look_for_regions(self, session: Session, work: ConditionWork) -> None:
+        config = session.survey.config.condition
+        if config is None or config.roughness_regions is None:
+            return
+        grid, context = session.plan.ground.grid, product_context(session.plan)
+        tasks = [PieceTask(session.store, grid, context, config.roughness_regions, (one,)) for one in work.due_pieces]
+        bar = session.bar("roughness regions")
+        session.failed(self.name, run_units(regions_of_pieces, tasks, session.manifest, session.compute, bar))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """The layer of reference lines can be opened as stated; there is a surface where its heights are asked for."""
@@ -75,7 +86,7 @@ class Condition(Stage):
             return StageState()
         work = plan_condition(session)
         stale = self._stale(work)
-        current = len(work.stretches) + sum(len(g.indices) for g in work.groups) - stale
+        current = len(work.stretches) + len(work.pieces) + sum(len(g.indices) for g in work.groups) - stale
         return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
 
     def _stale(self, work: ConditionWork) -> int:
@@ -85,11 +96,13 @@ class Condition(Stage):
             + work.values_due
             + len(work.due_files)
             + len(work.due_pictures)
+            + len(work.due_pieces)
         )
 
     def folders(self) -> Sequence[str]:
-        """Tables of lines, lanes, profiles, cross-sections and values, and the section table."""
+        """Tables of lines, lanes, profiles, cross-sections, values and roughness regions, and the section table."""
         return (
             "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
             "tables/condition_values", "products/condition_sections", "products/condition_pictures",
+            "tables/roughness_sections", "products/roughness_regions", "products/roughness_pictures",
         )  # fmt: skip

@@ -1,0 +1,66 @@
+"""Intensity: normalised for range and incidence, and parted into three classes."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+
+_STEEPEST_RAD: Final = np.radians(80.0)
+"""Beyond it the cosine is held, lest glancing returns outshine all others."""
+
+
+def normalised_intensity(
+    intensity: Float64, range_m: Float64, incidence_rad: Float64, reference_range_m: float
+) -> Float64:
+    """(n,) intensities as from `reference_range_m` at right angles: I · (R / R₀)² / cos θ.
+
+    The lidar equation of an extended Lambertian target (Höfle & Pfeifer 2007, equation 6, without the atmosphere). For
+    sensors whose intensity is the received power; one that has already been corrected for range stays as it is.
+
+    Parameters
+    ----------
+    intensity, range_m : (n,); incidence_rad : (n,) angle between the beam and the surface's normal, held at 80°.
+    """
+    cosine = np.cos(np.minimum(np.abs(incidence_rad), _STEEPEST_RAD))
+    normalised: Float64 = intensity * (range_m / reference_range_m) ** 2 / cosine
+    return normalised
+
+
+def range_and_incidence(points_m: Float64, sensor_m: Float64, normal: Float64) -> tuple[Float64, Float64]:
+    """Ranges (n,) (m) and angles of incidence (n,) (rad) of points seen from sensors.
+
+    Parameters
+    ----------
+    points_m, sensor_m : (n, 3) in one frame; normal : (3,) or (n, 3) unit normals of the surface.
+    """
+    beam = sensor_m - points_m
+    length = np.sqrt(np.sum(beam * beam, axis=1))
+    cosine = np.abs(np.sum(beam * normal, axis=1)) / np.maximum(length, 1e-9)
+    return length, np.arccos(np.clip(cosine, 0.0, 1.0))
+
+
+def three_classes(values: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Two thresholds t₁ < t₂ that part 8-bit values into ≤ t₁, ≤ t₂ and above (Otsu 1979, three classes).
+
+    Of all pairs, the one with the greatest variance between the classes, of equals the first; None with fewer than
+    three different values.
+    """
+    counts = np.bincount(values.ravel(), minlength=256).astype(np.float64)
+    if np.count_nonzero(counts) < 3:
+        return None
+    weight, moment = np.cumsum(counts), np.cumsum(counts * np.arange(256))
+
+    def between(q: Float64, m: Float64) -> Float64:
+        """Weight times squared mean: what a class adds to the variance between classes, but for a constant."""
+        return np.divide(m * m, q, out=np.zeros_like(m), where=q > 0.0)
+
+    first, second = weight[:, None], weight[None, :]
+    middle = between(second - first, moment[None, :] - moment[:, None])
+    total = between(weight, moment)[:, None] + middle + between(weight[-1] - weight, moment[-1] - moment)[None, :]
+    allowed = (first > 0) & (second > first) & (second < weight[-1])
+    best = int(np.argmax(np.where(allowed, total, -1.0)))
+    return best // 256, best % 256

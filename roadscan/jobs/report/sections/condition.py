@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from roadscan.jobs.condition.pictures import PICTURES
+from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Picture, Table
 from roadscan.jobs.report.section import Section
 from roadscan.jobs.session import Session
@@ -28,15 +29,16 @@ class Condition(Section):
     position = 500
 
     def blocks(self, session: Session) -> Iterator[Block]:
-        """A row a section; strip charts and cross-sections by lane and kilometre."""
+        """A row a section; strip charts and cross-sections by lane and kilometre; roughness regions."""
         rows = _sections(session)
         if not rows:
             return
         head = ("road", "lane", "from (m)", "to (m)", *(title for title, _, _ in _COLUMNS), "remark")
         yield Table(head, [_row(r) for r in rows], "A dash: not measured", "condition_sections")
-        shown = sorted(r.path for r in session.manifest.of(PICTURES).values() if r.path)
-        for path in shown[:_MOST_PICTURES]:
-            yield Picture(session.store.read_bytes(path), path.rsplit("/", 1)[-1].removesuffix(".png"))
+        for product in (PICTURES, REGION_PICTURES):
+            shown = sorted(r.path for r in session.manifest.of(product).values() if r.path)
+            for path in shown[:_MOST_PICTURES]:
+                yield Picture(session.store.read_bytes(path), path.rsplit("/", 1)[-1].removesuffix(".png"))
 
 
 def _sections(session: Session) -> list[dict[str, Any]]:

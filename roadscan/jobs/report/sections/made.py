@@ -15,6 +15,9 @@ from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
 
+from roadscan.jobs.adjust.outcome import PICTURES as ADJUSTMENT_PICTURES
+from roadscan.jobs.condition.pictures import PICTURES as CONDITION_PICTURES
+from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.jobs.report.section import Section
 from roadscan.jobs.session import Session
@@ -27,6 +30,7 @@ _EDGE: Final = 900
 _MOST_BYTES: Final = 512_000_000
 """A file of an object store that is larger is not fetched for a small picture."""
 _MOST_OF_A_PRODUCT: Final = 4
+_SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
 
 UInt8 = npt.NDArray[np.uint8]
@@ -65,7 +69,8 @@ def _shown(session: Session) -> Iterator[OutputRecord]:
     """The first rasters and pictures of each product over many tiles, by path."""
     counts: Counter[str] = Counter()
     for record in sorted(session.manifest.all(), key=lambda r: r.path):
-        if not record.path.startswith("products/") or not record.path.endswith(_SUFFIXES):
+        is_picture = record.path.startswith("products/") and record.path.endswith(_SUFFIXES)
+        if not is_picture or record.product in _SHOWN_ELSEWHERE:
             continue
         counts[record.product] += 1
         if counts[record.product] <= _MOST_OF_A_PRODUCT:

@@ -146,10 +146,15 @@ class OpenSurvey:
         """
         import duckdb
 
+        from roadscan.jobs.ask import not_made
+        from roadscan.tables.sql import missing_table
+
         try:
             return self.connect().sql(statement)
         except duckdb.Error as error:
-            raise RoadscanError(
+            missing = missing_table(error)
+            told = None if missing is None else not_made(missing, self.survey)
+            raise told or RoadscanError(
                 f"the query failed: {error}", change="sql('SHOW TABLES') lists what there is"
             ) from error
 
@@ -180,11 +185,13 @@ class OpenSurvey:
         Raises
         ------
         RoadscanError
-            where there is no such table (yet), or no such column.
+            where there is no such table (yet), no such column, run or sensor, or the span ends before it starts.
         """
+        from roadscan.jobs.ask import not_made
+
         known = self.tables
         if name not in known:
-            raise RoadscanError(
+            raise not_made(name, self.survey) or RoadscanError(
                 f"there is no table '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known)
             )
         where = [f"{c} = '{_quoted(v)}'" for c, v in (("run", run), ("sensor", sensor)) if v is not None]
@@ -192,6 +199,8 @@ class OpenSurvey:
         if start is not None or end is not None:
             first = _gps_ns(start) if start is not None else 0
             last = _gps_ns(end) - 1 if end is not None else 2**62
+            if last < first - 1:
+                raise ConfigError(f"the span ends ({end}) before it starts ({start})", expected="start before end")
             source = f"{name}_between({first}, {last})"
         statement = f"SELECT * FROM {source}" + (" WHERE " + " AND ".join(where) if where else "")
         with self.connect() as connection:
@@ -199,6 +208,8 @@ class OpenSurvey:
 
             try:
                 rows = connection.sql(statement).to_arrow_table()
+                if not rows.num_rows:
+                    self._check_values(connection, name, {"run": run, "sensor": sensor})
             except duckdb.Error as error:
                 raise RoadscanError(f"table '{name}': {error}", expected="a table with these columns") from error
         return _frame(rows, self.crs)
@@ -262,6 +273,19 @@ class OpenSurvey:
         session = self.session
         own = (r.path for r in session.manifest.of(product).values() if r.path)
         return sorted(session.store.path(path) for path in own)
+
+    def _check_values(self, connection: duckdb.DuckDBPyConnection, table: str, wanted: dict[str, str | None]) -> None:
+        """Refuse a run or sensor that neither the survey file nor the table knows."""
+        for column, value in wanted.items():
+            stated = self.runs if column == "run" else self.survey.rig.sensors
+            if value is None or value in stated:
+                continue
+            held = connection.execute(f'SELECT DISTINCT {column} FROM "{table}"').fetchall()
+            known = sorted({*stated, *(one for (one,) in held)})
+            if value not in known:
+                raise ConfigError(
+                    f"unknown {column} '{value}'{nearest(value, known)}", expected="one of: " + ", ".join(known)
+                )
 
     def _check_run(self, run: str) -> None:
         if run not in self.runs:
@@ -383,7 +407,12 @@ def _selection(tiles: Sequence[str] | None) -> Selection | None:
 def _box(bbox: Box | None) -> Bounds | None:
     from roadscan.tiles.grid import Bounds
 
-    return None if bbox is None else Bounds(*bbox)
+    if bbox is None:
+        return None
+    west, south, east, north = bbox
+    if not (west < east and south < north):
+        raise ConfigError(f"bbox {tuple(bbox)}", expected="west, south, east, north on the map (m), in this order")
+    return Bounds(west, south, east, north)
 
 
 def _clock(stated: Clock | Mapping[str, Any] | str | None) -> Clock | None:
@@ -404,7 +433,14 @@ def _gps_ns(instant: Instant) -> int:
 
     if isinstance(instant, int | np.integer):
         return int(instant)
-    moment = dt.datetime.fromisoformat(instant) if isinstance(instant, str) else instant
+    try:
+        moment = dt.datetime.fromisoformat(instant) if isinstance(instant, str) else instant
+    except ValueError:
+        moment = None
+    if not isinstance(moment, dt.datetime):
+        raise ConfigError(
+            f"{instant!r} is no instant", expected="whole GPS nanoseconds, a datetime, or text as 2026-05-04T09:30:00Z"
+        )
     if moment.tzinfo is None:
         raise ConfigError(f"{moment} has no zone", expected="UTC, such as 2026-05-04T09:30:00Z")
     return gps_ns_from_utc(moment)

@@ -70,6 +70,34 @@ def test_an_unknown_table_names_the_nearest(survey: rs.OpenSurvey) -> None:
         survey.table("trajectry")
 
 
+def test_a_table_that_is_not_made_yet_says_what_makes_it(survey: rs.OpenSurvey) -> None:
+    for ask in (lambda: survey.table("cracks"), lambda: survey.sql("SELECT * FROM cracks")):
+        with pytest.raises(rs.RoadscanError, match=r"'cracks' is not made yet; add \"cracks\" to \[products\] make"):
+            ask()
+
+
+def test_rows_of_what_is_not_there_are_refused(survey: rs.OpenSurvey) -> None:
+    run = survey.runs[0]
+    for wanted, told in (
+        ({"run": run + "x"}, f"unknown run '{run}x'.*did you mean '{run}'"),
+        ({"sensor": "trajektory"}, "unknown sensor 'trajektory'.*did you mean 'trajectory'"),
+        ({"start": 5, "end": 3}, "before it starts"),
+        ({"start": 5.5}, "5.5 is no instant"),
+        ({"start": "monday"}, "'monday' is no instant"),
+    ):
+        with pytest.raises(rs.RoadscanError, match=told):
+            survey.table("trajectory", **wanted)
+    assert survey.table("trajectory", run=run, end=5).empty
+
+
+def test_a_box_costs_what_it_holds(survey: rs.OpenSurvey) -> None:
+    whole = survey.cells()
+    assert survey.cells(bbox=(0.0, 0.0, 1e9, 1e9)).equals(whole)
+    for box in ((5.0, 0.0, 3.0, 1.0), (np.nan, 0.0, 3.0, 1.0)):
+        with pytest.raises(rs.RoadscanError, match="west, south, east, north"):
+            survey.cells(bbox=box)
+
+
 def test_cells_are_those_of_the_geotiff(survey: rs.OpenSurvey) -> None:
     path = survey.products["geotiff"].paths()[0]
     tile = Path(path).name.split(".")[0]

@@ -129,15 +129,21 @@ class OpenSurvey:
 
         return report_page(self.session)
 
-    def connect(self) -> duckdb.DuckDBPyConnection:
-        """A DuckDB connection in which each table of the survey is a view; the caller closes it."""
+    def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
+        """A DuckDB connection in which each table of the survey is a view; the caller closes it.
+
+        Its statements reach the store and memory; `unconfined` lets them read and write any file.
+        """
         from roadscan.jobs.navigate.navigate import known_keys
         from roadscan.tables.sql import connect
 
-        return connect(self.store, known_keys(self.survey, self.store))
+        return connect(self.store, known_keys(self.survey, self.store), unconfined=unconfined)
 
-    def sql(self, statement: str) -> duckdb.DuckDBPyRelation:
+    def sql(self, statement: str, *, unconfined: bool = False) -> duckdb.DuckDBPyRelation:
         """Answer to an SQL statement; `.df()`, `.arrow()`, `.pl()` or `.fetchall()` bring it over.
+
+        It is computed when it is brought over. Its files are not held against their records, as those of `table` are.
+        `unconfined` lets the statement read and write any file.
 
         Raises
         ------
@@ -150,7 +156,7 @@ class OpenSurvey:
         from roadscan.tables.sql import missing_table
 
         try:
-            return self.connect().sql(statement)
+            return self.connect(unconfined=unconfined).sql(statement)
         except duckdb.Error as error:
             missing = missing_table(error)
             told = None if missing is None else not_made(missing, self.survey)
@@ -185,9 +191,10 @@ class OpenSurvey:
         Raises
         ------
         RoadscanError
-            where there is no such table (yet), no such column, run or sensor, or the span ends before it starts.
+            where there is no such table (yet), no such column, run or sensor, the span ends before it starts, or
+            a file of the answer is damaged.
         """
-        from roadscan.jobs.ask import not_made
+        from roadscan.jobs.ask import ask, not_made
 
         known = self.tables
         if name not in known:
@@ -203,15 +210,9 @@ class OpenSurvey:
                 raise ConfigError(f"the span ends ({end}) before it starts ({start})", expected="start before end")
             source = f"{name}_between({first}, {last})"
         statement = f"SELECT * FROM {source}" + (" WHERE " + " AND ".join(where) if where else "")
-        with self.connect() as connection:
-            import duckdb
-
-            try:
-                rows = connection.sql(statement).to_arrow_table()
-                if not rows.num_rows:
-                    self._check_values(connection, name, {"run": run, "sensor": sensor})
-            except duckdb.Error as error:
-                raise RoadscanError(f"table '{name}': {error}", expected="a table with these columns") from error
+        rows = ask(self.survey, self.store, statement)
+        if not rows.num_rows:
+            self._check_values(name, {"run": run, "sensor": sensor})
         return _frame(rows, self.crs)
 
     def trajectory(self, run: str, *, start: Instant | None = None, end: Instant | None = None) -> pd.DataFrame:
@@ -274,14 +275,16 @@ class OpenSurvey:
         own = (r.path for r in session.manifest.of(product).values() if r.path)
         return sorted(session.store.path(path) for path in own)
 
-    def _check_values(self, connection: duckdb.DuckDBPyConnection, table: str, wanted: dict[str, str | None]) -> None:
+    def _check_values(self, table: str, wanted: dict[str, str | None]) -> None:
         """Refuse a run or sensor that neither the survey file nor the table knows."""
+        from roadscan.jobs.ask import ask
+
         for column, value in wanted.items():
             stated = self.runs if column == "run" else self.survey.rig.sensors
             if value is None or value in stated:
                 continue
-            held = connection.execute(f'SELECT DISTINCT {column} FROM "{table}"').fetchall()
-            known = sorted({*stated, *(one for (one,) in held)})
+            held = ask(self.survey, self.store, f'SELECT DISTINCT {column} FROM "{table}"').column(0).to_pylist()
+            known = sorted({*stated, *held})
             if value not in known:
                 raise ConfigError(
                     f"unknown {column} '{value}'{nearest(value, known)}", expected="one of: " + ", ".join(known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +89,27 @@ def test_rows_of_what_is_not_there_are_refused(survey: rs.OpenSurvey) -> None:
         with pytest.raises(rs.RoadscanError, match=told):
             survey.table("trajectory", **wanted)
     assert survey.table("trajectory", run=run, end=5).empty
+
+
+def test_an_answer_of_a_damaged_file_is_refused(survey: rs.OpenSurvey) -> None:
+    root = Path(survey.store.path("tables"))
+    file = next(root.glob("trajectory/**/*.parquet"))
+    whole, before = file.read_bytes(), file.stat()
+    try:
+        file.write_bytes(whole[:400] + bytes(b ^ 0x41 for b in whole[400:420]) + whole[420:])
+        with pytest.raises(rs.RoadscanError, match="content has changed"):
+            survey.table("trajectory")
+    finally:
+        file.write_bytes(whole)
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert len(survey.table("trajectory"))
+
+
+def test_sql_reaches_other_files_where_it_is_told_to(survey: rs.OpenSurvey) -> None:
+    statement = f"SELECT count(*) FROM read_text('{survey.file}')"
+    with pytest.raises(rs.RoadscanError, match="disabled by configuration"):
+        survey.sql(statement)
+    assert survey.sql(statement, unconfined=True).fetchall() == [(1,)]
 
 
 def test_a_box_costs_what_it_holds(survey: rs.OpenSurvey) -> None:

@@ -66,7 +66,7 @@ def navigate(
     draw_trajectories(survey, store, done, [planned.run for planned in wanted], report)
     if failures:
         raise RunError(
-            f"{len(failures)} trajectories could not be computed: " + " | ".join(failures),
+            f"{'1 trajectory' if len(failures) == 1 else f'{len(failures)} trajectories'} could not be computed: " + " | ".join(failures),
             change="correct the survey or rig file or the logs; the next run computes only what is missing",
         )
     return done

@@ -129,15 +129,21 @@ class OpenSurvey:
 
         return report_page(self.session)
 
-    def connect(self) -> duckdb.DuckDBPyConnection:
-        """A DuckDB connection in which each table of the survey is a view; the caller closes it."""
+    def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
+        """A DuckDB connection in which each table of the survey is a view; the caller closes it.
+
+        Its statements reach the store and memory; `unconfined` lets them read and write any file.
+        """
         from roadscan.jobs.navigate.navigate import known_keys
         from roadscan.tables.sql import connect
 
-        return connect(self.store, known_keys(self.survey, self.store))
+        return connect(self.store, known_keys(self.survey, self.store), unconfined=unconfined)
 
-    def sql(self, statement: str) -> duckdb.DuckDBPyRelation:
+    def sql(self, statement: str, *, unconfined: bool = False) -> duckdb.DuckDBPyRelation:
         """Answer to an SQL statement; `.df()`, `.arrow()`, `.pl()` or `.fetchall()` bring it over.
+
+        It is computed when it is brought over. Its files are not held against their records, as those of `table` are.
+        `unconfined` lets the statement read and write any file.
 
         Raises
         ------
@@ -146,10 +152,15 @@ class OpenSurvey:
         """
         import duckdb
 
+        from roadscan.jobs.ask import not_made
+        from roadscan.tables.sql import missing_table
+
         try:
-            return self.connect().sql(statement)
+            return self.connect(unconfined=unconfined).sql(statement)
         except duckdb.Error as error:
-            raise RoadscanError(
+            missing = missing_table(error)
+            told = None if missing is None else not_made(missing, self.survey)
+            raise told or RoadscanError(
                 f"the query failed: {error}", change="sql('SHOW TABLES') lists what there is"
             ) from error
 
@@ -180,11 +191,14 @@ class OpenSurvey:
         Raises
         ------
         RoadscanError
-            where there is no such table (yet), or no such column.
+            where there is no such table (yet), no such column, run or sensor, the span ends before it starts, or
+            a file of the answer is damaged.
         """
+        from roadscan.jobs.ask import ask, not_made
+
         known = self.tables
         if name not in known:
-            raise RoadscanError(
+            raise not_made(name, self.survey) or RoadscanError(
                 f"there is no table '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known)
             )
         where = [f"{c} = '{_quoted(v)}'" for c, v in (("run", run), ("sensor", sensor)) if v is not None]
@@ -192,15 +206,13 @@ class OpenSurvey:
         if start is not None or end is not None:
             first = _gps_ns(start) if start is not None else 0
             last = _gps_ns(end) - 1 if end is not None else 2**62
+            if last < first - 1:
+                raise ConfigError(f"the span ends ({end}) before it starts ({start})", expected="start before end")
             source = f"{name}_between({first}, {last})"
         statement = f"SELECT * FROM {source}" + (" WHERE " + " AND ".join(where) if where else "")
-        with self.connect() as connection:
-            import duckdb
-
-            try:
-                rows = connection.sql(statement).to_arrow_table()
-            except duckdb.Error as error:
-                raise RoadscanError(f"table '{name}': {error}", expected="a table with these columns") from error
+        rows = ask(self.survey, self.store, statement)
+        if not rows.num_rows:
+            self._check_values(name, {"run": run, "sensor": sensor})
         return _frame(rows, self.crs)
 
     def trajectory(self, run: str, *, start: Instant | None = None, end: Instant | None = None) -> pd.DataFrame:
@@ -262,6 +274,21 @@ class OpenSurvey:
         session = self.session
         own = (r.path for r in session.manifest.of(product).values() if r.path)
         return sorted(session.store.path(path) for path in own)
+
+    def _check_values(self, table: str, wanted: dict[str, str | None]) -> None:
+        """Refuse a run or sensor that neither the survey file nor the table knows."""
+        from roadscan.jobs.ask import ask
+
+        for column, value in wanted.items():
+            stated = self.runs if column == "run" else self.survey.rig.sensors
+            if value is None or value in stated:
+                continue
+            held = ask(self.survey, self.store, f'SELECT DISTINCT {column} FROM "{table}"').column(0).to_pylist()
+            known = sorted({*stated, *held})
+            if value not in known:
+                raise ConfigError(
+                    f"unknown {column} '{value}'{nearest(value, known)}", expected="one of: " + ", ".join(known)
+                )
 
     def _check_run(self, run: str) -> None:
         if run not in self.runs:
@@ -383,7 +410,12 @@ def _selection(tiles: Sequence[str] | None) -> Selection | None:
 def _box(bbox: Box | None) -> Bounds | None:
     from roadscan.tiles.grid import Bounds
 
-    return None if bbox is None else Bounds(*bbox)
+    if bbox is None:
+        return None
+    west, south, east, north = bbox
+    if not (west < east and south < north):
+        raise ConfigError(f"bbox {tuple(bbox)}", expected="west, south, east, north on the map (m), in this order")
+    return Bounds(west, south, east, north)
 
 
 def _clock(stated: Clock | Mapping[str, Any] | str | None) -> Clock | None:
@@ -404,7 +436,14 @@ def _gps_ns(instant: Instant) -> int:
 
     if isinstance(instant, int | np.integer):
         return int(instant)
-    moment = dt.datetime.fromisoformat(instant) if isinstance(instant, str) else instant
+    try:
+        moment = dt.datetime.fromisoformat(instant) if isinstance(instant, str) else instant
+    except ValueError:
+        moment = None
+    if not isinstance(moment, dt.datetime):
+        raise ConfigError(
+            f"{instant!r} is no instant", expected="whole GPS nanoseconds, a datetime, or text as 2026-05-04T09:30:00Z"
+        )
     if moment.tzinfo is None:
         raise ConfigError(f"{moment} has no zone", expected="UTC, such as 2026-05-04T09:30:00Z")
     return gps_ns_from_utc(moment)

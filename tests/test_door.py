@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +69,55 @@ def test_tables_with_a_geometry_lie_on_the_map(survey: rs.OpenSurvey) -> None:
 def test_an_unknown_table_names_the_nearest(survey: rs.OpenSurvey) -> None:
     with pytest.raises(rs.RoadscanError, match=r"there is no table 'trajectry'.*trajectory"):
         survey.table("trajectry")
+
+
+def test_a_table_that_is_not_made_yet_says_what_makes_it(survey: rs.OpenSurvey) -> None:
+    for ask in (lambda: survey.table("cracks"), lambda: survey.sql("SELECT * FROM cracks")):
+        with pytest.raises(rs.RoadscanError, match=r"'cracks' is not made yet; add \"cracks\" to \[products\] make"):
+            ask()
+
+
+def test_rows_of_what_is_not_there_are_refused(survey: rs.OpenSurvey) -> None:
+    run = survey.runs[0]
+    for wanted, told in (
+        ({"run": run + "x"}, f"unknown run '{run}x'.*did you mean '{run}'"),
+        ({"sensor": "trajektory"}, "unknown sensor 'trajektory'.*did you mean 'trajectory'"),
+        ({"start": 5, "end": 3}, "before it starts"),
+        ({"start": 5.5}, "5.5 is no instant"),
+        ({"start": "monday"}, "'monday' is no instant"),
+    ):
+        with pytest.raises(rs.RoadscanError, match=told):
+            survey.table("trajectory", **wanted)
+    assert survey.table("trajectory", run=run, end=5).empty
+
+
+def test_an_answer_of_a_damaged_file_is_refused(survey: rs.OpenSurvey) -> None:
+    root = Path(survey.store.path("tables"))
+    file = next(root.glob("trajectory/**/*.parquet"))
+    whole, before = file.read_bytes(), file.stat()
+    try:
+        file.write_bytes(whole[:400] + bytes(b ^ 0x41 for b in whole[400:420]) + whole[420:])
+        with pytest.raises(rs.RoadscanError, match="content has changed"):
+            survey.table("trajectory")
+    finally:
+        file.write_bytes(whole)
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert len(survey.table("trajectory"))
+
+
+def test_sql_reaches_other_files_where_it_is_told_to(survey: rs.OpenSurvey) -> None:
+    statement = f"SELECT count(*) FROM read_text('{survey.file}')"
+    with pytest.raises(rs.RoadscanError, match="disabled by configuration"):
+        survey.sql(statement)
+    assert survey.sql(statement, unconfined=True).fetchall() == [(1,)]
+
+
+def test_a_box_costs_what_it_holds(survey: rs.OpenSurvey) -> None:
+    whole = survey.cells()
+    assert survey.cells(bbox=(0.0, 0.0, 1e9, 1e9)).equals(whole)
+    for box in ((5.0, 0.0, 3.0, 1.0), (np.nan, 0.0, 3.0, 1.0)):
+        with pytest.raises(rs.RoadscanError, match="west, south, east, north"):
+            survey.cells(bbox=box)
 
 
 def test_cells_are_those_of_the_geotiff(survey: rs.OpenSurvey) -> None:

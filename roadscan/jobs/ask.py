@@ -63,10 +63,16 @@ def ask(
         return query(store, statement, known_keys(survey, store), damaged, unconfined=unconfined)
     except RoadscanError as error:
         name = missing_table(error.__cause__)
-        way = None if name is None else _way_to(name.removesuffix("_between"), survey)
-        if way is None:
+        told = None if name is None else not_made(name, survey)
+        if told is None:
             raise
-        raise RoadscanError(f"the table '{name}' is not made yet", change=way) from error
+        raise told from error
+
+
+def not_made(name: str, survey: Survey) -> RoadscanError | None:
+    """The error that says what makes a table that is not there yet; None where no such table is known."""
+    way = _way_to(name.removesuffix("_between"), survey)
+    return None if way is None else RoadscanError(f"the table '{name}' is not made yet", change=way)
 
 
 def _way_to(table: str, survey: Survey) -> str | None:

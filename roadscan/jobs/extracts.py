@@ -91,7 +91,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
                 f"tile {tile} holds no cells{nearest(tile, map(str, records))}", expected="a finished tile"
             )
     else:
-        chosen = set(records) if box is None else {t for t in grid.tiles_in(box) if t in records}
+        chosen = {t for t in records if box is None or grid.bounds(t).meets(box)}
     if not chosen:
         raise ConfigError("no finished tile lies there", expected="a box that touches a tile (table `tiles`)")
     edge, cell_m = grid.cells_per_edge, grid.cell_m

@@ -25,6 +25,15 @@ class Bounds:
     easting_max_m: float
     northing_max_m: float
 
+    def meets(self, other: Bounds) -> bool:
+        """Whether two boxes share ground."""
+        return (
+            self.easting_min_m < other.easting_max_m
+            and other.easting_min_m < self.easting_max_m
+            and self.northing_min_m < other.northing_max_m
+            and other.northing_min_m < self.northing_max_m
+        )
+
 
 @dataclass(frozen=True)
 class TileGrid:

@@ -65,8 +65,9 @@ def navigate(
                 report(f"doubtful: run '{record.run}': {doubt}")
     draw_trajectories(survey, store, done, [planned.run for planned in wanted], report)
     if failures:
+        number = "1 trajectory" if len(failures) == 1 else f"{len(failures)} trajectories"
         raise RunError(
-            f"{len(failures)} trajectories could not be computed: " + " | ".join(failures),
+            f"{number} could not be computed: " + " | ".join(failures),
             change="correct the survey or rig file or the logs; the next run computes only what is missing",
         )
     return done

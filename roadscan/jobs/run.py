@@ -78,16 +78,15 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
     removed.
     """
     whole = {stage.name for stage in done}.issuperset(stage.name for stage in stages())
+    write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
     if whole:
+        _report(session)
         session.manifest.compact()
         if session.selection is None and not session.failures:
             folders = [folder for stage in stages() for folder in stage.folders()]
             removed = end_changes(session.store, session.manifest, folders if session.goes_on else ())
             if removed:
                 session.note(_removed_words(removed))
-    write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
-    if whole:
-        _report(session)
     if session.store.is_folder:
         logs = read_log_records(session.store, damaged=[])
         note_written(session.store, session.began_ns, recorded_files(session.store, logs, session.manifest))

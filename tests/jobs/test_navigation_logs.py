@@ -127,9 +127,11 @@ def test_a_changed_accuracy_file_makes_the_trajectory_new(tmp_path: Path) -> Non
     assert len(plan_logs(survey, store)[0]) == 1
 
 
-def test_stated_errors_of_poses_reach_the_tiles(finished: Simulated) -> None:
+def test_stated_errors_of_poses_reach_the_tiles(simulated: Simulated) -> None:
+    """Those of recorded poses; an adjustment makes them smaller (tests/jobs/test_adjust.py)."""
     sigma = Scene.load("demo").noise.position_m
-    rows = query(finished.store(), "SELECT sigma_horizontal_m, sigma_down_m FROM tiles").to_pylist()
+    recorded = simulated.run("store-recorded", adjust__on=False, products__make=["tile_table"])
+    rows = query(recorded.store, "SELECT sigma_horizontal_m, sigma_down_m FROM tiles").to_pylist()
     assert rows
     for row in rows:
         assert row["sigma_horizontal_m"] == pytest.approx(sigma * 2**0.5, rel=0.02)

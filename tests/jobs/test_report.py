@@ -104,8 +104,8 @@ def test_small_pictures_show_the_products(finished: Simulated) -> None:
     page = Reader(finished.store().read_bytes(PATH).decode("utf-8"))
     pictures = [Image.open(io.BytesIO(base64.b64decode((i["src"] or "").split(",")[1]))) for i in page.of("img")]
     assert pictures
+    assert sum(max(picture.size) <= 900 for picture in pictures) >= 2  # others are shown whole: of the adjustment
     for picture in pictures:
-        assert max(picture.size) <= 900
         assert np.asarray(picture.convert("L")).std() > 5.0  # something is to be seen
 
 

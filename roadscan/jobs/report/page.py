@@ -15,7 +15,6 @@ from roadscan.jobs.report.blocks import Paragraph, Part
 from roadscan.jobs.report.section import Section, sections
 from roadscan.jobs.session import Session
 from roadscan.model.errors import RoadscanError
-from roadscan.tables.manifest import Manifest
 
 REPORT: Final = "report"
 """Product of the report's record."""
@@ -46,7 +45,7 @@ def report_page(session: Session) -> str:
 def keep_report(session: Session) -> str:
     """Where the report lies, relative to the survey's root; written where it differs from the one that is there."""
     page = report_page(session).encode("utf-8")
-    manifest = Manifest(session.store, [])
+    manifest = session.manifest
     known, key = manifest.get(REPORT, REPORT), key_of(page.hex())
     if known is None or known.key != key or not session.store.exists(PATH):
 

@@ -77,6 +77,33 @@ def placed(seen, mounting, position, rotation, shift, turn):
     return place, in_body, from_sensor, beam, turned
 
 
+@inlined
+def vector(rows, i):
+    """Row i of an array (n, 3) as three numbers."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@inlined
+def matrix(stack, i):
+    """Matrix i of an array (n, 3, 3) as nine numbers, row by row."""
+    return (
+        stack[i, 0, 0], stack[i, 0, 1], stack[i, 0, 2],
+        stack[i, 1, 0], stack[i, 1, 1], stack[i, 1, 2],
+        stack[i, 2, 0], stack[i, 2, 1], stack[i, 2, 2],
+    )  # fmt: skip
+
+
+@inlined
+def end(side, mounting, shift, turn, i):
+    """End i of a side, as :func:`placed` returns it."""
+    body, point, position, rotation = side
+    j = i if position.shape[0] > 1 else 0
+    b = body[i]
+    return placed(
+        vector(point, i), mounting, vector(position, j), matrix(rotation, j), vector(shift, b), matrix(turn, b)
+    )
+
+
 @kernel
 def tie_residuals(first, first_mounting, second, second_mounting, shift, turn, weight, on_object, residual):
     """Whitened differences of n ties.
@@ -87,46 +114,9 @@ def tie_residuals(first, first_mounting, second, second_mounting, shift, turn, w
     weight : (n, k, 3) float64, 1/m, world axes; with `on_object` the axes of the second end's body.
     residual : (n, k) float64, out.
     """
-    body_1, point_1, position_1, rotation_1 = first
-    body_2, point_2, position_2, rotation_2 = second
-    many_1, many_2 = position_1.shape[0] > 1, position_2.shape[0] > 1
     for i in range(weight.shape[0]):
-        j = i if many_1 else 0
-        b = body_1[i]
-        p = placed(
-            (point_1[i, 0], point_1[i, 1], point_1[i, 2]),
-            first_mounting,
-            (position_1[j, 0], position_1[j, 1], position_1[j, 2]),
-            (
-                rotation_1[j, 0, 0], rotation_1[j, 0, 1], rotation_1[j, 0, 2],
-                rotation_1[j, 1, 0], rotation_1[j, 1, 1], rotation_1[j, 1, 2],
-                rotation_1[j, 2, 0], rotation_1[j, 2, 1], rotation_1[j, 2, 2],
-            ),
-            (shift[b, 0], shift[b, 1], shift[b, 2]),
-            (
-                turn[b, 0, 0], turn[b, 0, 1], turn[b, 0, 2],
-                turn[b, 1, 0], turn[b, 1, 1], turn[b, 1, 2],
-                turn[b, 2, 0], turn[b, 2, 1], turn[b, 2, 2],
-            ),
-        )  # fmt: skip
-        j = i if many_2 else 0
-        b = body_2[i]
-        q = placed(
-            (point_2[i, 0], point_2[i, 1], point_2[i, 2]),
-            second_mounting,
-            (position_2[j, 0], position_2[j, 1], position_2[j, 2]),
-            (
-                rotation_2[j, 0, 0], rotation_2[j, 0, 1], rotation_2[j, 0, 2],
-                rotation_2[j, 1, 0], rotation_2[j, 1, 1], rotation_2[j, 1, 2],
-                rotation_2[j, 2, 0], rotation_2[j, 2, 1], rotation_2[j, 2, 2],
-            ),
-            (shift[b, 0], shift[b, 1], shift[b, 2]),
-            (
-                turn[b, 0, 0], turn[b, 0, 1], turn[b, 0, 2],
-                turn[b, 1, 0], turn[b, 1, 1], turn[b, 1, 2],
-                turn[b, 2, 0], turn[b, 2, 1], turn[b, 2, 2],
-            ),
-        )  # fmt: skip
+        p = end(first, first_mounting, shift, turn, i)
+        q = end(second, second_mounting, shift, turn, i)
         d = (p[0][0] - q[0][0], p[0][1] - q[0][1], p[0][2] - q[0][2])
         if on_object:
             d = back(q[4], d)
@@ -146,46 +136,9 @@ def tie_rows(first, first_mounting, second, second_mounting, shift, turn, weight
     rows : (n, k, 26) float64, out; derivatives of the first end, then of the second. Those of what an end does not
         have are without meaning.
     """
-    body_1, point_1, position_1, rotation_1 = first
-    body_2, point_2, position_2, rotation_2 = second
-    many_1, many_2 = position_1.shape[0] > 1, position_2.shape[0] > 1
     for i in range(weight.shape[0]):
-        j = i if many_1 else 0
-        b = body_1[i]
-        p = placed(
-            (point_1[i, 0], point_1[i, 1], point_1[i, 2]),
-            first_mounting,
-            (position_1[j, 0], position_1[j, 1], position_1[j, 2]),
-            (
-                rotation_1[j, 0, 0], rotation_1[j, 0, 1], rotation_1[j, 0, 2],
-                rotation_1[j, 1, 0], rotation_1[j, 1, 1], rotation_1[j, 1, 2],
-                rotation_1[j, 2, 0], rotation_1[j, 2, 1], rotation_1[j, 2, 2],
-            ),
-            (shift[b, 0], shift[b, 1], shift[b, 2]),
-            (
-                turn[b, 0, 0], turn[b, 0, 1], turn[b, 0, 2],
-                turn[b, 1, 0], turn[b, 1, 1], turn[b, 1, 2],
-                turn[b, 2, 0], turn[b, 2, 1], turn[b, 2, 2],
-            ),
-        )  # fmt: skip
-        j = i if many_2 else 0
-        b = body_2[i]
-        q = placed(
-            (point_2[i, 0], point_2[i, 1], point_2[i, 2]),
-            second_mounting,
-            (position_2[j, 0], position_2[j, 1], position_2[j, 2]),
-            (
-                rotation_2[j, 0, 0], rotation_2[j, 0, 1], rotation_2[j, 0, 2],
-                rotation_2[j, 1, 0], rotation_2[j, 1, 1], rotation_2[j, 1, 2],
-                rotation_2[j, 2, 0], rotation_2[j, 2, 1], rotation_2[j, 2, 2],
-            ),
-            (shift[b, 0], shift[b, 1], shift[b, 2]),
-            (
-                turn[b, 0, 0], turn[b, 0, 1], turn[b, 0, 2],
-                turn[b, 1, 0], turn[b, 1, 1], turn[b, 1, 2],
-                turn[b, 2, 0], turn[b, 2, 1], turn[b, 2, 2],
-            ),
-        )  # fmt: skip
+        p = end(first, first_mounting, shift, turn, i)
+        q = end(second, second_mounting, shift, turn, i)
         root = math.sqrt(counts[i])
         d = (p[0][0] - q[0][0], p[0][1] - q[0][1], p[0][2] - q[0][2])
         arm = q[1]

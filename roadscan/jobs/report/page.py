@@ -12,7 +12,7 @@ from roadscan import __version__
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import keep_file
 from roadscan.jobs.report.blocks import Paragraph, Part
-from roadscan.jobs.report.section import Section, sections
+from roadscan.jobs.report.section import Material, Section, sections
 from roadscan.jobs.session import Session
 from roadscan.model.errors import RoadscanError
 
@@ -28,7 +28,8 @@ def report_page(session: Session) -> str:
     A section whose tables are damaged says so in its place; the others stand.
     """
     config = session.survey.config
-    parts = [part for part in (_part(section, session) for section in sections()) if part.blocks]
+    material = Material(session)
+    parts = [part for part in (_part(section, material) for section in sections()) if part.blocks]
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
@@ -56,9 +57,9 @@ def keep_report(session: Session) -> str:
     return PATH
 
 
-def _part(section: Section, session: Session) -> Part:
+def _part(section: Section, material: Material) -> Part:
     try:
-        return Part(section.name, section.title, tuple(section.blocks(session)))
+        return Part(section.name, section.title, tuple(section.blocks(material)))
     except RoadscanError as error:
         told = Paragraph(f"This section could not be made: {error}", is_warning=True)
         return Part(section.name, section.title, (told,))

@@ -5,13 +5,41 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Final
 
+from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.report.blocks import Block
 from roadscan.jobs.session import Session
+from roadscan.jobs.summary import SurveySummary, survey_summary
 from roadscan.plugins import found_kinds
+from roadscan.tables.logs import LogRecord, read_log_records
 
 ENTRY_POINT_GROUP: Final = "roadscan.report_sections"
+
+
+@dataclass(frozen=True)
+class Material:
+    """What sections are made of; what several of them ask for is found once."""
+
+    session: Session
+
+    @cached_property
+    def summary(self) -> SurveySummary:
+        """Figures of the whole survey."""
+        return survey_summary(self.session.survey, self.session.store)
+
+    @cached_property
+    def records(self) -> dict[str, LogRecord]:
+        """All sound records of logs by key."""
+        return {record.key: record for record in read_log_records(self.session.store, damaged=[])}
+
+    @cached_property
+    def logs(self) -> list[LogRecord]:
+        """Records of the survey file's logs and of the trajectories computed from them."""
+        listed = set(known_keys(self.session.survey, self.session.store, self.session.logs))
+        return [record for key, record in self.records.items() if key in listed]
 
 
 class Section(ABC):
@@ -26,7 +54,7 @@ class Section(ABC):
     condition 500, assets 600, products 900."""
 
     @abstractmethod
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """What the section shows; nothing where the survey has nothing of its kind: it is left out then."""
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from roadscan.jobs.adjust.outcome import FOLDER, PICTURES, known_lines, known_notes
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
-from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
 from roadscan.tables.store import Store
 
@@ -25,8 +25,9 @@ class Adjustment(Section):
     title = "Adjustment: seams and control"
     position = 300
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """Figures in words, what was found wrong, accuracy, seams before and after, control points, targets."""
+        session = material.session
         store, manifest = session.store, session.manifest
         for note in known_notes(manifest):
             yield Paragraph(note, is_warning=True)

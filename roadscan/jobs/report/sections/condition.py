@@ -8,7 +8,7 @@ from typing import Any, Final
 from roadscan.jobs.condition.pictures import PICTURES
 from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Picture, Table
-from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
 from roadscan.tables.schema import table_schema
 
@@ -28,8 +28,9 @@ class Condition(Section):
     title = "Condition of the lanes"
     position = 500
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A row a section; strip charts and cross-sections by lane and kilometre; roughness regions."""
+        session = material.session
         rows = _sections(session)
         if not rows:
             return

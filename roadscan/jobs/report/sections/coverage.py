@@ -14,9 +14,8 @@ import numpy.typing as npt
 from roadscan.jobs.plan.drives import Drives
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
-from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.report.sections.recorded import seconds_of
-from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.ids import TileId
@@ -42,8 +41,9 @@ class Coverage(Section):
     title = "Passes and coverage"
     position = 110
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A map of runs over tiles; a row a pass."""
+        session = material.session
         try:
             plan = session.plan
         except NothingToPlaceError:
@@ -100,15 +100,12 @@ def _corners(tiles: Sequence[OutputRecord], size_m: float) -> Float64:
 
 def _squares(tiles: Sequence[OutputRecord], size_m: float) -> tuple[list[tuple[float, float, str]], float]:
     """West and south edge and colour of squares, and their edge (m): tiles, or squares of them where they are many."""
-    together = 1
-    while True:
-        cells: dict[tuple[int, int], list[dict[str, Any]]] = defaultdict(list)
-        for record in tiles:
-            tile = TileId.parse(record.unit)
-            cells[tile.column // together, tile.row // together].append(record.figures())
-        if len(cells) <= _MOST_SQUARES:
-            break
+    ids, together = [TileId.parse(record.unit) for record in tiles], 1
+    while len({(tile.column // together, tile.row // together) for tile in ids}) > _MOST_SQUARES:
         together *= 2
+    cells: dict[tuple[int, int], list[dict[str, Any]]] = defaultdict(list)
+    for tile, record in zip(ids, tiles, strict=True):
+        cells[tile.column // together, tile.row // together].append(record.figures())
     edge_m = size_m * together
     return [(c * edge_m, r * edge_m, _colour(held)) for (c, r), held in sorted(cells.items())], edge_m
 

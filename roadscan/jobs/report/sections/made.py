@@ -19,9 +19,8 @@ from roadscan.jobs.adjust.outcome import PICTURES as ADJUSTMENT_PICTURES
 from roadscan.jobs.condition.pictures import PICTURES as CONDITION_PICTURES
 from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
-from roadscan.jobs.report.section import Section
+from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
-from roadscan.jobs.summary import survey_summary
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tables.store import Store
 
@@ -43,10 +42,10 @@ class Made(Section):
     title = "Products"
     position = 900
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A row a product, then small pictures of the first rasters and pictures of each survey product."""
-        files = survey_summary(session.survey, session.store).files
-        files.pop("report", None)
+        session = material.session
+        files = {name: one for name, one in material.summary.files.items() if name != "report"}
         if not files:
             return
         root = session.store.root.rstrip("/") + "/"

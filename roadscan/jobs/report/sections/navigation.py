@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.navigation_status import NavigationStatus, navigation_status
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture
-from roadscan.jobs.report.section import Section
-from roadscan.jobs.session import Session
-from roadscan.tables.logs import read_log_records
+from roadscan.jobs.report.section import Material, Section
 
 
 class Navigation(Section):
@@ -19,12 +16,10 @@ class Navigation(Section):
     title = "Trajectories, clocks and mountings"
     position = 200
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A line for each of them, doubts, and the recorded pictures."""
-        store = session.store
-        listed = set(known_keys(session.survey, store, session.logs))
-        records = {r.key: r for r in read_log_records(store, damaged=[])}
-        found = navigation_status(session.survey, store, [r for k, r in records.items() if k in listed], records)
+        store = material.session.store
+        found = navigation_status(material.session.survey, store, material.logs, material.records)
         for doubt in found.doubts:
             yield Paragraph(doubt, is_warning=True)
         for line in found.lines():

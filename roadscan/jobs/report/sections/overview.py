@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from roadscan.jobs.report.blocks import Block, Paragraph, Table
-from roadscan.jobs.report.section import Section
-from roadscan.jobs.session import Session
-from roadscan.jobs.summary import SurveySummary, survey_summary
-from roadscan.tables.manifest import read_failures
+from roadscan.jobs.report.section import Material, Section
+from roadscan.jobs.summary import SurveySummary
 
 
 class Overview(Section):
@@ -18,11 +16,10 @@ class Overview(Section):
     title = "The survey at a glance"
     position = 10
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A table of figures; each failure by name."""
-        found = survey_summary(session.survey, session.store)
-        yield Table(("figure", "value"), tuple(_figures(found)))
-        failures = read_failures(session.store)
+        yield Table(("figure", "value"), tuple(_figures(material.summary)))
+        failures = material.summary.failures
         if not failures:
             yield Paragraph("Nothing failed in the last run.")
             return

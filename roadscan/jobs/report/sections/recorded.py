@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.report.blocks import Block, Table
-from roadscan.jobs.report.section import Section
-from roadscan.jobs.session import Session
-from roadscan.jobs.summary import survey_summary
+from roadscan.jobs.report.section import Material, Section
 from roadscan.model.gpstime import utc_from_gps_ns
-from roadscan.tables.logs import LogRecord, read_log_records
+from roadscan.tables.logs import LogRecord
 
 
 class Recorded(Section):
@@ -21,23 +18,21 @@ class Recorded(Section):
     title = "What was recorded"
     position = 100
 
-    def blocks(self, session: Session) -> Iterator[Block]:
+    def blocks(self, material: Material) -> Iterator[Block]:
         """A row a log; rejects by reason; fates."""
-        listed = set(known_keys(session.survey, session.store, session.logs))
-        records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
-        if not records:
+        if not material.logs:
             return
         yield Table(
             ("log", "run", "sensor", "format", "first epoch", "last epoch", "rows", "rejected"),
-            [_row(r) for r in records],
+            [_row(r) for r in material.logs],
         )
         reasons: Counter[str] = Counter()
-        for record in records:
+        for record in material.logs:
             reasons.update(record.reject_reasons)
         if reasons:
             rows = [(reason, f"{count:,}") for reason, count in reasons.most_common()]
             yield Table(("reason", "records"), rows, "Records that could not be used", "rejects")
-        fates = survey_summary(session.survey, session.store).readings
+        fates = material.summary.readings
         if fates:
             total = sum(fates.values())
             shares = [(name.replace("_", " "), f"{count:,}", f"{count / total:.2%}") for name, count in fates.items()]

@@ -1,0 +1,96 @@
+"""The contract of a kind of assets, and the registry that finds kinds by themselves.
+
+A kind is one file of `roadscan/assets/kinds/` (or an entry point of the group ``roadscan.asset_kinds``) with a subclass
+of :class:`AssetKind`, and one file `schemas/assets/<name>.toml` with its columns. Evidence is found tile by tile;
+pieces of all tiles are joined to objects, so that nothing is fitted in one tile and cut at its border.
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final
+
+import pyarrow as pa
+import shapely
+
+from roadscan.assets.scene import Scene
+from roadscan.model.strict import Strict
+from roadscan.plugins import found_kinds
+
+ENTRY_POINT_GROUP: Final = "roadscan.asset_kinds"
+
+
+class NoOptions(Strict):
+    """A kind without settings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marked:
+    """Returns that belong to pieces of a kind, for the classes of the LAS product."""
+
+    rows: Any
+    """Rows of the scene's returns."""
+    code: int
+    """Class of :mod:`roadscan.assets.classes`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a tile tells of a kind."""
+
+    pieces: pa.Table
+    """A row a piece, columns as the kind's `piece_schema`; coordinates are those of the map (easting, northing)."""
+    marked: tuple[Marked, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class AssetObject:
+    """An asset as it was found. Coordinates are easting, northing and height of the map frame (m)."""
+
+    geometry: shapely.Geometry
+    """Point, line or polygon with heights."""
+    sigma_horizontal_m: float
+    sigma_height_m: float
+    probability: float
+    """That it is an asset of this kind: of objects with 0.9, nine of ten are."""
+    returns: int
+    passes: int
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    """Values of the kind's own columns; a missing one is unknown."""
+
+
+class AssetKind(ABC):
+    """A kind of assets: its evidence in a tile, and how pieces of all tiles become objects."""
+
+    name: ClassVar[str]
+    """Of its table and its schema, such as `pole`."""
+    title: ClassVar[str]
+    options: ClassVar[type[Strict]] = NoOptions
+    after: ClassVar[Sequence[str]] = ()
+    """Kinds whose objects this one looks at when it joins."""
+    piece_schema: ClassVar[pa.Schema]
+
+    @abstractmethod
+    def evidence(self, scene: Scene, options: Any) -> Evidence:
+        """Pieces of this kind in the scene's tile, a pure function of the scene."""
+
+    @abstractmethod
+    def objects(
+        self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
+    ) -> Iterable[AssetObject]:
+        """Objects of the pieces of all tiles, in an order that depends on the objects alone.
+
+        `pieces` come in the order of tiles (row, column); `others` holds the objects of the kinds named by `after`.
+        """
+
+
+@functools.cache
+def asset_kinds() -> dict[str, AssetKind]:
+    """All kinds by name."""
+    found = found_kinds("roadscan.assets.kinds", AssetKind, ENTRY_POINT_GROUP)
+    return {name: kind() for name, kind in found.items()}

@@ -1,0 +1,65 @@
+"""Returns of a piece of the map as the finders of assets get them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """Returns (n,) of an asset tile and its halo, in canonical order, so that equal readings give equal bytes.
+
+    Coordinates count from `corner_m`, a corner of the tile in the map: x to the east, y to the north (m). Heights are
+    those of the map frame.
+    """
+
+    corner_m: tuple[float, float]
+    """Easting and northing of the corner that x and y count from (m)."""
+    x_m: Float64
+    y_m: Float64
+    height_m: Float64
+    intensity: Float32
+    """As recorded, or calibrated where the survey has gains (`calibrated`); digital numbers of 16 bits."""
+    epoch_gps_ns: npt.NDArray[np.int64]
+    pass_id: npt.NDArray[np.uint16]
+    """Number of the pass of the survey that saw it: a drive of a lane."""
+    sensor: npt.NDArray[np.uint8]
+    """Number of the sensor, an index of `sensors`."""
+    laser: npt.NDArray[np.uint16]
+    """Laser of the sensor (ring), 0 for scanners with one."""
+    return_number: npt.NDArray[np.uint8]
+    """1 for the first return of a pulse."""
+    number_of_returns: npt.NDArray[np.uint8]
+    sensor_x_m: Float64
+    """Where the sensor stood when it saw the return: x, y from `corner_m` and height, like those of the return."""
+    sensor_y_m: Float64
+    sensor_height_m: Float64
+    sensors: tuple[str, ...] = ()
+    """Names of the sensors."""
+    calibrated: bool = False
+
+    def __len__(self) -> int:
+        return int(self.x_m.size)
+
+    @property
+    def range_m(self) -> Float64:
+        """Distance (n,) from the sensor to the return (m)."""
+        return np.sqrt(
+            (self.x_m - self.sensor_x_m) ** 2
+            + (self.y_m - self.sensor_y_m) ** 2
+            + (self.height_m - self.sensor_height_m) ** 2
+        )
+
+    def at(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.integer[Any]]) -> Self:
+        """The returns at `rows`, a mask (n,) or indices."""
+        arrays: dict[str, Any] = {
+            f.name: v[rows] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **arrays)

@@ -1,0 +1,74 @@
+"""What the finders of assets look at: returns with their height above the ground and their class."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.returns import Returns
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+
+class Box(NamedTuple):
+    """A rectangle from the corner that returns count from (m); the least edges belong to it, the greatest do not."""
+
+    x_min_m: float
+    y_min_m: float
+    x_max_m: float
+    y_max_m: float
+
+    def holds(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which points (any shape) lie in the rectangle."""
+        x, y = np.asarray(x_m), np.asarray(y_m)
+        return (x >= self.x_min_m) & (x < self.x_max_m) & (y >= self.y_min_m) & (y < self.y_max_m)
+
+
+@dataclass(frozen=True, eq=False)
+class GroundModel:
+    """Bare earth as a raster: row 0 is the southern one, column 0 the western one."""
+
+    x_min_m: float
+    y_min_m: float
+    cell_m: float
+    height_m: Float32
+    """(rows, columns) height at the middle of each cell; NaN where nothing is known near."""
+    seen: npt.NDArray[np.bool_]
+    """(rows, columns) True where ground was seen; elsewhere the height is interpolated between seen cells."""
+
+    def height_at(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Float64:
+        """Height (as the points) of bare earth, bilinear between cells; NaN where it is not known."""
+        x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
+        rows, columns = self.height_m.shape
+        u = np.clip((x - self.x_min_m) / self.cell_m - 0.5, 0.0, columns - 1.0)
+        v = np.clip((y - self.y_min_m) / self.cell_m - 0.5, 0.0, rows - 1.0)
+        c0, r0 = np.minimum(u.astype(np.int64), columns - 2), np.minimum(v.astype(np.int64), rows - 2)
+        c0, r0 = np.maximum(c0, 0), np.maximum(r0, 0)
+        c1, r1 = np.minimum(c0 + 1, columns - 1), np.minimum(r0 + 1, rows - 1)
+        fu, fv = u - c0, v - r0
+        z = self.height_m.astype(np.float64)
+        south = z[r0, c0] * (1 - fu) + z[r0, c1] * fu
+        north = z[r1, c0] * (1 - fu) + z[r1, c1] * fu
+        return np.asarray(south * (1 - fv) + north * fv)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An asset tile with its halo. Evidence found in it is a pure function of it."""
+
+    returns: Returns
+    tile: Box
+    """The tile itself: a piece belongs to the tile that holds its reference point, lines and areas are cut at it."""
+    window: Box
+    """The tile with its halo."""
+    ground: GroundModel
+    above_ground_m: Float32
+    """(n,) height of each return above bare earth; NaN where that is not known."""
+    classes: npt.NDArray[np.uint8]
+    """(n,) class of each return (:mod:`roadscan.assets.classes`): ground, vegetation, building, vehicle, person …"""
+    drive_xyh_m: Float64
+    """(p, 4) the drives through the window: x, y, height of the sensor, and the pass, in the order of time."""

@@ -38,6 +38,10 @@ class Settings:
     """Length of the road whose passes are adjusted."""
     adjustment_seeds: int = 10
     """Draws of the reference site's observations."""
+    reference_m: float = 3300.0
+    """Length of the reference site whose logs are simulated."""
+    reference_runs: int = 12
+    """Runs over it."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -23,10 +23,11 @@ class GaussMarkov:
     x(t + dt) = e^(−dt/τ) · x(t) + σ · sqrt(1 − e^(−2dt/τ)) · w  (Gelb 1974, 3.8).
     """
 
-    def __init__(self, rng: np.random.Generator, sigma: Float64, time_constant_s: float, step_s: float) -> None:
+    def __init__(self, rng: np.random.Generator, sigma: Float64, time_constant_s: npt.ArrayLike, step_s: float) -> None:
+        """`sigma` (k,); `time_constant_s`: one, or (k,) of each component."""
         self._rng = rng
         self._sigma = sigma
-        self._keep = float(np.exp(-step_s / time_constant_s))
+        self._keep = np.broadcast_to(np.exp(-step_s / np.asarray(time_constant_s, np.float64)), sigma.shape)
         self._last = sigma * rng.standard_normal(sigma.size)
 
     def take(self, count: int) -> Float64:
@@ -34,7 +35,8 @@ class GaussMarkov:
         if count == 0:
             return np.zeros((0, self._sigma.size))
         steps = self._sigma * np.sqrt(1.0 - self._keep**2) * self._rng.standard_normal((count, self._sigma.size))
-        out, _ = lfilter([1.0], [1.0, -self._keep], steps, axis=0, zi=self._keep * self._last[None])
-        self._last = out[-1]
-        values: Float64 = out
+        values: Float64 = np.empty_like(steps)
+        for k, keep in enumerate(self._keep.tolist()):
+            values[:, k], _ = lfilter([1.0], [1.0, -keep], steps[:, k], zi=[keep * self._last[k]])
+        self._last = values[-1].copy()
         return values

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.model.gpstime import NS_PER_S, WEEK_S
 from roadscan.simulate.drive import Drive, Poses
 from roadscan.simulate.noise import GaussMarkov, stream
-from roadscan.simulate.scene import Noise, Scene
+from roadscan.simulate.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -80,33 +80,28 @@ def write_accuracy(scene: Scene, drive: Drive, file: Path) -> Iterator[int]:
     """
     first, last = drive.recorded_span_gps_ns
     epochs = np.arange(first // NS_PER_S * NS_PER_S, last + NS_PER_S, NS_PER_S)
-    noise = scene.noise
-    position = max(noise.position_m, _LEAST_SIGMA_M)
-    tilt = max(noise.attitude_deg, _LEAST_SIGMA_DEG) * 60.0
-    velocity = _velocity_sigma(noise)
+    sigma = np.array(scene.noise.pose_sigma())
+    position = np.maximum(sigma[:3], _LEAST_SIGMA_M)
+    velocity = position * np.sqrt(2.0 * (1.0 - np.exp(-1.0 / np.array(scene.noise.pose_time_constants_s()[:3]))))
+    tilt = max(float(sigma[3]), _LEAST_SIGMA_DEG) * 60.0
+    heading = max(float(sigma[5]), 2.0 * _LEAST_SIGMA_DEG) * 60.0
     rows = np.empty((epochs.size, 10))
     rows[:, 0] = epochs % (WEEK_S * NS_PER_S) / NS_PER_S
-    rows[:, 1:] = [position, position, position, velocity, velocity, velocity, tilt, tilt, 2 * tilt]
+    rows[:, 1:] = [*position, *velocity, tilt, tilt, heading]
     file.write_bytes(rows.astype("<f8").tobytes())
     yield epochs.size
-
-
-def _velocity_sigma(noise: Noise) -> float:
-    """Change of the position's error in a second (m/s): what a Gauss–Markov process gives."""
-    sigma = max(noise.position_m, _LEAST_SIGMA_M)
-    return sigma * math.sqrt(2.0 * (1.0 - math.exp(-1.0 / noise.time_constant_s)))
 
 
 class _Errors:
     """Gauss–Markov errors of position (north, east, down) and attitude (roll, pitch, heading)."""
 
     def __init__(self, scene: Scene, number: int) -> None:
-        noise = scene.noise
-        tilt = math.radians(noise.attitude_deg)
+        sigma = np.array(scene.noise.pose_sigma())
+        sigma[3:] = np.radians(sigma[3:])
         self._process = GaussMarkov(
             stream(scene.seed, number, "trajectory"),
-            np.array([noise.position_m] * 3 + [tilt, tilt, 2 * tilt]),
-            noise.time_constant_s,
+            sigma,
+            np.array(scene.noise.pose_time_constants_s()),
             1.0 / scene.trajectory.poses_per_s,
         )
 

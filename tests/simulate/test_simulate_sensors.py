@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pynmea2
 import pytest
 from pyins import strapdown
+from pyproj import Transformer
 
 from roadscan.jobs.ingest.ingest import ingest
 from roadscan.model.errors import ConfigError
@@ -203,6 +204,35 @@ def test_accuracy_file_states_the_errors(tmp_path: Path):
     assert np.allclose(rows[:, 7], scene.noise.attitude_deg * 60.0)
     assert np.allclose(rows[:, 9], 2 * scene.noise.attitude_deg * 60.0)
     assert np.all(np.diff(rows[:, 0]) == 1.0)
+
+
+def test_components_of_the_poses_have_errors_and_time_constants_of_their_own(tmp_path: Path):
+    noise = {"position_m": 0.01, "down_m": 0.03, "attitude_deg": 0.01, "heading_deg": 0.05, "time_constant_s": 0.2,
+             "attitude_time_constant_s": 1.0}  # fmt: skip
+    passes = [{"lane": 2, "stops": [{"at_m": 10.0, "duration_s": 200.0}]}]
+    scene = Scene.load("demo").changed(length_m=20.0, noise=noise, passes=passes, **BARE)
+    folder = simulate(scene, tmp_path / "s").folder
+    accuracy = np.fromfile(folder / "raw" / "run-1" / "trajectory.smrmsg", "<f8").reshape(-1, 10)
+    assert np.allclose(accuracy[:, [1, 2, 3, 7, 8, 9]], [0.01, 0.01, 0.03, 0.6, 0.6, 3.0])
+    stated = np.fromfile(folder / "raw" / "run-1" / "trajectory.sbet", "<f8").reshape(-1, 17)
+    true = pq.read_table(truth.load(folder).trajectory_file("run-1")).to_pandas()
+    place = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    longitude, latitude, height = place.transform(true.x_world_m, true.y_world_m, true.z_world_m)
+    north = (stated[:, 1] - np.radians(latitude)) * 6_367_000.0
+    still = np.hypot(np.gradient(longitude), np.gradient(latitude)) < 1e-12
+    spread, tau = spread_and_time(north[still], 0.005)
+    assert (spread, tau) == pytest.approx((0.01, 0.2), rel=0.15)
+    spread, tau = spread_and_time((stated[:, 3] - height)[still], 0.005)
+    assert (spread, tau) == pytest.approx((0.03, 0.2), rel=0.15)
+    spread, tau = spread_and_time(np.degrees(stated[still, 9]), 0.005)
+    assert (spread, tau) == pytest.approx((0.05, 1.0), rel=0.3)
+
+
+def spread_and_time(error: np.ndarray, step_s: float) -> tuple[float, float]:
+    """Standard deviation, and time constant by the correlation of neighbours, of a first-order process."""
+    centred = error - error.mean()
+    keep = float((centred[1:] * centred[:-1]).mean() / (centred**2).mean())
+    return float(centred.std()), -step_s / math.log(keep)
 
 
 STARTS = {

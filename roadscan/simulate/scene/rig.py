@@ -269,12 +269,29 @@ class Noise(Strict):
     """Share of profiler readings that are wrong: anywhere within 30 mm of the road."""
     position_m: float = Field(default=0.0, ge=0.0)
     """Position error of the stated trajectory, a Gauss–Markov process on each of north, east, down (m)."""
+    down_m: float | None = Field(default=None, ge=0.0)
+    """The same of down, where it differs from that of north and east (m)."""
     attitude_deg: float = Field(default=0.0, ge=0.0)
-    """Error of the stated roll and pitch, likewise; that of heading is twice this (degrees)."""
+    """Error of the stated roll and pitch, likewise (degrees)."""
+    heading_deg: float | None = Field(default=None, ge=0.0)
+    """Error of the stated heading, likewise; twice that of roll and pitch where left out (degrees)."""
     time_constant_s: float = Field(default=30.0, gt=0.0)
     """Time constant of the trajectory's errors (s)."""
+    attitude_time_constant_s: float | None = Field(default=None, gt=0.0)
+    """The same of roll, pitch and heading, where it differs from that of the position (s)."""
     control_m: float = Field(default=0.0, ge=0.0)
     """Error of the control points, on each coordinate (m)."""
+
+    def pose_sigma(self) -> tuple[float, float, float, float, float, float]:
+        """1 σ of the stated north, east, down (m), roll, pitch, heading (degrees)."""
+        down = self.position_m if self.down_m is None else self.down_m
+        heading = 2.0 * self.attitude_deg if self.heading_deg is None else self.heading_deg
+        return self.position_m, self.position_m, down, self.attitude_deg, self.attitude_deg, heading
+
+    def pose_time_constants_s(self) -> tuple[float, float, float, float, float, float]:
+        """Time constants of the same (s)."""
+        turned = self.attitude_time_constant_s or self.time_constant_s
+        return *(self.time_constant_s,) * 3, *(turned,) * 3
 
 
 class Trajectory(Strict):

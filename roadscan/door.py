@@ -18,6 +18,7 @@ from roadscan.model.errors import ConfigError, RoadscanError, nearest
 
 if TYPE_CHECKING:
     import duckdb
+    import geopandas as gpd
     import pandas as pd
     import pyarrow as pa
     import xarray as xr
@@ -128,6 +129,21 @@ class OpenSurvey:
         from roadscan.jobs.report.page import report_page
 
         return report_page(self.session)
+
+    def changes_since(self, earlier: OpenSurvey) -> gpd.GeoDataFrame:
+        """Change of the road's condition since an earlier survey, a row a quantity of a section, with its line.
+
+        Raises
+        ------
+        RoadscanError
+            where the maps differ, or a survey has no sections of condition.
+        """
+        import geopandas
+
+        from roadscan.jobs.condition.compare import compare_surveys
+
+        found = compare_surveys(earlier.session, self.session)
+        return geopandas.GeoDataFrame(found.table.to_pandas(), geometry=found.lines, crs=self.crs)
 
     def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
         """A DuckDB connection in which each table of the survey is a view; the caller closes it.

@@ -1,4 +1,4 @@
-"""The command that writes the report."""
+"""Commands that write about surveys: the report of one, the changes between two."""
 
 from __future__ import annotations
 
@@ -25,3 +25,23 @@ def report(
     if out is not None:
         out.write_bytes(session.store.read_bytes(path))
     typer.echo(f"report: {out or session.store.path(path)}")
+
+
+def compare(
+    earlier: Annotated[Path, typer.Argument(metavar="EARLIER", help="Survey file of the earlier survey.")],
+    later: Annotated[Path, typer.Argument(metavar="LATER", help="Survey file of the later survey.")],
+    out: Annotated[Path | None, typer.Option(help="Write all changes: .csv, or .parquet with lines.")] = None,
+) -> None:
+    """Change of the road's condition between two surveys, section by section, and whether it is more than chance."""
+    from roadscan.cli.terminal import print_table
+    from roadscan.jobs.condition.compare import compare_surveys
+    from roadscan.jobs.session import Session
+
+    changes = compare_surveys(Session.open(earlier), Session.open(later))
+    if out is not None:
+        changes.write(out)
+    print_table(("quantity", "sections", "larger", "smaller", "no change shown", "not judged"), changes.summary())
+    if changes.alone:
+        typer.echo(f"note: {changes.alone} sections of the later survey have none in the earlier one")
+    if out is not None:
+        typer.echo(f"changes: {out}")

@@ -91,9 +91,12 @@ def small_scene(**changes: object) -> Scene:
 
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
-    """Two passes of a short road, raw logs only."""
+    """Two passes of a short road, raw logs only; the poses hold as they were recorded."""
     folder = tmp_path_factory.mktemp("simulated") / "survey"
-    return Simulated(simulate(small_scene(), folder).survey_file)
+    survey_file = simulate(small_scene(), folder).survey_file
+    with survey_file.open("a") as stream:
+        stream.write("\n[adjust]\non = false\n")
+    return Simulated(survey_file)
 
 
 @pytest.fixture(scope="session")

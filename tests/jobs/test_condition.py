@@ -24,6 +24,7 @@ from roadscan.condition.lane_data import LaneData
 from roadscan.condition.survey_lane import survey_lane
 from roadscan.jobs.condition import stretches
 from roadscan.jobs.condition.against_truth import compared_values, true_lane
+from roadscan.jobs.condition.compare import compare_surveys
 from roadscan.jobs.condition.values import GroupTask, load_lane
 from roadscan.jobs.condition.work import MADE, plan_condition
 from roadscan.jobs.products import product_context
@@ -31,6 +32,7 @@ from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.model.errors import ConfigError
 from roadscan.products.distress.cracks import COLUMNS as CRACKS
 from roadscan.products.geo_table import write_geo_table
 from roadscan.tables.manifest import OutputRecord
@@ -314,3 +316,38 @@ def test_without_its_section_there_is_no_condition(surveyed: RoughSurvey, tmp_pa
     stage_named("condition").run(bare)
     assert not any(bare.manifest.of(name) for name in MADE)
     assert not session.store.files("tables/profiles_longitudinal")
+
+
+def test_a_second_survey_tells_what_changed_and_what_did_not(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    """Ruts 6 mm deeper, the same unevenness, driven slower: against the truth of both scenes."""
+    slab = {"station_m": 60.0, "offset_m": 1.75, "length_m": 12.0, "width_m": 3.5, "height_m": -1e-3 * STEP_MM}
+    plain = rough_scene(2.0, 160.0)
+    deeper = [rut.model_dump() | {"depth_m": rut.depth_m + 0.006} for rut in plain.road.ruts]
+    scene = plain.changed(
+        passes=[{"lane": 2, "speed_m_per_s": 16.7}], road={"patches": [slab], "ruts": deeper},
+        profilers={"spacing_m": 0.05, "readings": 200},
+    )  # fmt: skip
+    later = RoughSurvey.made(scene, tmp_path / "later")
+    session = later.session("store", section_m=50.0)
+    run(session)
+    before = surveyed.session("store", section_m=50.0)
+    changes = compare_surveys(before, session)
+    frame = changes.table.to_pandas()
+    assert changes.alone == 0 and set(frame["share_in_common"].round(2)) == {1.0}
+    ruts = frame[frame["quantity"].isin(["rut_depth_mean_left_mm", "rut_depth_mean_right_mm"])].dropna(subset="change")
+    assert len(ruts) >= 6 and set(ruts["verdict"]) == {"larger"}
+    truths = [
+        driven(list(compared_values(s, made.height_at)), ("2",)) for s, made in ((before, surveyed), (session, later))
+    ]
+    for side in ("left", "right"):
+        was, now = (held["section", f"rut_depth_mean_{side}_mm"][:, 1] for held in truths)
+        own = ruts[ruts["quantity"] == f"rut_depth_mean_{side}_mm"]["change"].to_numpy()
+        assert np.abs(own - (now - was)[: own.size]).max() < 0.5
+    smooth = frame[(frame["quantity"] == "mri_m_per_km") & frame["change"].notna()]
+    assert len(smooth) and set(smooth["verdict"]) <= {"no change shown"}
+    changes.write(tmp_path / "changes.parquet")
+    assert len(geopandas.read_parquet(tmp_path / "changes.parquet")) == len(frame)
+    changes.write(tmp_path / "changes.csv")
+    assert len(pd.read_csv(tmp_path / "changes.csv")) == len(frame)
+    with pytest.raises(ConfigError, match=r"\.csv or \.parquet"):
+        changes.write(tmp_path / "changes.xlsx")

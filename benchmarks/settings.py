@@ -42,6 +42,8 @@ class Settings:
     """Length of the reference site whose logs are simulated."""
     reference_runs: int = 12
     """Runs over it."""
+    seam_m: float = 120.0
+    """Length of the roads whose seams are judged."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -153,7 +153,11 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
 
 
 def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
-    """Sums over each `every`-th cell that both saw; offset, tilts and contrast between the pictures are eliminated."""
+    """Sums over each `every`-th cell that both saw.
+
+    Contrast and a surface of the second degree between the pictures are eliminated: each picture lacks such a surface of
+    its own, fitted to what that traverse saw, and the two saw different parts of a rut.
+    """
     row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
     if row.size < 64:
         return None
@@ -161,7 +165,8 @@ def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
     own, other = laid.first_slope[row, column][:, ::-1], laid.second_slope[row, column][:, ::-1]
     there = first[row, column] - left
     half = 0.5 * len(first)
-    nuisance = np.stack([np.ones(row.size), row / half - 1.0, column / half - 1.0, there], axis=-1)
+    x, y = row / half - 1.0, column / half - 1.0
+    nuisance = np.stack([np.ones(row.size), x, y, x * x, x * y, y * y, there], axis=-1)
     left, weight, sigma = _weighed(nuisance, left)
     weighted = nuisance * weight[:, None]
     stacked = np.concatenate([own, other], axis=1)
@@ -191,7 +196,7 @@ def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
 
 
 def _weighed(nuisance: Float64, left: Float64) -> tuple[Float64, Float64, float]:
-    """Residuals without offset, tilts and contrast; Huber's weights (n,); 1 σ of the residuals."""
+    """Residuals without contrast and surface; Huber's weights (n,); 1 σ of the residuals."""
     weight = np.ones(left.size)
     for _ in range(2):
         weighted = nuisance * weight[:, None]

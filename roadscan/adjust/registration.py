@@ -155,8 +155,8 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
 def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
     """Sums over each `every`-th cell that both saw.
 
-    Contrast and a surface of the second degree between the pictures are eliminated: each picture lacks such a surface of
-    its own, fitted to what that traverse saw, and the two saw different parts of a rut.
+    Contrast and a surface of the second degree between the pictures are eliminated: each picture lacks such a surface
+    of its own, fitted to what that traverse saw, and the two saw different parts of a rut.
     """
     row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
     if row.size < 64:

@@ -306,3 +306,38 @@ def test_corrections_of_another_program_stay(adjusted: Simulated, tmp_path: Path
     kept = rows(store, "SELECT DISTINCT down_m FROM corrections WHERE run = 'run-1'")
     assert kept == [{"down_m": 0.01}]
     assert rows(store, "SELECT DISTINCT run FROM corrections ORDER BY run") == [{"run": f"run-{k}"} for k in (1, 2, 3)]
+
+
+def test_a_control_point_whose_place_is_wrong_is_named_and_bends_nothing(adjusted: Simulated, tmp_path: Path) -> None:
+    before = rows(adjusted.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
+
+    def shifted(points: dict[str, dict[str, str]]) -> None:
+        points["G003"]["easting_m"] = f"{float(points['G003']['easting_m']) + 0.05:.4f}"
+
+    copy = with_control(adjusted, tmp_path / "survey", shifted)
+    run = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"))
+    told = [line for line in run.reporter.lines if "1 control points contradict" in line]
+    assert [line for line in told if "G003 (" in line and "mm in place" in line]
+    after = rows(copy.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
+    for name in ("easting_after_m", "northing_after_m", "height_after_m"):
+        assert max(abs(a[name] - b[name]) for a, b in zip(after, before, strict=True)) < 0.002
+    weights = rows(copy.store(), "SELECT DISTINCT name FROM control_residuals WHERE weight_horizontal = 0")
+    assert weights == [{"name": "G003"}]
+
+
+def test_targets_picked_by_hand_stand_in_for_those_that_would_be_found(adjusted: Simulated, tmp_path: Path) -> None:
+    """A tester picks the true places as the recorded poses show them: the check points come as near as by finding."""
+    found = rows(adjusted.store(), "FROM control_residuals ORDER BY point, run")
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    with (copy.survey_file.parent / "picked.csv").open("w", newline="") as stream:
+        out = csv.writer(stream)
+        out.writerow(["run", "name", "easting_m", "northing_m"])
+        for row in found:
+            seen = [row[f"{axis}_m"] - row[f"{axis}_before_m"] for axis in ("easting", "northing")]
+            out.writerow([row["run"], row["name"], *(f"{value:.4f}" for value in seen)])
+    targets = CIRCLES["adjust__targets"] | {"shape": "none", "picked": "picked.csv", "picked_sigma_m": 0.002}
+    adjust(copy, adjust__targets=targets)
+    after = rows(copy.store(), "FROM control_residuals ORDER BY point, run")
+    assert {row["status"] for row in after} == {"picked"}
+    for name in ("easting_after_m", "northing_after_m"):
+        assert max(abs(a[name] - b[name]) for a, b in zip(after, found, strict=True)) < 0.004

@@ -5,6 +5,7 @@ The command line prints what stands here.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -278,6 +279,30 @@ class OpenSurvey:
         from roadscan.jobs.extracts import points_of_tile
 
         return points_of_tile(self.session, tile)
+
+    def pictures_of(
+        self, easting_m: float, northing_m: float, height_m: float | None = None, *, reach_m: float = 60.0
+    ) -> pd.DataFrame:
+        """Pictures that see a place of the map (m), that with the finest resolution first.
+
+        Without a height it is that of the surveyed ground there. Whether something stands between is not looked at.
+
+        Returns
+        -------
+        Columns run, camera, file, u_px, v_px (from the centre of the upper left pixel), distance_m, resolution_m.
+
+        Raises
+        ------
+        RoadscanError
+            where nothing tells the height, or the survey has no pictures with poses.
+        """
+        import pandas
+
+        from roadscan.jobs.where import PictureOfPlace, pictures_of_place
+
+        found = pictures_of_place(self.session, easting_m, northing_m, height_m, reach_m)
+        names = [f.name for f in dataclasses.fields(PictureOfPlace)]
+        return pandas.DataFrame([{n: getattr(one, n) for n in names} for one in found], columns=names)
 
     @property
     def products(self) -> dict[str, MadeProduct]:

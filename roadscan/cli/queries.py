@@ -1,4 +1,4 @@
-"""The command that asks the tables."""
+"""Commands that ask: the tables, and the pictures of a place."""
 
 from __future__ import annotations
 
@@ -50,6 +50,31 @@ def sql(
     else:
         _show(result, wide)
     raise typer.Exit(1 if damaged else 0)
+
+
+def where(
+    easting_m: Annotated[float, typer.Argument(metavar="EASTING", help="Easting on the map (m).")],
+    northing_m: Annotated[float, typer.Argument(metavar="NORTHING", help="Northing on the map (m).")],
+    survey_file: SurveyOption,
+    height_m: Annotated[
+        float | None, typer.Argument(metavar="[HEIGHT]", help="Height on the map (m); that of the ground by default.")
+    ] = None,
+    reach: Annotated[float, typer.Option(help="Farthest distance from a camera (m).")] = 60.0,
+) -> None:
+    """Pictures that see a place, the finest first, with the pixel that shows it. What stands between is not looked at.
+
+    Write -- before coordinates that are negative.
+    """
+    from roadscan.jobs.session import Session
+    from roadscan.jobs.where import pictures_of_place
+
+    found = pictures_of_place(Session.open(survey_file), easting_m, northing_m, height_m, reach)
+    rows = [
+        (one.run, one.camera, f"{one.u_px:.1f}", f"{one.v_px:.1f}", f"{one.distance_m:.2f}",
+         f"{1e3 * one.resolution_m:.1f}", str(one.file))
+        for one in found
+    ]  # fmt: skip
+    print_table(("run", "camera", "u px", "v px", "distance m", "mm per px", "file"), rows)
 
 
 def _show(result: pa.Table, wide: bool) -> None:

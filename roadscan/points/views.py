@@ -19,7 +19,7 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
 
-__all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Views", "best_views", "sampled"]
+__all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Views", "best_views", "sampled", "seen_in"]
 
 NO_VIEW: Final = -1
 
@@ -137,6 +137,42 @@ def best_views(
             views.up_world[number], lens.parameters, limits, lens.hidden, number, best, chosen, pixel,
         )  # fmt: skip
     return Shown(chosen, pixel)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A picture that may show a place."""
+
+    view: int
+    """Number of the picture."""
+    pixel: tuple[float, float]
+    """u, v from the centre of the upper left pixel."""
+    distance_m: float
+    resolution_m: float
+    """What a pixel spans there, across the ray (m)."""
+
+
+def seen_in(point_world_m: Sequence[Float64], views: Views, rule: PictureRule) -> list[Seen]:
+    """The pictures that may show one place, that with the finest resolution first.
+
+    Whether something stands between is not looked at.
+
+    Parameters
+    ----------
+    point_world_m : (3,) the place in each of the world frames that the views count.
+    """
+    found: list[Seen] = []
+    for number in range(len(views)):
+        place = point_world_m[views.world[number]].reshape(1, 3)
+        alone = views.picked(np.array([number]))
+        shown = best_views([place] * len(point_world_m), alone, rule)
+        if shown.view[0] == NO_VIEW:
+            continue
+        distance = float(np.linalg.norm(place[0] - views.eye_world_m[number]))
+        focal_px = float(np.sqrt(np.prod(views.lenses[views.lens[number]].parameters[:2])))
+        u, v = shown.pixel[0].tolist()
+        found.append(Seen(number, (u, v), distance, distance / focal_px))
+    return sorted(found, key=lambda one: (one.resolution_m, one.view))
 
 
 def sampled(picture: UInt8, pixel: Float64) -> UInt8:

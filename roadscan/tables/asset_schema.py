@@ -22,6 +22,8 @@ _TYPES: Final = {
     "string": pa.string(),
 }
 _COMMON: Final = "common"
+ASSET_FOLDER: Final = "products/assets"
+"""Folder of the tables, relative to the survey's root: a file a table."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,12 @@ class AssetSchema:
 def asset_kind_names() -> list[str]:
     """Names of all kinds of assets."""
     return sorted(p.stem for p in (schema_folder() / "assets").glob("*.toml") if p.stem != _COMMON)
+
+
+@functools.cache
+def asset_tables() -> dict[str, str]:
+    """Kind of assets by the name of its table, in the order of these."""
+    return dict(sorted((asset_schema(kind).table, kind) for kind in asset_kind_names()))
 
 
 @functools.cache

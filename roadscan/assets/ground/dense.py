@@ -72,7 +72,7 @@ def dense_ground(place: Place) -> Found:
 
 
 def judged(sums: npt.NDArray[np.float64]) -> Cells:
-    """Which cells are rough or even, from their sums (rows, columns, 5) (:mod:`roadscan.kernels.assets.ground_cells`)."""
+    """Which cells are rough or even, from their sums (rows, columns, 5) as `scatter` makes them."""
     count, total, squares, close, close_total = np.moveaxis(sums, -1, 0)
     several = count >= _LEAST
     mean = np.divide(total, count, out=np.zeros(count.shape), where=several)

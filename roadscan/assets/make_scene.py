@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.ground.bare_earth import bare_earth
+from roadscan.assets.ground.surface import Place
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
 from roadscan.model.asset_ground import GroundSettings
@@ -28,8 +29,9 @@ def make_scene(
     drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass, in the order of time.
     settings : of bare earth; its defaults where left out.
     """
-    ground = bare_earth(returns, window, settings if settings is not None else GroundSettings())
+    drive = np.asarray(drive_xyh_m, np.float64).reshape(-1, 4)
+    ground = bare_earth(Place(returns, window, drive, settings if settings is not None else GroundSettings()))
     found = np.full(len(returns), classes.UNCLASSIFIED, np.uint8)
     found[ground.on_ground] = classes.GROUND
     found[ground.below] = classes.LOW_NOISE
-    return Scene(returns, tile, window, ground.model, ground.above_m, found, np.asarray(drive_xyh_m, np.float64))
+    return Scene(returns, tile, window, ground.model, ground.above_m, found, drive)

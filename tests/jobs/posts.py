@@ -46,7 +46,8 @@ class Posts(AssetKind):
         column = ((r.x_m[rows] - box.x_min_m) / CELL_M).astype(int)
         line = ((r.y_m[rows] - box.y_min_m) / CELL_M).astype(int)
         shape = (line.max(initial=0) + 1, column.max(initial=0) + 1)
-        number, count = ndimage.label(np.bincount(line * shape[1] + column, minlength=shape[0] * shape[1]).reshape(shape) > 0, np.ones((3, 3)))
+        held = np.bincount(line * shape[1] + column, minlength=shape[0] * shape[1]).reshape(shape)
+        number, count = ndimage.label(held > 0, np.ones((3, 3)))
         own = number[line, column] if rows.size else np.zeros(0, int)
         found, marked = [], []
         for one in range(1, count + 1):

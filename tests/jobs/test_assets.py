@@ -177,8 +177,14 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     above = np.asarray(points.z[ground]) - bridged[rows, columns]
     assert np.nanpercentile(np.abs(above), 90) <= 0.03
     assert not np.isnan(bridged[rows, columns]).any()
-    assert np.isnan(seen).any() and not (np.isnan(bridged) & ~np.isnan(seen)).any()
     assert (seen == bridged)[~np.isnan(seen)].all()
+    holes = 0
+    for path in own.store.files("products/bare_earth"):
+        with rasterio.open(own.store.path(path)) as raster:
+            seen, bridged = raster.read()
+        assert not (np.isnan(bridged) & ~np.isnan(seen)).any()
+        holes += np.count_nonzero(np.isnan(seen) & ~np.isnan(bridged))
+    assert holes > 0
 
 
 class Backwards(Inline):

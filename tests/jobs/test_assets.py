@@ -25,6 +25,10 @@ from roadscan.jobs.assets.evidence import EVIDENCE
 from roadscan.jobs.assets.objects import OBJECTS
 from roadscan.jobs.assets.work import MADE, due_joins, plan_evidence
 from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.report.blocks import Drawing, Table
+from roadscan.jobs.report.page import report_page
+from roadscan.jobs.report.section import Material
+from roadscan.jobs.report.sections.assets import Assets as AssetsSection
 from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
@@ -314,3 +318,14 @@ def test_python_gets_a_geodataframe(street: Simulated) -> None:
     assert found.has_z.all() and len(found) == 3
     detail = json.loads(session(street).manifest.of("assets")["poles.parquet"].detail)
     assert detail == {"objects": 3}
+
+
+def test_the_report_shows_the_posts(street: Simulated) -> None:
+    own = session(street)
+    blocks = list(AssetsSection().blocks(Material(own)))
+    counts, drawing, table = blocks
+    assert isinstance(counts, Table) and counts.rows[0][:2] == ("Pole", "3")
+    assert isinstance(drawing, Drawing) and len(drawing.lines) == 6
+    assert isinstance(table, Table) and len(table.rows) == 3
+    assert table.full_table == "poles"
+    assert "Pole" in report_page(own)

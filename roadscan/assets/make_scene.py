@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.cubes import cubes_of
 from roadscan.assets.ground.bare_earth import bare_earth
 from roadscan.assets.ground.surface import Place
+from roadscan.assets.moving import road_users
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
 from roadscan.model.asset_ground import GroundSettings
+
+_ABOVE_M: Final = 0.1
+"""Returns are looked at that do not lie on the ground and stand higher above it."""
 
 
 def make_scene(
@@ -34,4 +41,9 @@ def make_scene(
     found = np.full(len(returns), classes.UNCLASSIFIED, np.uint8)
     found[ground.on_ground] = classes.GROUND
     found[ground.below] = classes.LOW_NOISE
+    above = ~ground.on_ground & (ground.above_m > _ABOVE_M)
+    cubes = cubes_of(returns, ground.above_m, above, window)
+    users = road_users(returns, ground.above_m, ground.on_ground, cubes, window)
+    found[users.vehicle] = classes.VEHICLE
+    found[users.person] = classes.PERSON
     return Scene(returns, tile, window, ground.model, ground.above_m, found, drive)

@@ -1,1 +1,1 @@
-"""Loops of the finders of assets."""
+"""Loops over returns of lidars: ground, vehicles, classes."""

@@ -79,7 +79,9 @@ def not_made(name: str, survey: Survey) -> RoadscanError | None:
 def _way_to(table: str, survey: Survey) -> str | None:
     """What makes a table; None where no such table is known."""
     if table in asset_tables():
-        return f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"
+        return (
+            f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"
+        )
     if table not in schema_names() and table not in _MADE_BY:
         return None
     made = next((p for p in products().values() if isinstance(p, SurveyProduct) and p.table == table), None)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from roadscan.model.asset_ground import GroundSettings
 from roadscan.model.strict import Strict
@@ -37,6 +37,9 @@ class AssetsConfig(Strict):
     max_block_returns: int = Field(default=6_000_000, ge=1)
     """Squares that are expected to hold more returns together are not searched by one task; a worker needs about
     400 MB and 120 bytes a return. Changes no result."""
+    intensity: Literal["calibrated", "raw"] = "calibrated"
+    """Intensities that kinds look at: calibrated by gains for each laser, range and angle of incidence, which some
+    squares tell (table `intensity_gains`), or as recorded. Classified points always hold recorded ones."""
     ground: GroundSettings = GroundSettings()
     """Bare earth."""
     options: dict[str, dict[str, Any]] = {}
@@ -49,7 +52,13 @@ class AssetsConfig(Strict):
     bare_earth: bool = True
     """Write the bare earth of each square as a GeoTIFF."""
     cross_sections: GroundSectionsConfig | None = None
-    """Cross-sections of bare earth by station; left out, none."""
+    """Cross-sections of bare earth by station (CSV, DXF); left out, none."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.cross_sections is not None and not self.bare_earth:
+            raise ValueError("cross_sections are made of bare earth: bare_earth = false leaves them without it")
+        return self
 
     def edge_m(self, tile_size_m: float) -> float:
         """Edge of the squares (m): the least multiple of the survey's tiles that is no shorter than `tile_m`."""

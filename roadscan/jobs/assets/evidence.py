@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
@@ -30,7 +31,7 @@ from roadscan.model.strict import Strict
 from roadscan.products.assets.bare_earth import within, write_bare_earth
 from roadscan.products.assets.classified_points import classified_points, write_classified
 from roadscan.products.base import ProductContext
-from roadscan.tables.manifest import Manifest, OutputRecord
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.store import Store
 from roadscan.tiles.blocks import Block
 
@@ -66,6 +67,8 @@ class EvidenceTask:
     kinds: tuple[tuple[str, Strict], ...]
     """All kinds of the survey with their settings: the classes of points come from all of them."""
     ground: GroundSettings
+    gains: OutputRecord | None
+    """Table that intensities are calibrated by; None where they are taken as recorded."""
     context: ProductContext
 
     @property
@@ -79,9 +82,12 @@ class EvidenceTask:
         return self.load.readings.store
 
 
-def due_squares(plan: AssetPlan, manifest: Manifest, forced: Sequence[TileId] = ()) -> list[SquareWork]:
+def due_squares(
+    plan: AssetPlan, manifest: Manifest, gains: OutputRecord | None, forced: Sequence[TileId] = ()
+) -> list[SquareWork]:
     """What is missing or stale of each square, and all of those that are forced."""
-    kind_keys = {one.name: one.evidence_key() for one in plan.kinds}
+    calibrated = "" if gains is None else gains.digest
+    kind_keys = {one.name: key_of(one.evidence_key(), calibrated) for one in plan.kinds}
     code = code_digest("roadscan.jobs.assets.evidence:find_evidence")
     anew = set(forced)
     found: list[SquareWork] = []
@@ -99,21 +105,27 @@ def due_squares(plan: AssetPlan, manifest: Manifest, forced: Sequence[TileId] = 
     return found
 
 
-def evidence_tasks(plan: AssetPlan, due: Sequence[SquareWork], workers: int = 1) -> list[EvidenceTask]:
+def evidence_tasks(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, workers: int = 1
+) -> list[EvidenceTask]:
     """Tasks over the squares of which anything is due."""
-    return [_task(plan, due, squares) for squares in plan.blocks([one.square for one in due], workers)]
+    return [_task(plan, due, gains, squares) for squares in plan.blocks([one.square for one in due], workers)]
 
 
-def singly(plan: AssetPlan, due: Sequence[SquareWork], squares: Sequence[TileId]) -> list[EvidenceTask]:
+def singly(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: Sequence[TileId]
+) -> list[EvidenceTask]:
     """A task for each square."""
-    return [_task(plan, due, (square,)) for square in squares]
+    return [_task(plan, due, gains, (square,)) for square in squares]
 
 
-def _task(plan: AssetPlan, due: Sequence[SquareWork], squares: tuple[TileId, ...]) -> EvidenceTask:
+def _task(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: tuple[TileId, ...]
+) -> EvidenceTask:
     chosen = set(squares)
     return EvidenceTask(
         plan.load(squares), tuple(one for one in due if one.square in chosen),
-        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, plan.context,
+        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, gains, plan.context,
     )  # fmt: skip
 
 
@@ -122,11 +134,14 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     due = {one.square: one for one in task.work}
-    with task.store.scratch() as folder:
+    store, gains = task.store, None
+    if task.gains is not None:
+        gains = store.parse_table(read_recorded(store, task.gains), task.gains.path)
+    with store.scratch() as folder:
         for loaded in load_squares(task.load):
             work = due[loaded.square]
             try:
-                search = _Search(task, work, loaded, folder)
+                search = _Search(task, work, loaded, folder, gains)
                 records += search.records()
                 failures += search.failures
             except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
@@ -137,8 +152,10 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
 class _Search:
     """A square on its way from returns to files."""
 
-    def __init__(self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path) -> None:
-        self._task, self._work, self._loaded, self._folder = task, work, loaded, folder
+    def __init__(
+        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path, gains: pa.Table | None
+    ) -> None:
+        self._task, self._work, self._loaded, self._folder, self._gains = task, work, loaded, folder, gains
         self.failures: list[tuple[str, str]] = []
 
     def records(self) -> Iterator[OutputRecord]:
@@ -150,6 +167,7 @@ class _Search:
         scene = make_scene(
             self._loaded.returns, grid.own_box, grid.window_box, self._loaded.drive_xyh_m, self._task.ground
         )
+        seen = scene if self._gains is None else calibrated_scene(scene, self._gains)
         keys = dict(self._work.kinds)
         marked: list[Marked] = []
         for name, options in self._task.kinds:
@@ -157,7 +175,7 @@ class _Search:
                 continue
             try:
                 kind = asset_kinds()[name]
-                found = kind.evidence(scene, options)
+                found = kind.evidence(seen, options)
                 if name in keys:
                     yield self._write_pieces(kind, found, keys[name])
                 marked += found.marked

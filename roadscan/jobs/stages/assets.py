@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
+from roadscan.jobs.assets.gains import current_gains, find_samples, sample_tasks, write_gains
 from roadscan.jobs.assets.objects import OBJECTS, Cluster, join_objects, plan_joins
 from roadscan.jobs.assets.plan import AssetPlan, check_assets
+from roadscan.jobs.assets.sections import SECTIONS, plan_sections, write_sections
 from roadscan.jobs.assets.tables import TABLES, plan_files, plan_tables, write_file, write_table
 from roadscan.jobs.assets.work import AssetsWork, due_joins, plan_evidence
 from roadscan.jobs.condition.lines import roads_key, survey_roads
@@ -34,18 +36,32 @@ class Assets(Stage):
             return
         if not work.plan.keys:
             session.note("assets: no lidar, no line scanner with a turning mirror and no cloud saw anything")
-        self._search(session, work, work.plan)
-        self._join(session, work.plan)
-        self._write(session, work.plan)
+        if work.gains_due:
+            self._calibrate(session, work, work.plan)
+            work = plan_evidence(session)
+        if work.plan is not None:
+            self._search(session, work, work.plan)
+            self._join(session, work.plan)
+            self._write(session, work.plan)
+
+    def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        """Gains of the intensity: samples of some squares, then the table."""
+        manifest, due = session.manifest, work.samples
+        failures = run_tasks(
+            find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
+            manifest, session.compute, session.bar("squares that tell of intensity"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+        if not work.gains.due(manifest):
+            manifest.add([write_gains(work.gains, manifest, plan, work.gains.key(manifest))])
 
     def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
         manifest = session.manifest
-        due = work.squares
-
-        tasks = evidence_tasks(plan, due, session.compute.workers)
+        due, gains = work.squares, current_gains(work.gains, session.manifest)
+        tasks = evidence_tasks(plan, due, gains, session.compute.workers)
         failures = run_tasks(
-            find_evidence, tasks, len(due), lambda squares: singly(plan, due, squares), manifest, session.compute,
-            session.bar("squares searched for assets"),
+            find_evidence, tasks, len(due), lambda squares: singly(plan, due, gains, squares), manifest,
+            session.compute, session.bar("squares searched for assets"),
         )  # fmt: skip
         session.failed(self.name, failures)
 
@@ -73,6 +89,11 @@ class Assets(Stage):
         for file in plan_files(plan.kinds, manifest, plan.config, context):
             if not manifest.is_current(TABLES, file.unit, file.key):
                 manifest.add([write_file(file, session.store, context)])
+        sections = plan_sections(roads, plan.config.cross_sections, plan.grid, manifest, context)
+        manifest.remove(manifest.beside({SECTIONS}, {unit for one in sections for unit in one.units}))
+        for one in sections:
+            if not all(manifest.is_current(SECTIONS, unit, one.key) for unit in one.units):
+                manifest.add(write_sections(one, plan.grid, session.store, context))
         manifest.settle()
 
     def check(self, survey: Survey) -> list[RoadscanError]:
@@ -110,6 +131,7 @@ class Assets(Stage):
     def folders(self) -> Sequence[str]:
         """Evidence, objects, tables and files, classified points, bare earth."""
         return (
-            "tables/asset_evidence", "tables/asset_objects", ASSET_FOLDER, "products/classified_points",
+            "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
+            ASSET_FOLDER, "products/classified_points", "products/ground_sections",
             "products/bare_earth",
         )  # fmt: skip

@@ -63,11 +63,8 @@ def _layers(material: Material) -> list[tuple[AssetSchema, Layer]]:
     if not held.keys() & tables.keys():
         return []
     context = product_context(session.plan)
-    return [
-        (schema, read_layer(schema, held[name], session.store, context))
-        for name, kind in tables.items()
-        if name in held and (schema := asset_schema(kind))
-    ]
+    found = [(asset_schema(kind), held[name]) for name, kind in tables.items() if name in held]
+    return [(schema, read_layer(schema, record, session.store, context)) for schema, record in found]
 
 
 def _summed(schema: AssetSchema, layer: Layer) -> tuple[str, ...]:

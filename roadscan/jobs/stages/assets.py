@@ -1,0 +1,115 @@
+"""Stage `assets`: returns into evidence, evidence into objects, objects into tables and files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
+from roadscan.jobs.assets.objects import OBJECTS, Cluster, join_objects, plan_joins
+from roadscan.jobs.assets.plan import AssetPlan, check_assets
+from roadscan.jobs.assets.tables import TABLES, plan_files, plan_tables, write_file, write_table
+from roadscan.jobs.assets.work import AssetsWork, due_joins, plan_evidence
+from roadscan.jobs.condition.lines import roads_key, survey_roads
+from roadscan.jobs.condition.tasks import run_units
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.tiles.tiles import run_tasks
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
+from roadscan.tables.asset_schema import ASSET_FOLDER
+
+
+class Assets(Stage):
+    """What stands on, beside and over the road, where the survey file has a section `[assets]`."""
+
+    name = "assets"
+    title = "what stands on, beside and over the road: ground, kerbs, markings, signs, poles, by kind"
+    after = ("condition",)
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or stale."""
+        work = plan_evidence(session)
+        session.manifest.remove(work.gone)
+        if work.plan is None:
+            return
+        if not work.plan.keys:
+            session.note("assets: no lidar, no line scanner with a turning mirror and no cloud saw anything")
+        self._search(session, work, work.plan)
+        self._join(session, work.plan)
+        self._write(session, work.plan)
+
+    def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        manifest = session.manifest
+        due = work.squares
+
+        tasks = evidence_tasks(plan, due, session.compute.workers)
+        failures = run_tasks(
+            find_evidence, tasks, len(due), lambda squares: singly(plan, due, squares), manifest, session.compute,
+            session.bar("squares searched for assets"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+
+    def _join(self, session: Session, plan: AssetPlan) -> None:
+        """Join pieces kind after kind, each after those that it looks at."""
+        manifest = session.manifest
+        clusters: dict[str, list[Cluster]] = {}
+        for wanted in plan.kinds:
+            joins = plan_joins(session.store, plan.grid, wanted, manifest, clusters)
+            manifest.remove(joins.gone)
+            due = joins.due(manifest)
+            if due:
+                bar = session.bar(f"objects: {wanted.name}")
+                failed = run_units(join_objects, due, manifest, session.compute, bar)
+                session.failed(self.name, failed)
+
+    def _write(self, session: Session, plan: AssetPlan) -> None:
+        manifest, context = session.manifest, plan.context
+        roads, key = survey_roads(plan.survey, manifest)
+        if plan.kinds and not roads.lines:
+            session.note("assets: no run has a trajectory of 20 m or more, so assets have no road, station and offset")
+        for table in plan_tables(plan.kinds, manifest, key, context):
+            if not manifest.is_current(TABLES, table.unit, table.key):
+                manifest.add([write_table(table, roads, session.store, context)])
+        for file in plan_files(plan.kinds, manifest, plan.config, context):
+            if not manifest.is_current(TABLES, file.unit, file.key):
+                manifest.add([write_file(file, session.store, context)])
+        manifest.settle()
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Kinds, their settings and sensors are such that there are."""
+        try:
+            check_assets(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """Outputs of squares, objects and files that are there, and those that are due as far as is known by now."""
+        if session.survey.config.assets is None:
+            return StageState()
+        work = plan_evidence(session)
+        plan, manifest = work.plan, session.manifest
+        if plan is None:
+            return StageState()
+        made = manifest.files()
+        stale = work.evidence_due
+        if not stale:
+            stale = len(due_joins(plan, manifest)) or self._files_due(session, plan)
+        current = sum(made.get(name, 0) for name in (EVIDENCE, OBJECTS, TABLES))
+        next_run = {"asset squares": len(work.squares)} if work.squares else {}
+        return StageState(current, stale, next_run=next_run or ({"assets": stale} if stale else {}))
+
+    def _files_due(self, session: Session, plan: AssetPlan) -> int:
+        manifest, context = session.manifest, plan.context
+        key = roads_key(plan.survey)
+        tables = plan_tables(plan.kinds, manifest, key, context)
+        due = sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
+        files = plan_files(plan.kinds, manifest, plan.config, context)
+        return due + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
+
+    def folders(self) -> Sequence[str]:
+        """Evidence, objects, tables and files, classified points, bare earth."""
+        return (
+            "tables/asset_evidence", "tables/asset_objects", ASSET_FOLDER, "products/classified_points",
+            "products/bare_earth",
+        )  # fmt: skip

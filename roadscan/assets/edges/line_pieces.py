@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
@@ -22,17 +23,24 @@ NODE_COLUMNS: Final = (
     "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low_m",
     "seen_high_m", "seen",
 )  # fmt: skip
-LINE_PIECES: Final = pa.schema(
-    [pa.field(name, pa.list_(pa.float64()), nullable=False) for name in NODE_COLUMNS]
-    + [
-        pa.field("returns", pa.int64(), nullable=False),
-        pa.field("passes", pa.list_(pa.int32()), nullable=False),
-        pa.field("first_epoch_gps_ns", pa.int64(), nullable=False),
-        pa.field("last_epoch_gps_ns", pa.int64(), nullable=False),
-        pa.field("cut_first", pa.bool_(), nullable=False),
-        pa.field("cut_last", pa.bool_(), nullable=False),
-    ]
-)
+
+
+def line_schema(columns: Sequence[str]) -> pa.Schema:
+    """Columns of a piece of a line: a value a node of each of `columns`, and what saw it."""
+    return pa.schema(
+        [pa.field(name, pa.list_(pa.float64()), nullable=False) for name in columns]
+        + [
+            pa.field("returns", pa.int64(), nullable=False),
+            pa.field("passes", pa.list_(pa.int32()), nullable=False),
+            pa.field("first_epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field("last_epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field("cut_first", pa.bool_(), nullable=False),
+            pa.field("cut_last", pa.bool_(), nullable=False),
+        ]
+    )
+
+
+LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 """Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
 its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured."""
 JOIN_M: Final = 0.5
@@ -55,19 +63,22 @@ class Seen(NamedTuple):
             return self if other.returns == 0 else other
         return Seen(
             self.returns + other.returns, tuple(sorted({*self.passes, *other.passes})),
-            min(self.first_epoch_gps_ns, other.first_epoch_gps_ns), max(self.last_epoch_gps_ns, other.last_epoch_gps_ns),
+            min(self.first_epoch_gps_ns, other.first_epoch_gps_ns),
+            max(self.last_epoch_gps_ns, other.last_epoch_gps_ns),
         )  # fmt: skip
 
 
 class Line(NamedTuple):
-    """A line of nodes (n, columns as `NODE_COLUMNS`) in the map, and what saw it."""
+    """A line of nodes (n, columns) in the map, and what saw it."""
 
     nodes: Float64
     seen_by: Seen
+    names: tuple[str, ...] = NODE_COLUMNS
+    """Names of the columns."""
 
     def column(self, name: str) -> Float64:
         """A column (n,) of its nodes."""
-        return np.asarray(self.nodes[:, NODE_COLUMNS.index(name)])
+        return np.asarray(self.nodes[:, self.names.index(name)])
 
     @property
     def length_m(self) -> float:
@@ -96,7 +107,7 @@ def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
     """Parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes."""
     parts: list[list[Float64]] = []
     cuts: list[list[bool]] = []
-    for a, b in zip(nodes[:-1], nodes[1:], strict=True):
+    for a, b in itertools.pairwise(nodes):
         inner = _inside(a[:2], b[:2], tile)
         if inner is None:
             continue
@@ -131,16 +142,18 @@ def _between(a: Float64, b: Float64, share: float) -> Float64:
     return np.where(np.isnan(a), b, np.where(np.isnan(b), a, mixed))
 
 
-def pieces_table(parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster) -> pa.Table:
-    """Rows of `LINE_PIECES`: parts of lines in the map, with what saw them."""
+def pieces_table(
+    parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster, schema: pa.Schema = LINE_PIECES
+) -> pa.Table:
+    """Rows of a schema of :func:`line_schema`: parts of lines in the map, with what saw them."""
     corner = scene.returns.corner_m
     seen = seen_by([p.nodes[:, :2] for p in parts], scene, raster)
-    columns: dict[str, list[Any]] = {name: [] for name in LINE_PIECES.names}
+    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
     for part, one in zip(parts, seen, strict=True):
         nodes = part.nodes.copy()
         nodes[:, 0] += corner[0]
         nodes[:, 1] += corner[1]
-        for name, column in zip(NODE_COLUMNS, nodes.T, strict=True):
+        for name, column in zip(node_names(schema), nodes.T, strict=True):
             columns[name].append(column)
         columns["returns"].append(one.returns)
         columns["passes"].append(list(one.passes))
@@ -148,7 +161,12 @@ def pieces_table(parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster) -
         columns["last_epoch_gps_ns"].append(one.last_epoch_gps_ns)
         columns["cut_first"].append(part.cut_first)
         columns["cut_last"].append(part.cut_last)
-    return pa.table(columns, schema=LINE_PIECES)
+    return pa.table(columns, schema=schema)
+
+
+def node_names(schema: pa.Schema) -> tuple[str, ...]:
+    """Names of the columns that hold a value a node."""
+    return tuple(f.name for f in schema if f.type == pa.list_(pa.float64()))
 
 
 def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> list[Seen]:
@@ -191,7 +209,8 @@ def dense(line: Float64, every_m: float) -> tuple[Float64, Float64]:
 
 def joined_lines(pieces: pa.Table) -> list[Line]:
     """Lines of the pieces of all tiles: ends on a border meet the nearest end from the other side that goes on."""
-    lines = [_line(row) for row in pieces.to_pylist()]
+    names = node_names(pieces.schema)
+    lines = [_line(row, names) for row in pieces.to_pylist()]
     cut_first, cut_last = pieces["cut_first"].to_pylist(), pieces["cut_last"].to_pylist()
     after = _partners(lines, [i for i, c in enumerate(cut_last) if c], [i for i, c in enumerate(cut_first) if c])
     begun = set(after.values())
@@ -210,10 +229,10 @@ def joined_lines(pieces: pa.Table) -> list[Line]:
     return found
 
 
-def _line(row: dict[str, Any]) -> Line:
-    nodes = np.column_stack([np.array([np.nan if v is None else v for v in row[name]]) for name in NODE_COLUMNS])
+def _line(row: dict[str, Any], names: tuple[str, ...]) -> Line:
+    nodes = np.column_stack([np.array([np.nan if v is None else v for v in row[name]]) for name in names])
     seen = Seen(row["returns"], tuple(row["passes"]), row["first_epoch_gps_ns"], row["last_epoch_gps_ns"])
-    return Line(nodes, seen)
+    return Line(nodes, seen, names)
 
 
 def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]) -> dict[int, int]:
@@ -250,4 +269,4 @@ def _end_to_end(a: Line, b: Line) -> Line:
     known = np.isfinite(both)
     middle = np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     middle = np.where(known.any(axis=0), middle, np.nan)
-    return Line(np.concatenate([a.nodes[:-1], middle[None], b.nodes[1:]]), a.seen_by.with_other(b.seen_by))
+    return Line(np.concatenate([a.nodes[:-1], middle[None], b.nodes[1:]]), a.seen_by.with_other(b.seen_by), a.names)

@@ -101,7 +101,7 @@ def types_along(line: Line, dropped_m: float) -> list[str]:
 
 def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject:
     """A kerb of one type; returns and epochs are the share and the span of its line's."""
-    nodes = Line(line.nodes[rows], line.seen_by)
+    nodes = Line(line.nodes[rows], line.seen_by, line.names)
     step, sigma = nodes.column("step_m"), nodes.column("sigma_step_m")
     known = np.isfinite(step)
     share = len(nodes.nodes) / len(line.nodes)

@@ -220,8 +220,10 @@ def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
         top_m = float(np.quantile(top, 0.9) + 1.0) * LEVEL_M
         if Shape(length_m, width_m, top_m, fill, float(scattering[k]), ground).is_vehicle:
             wider = cv2.dilate(inside.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
-            wider &= inside | (~tall[part] & ((label[part] == 0) | (label[part] == k)))
-            found[part][wider] = np.maximum(found[part][wider], int(top.max()) + 1)
+            wider &= (label[part] == 0) | inside
+            reached = int(np.quantile(top, 0.9)) + 1
+            wider &= held.top[part] <= reached + 1  # what is taller stands beside it
+            found[part][wider] = np.maximum(found[part][wider], reached + 1)
     return found
 
 

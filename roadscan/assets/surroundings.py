@@ -23,13 +23,18 @@ _PLANAR, _UPRIGHT, _THICK = 0.4, 0.25, 0.4
 thicker (cubes)."""
 _WALL_CUBES, _WALL_M, _WALL_LENGTH_M = 2, 1.5, 4.0
 """A wall has so many of them above one another, half of all that stand there, reaches this height, and is this long."""
+_FOOT_M: Final = 1.8
+"""It is seen below this height: a crown is not."""
+_CUBES_UP: Final = 1 << 20
+"""Higher than any cube."""
 _IN_LEAVES: Final = 0.6
 """What scatters more is no wall, even in front of one."""
 _LEAFY: Final = 0.2
 """Mean scattering of the columns around from which things are vegetation."""
 _MEDIUM_M, _HIGH_M = 0.5, 2.0
 """Heights from which vegetation is medium and high."""
-_ROOF_M: Final = 2.5
+_ROOF_M, _ROOF_LENGTH_M = 2.5, 6.0
+"""A roof lies above this height, and is this long."""
 _WIRE_LINEAR, _WIRE_LEVEL, _WIRE_M, _WIRE_LENGTH_M = 0.8, 0.4, 4.0, 3.0
 """A wire is linear, level, above the ground by so much, and so long."""
 _NEAR_M: Final = 15.0
@@ -88,15 +93,19 @@ def near_walls(cubes: Cubes, grid: Grid) -> Bools:
     planar = (features[:, voxels.PLANARITY] >= _PLANAR) & (features[:, voxels.THICKNESS] <= _THICK)
     upright = planar & (features[:, voxels.NORMAL_UP] <= _UPRIGHT)
     many, all_there = np.zeros(grid.shape, np.int64), np.zeros(grid.shape, np.int64)
-    top = np.zeros(grid.shape, np.int64)
+    top, low = np.zeros(grid.shape, np.int64), np.full(grid.shape, _CUBES_UP)
     np.add.at(many, (row[upright], column[upright]), 1)
     np.add.at(all_there, (row, column), 1)
     np.maximum.at(top, (row[upright], column[upright]), place[upright, 2] + 1)
-    walls = long_ones((many >= _WALL_CUBES) & (top * EDGE_M >= _WALL_M) & (2 * many >= all_there), _WALL_LENGTH_M)
+    np.minimum.at(low, (row, column), place[:, 2].astype(np.int64))
+    walls = (many >= _WALL_CUBES) & (top * EDGE_M >= _WALL_M) & (2 * many >= all_there) & (low * EDGE_M < _FOOT_M)
+    walls = long_ones(walls, _WALL_LENGTH_M)
     roof = planar & ~upright & (place[:, 2] * EDGE_M >= _ROOF_M)
     roofs = np.zeros(grid.shape, np.bool_)
     roofs[row[roof], column[roof]] = True
-    roofs = long_ones(cv2.morphologyEx(roofs.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0, 3.0)
+    roofs = long_ones(
+        cv2.morphologyEx(roofs.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0, _ROOF_LENGTH_M
+    )
     return np.asarray(walls[row, column] | (roofs[row, column] & roof))
 
 

@@ -27,6 +27,7 @@ _GAP_SLICES: Final = 4
 _LEAST_RETURNS: Final = 8
 _HIGHEST_FOOT_M: Final = 2.0
 """Parked cars and hedges hide the foot of a shaft, not more of it."""
+_FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1
 _MOST_FITTED: Final = 3000
 _RING_M: Final = 0.6
 _ALONE_M: Final = 0.6
@@ -130,7 +131,7 @@ def _scores(slices: Slices) -> Int64:
     row = ((slices.y_m - slices.corner_m[1]) / CELL_M).astype(np.int64)
     scores = np.zeros(slices.level.size, np.int64)
     masks = np.zeros(slices.counts.shape[1:], np.int64)
-    slices_above_one_another(row, column, slices.level, round(_REACH_M / CELL_M), masks, scores)
+    slices_above_one_another(row, column, slices.level, round(_REACH_M / CELL_M), _FOOT_SLICES, masks, scores)
     return scores
 
 

@@ -66,9 +66,10 @@ def label_slices(counts, labels, boxes, stack):
 
 
 @kernel
-def slices_above_one_another(row, column, level, reach, masks, scores):
+def slices_above_one_another(row, column, level, reach, foot, masks, scores):
     """Give each component the number of slices that hold a component within `reach` cells of its middle.
 
+    It is 0 where none of the `foot` lowest slices does.
     row, column, level : (n,) int64 cell of the middle, and slice (0 … 62); masks : (rows, columns) int64, zeroed;
     scores : (n,) int64.
     """
@@ -81,6 +82,8 @@ def slices_above_one_another(row, column, level, reach, masks, scores):
             for c in range(max(column[i] - reach, 0), min(column[i] + reach + 1, columns)):
                 mask |= masks[r, c]
         ones = 0
+        if mask & ((1 << foot) - 1) == 0:
+            mask = 0
         while mask != 0:
             mask &= mask - 1
             ones += 1

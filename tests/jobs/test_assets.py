@@ -173,8 +173,8 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     with rasterio.open(
         own.store.path(largest.replace("classified_points", "bare_earth").replace(".laz", ".tif"))
     ) as raster:
-        seen, bridged = raster.read()
-        assert raster.descriptions == ("bare earth, seen", "bare earth, holes bridged")
+        seen, bridged, sigma = raster.read()
+        assert raster.descriptions == ("bare earth, seen", "bare earth, holes bridged", "bare earth, 1 sigma")
         assert raster.bounds == pytest.approx([*np.floor(raster.bounds[:2]), *np.floor(raster.bounds[:2]) + 5.0])
         place = rasterio.transform.rowcol(raster.transform, points.x[ground], points.y[ground])
     rows, columns = np.clip(place, 0, 19)  # coordinates are rounded to 1 mm, to the border at the most
@@ -182,10 +182,11 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     assert np.nanpercentile(np.abs(above), 90) <= 0.03
     assert not np.isnan(bridged[rows, columns]).any()
     assert (seen == bridged)[~np.isnan(seen)].all()
+    assert 0.0 < np.nanmedian(sigma) < 0.05
     holes = 0
     for path in own.store.files("products/bare_earth"):
         with rasterio.open(own.store.path(path)) as raster:
-            seen, bridged = raster.read()
+            seen, bridged, sigma = raster.read()
         assert not (np.isnan(bridged) & ~np.isnan(seen)).any()
         holes += np.count_nonzero(np.isnan(seen) & ~np.isnan(bridged))
     assert holes > 0

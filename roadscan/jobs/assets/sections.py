@@ -102,7 +102,7 @@ def _rows(task: SectionTask, grid: AssetGrid, store: Store, context: ProductCont
     last = np.floor((line.first_m + line.length_m) / config.spacing_m)
     station = np.arange(first, last + 1) * config.spacing_m
     half = int(config.half_width_m / config.step_m + 1e-9)
-    offset = np.arange(-half, half + 1) * config.step_m
+    offset = np.arange(-half, half + 1, dtype=np.float64) * config.step_m
     shape = (station.size, offset.size)
     height, sigma, seen = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, bool)
     for square, record in sorted(task.ground.items(), key=lambda one: (one[0].row, one[0].column)):

@@ -29,12 +29,12 @@ def within(model: GroundModel, box: Box) -> GroundModel | None:
     part = slice(int(r[0]), int(r[-1]) + 1), slice(int(c[0]), int(c[-1]) + 1)
     return GroundModel(
         model.x_min_m + int(c[0]) * model.cell_m, model.y_min_m + int(r[0]) * model.cell_m, model.cell_m,
-        model.height_m[part], model.seen[part],
+        model.height_m[part], model.seen[part], None if model.sigma_m is None else model.sigma_m[part],
     )  # fmt: skip
 
 
 def write_bare_earth(path: Path, model: GroundModel, corner_m: tuple[float, float], context: ProductContext) -> None:
-    """Write two bands: heights of cells where the ground was seen, and heights with the holes bridged.
+    """Write three bands: heights of cells where the ground was seen, heights with the holes bridged, and their 1 σ.
 
     A hole (under a vehicle, in the shade of a wall) is NaN in the first band; NaN in the second is not known at all.
 
@@ -51,8 +51,11 @@ def write_bare_earth(path: Path, model: GroundModel, corner_m: tuple[float, floa
     height = (model.height_m / height_m).astype(np.float32)[::-1]
     seen = np.where(model.seen[::-1], height, np.float32(np.nan)).astype(np.float32)
     unit = height_unit(context.map)
-    bands = [Band("bare earth, seen", unit), Band("bare earth, holes bridged", unit)]
-    image = dense_image([np.ascontiguousarray(seen), np.ascontiguousarray(height)])
+    sigma = np.full(height.shape, np.nan, np.float32)
+    if model.sigma_m is not None:
+        sigma = (model.sigma_m / height_m).astype(np.float32)[::-1]
+    bands = [Band(f"bare earth, {what}", unit) for what in ("seen", "holes bridged", "1 sigma")]
+    image = dense_image([np.ascontiguousarray(band) for band in (seen, height, sigma)])
     write_cog(path, [image], about(place, bands, context))
 
 
@@ -73,7 +76,8 @@ def read_bare_earth(content: bytes, corner_m: tuple[float, float], context: Prod
         raise StoreError(f"the bare earth cannot be read: {error}", change="make it again") from error
     rows = bands.shape[1]
     cell_m = place.a * unit_m
+    seen, height, sigma = (np.ascontiguousarray(band[::-1]) for band in bands)
     return GroundModel(
         place.c * unit_m - corner_m[0], place.f * unit_m - rows * cell_m - corner_m[1], cell_m,
-        np.ascontiguousarray(bands[1][::-1] * np.float32(height_m)), np.ascontiguousarray(~np.isnan(bands[0][::-1])),
+        height * np.float32(height_m), ~np.isnan(seen), sigma * np.float32(height_m),
     )  # fmt: skip

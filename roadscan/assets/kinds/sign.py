@@ -42,7 +42,7 @@ class Sign(AssetKind):
 
 def _place(plate: Plate) -> Place:
     sigma = max(0.01, plate.outline.misfit_m / 3.0)
-    values = {
+    values: dict[str, float | str | None] = {
         "width_m": plate.outline.width_m, "plate_height_m": plate.outline.height_m, "shape": plate.outline.shape,
         "clearance_m": max(plate.clearance_m, 0.0), "facing_deg": plate.facing_deg, "tilt_deg": plate.tilt_deg,
     }  # fmt: skip

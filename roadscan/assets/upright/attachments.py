@@ -96,10 +96,10 @@ def crown(near: About, shaft: Shaft, others_xy: Float64) -> tuple[float, float, 
 
 
 def arms(near: About, shaft: Shaft) -> Arms | None:
-    """What reaches out sideways near the top of a shaft at least 3 m high, in one or two directions; None where nothing.
+    """What reaches out sideways near the top of a shaft 3 m high or higher, in one or two directions; else None.
 
-    Of 24 directions those count whose strip, 0.5 m wide, holds returns from the shaft outwards without a gap. Where more
-    than a third of them do, a crown or a roof is about.
+    Of 24 directions those count whose strip, 0.5 m wide, holds returns from the shaft outwards without a gap. Where
+    more than a third of them do, a crown or a roof is about.
     """
     if shaft.top_above_m < 3.0:
         return None
@@ -152,5 +152,5 @@ def signal_head(near: About, shaft: Shaft) -> tuple[float, float] | None:
     plan = np.column_stack([right, ahead])
     _, _, axes = np.linalg.svd(plan - plan.mean(axis=0), full_matrices=False)
     sizes = np.ptp(np.quantile((plan - plan.mean(axis=0)) @ axes.T, [0.03, 0.97], axis=0), axis=0)
-    boxy = 0.15 <= float(sizes[1]) and float(sizes[0]) <= 0.75 and 0.55 <= high - low <= 1.5
+    boxy = float(sizes[1]) >= 0.15 and float(sizes[0]) <= 0.75 and 0.55 <= high - low <= 1.5
     return (float(low + high) / 2, float(high - low)) if boxy else None

@@ -38,7 +38,7 @@ class Axis:
         return math.degrees(math.atan(math.hypot(self.slope_x, self.slope_y)))
 
     def at(self, height_m: npt.ArrayLike) -> tuple[Float64, Float64]:
-        """x and y of the axis at heights (any shape)."""
+        """X and y of the axis at heights (any shape)."""
         past = np.asarray(height_m, np.float64) - self.height_m
         return self.x_m + self.slope_x * past, self.y_m + self.slope_y * past
 
@@ -47,8 +47,9 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     """Cylinder through returns (n, 3), seen from (n, 2).
 
     Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines tells the
-    radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one radius
-    away from it (Gauss–Newton, Huber weights). A circle fit alone tells neither for shafts as thin as the range noise.
+    radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one
+    radius away from it (Gauss–Newton, Huber weights). A circle fit alone tells neither for shafts as thin as the range
+    noise.
 
     lean : the axis may lean; otherwise it is upright.
     """

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
-from roadscan.kernels.assets.ground_cells import ground_moments
+from roadscan.kernels.assets.grown_cells import ground_moments
 from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ class LandscapeOptions(Strict):
 
 
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
-    """Cells of the tile that are probably grown over: plants stand on them, or they are rough, or as bright as grass."""
+    """Cells of the tile that are probably grown over: plants stand on them, or they are rough or as bright as grass."""
     returns, tile = scene.returns, scene.tile
     kind = np.zeros(256, np.uint8)
     kind[list(_GROUND)], kind[list(_GROWN)] = 1, 2
@@ -92,7 +92,9 @@ def _road_cells(scene: Scene, shape: tuple[int, ...], corner: Float64) -> npt.ND
     return out
 
 
-def _table(scene: Scene, chosen: npt.NDArray[np.bool_], probability: Float64, counted: npt.NDArray[np.bool_]) -> pa.Table:
+def _table(
+    scene: Scene, chosen: npt.NDArray[np.bool_], probability: Float64, counted: npt.NDArray[np.bool_]
+) -> pa.Table:
     """Rows of the chosen cells."""
     returns, tile = scene.returns, scene.tile
     at = np.flatnonzero(counted & tile.holds(returns.x_m, returns.y_m))

@@ -83,10 +83,7 @@ class Chain:
 
 def pieces_of_panels(scene: Scene, panels: list[Panel]) -> pa.Table:
     """Pieces of panels inside the scene's tile; ends at its border lie on it."""
-    rows = []
-    for panel in panels:
-        for part in _inside(panel, scene.tile):
-            rows.append(_row(scene, panel, part))
+    rows = [_row(scene, panel, part) for panel in panels for part in _inside(panel, scene.tile)]
     return pa.Table.from_pylist(rows, schema=PIECE_SCHEMA)
 
 
@@ -128,13 +125,18 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
     xy = np.array(points)
     numbers, shares = np.array([k for k, _, _ in run]), np.array([b - a for _, a, b in run])
     rows = panel.rows[np.isin(panel.stretch, numbers)]
-    seen = seen_by(scene, rows) if rows.size else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
+    seen = (
+        seen_by(scene, rows)
+        if rows.size
+        else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
+    )
     counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed")}
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),
         **{name: value.tolist() for name, value in (counts | heights).items()},
-        "open_top": panel.open_top[numbers].astype(float).tolist(), "length_m": np.hypot(*np.diff(xy, axis=0).T).tolist(),
+        "open_top": panel.open_top[numbers].astype(float).tolist(),
+        "length_m": np.hypot(*np.diff(xy, axis=0).T).tolist(),
         "across_m": panel.across_m, "vegetation": panel.vegetation, "sensor_x_m": east + panel.seen_from_m[0],
         "sensor_y_m": north + panel.seen_from_m[1], "seen": seen.pop("returns"), **seen,
     }  # fmt: skip
@@ -196,7 +198,13 @@ def _matched(parts: list[Chain]) -> dict[tuple[int, int], tuple[int, int]]:
                     beside = abs(float(outwards[i][0] * gap[1] - outwards[i][1] * gap[0]))
                     straight = -float(outwards[i] @ outwards[j]) >= _JOIN_TURN
                     alike = abs(levels[i // 2] - levels[j // 2]) <= _JOIN_LEVEL_M
-                    if alike and apart <= _JOIN_M and straight and beside <= _JOIN_BESIDE_M and float(outwards[i] @ gap) > -0.5:
+                    if (
+                        alike
+                        and apart <= _JOIN_M
+                        and straight
+                        and beside <= _JOIN_BESIDE_M
+                        and float(outwards[i] @ gap) > -0.5
+                    ):
                         pairs.append((apart, i, j))
     joined: dict[tuple[int, int], tuple[int, int]] = {}
     for _, i, j in sorted(pairs):
@@ -250,7 +258,12 @@ def _linked(parts: list[Chain]) -> Chain:
         gap = float(np.hypot(*(part.xy_m[0] - xy[-1][-1])))
         if gap > _SHORTEST_M:
             xy.append(part.xy_m)
-            empty = dict.fromkeys(STRETCHES, 0.0) | {"length_m": gap, "low_m": np.nan, "high_m": np.nan, "bulk_m": np.nan}
+            empty = dict.fromkeys(STRETCHES, 0.0) | {
+                "length_m": gap,
+                "low_m": np.nan,
+                "high_m": np.nan,
+                "bulk_m": np.nan,
+            }
             empty["ground_m"] = float((values["ground_m"][-1][-1] + part.values["ground_m"][0]) / 2)
             for name in STRETCHES:
                 values[name].append(np.array([empty[name]]))

@@ -49,7 +49,8 @@ def outline_of(points: Float64) -> Outline:
     if best is None:
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
-        return Outline("other", (float(middle[0]), float(middle[1])), *map(float, high - low), misfit_m=math.inf)
+        wide, tall = map(float, high - low)
+        return Outline("other", (float(middle[0]), float(middle[1])), wide, tall, math.inf)
     misfit, shape, solution = best
     width, height = float(solution[2]), float(solution[-1])
     if shape == "rectangle" and abs(width - height) < _SQUARE * max(width, height):

@@ -126,9 +126,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
 
 def lowest_places(pieces: pa.Table, apart_m: float) -> list[dict[str, Any]]:
     """The lowest cells of each drive, each at least so far from a lower one, with what hangs there (`type`)."""
-    rows = sorted(
-        pieces.to_pylist(), key=lambda r: (r["pass_id"], r["clearance_m"], r["easting_m"], r["northing_m"])
-    )
+    rows = sorted(pieces.to_pylist(), key=lambda r: (r["pass_id"], r["clearance_m"], r["easting_m"], r["northing_m"]))
     out: list[dict[str, Any]] = []
     for pass_id in sorted({r["pass_id"] for r in rows}):
         own = [r for r in rows if r["pass_id"] == pass_id]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -109,9 +109,10 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     centre = (xy[:-1] + xy[1:]) / 2
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
+    vegetation = float(np.isin(scene.classes[rows], _VEGETATION).mean())
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
-        np.bincount(stretch, minlength=count), none, none, open_top, region.across_m, float(np.isin(scene.classes[rows], _VEGETATION).mean()), sensor, rows, stretch,
+        np.bincount(stretch, minlength=count), none, none, open_top, region.across_m, vegetation, sensor, rows, stretch,
     )  # fmt: skip
 
 
@@ -125,7 +126,8 @@ def _medians(d: Float64, stretch: Int64, count: int) -> Float64:
     known = np.isfinite(out)
     if not known.any():
         return np.full(count, float(np.median(d)))
-    return np.interp(np.arange(count), np.flatnonzero(known), out[known])
+    filled: Float64 = np.interp(np.arange(count), np.flatnonzero(known), out[known])
+    return filled
 
 
 def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
@@ -137,10 +139,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     taken[some] = True
     rectangles = np.concatenate(
         [np.zeros((0, 6))]
-        + [
-            np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08])
-            for p in panels
-        ]
+        + [np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08]) for p in panels]
     )
     passed = np.zeros(len(rectangles), np.int64)
     passing_lines(
@@ -151,13 +150,6 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     for p in panels:
         count = p.returns.size
         stopped = np.bincount(p.stretch[taken[p.rows]], minlength=count)
-        out.append(_replaced(p, stopped, passed[first : first + count]))
+        out.append(replace(p, stopped=stopped, passed=passed[first : first + count]))
         first += count
     return out
-
-
-def _replaced(p: Panel, stopped: Int64, passed: Int64) -> Panel:
-    return Panel(
-        p.xy_m, p.ground_m, p.low_m, p.high_m, p.bulk_m, p.returns, stopped, passed, p.open_top, p.across_m, p.vegetation,
-        p.seen_from_m, p.rows, p.stretch,
-    )  # fmt: skip

@@ -72,7 +72,7 @@ def regions_of(scene: Scene) -> list[Region]:
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
     index = np.full((LAYERS, rows, columns), -1, np.int32)
     above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)
-    most = int(min(np.count_nonzero(np.isfinite(above)), index.size))
+    most = min(int(np.count_nonzero(np.isfinite(above))), int(index.size))
     moments, voxel = np.empty((max(most, 1), 10)), np.empty(len(returns), np.int32)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
     sizes = np.array([SIDE_M, LAYER_M])
@@ -147,9 +147,7 @@ def _boxes_near(ends: Float64, i: int) -> Int64:
     return np.flatnonzero((x0 <= x1[i] + gap) & (x1 >= x0[i] - gap) & (y0 <= y1[i] + gap) & (y1 >= y0[i] - gap))
 
 
-def _on_one_line(
-    first: tuple[Float64, Float64, float, float], second: tuple[Float64, Float64, float, float]
-) -> bool:
+def _on_one_line(first: tuple[Float64, Float64, float, float], second: tuple[Float64, Float64, float, float]) -> bool:
     """Whether two lines continue each other: nearly parallel, the nearer parts within 0.15 m, a short gap or none."""
     (m1, a1, s1, t1), (m2, a2, s2, t2) = first, second
     if abs(float(a1 @ a2)) < math.cos(math.radians(_JOIN_TURN_DEG)):

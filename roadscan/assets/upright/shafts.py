@@ -1,4 +1,4 @@
-"""Shafts: thin, upright things that stand on the ground with free space around them. Poles, trunks and posts are some."""
+"""Shafts: thin, upright things that stand on the ground with free space around them, as poles and trunks do."""
 
 from __future__ import annotations
 
@@ -122,7 +122,8 @@ class _Neighbours:
             parts.append(self._order[first:last])
         near = np.sort(np.concatenate(parts))
         away = np.hypot(self._slices.x_m[near] - self._slices.x_m[i], self._slices.y_m[near] - self._slices.y_m[i])
-        return near[away <= reach_m]
+        out: Int64 = near[away <= reach_m]
+        return out
 
 
 def _scores(slices: Slices) -> Int64:
@@ -146,7 +147,10 @@ def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]
         if np.unique(level[kept]).size >= 4:
             bx, by = (_slope(level[kept] - middle, v[kept]) for v in (x, y))
             bx, by = (float(np.clip(b, -_MOST_LEAN * SLICE_M, _MOST_LEAN * SLICE_M)) for b in (bx, by))
-        ax, ay = float(np.median((x - bx * (level - middle))[kept])), float(np.median((y - by * (level - middle))[kept]))
+        ax, ay = (
+            float(np.median((x - bx * (level - middle))[kept])),
+            float(np.median((y - by * (level - middle))[kept])),
+        )
         kept = np.hypot(x - ax - bx * (level - middle), y - ay - by * (level - middle)) <= reach
         if not kept.any():
             return near[:0]

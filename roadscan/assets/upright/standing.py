@@ -23,6 +23,10 @@ LEAST: Final = 0.5
 """What is less probable is left out."""
 _LOW_M: Final = 1.35
 """Posts up to this height are delineators and bollards."""
+_BOLLARD_M: Final = 0.08
+_SIGNAL_M: Final = 8.0
+_LAMP_M: Final = 3.5
+"""Least height of a lamp post."""
 _IN_PLANE_M: Final = 0.35
 _APART_M: Final = 0.45
 
@@ -65,19 +69,21 @@ def probability_of(shaft: Shaft, inside_plane: bool) -> float:
     Measures: slices that show it, the share of them from its foot up, the share of the returns about it that are its
     own, the share of slices free around, the height of its hidden foot, its lean, its roughness.
     """
+    lean = shaft.axis.lean_deg
     if shaft.top_above_m <= _LOW_M:
-        return logistic(
-            -9.0,
-            [(1.0, min(shaft.slices, 4)), (6.0, shaft.alone), (2.5, shaft.free), (-25.0, max(shaft.axis.radius_m - 0.13, 0.0)),
-             (-0.3, shaft.axis.lean_deg), (-3.0, max(shaft.low_above_m - 0.3, 0.0)), (-3.0, shaft.covered), (-6.0, inside_plane),
-             (-0.1, max(25 - shaft.rows.size, 0))],
-        )  # fmt: skip
+        low = [
+            (1.0, min(shaft.slices, 4)), (6.0, shaft.alone), (2.5, shaft.free), (-3.0, shaft.covered),
+            (-25.0, max(shaft.axis.radius_m - 0.13, 0.0)), (-3.0, max(shaft.low_above_m - 0.3, 0.0)), (-0.3, lean),
+            (-0.1, max(25 - shaft.rows.size, 0)), (-6.0, float(inside_plane)),
+        ]  # fmt: skip
+        return logistic(-9.0, low)
     rough = shaft.axis.residual_m / (0.05 + 0.2 * shaft.axis.radius_m)
-    return logistic(
-        -12.5,
-        [(0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free), (-1.6, max(rough - 1.0, 0.0)),
-         (-2.0, max(shaft.low_above_m - 0.8, 0.0)), (-0.35, max(shaft.axis.lean_deg - 5.0, 0.0)), (-5.0, inside_plane)],
-    )  # fmt: skip
+    high = [
+        (0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free),
+        (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)), (-0.35, max(lean - 5.0, 0.0)),
+        (-5.0, float(inside_plane)),
+    ]  # fmt: skip
+    return logistic(-12.5, high)
 
 
 def tree_probability(shaft: Shaft, filled_directions: float) -> float:
@@ -103,28 +109,33 @@ def _apart(judged: list[tuple[Shaft, float]]) -> list[tuple[Shaft, float]]:
 def _told(shaft: Shaft, probability: float, near: About, tree: float, trunks: npt.NDArray[np.float64]) -> Upright:
     """What a shaft is, with the values of its kind."""
     diameter, lean = round(2.0 * shaft.axis.radius_m, 4), round(shaft.axis.lean_deg, 3)
-    here = np.array([shaft.axis.x_m, shaft.axis.y_m])
-    if shaft.top_above_m <= _LOW_M and tree < 0.5:
-        kind = "bollard" if diameter > 0.08 else "post"
-        values = {"asset_height_m": shaft.top_above_m, "type": kind, "diameter_m": diameter}
-        return Upright("delineator", shaft, probability, shaft.rows, values)
+    values: dict[str, float | str | None] = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter}
     if tree >= 0.5:
-        others = trunks[np.hypot(*(trunks - here).T) > 0.2] - here
-        top, wide, rows = crown(near, shaft, others)
-        values = {
-            "asset_height_m": top, "trunk_diameter_m": diameter, "crown_diameter_m": wide if np.isfinite(wide) else None,
-            "lean_deg": lean,
-        }  # fmt: skip
-        return Upright("tree", shaft, probability * tree, np.union1d(shaft.rows, rows), values)
-    values = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter, "lean_deg": lean}
-    head = signal_head(near, shaft)
+        return _tree(shaft, probability * tree, near, trunks)
+    if shaft.top_above_m <= _LOW_M:
+        values["type"] = "bollard" if diameter > _BOLLARD_M else "post"
+        return Upright("delineator", shaft, probability, shaft.rows, values)
+    values["lean_deg"] = lean
     out = arms(near, shaft)
-    if head is not None and shaft.top_above_m < 8.0:
-        return Upright("signal", shaft, probability, shaft.rows, values | {"arm_m": out.reach_m if out else None})
-    if out is not None and shaft.top_above_m >= 3.5:
-        arm = {
-            "asset_height_m": max(shaft.top_above_m, out.top_above_m), "type": "double_arm" if out.other_m else "arm",
-            "arm_m": out.reach_m, "lamp_height_m": out.lamp_above_m,
+    if signal_head(near, shaft) is not None and shaft.top_above_m < _SIGNAL_M:
+        values["arm_m"] = out.reach_m if out else None
+        return Upright("signal", shaft, probability, shaft.rows, values)
+    if out is not None and shaft.top_above_m >= _LAMP_M:
+        values |= {
+            "asset_height_m": max(shaft.top_above_m, out.top_above_m), "arm_m": out.reach_m,
+            "type": "double_arm" if out.other_m else "arm", "lamp_height_m": out.lamp_above_m,
         }  # fmt: skip
-        return Upright("lighting", shaft, probability, shaft.rows, values | arm)
+        return Upright("lighting", shaft, probability, shaft.rows, values)
     return Upright("pole", shaft, probability, shaft.rows, values)
+
+
+def _tree(shaft: Shaft, probability: float, near: About, trunks: npt.NDArray[np.float64]) -> Upright:
+    """A tree with its crown; returns nearer to another trunk belong to that."""
+    here = np.array([shaft.axis.x_m, shaft.axis.y_m])
+    others = trunks[np.hypot(*(trunks - here).T) > 0.2] - here
+    top, wide, rows = crown(near, shaft, others)
+    values: dict[str, float | str | None] = {
+        "asset_height_m": top, "trunk_diameter_m": round(2.0 * shaft.axis.radius_m, 4),
+        "crown_diameter_m": wide if np.isfinite(wide) else None, "lean_deg": round(shaft.axis.lean_deg, 3),
+    }  # fmt: skip
+    return Upright("tree", shaft, probability, np.union1d(shaft.rows, rows), values)

@@ -16,7 +16,11 @@ def mark_corridor(x, y, reach_m, corner, cell_m, inside):
     """
     rows, columns = inside.shape
     for i in range(x.size):
-        j = i + 1 if i + 1 < x.size and math.hypot(x[min(i + 1, x.size - 1)] - x[i], y[min(i + 1, x.size - 1)] - y[i]) <= 5.0 else i
+        j = (
+            i + 1
+            if i + 1 < x.size and math.hypot(x[min(i + 1, x.size - 1)] - x[i], y[min(i + 1, x.size - 1)] - y[i]) <= 5.0
+            else i
+        )
         west, east = min(x[i], x[j]) - reach_m - corner[0], max(x[i], x[j]) + reach_m - corner[0]
         south, north = min(y[i], y[j]) - reach_m - corner[1], max(y[i], y[j]) + reach_m - corner[1]
         wx, wy = x[j] - x[i], y[j] - y[i]

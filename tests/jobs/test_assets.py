@@ -16,9 +16,11 @@ import pandas as pd
 import pyogrio
 import pytest
 import rasterio
+import shapely
+from scipy.spatial import cKDTree
 
 import roadscan
-from roadscan.assets.classes import GROUND, POLE
+from roadscan.assets.classes import GROUND, POLE, ROAD
 from roadscan.assets.kind import Evidence
 from roadscan.assets.scene import Scene
 from roadscan.jobs.assets.evidence import EVIDENCE
@@ -43,7 +45,7 @@ from roadscan.tables.store import Store
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.posts import Posts, only_kinds
 
-SETTINGS = {"tile_m": 5.0, "halo_m": 4.0}
+SETTINGS = {"tile_m": 5.0, "halo_m": 4.0, "cross_sections": {"spacing_m": 4.0, "half_width_m": 4.0}}
 STAGES = ("ingest", "navigate", "footprints", "assets")
 
 
@@ -158,7 +160,7 @@ def test_points_have_classes_and_files_say_what_these_are(street: Simulated) -> 
         for code, count in zip(*np.unique(points.classification, return_counts=True), strict=True):
             codes[int(code)] = codes.get(int(code), 0) + int(count)
     loaded = query(own.store, "SELECT count(*) AS n FROM returns")
-    assert codes[GROUND] > 20_000
+    assert codes[GROUND] + codes[ROAD] > 20_000
     posts = geopandas.read_parquet(own.store.path("products/assets/poles.parquet"))
     assert 0.5 * posts["returns"].sum() <= codes[POLE] <= posts["returns"].sum()
     assert sum(codes.values()) == loaded["n"][0].as_py()
@@ -169,7 +171,7 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     largest = max(own.store.files("products/classified_points"), key=own.store.size)
     with laspy.open(own.store.path(largest)) as reader:
         points = reader.read()
-    ground = np.asarray(points.classification) == GROUND
+    ground = np.isin(points.classification, (GROUND, ROAD))
     with rasterio.open(
         own.store.path(largest.replace("classified_points", "bare_earth").replace(".laz", ".tif"))
     ) as raster:
@@ -190,6 +192,30 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
         assert not (np.isnan(bridged) & ~np.isnan(seen)).any()
         holes += np.count_nonzero(np.isnan(seen) & ~np.isnan(bridged))
     assert holes > 0
+
+
+def test_cross_sections_cross_the_road_on_bare_earth(street: Simulated) -> None:
+    own = session(street)
+    rows = pd.read_csv(own.store.path("products/ground_sections/road1.csv"))
+    assert (rows["station_m"] % 4.0 == 0.0).all() and rows["station_m"].nunique() >= 5
+    assert rows["offset_m"].abs().max() <= 4.0
+    drawn = pyogrio.read_dataframe(own.store.path("products/ground_sections/road1.dxf"))
+    assert drawn["Layer"].unique().tolist() == ["ground_sections"]
+    lines = shapely.get_coordinates(drawn.geometry.to_numpy(), include_z=True)
+    assert len(lines) == pytest.approx(len(rows), abs=5)
+    assert lines[:, 2].min() == pytest.approx(rows["height_m"].min(), abs=1e-3)
+    trees = []
+    for path in own.store.files("products/classified_points"):
+        with laspy.open(own.store.path(path)) as reader:
+            points = reader.read()
+        trees.append(points.xyz[np.isin(points.classification, (GROUND, ROAD))])
+    ground = np.concatenate(trees)
+    away, near = cKDTree(ground[:, :2]).query(rows[["easting_m", "northing_m"]].to_numpy())
+    close = (away < 0.05) & (rows["seen"].to_numpy() == 1)
+    assert close.sum() > 100
+    error = rows["height_m"].to_numpy()[close] - ground[near[close], 2]
+    assert np.percentile(np.abs(error), 90) <= 0.04  # a return errs by 15 mm
+    assert 0.0 < rows["sigma_height_m"].median() < 0.05
 
 
 class Backwards(Inline):

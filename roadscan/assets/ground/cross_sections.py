@@ -67,7 +67,7 @@ def cross_sections(ground: GroundModel, line_xy_m: Float64, station_m: Float64, 
 
 
 def stations(line_xy_m: Float64, station_m: Float64) -> tuple[Float64, Float64]:
-    """Places (s, 2) at stations of a line (n, 2) of some length, and unit vectors (s, 2) to its right there; NaN beyond its ends.
+    """Places (s, 2) at stations of a line (n, 2), and unit vectors (s, 2) to its right; places beyond its ends are NaN.
 
     The direction at a station is that of the line from half a metre before to half a metre behind it, so that it does
     not jump at the line's vertices.

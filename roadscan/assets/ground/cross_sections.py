@@ -67,17 +67,18 @@ def cross_sections(ground: GroundModel, line_xy_m: Float64, station_m: Float64, 
 
 
 def stations(line_xy_m: Float64, station_m: Float64) -> tuple[Float64, Float64]:
-    """Places (s, 2) at stations of a line (n, 2), and unit vectors (s, 2) to its right there; NaN beyond its ends.
+    """Places (s, 2) at stations of a line (n, 2), and unit vectors (s, 2) to its right; places beyond its ends are NaN.
 
     The direction at a station is that of the line from half a metre before to half a metre behind it, so that it does
     not jump at the line's vertices.
     """
     steps = np.hypot(*np.diff(line_xy_m, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = [np.column_stack([np.interp(s, along, line_xy_m[:, k]) for k in (0, 1)]) for s in _about(station_m)]
+    beyond = (station_m < 0.0) | (station_m > along[-1])
+    near = np.clip(station_m, 0.0, along[-1])
+    at = [np.column_stack([np.interp(s, along, line_xy_m[:, k]) for k in (0, 1)]) for s in _about(near)]
     way = at[2] - at[0]
     way /= np.hypot(way[:, 0], way[:, 1])[:, None]
-    beyond = (station_m < 0.0) | (station_m > along[-1])
     place = np.where(beyond[:, None], np.nan, at[1])
     return place, np.column_stack([way[:, 1], -way[:, 0]])
 

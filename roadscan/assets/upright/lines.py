@@ -128,7 +128,11 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
     xy = np.array(points)
     numbers, shares = np.array([k for k, _, _ in run]), np.array([b - a for _, a, b in run])
     rows = panel.rows[np.isin(panel.stretch, numbers)]
-    seen = seen_by(scene, rows) if rows.size else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
+    seen = (
+        seen_by(scene, rows)
+        if rows.size
+        else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
+    )
     counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed")}
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
@@ -196,7 +200,13 @@ def _matched(parts: list[Chain]) -> dict[tuple[int, int], tuple[int, int]]:
                     beside = abs(float(outwards[i][0] * gap[1] - outwards[i][1] * gap[0]))
                     straight = -float(outwards[i] @ outwards[j]) >= _JOIN_TURN
                     alike = abs(levels[i // 2] - levels[j // 2]) <= _JOIN_LEVEL_M
-                    if alike and apart <= _JOIN_M and straight and beside <= _JOIN_BESIDE_M and float(outwards[i] @ gap) > -0.5:
+                    if (
+                        alike
+                        and apart <= _JOIN_M
+                        and straight
+                        and beside <= _JOIN_BESIDE_M
+                        and float(outwards[i] @ gap) > -0.5
+                    ):
                         pairs.append((apart, i, j))
     joined: dict[tuple[int, int], tuple[int, int]] = {}
     for _, i, j in sorted(pairs):
@@ -250,7 +260,12 @@ def _linked(parts: list[Chain]) -> Chain:
         gap = float(np.hypot(*(part.xy_m[0] - xy[-1][-1])))
         if gap > _SHORTEST_M:
             xy.append(part.xy_m)
-            empty = dict.fromkeys(STRETCHES, 0.0) | {"length_m": gap, "low_m": np.nan, "high_m": np.nan, "bulk_m": np.nan}
+            empty = dict.fromkeys(STRETCHES, 0.0) | {
+                "length_m": gap,
+                "low_m": np.nan,
+                "high_m": np.nan,
+                "bulk_m": np.nan,
+            }
             empty["ground_m"] = float((values["ground_m"][-1][-1] + part.values["ground_m"][0]) / 2)
             for name in STRETCHES:
                 values[name].append(np.array([empty[name]]))

@@ -137,10 +137,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     taken[some] = True
     rectangles = np.concatenate(
         [np.zeros((0, 6))]
-        + [
-            np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08])
-            for p in panels
-        ]
+        + [np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08]) for p in panels]
     )
     passed = np.zeros(len(rectangles), np.int64)
     passing_lines(

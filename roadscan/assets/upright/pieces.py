@@ -94,9 +94,7 @@ def objects_at_places(pieces: pa.Table, apart_m: float) -> list[AssetObject]:
 
 
 def _distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:
-    return float(
-        np.sqrt(sum((first[name] - second[name]) ** 2 for name in ("easting_m", "northing_m", "height_m")))
-    )
+    return float(np.sqrt(sum((first[name] - second[name]) ** 2 for name in ("easting_m", "northing_m", "height_m"))))
 
 
 def _object(row: Mapping[str, Any], names: Sequence[str]) -> AssetObject:

@@ -117,7 +117,11 @@ def _clusters(scene: Scene, rows: Int64) -> list[Int64]:
     flat = (cells[:, 0] + 1) + span[0] * ((cells[:, 1] + 1) + span[1] * (cells[:, 2] + 1))
     voxels, owner = np.unique(flat, return_inverse=True)
     steps = [
-        i + span[0] * (j + span[1] * k) for k in (-1, 0, 1) for j in (-1, 0, 1) for i in (-1, 0, 1) if (k, j, i) > (0, 0, 0)
+        i + span[0] * (j + span[1] * k)
+        for k in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        for i in (-1, 0, 1)
+        if (k, j, i) > (0, 0, 0)
     ]
     pairs = []
     for step in steps:
@@ -191,9 +195,7 @@ def _axes(normal: Float64) -> tuple[Float64, Float64]:
     return right, np.cross(normal, right)
 
 
-def _on_plane(
-    scene: Scene, near: Int64, middle: Float64, normal: Float64, cluster: Float64
-) -> tuple[Int64, float]:
+def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, cluster: Float64) -> tuple[Int64, float]:
     """Returns on the plane within the box of the cluster, and the share of those just outside it."""
     returns = scene.returns
     past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - middle

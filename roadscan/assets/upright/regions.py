@@ -147,9 +147,7 @@ def _boxes_near(ends: Float64, i: int) -> Int64:
     return np.flatnonzero((x0 <= x1[i] + gap) & (x1 >= x0[i] - gap) & (y0 <= y1[i] + gap) & (y1 >= y0[i] - gap))
 
 
-def _on_one_line(
-    first: tuple[Float64, Float64, float, float], second: tuple[Float64, Float64, float, float]
-) -> bool:
+def _on_one_line(first: tuple[Float64, Float64, float, float], second: tuple[Float64, Float64, float, float]) -> bool:
     """Whether two lines continue each other: nearly parallel, the nearer parts within 0.15 m, a short gap or none."""
     (m1, a1, s1, t1), (m2, a2, s2, t2) = first, second
     if abs(float(a1 @ a2)) < math.cos(math.radians(_JOIN_TURN_DEG)):

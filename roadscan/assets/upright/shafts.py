@@ -145,7 +145,10 @@ def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]
         if np.unique(level[kept]).size >= 4:
             bx, by = (_slope(level[kept] - middle, v[kept]) for v in (x, y))
             bx, by = (float(np.clip(b, -_MOST_LEAN * SLICE_M, _MOST_LEAN * SLICE_M)) for b in (bx, by))
-        ax, ay = float(np.median((x - bx * (level - middle))[kept])), float(np.median((y - by * (level - middle))[kept]))
+        ax, ay = (
+            float(np.median((x - bx * (level - middle))[kept])),
+            float(np.median((y - by * (level - middle))[kept])),
+        )
         kept = np.hypot(x - ax - bx * (level - middle), y - ay - by * (level - middle)) <= reach
         if not kept.any():
             return near[:0]

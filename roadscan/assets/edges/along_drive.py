@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
@@ -30,6 +31,7 @@ KERB_EVIDENCE: Final = 6.0
 BARRIER_EVIDENCE: Final = 3.0
 LEAST_EVIDENCE: Final = 0.6
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
+_EDGES: Final[weakref.WeakKeyDictionary[Scene, list[CutEdge]]] = weakref.WeakKeyDictionary()
 
 
 class Track(NamedTuple):
@@ -73,6 +75,12 @@ def _stations(part: Float64, earlier: Float64) -> Iterator[Track]:
 
 def road_edges(scene: Scene) -> list[CutEdge]:
     """Edges beside the drives within the scene's tile: nodes (n, `EDGE_COLUMNS`) in the direction of the drive."""
+    if scene not in _EDGES:
+        _EDGES[scene] = _found(scene)
+    return _EDGES[scene]
+
+
+def _found(scene: Scene) -> list[CutEdge]:
     raster = raster_of(scene)
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []

@@ -33,7 +33,12 @@ class EdgeSettings(NamedTuple):
     """Share of a node's window along the edge that has to be seen on both sides."""
     ratio: float = 4.0
     """Least step over the scatter of its sides."""
+    least_part_m: float = 1.0
+    """Shorter parts of a path are left out."""
     least_length_m: float = 2.0
+    """Length that has to be seen of an edge, all its parts together."""
+    least_evidence: float = 8.0
+    """Least evidence (σ · m) of all parts of an edge."""
     bridge_m: float = 7.0
     """Longest gap between two edges in one line: a car, a driveway."""
     bridge_offset_m: float = 0.25
@@ -47,6 +52,8 @@ class Edge(NamedTuple):
     nodes: Nodes
     seen: Mask
     """(n,) nodes whose step was measured; the others bridge what is hidden."""
+    evidence: float
+    """Evidence (σ · m) of its places."""
 
 
 DEFAULT: Final = EdgeSettings()
@@ -78,11 +85,11 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
         nodes = profiles.nodes_of(profiles.chain_line(chain), heights, raster, slopes)
-        parts += _told(nodes, settings)
+        parts += _told(nodes, chain.evidence, settings)
     return _bridged(parts, heights, raster, slopes, settings)
 
 
-def _told(nodes: Nodes, settings: EdgeSettings) -> list[Edge]:
+def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
     """Runs of nodes whose step can be told; two nodes that cannot be are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_running(c, known) for c in (nodes.seen_low_m, nodes.seen_high_m, nodes.scatter_m))
@@ -95,8 +102,8 @@ def _told(nodes: Nodes, settings: EdgeSettings) -> list[Edge]:
     edges = []
     for k in range(1, count + 1):
         rows = np.flatnonzero(number == k)
-        if (len(rows) - 1) * NODE_M >= settings.least_length_m:
-            edges.append(Edge(nodes.at(rows), good[rows]))
+        if (len(rows) - 1) * NODE_M >= settings.least_part_m:
+            edges.append(Edge(nodes.at(rows), good[rows], evidence * len(rows) / len(good)))
     return edges
 
 
@@ -131,7 +138,9 @@ def _bridged(
         while at in after:
             at = after[at]
             edge = _joined(edge, parts[at], heights, raster, slopes, settings)
-        edges.append(edge)
+        enough = edge.evidence >= settings.least_evidence
+        if enough and float(edge.seen.sum() - 1) * NODE_M >= settings.least_length_m:
+            edges.append(edge)
     return edges
 
 
@@ -169,7 +178,7 @@ def _joined(
     share = (np.arange(1, pieces) / pieces)[:, None]
     between = ends[0] + share * (ends[1] - ends[0])
     if len(between) == 0:
-        return Edge(_chained(a.nodes, b.nodes), np.concatenate([a.seen, b.seen]))
+        return Edge(_chained(a.nodes, b.nodes), np.concatenate([a.seen, b.seen]), a.evidence + b.evidence)
     line = np.concatenate([ends[:1], between, ends[1:]])
     measured = profiles.nodes_of(line, heights, raster, slopes).at(slice(1, -1))
     seen = np.isfinite(measured.sigma_step_m) & (measured.seen_low_m >= settings.seen_low_m)
@@ -184,7 +193,7 @@ def _joined(
     )  # fmt: skip
     mixed = Nodes(*(np.where(seen, m, h) for m, h in zip(measured, hidden, strict=True)))
     nodes = _chained(_chained(a.nodes, mixed), b.nodes)
-    return Edge(nodes, np.concatenate([a.seen, seen, b.seen]))
+    return Edge(nodes, np.concatenate([a.seen, seen, b.seen]), a.evidence + b.evidence)
 
 
 def _chained(a: Nodes, b: Nodes) -> Nodes:

@@ -35,7 +35,7 @@ class PathSettings(NamedTuple):
     gap_cost: float = 1.0
     """Evidence that a metre without a place costs (σ)."""
     bend_cost: float = 12.0
-    begin: float = 8.0
+    begin: float = 5.0
     """Least evidence (σ · m) of a path through its strongest place."""
     go_on: float = 3.0
     """Least evidence (σ · m) of a path through any of its places."""

@@ -22,6 +22,7 @@ DEPTH_M: Final = 0.12
 """Returns up to this above the lowest one of a cell count as its ground."""
 REACH_M: Final = 0.45
 """Returns up to this above bare earth may be ground: the top of a kerb that the filter has taken for an object too."""
+BESIDE_VEHICLE_M: Final = 0.15
 UNEVENNESS_M: Final = 0.004
 """Standard deviation of a cell's true height about a smooth surface; no number of returns takes it away."""
 COARSE_M: Final = 1.5
@@ -99,6 +100,8 @@ def _made(scene: Scene) -> HeightRaster:
     count = np.zeros((rows, columns), np.int32)
     mean, variance = np.zeros((rows, columns)), np.zeros((rows, columns))
     returns = scene.returns
+    grid = HeightRaster(x_min, y_min, CELL_M, count, mean, variance, used)
+    used &= ~_beside_vehicles(scene, grid)
     low_heights(
         returns.x_m[used], returns.y_m[used], returns.height_m[used], (x_min, y_min, CELL_M), DEPTH_M, count, mean,
         variance,
@@ -107,6 +110,19 @@ def _made(scene: Scene) -> HeightRaster:
     row, column = raster.cells_of(returns.x_m[used], returns.y_m[used])
     used[used] = returns.height_m[used] <= raster.height_m[row, column] + DEPTH_M
     return replace(raster, used=used)
+
+
+def _beside_vehicles(scene: Scene, grid: HeightRaster) -> npt.NDArray[np.bool_]:
+    """Returns (n,) at vehicles: what is seen of the ground there ends at their outline, and steps go along it."""
+    x, y, rows, columns = scene.returns.x_m, scene.returns.y_m, *grid.count.shape
+    vehicle = scene.classes == classes.VEHICLE
+    row, column = grid.cells_of(x[vehicle], y[vehicle])
+    number = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    cells = math.ceil(BESIDE_VEHICLE_M / grid.cell_m)
+    reach = np.arange(-cells, cells + 1) * grid.cell_m
+    disc = np.hypot(reach, reach[:, None]) <= BESIDE_VEHICLE_M + 1e-9
+    near = scipy.ndimage.binary_dilation(number >= 2, disc)
+    return np.asarray(near[grid.cells_of(x, y)])
 
 
 def of_cells(

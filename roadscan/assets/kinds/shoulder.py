@@ -12,6 +12,7 @@ import scipy.ndimage
 import shapely
 from pydantic import Field
 
+from roadscan.assets.edges.along_drive import road_edges
 from roadscan.assets.edges.line_pieces import dense
 from roadscan.assets.edges.strips import ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
@@ -37,17 +38,22 @@ class ShoulderOptions(Strict):
 
 
 class Shoulder(AssetKind):
-    """Shoulders: polygons between road edges and the lane lines nearest to them. They need no evidence of their own."""
+    """Shoulders: polygons between road edges and the lane lines nearest to them. They follow from objects of other kinds."""
 
     name: ClassVar[str] = "shoulder"
     title: ClassVar[str] = "shoulders: paved strips beyond the outer lane line"
     options: ClassVar[type[Strict]] = ShoulderOptions
     after: ClassVar[Sequence[str]] = ("lane_line", "road_edge")
-    piece_schema: ClassVar[pa.Schema] = pa.schema([pa.field("easting_m", pa.float64(), nullable=False)])
+    piece_schema: ClassVar[pa.Schema] = pa.schema(
+        [pa.field(name, pa.float64(), nullable=False) for name in ("easting_m", "northing_m")]
+    )
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Nothing: shoulders follow from other kinds."""
-        return Evidence(self.piece_schema.empty_table())
+        """The first node of each road edge within the tile: a mark that there may be a shoulder."""
+        corner = scene.returns.corner_m
+        marks = [(corner[0] + part.nodes[0, 0], corner[1] + part.nodes[0, 1]) for part in road_edges(scene)]
+        columns = {"easting_m": [m[0] for m in marks], "northing_m": [m[1] for m in marks]}
+        return Evidence(pa.table(columns, schema=self.piece_schema))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

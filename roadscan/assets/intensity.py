@@ -6,7 +6,9 @@ calibration for multi-beam lasers*, do for the beams of one scanner). The logari
 
     log I = log ρ(place) + laser(sensor, laser) + range(sensor, r) + incidence(sensor, θ),
 
-with functions of r and θ that are linear between nodes. What the data do not tell (the common factor, a trend that
+with functions of r and θ that are linear between nodes. It is fitted to the mean intensities themselves, zeros
+included, as a generalised linear model with a logarithmic link (McCullagh and Nelder, 1989, section 8), so that dark
+ground and coarse digital numbers leave no bias. What the data do not tell (the common factor, a trend that
 range and incidence could both explain) is held at the smallest gains.
 """
 
@@ -36,7 +38,9 @@ _MOST_PLACES: Final = 4000
 _SLOPE_OVER_M: Final = 1.0
 """The ground's normal is that of a plane of this size."""
 _ROUNDS: Final = 8
-_LASER_PRIOR: Final = 1.0
+_EXCESS: Final = (-0.9, 2.0)
+_SCATTER, _LEAST_SCATTER = 0.3, 0.02
+_LASER_PRIOR: Final = 0.7
 """1 σ of a laser's logarithmic gain before anything is measured."""
 _LEVEL_PRIOR: Final = 1.0
 _BEND_PRIOR: Final = 0.10
@@ -69,9 +73,11 @@ class IntensitySample:
     laser: Int64
     range_m: Float64
     incidence_deg: Float64
-    log_intensity: Float64
-    """(m,) natural logarithm of the median intensity."""
+    intensity: Float64
+    """(m,) mean intensity."""
     returns: Int64
+    unit: float
+    """Least positive intensity of the sample: the digital number."""
 
 
 class _Terms(NamedTuple):
@@ -86,32 +92,32 @@ class _Terms(NamedTuple):
 def intensity_sample(scene: Scene) -> IntensitySample:
     """What the returns of a scene that lie on the ground, within its tile, tell of gains."""
     found, tile = scene.returns, scene.tile
-    rows = np.flatnonzero(
-        (np.abs(scene.above_ground_m) <= ON_GROUND_M) & tile.holds(found.x_m, found.y_m) & (found.intensity > 0)
-    )
+    rows = np.flatnonzero((np.abs(scene.above_ground_m) <= ON_GROUND_M) & tile.holds(found.x_m, found.y_m))
     ground = found.at(rows)
     place = _places(ground)
     incidence = incidence_deg(ground, scene.ground)
     bin_of_range = np.searchsorted(RANGE_NODES_M, ground.range_m)
     keys = (bin_of_range, ground.laser, ground.sensor, place)
-    order = np.lexsort((ground.intensity, *keys))
+    order = np.lexsort(keys)
     new = np.zeros(order.size, np.bool_)
     new[:1] = True
     for key in keys:
         new[1:] |= np.diff(key[order].astype(np.int64)) != 0
     first = np.flatnonzero(new)
     size = np.diff(np.append(first, order.size))
-    middle = order[first + size // 2]
-    means = [np.add.reduceat(v[order], first) / size if size.size else v[:0] for v in (ground.range_m, incidence)]
+    one = order[first]
+    measured = (ground.range_m, incidence, ground.intensity.astype(np.float64))
+    means = [np.add.reduceat(v[order], first) / size if size.size else v[:0] for v in measured]
     return IntensitySample(
         key=found.corner_m,
         sensors=found.sensors or tuple(str(i) for i in range(int(found.sensor.max(initial=0)) + 1)),
-        place=place[middle],
-        sensor=ground.sensor[middle].astype(np.int64),
-        laser=ground.laser[middle].astype(np.int64),
+        place=place[one],
+        sensor=ground.sensor[one].astype(np.int64),
+        laser=ground.laser[one].astype(np.int64),
         range_m=means[0],
         incidence_deg=means[1],
-        log_intensity=np.log(ground.intensity[middle].astype(np.float64)),
+        intensity=means[2],
+        unit=float(ground.intensity[ground.intensity > 0].min(initial=np.inf)),
         returns=size.astype(np.int64),
     )
 
@@ -119,24 +125,38 @@ def intensity_sample(scene: Scene) -> IntensitySample:
 def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
     """Gains (:data:`GAINS_SCHEMA`) that explain the samples best, the same for any order of them.
 
-    Iterated least squares on logarithms: the unknown reflectance of each place is eliminated, rows that do not fit
-    (paint that one laser saw and another did not) weigh less (Geman–McClure). An empty table of no samples.
+    Iterated least squares: the unknown reflectance of each place is eliminated, rows that do not fit (paint that one
+    laser saw and another did not) weigh less (Geman–McClure). An empty table of no samples.
     """
     rows = _together(samples)
     if not rows.place.size:
         return GAINS_SCHEMA.empty_table()
     terms = _terms_of(rows)
     columns, values = _design(rows, terms)
-    weight = np.minimum(rows.returns, 9).astype(np.float64)
-    weights, scale = weight, 1.0
+    solution, covariance = np.zeros(terms.count), np.zeros((terms.count, terms.count))
+    robust, scale = np.ones(rows.place.size), 1.0
     for _ in range(_ROUNDS):
-        solution, covariance = _solved(rows, (columns, values), weights, scale, terms)
-        residual = _without_places(rows, rows.log_intensity - (values * solution[columns]).sum(axis=1), weights)
-        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-        weights = weight / (1.0 + (residual / (2.0 * scale)) ** 2) ** 2
+        response = (values * solution[columns]).sum(axis=1)
+        mean = _place_means(rows, response, robust)
+        excess = np.clip(rows.intensity / mean - 1.0, *_EXCESS)
+        weights = robust * np.minimum(rows.returns, 9) / (1.0 + (rows.unit / (2.0 * _SCATTER * mean)) ** 2)
+        solution, covariance = _solved(rows, (columns, values), (np.log(mean) + excess, weights), scale, terms)
+        deviation = _without_places(rows, excess, weights)
+        scale = max(1.4826 * float(np.median(np.abs(deviation))), _LEAST_SCATTER)
+        robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
     solution -= _common_part(rows, terms, (columns, values), solution)
     told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.count)
     return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
+
+
+def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
+    """Expected intensity (m,) of each row: the reflectance of its place, as all its rows tell it, times the response."""
+    weighted = weights * rows.returns
+    factor = np.exp(response)
+    total = np.bincount(rows.place, weights=weighted * rows.intensity)
+    place = total / np.maximum(np.bincount(rows.place, weights=weighted * factor), 1e-12)
+    out: Float64 = np.maximum(place, rows.unit / 10.0)[rows.place] * factor
+    return out
 
 
 def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Returns:
@@ -229,11 +249,12 @@ def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
         parts.append((place + first, number[sample.sensor[kept]], *(v[kept] for v in _values(sample))))
         first += int(place.max(initial=-1)) + 1
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 7
-    return IntensitySample((0.0, 0.0), names, *joined)
+    unit = min((s.unit for s in ordered), default=1.0)
+    return IntensitySample((0.0, 0.0), names, *joined, unit=unit if np.isfinite(unit) else 1.0)
 
 
 def _values(sample: IntensitySample) -> tuple[npt.NDArray[np.generic], ...]:
-    return sample.laser, sample.range_m, sample.incidence_deg, sample.log_intensity, sample.returns
+    return sample.laser, sample.range_m, sample.incidence_deg, sample.intensity, sample.returns
 
 
 def _chosen(sample: IntensitySample) -> Int64:
@@ -292,23 +313,28 @@ def _without_places(rows: IntensitySample, value: Float64, weights: Float64) -> 
 
 
 def _solved(
-    rows: IntensitySample, design: tuple[Int64, Float64], weights: Float64, scale: float, terms: _Terms
+    rows: IntensitySample,
+    design: tuple[Int64, Float64],
+    observed: tuple[Float64, Float64],
+    scale: float,
+    terms: _Terms,
 ) -> tuple[Float64, Float64]:
-    """Unknowns and their covariance: normal equations without the places' reflectances, with the priors."""
-    import scipy.sparse as sparse
+    """Unknowns and their covariance: normal equations without the places' reflectances, with the priors.
 
-    columns, values = design
+    observed : (m,) logarithmic intensities and their weights.
+    """
+    from scipy import sparse
+
+    (columns, values), (value, weights) = design, observed
     size = rows.place.size
     at = np.repeat(np.arange(size), 5)
     matrix = sparse.csr_array((values.ravel(), (at, columns.ravel())), shape=(size, terms.count))
-    in_place = sparse.csr_array(
-        (weights, (rows.place, np.arange(size))), shape=(int(rows.place.max()) + 1, size)
-    )
+    in_place = sparse.csr_array((weights, (rows.place, np.arange(size))), shape=(int(rows.place.max()) + 1, size))
     total = np.maximum(np.bincount(rows.place, weights=weights), 1e-12)
     sums = in_place @ matrix
     weighted = sparse.csr_array(matrix.multiply(weights[:, None]))
     normal = (matrix.T @ weighted - sums.T @ sums.multiply(1.0 / total[:, None])).toarray()
-    right = matrix.T @ (weights * _without_places(rows, rows.log_intensity, weights))
+    right = matrix.T @ (weights * _without_places(rows, value, weights))
     full = normal / scale**2 + _prior(terms)
     covariance = np.linalg.inv(full)
     return covariance @ (right / scale**2), covariance
@@ -331,10 +357,8 @@ def _prior(terms: _Terms) -> Float64:
     return out
 
 
-def _common_part(
-    rows: IntensitySample, terms: _Terms, design: tuple[Int64, Float64], solution: Float64
-) -> Float64:
-    """What to take from the unknowns (k,) so that the mean gain of the rows is 1; taken from the lasers of all sensors."""
+def _common_part(rows: IntensitySample, terms: _Terms, design: tuple[Int64, Float64], solution: Float64) -> Float64:
+    """What to take from the unknowns (k,), of the lasers of all sensors, so that the mean gain of the rows is 1."""
     columns, values = design
     mean = float(np.average((values * solution[columns]).sum(axis=1), weights=rows.returns))
     out = np.zeros(terms.count)

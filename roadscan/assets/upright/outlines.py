@@ -13,6 +13,9 @@ Float64 = npt.NDArray[np.float64]
 
 _DIRECTIONS: Final = 36
 _TRIMMED: Final = 0.003
+_BEYOND: Final = 0.35
+"""The edge lies past the outermost return by this share of the mean distance from return to return: none of evenly
+spread returns would make it 0, a grid of them 0.5."""
 _SQUARE: Final = 0.08
 """Sides that differ by less than this share make a square."""
 
@@ -53,6 +56,8 @@ def outline_of(points: Float64) -> Outline:
         return Outline("other", (float(middle[0]), float(middle[1])), wide, tall, math.inf)
     misfit, shape, solution = best
     width, height = float(solution[2]), float(solution[-1])
+    beyond = _BEYOND * math.sqrt(width * height / len(points))
+    width, height = width + 2.0 * beyond, height + 2.0 * beyond
     if shape == "rectangle" and abs(width - height) < _SQUARE * max(width, height):
         shape = "square"
     return Outline(shape.split()[0], (float(solution[0]), float(solution[1])), width, height, misfit)

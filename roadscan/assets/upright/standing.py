@@ -67,7 +67,8 @@ def probability_of(shaft: Shaft, inside_plane: bool) -> float:
     """Probability that a shaft stands by itself: a logistic function of its measures.
 
     Measures: slices that show it, the share of them from its foot up, the share of the returns about it that are its
-    own, the share of slices free around, the height of its hidden foot, its lean, its roughness.
+    own, the share of slices free around, the height of its hidden foot, its lean, its roughness, its returns where they
+    are few.
     """
     lean = shaft.axis.lean_deg
     if shaft.top_above_m <= _LOW_M:
@@ -81,7 +82,7 @@ def probability_of(shaft: Shaft, inside_plane: bool) -> float:
     high = [
         (0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free),
         (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)), (-0.35, max(lean - 5.0, 0.0)),
-        (-5.0, float(inside_plane)),
+        (-5.0, float(inside_plane)), (-0.1, max(40 - shaft.rows.size, 0)),
     ]  # fmt: skip
     return logistic(-12.5, high)
 

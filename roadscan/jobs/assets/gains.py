@@ -34,7 +34,7 @@ _UNIT: Final = "all"
 _MOST_SQUARES: Final = 24
 """Squares that tell of gains; which ones is told by a digest of their place."""
 _LEAST_RETURNS: Final = 20_000
-_COLUMNS: Final = ("place", "sensor", "laser", "range_m", "incidence_deg", "log_intensity", "returns")
+_COLUMNS: Final = ("place", "sensor", "laser", "range_m", "incidence_deg", "intensity", "returns")
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,7 @@ def _sampled(task: SampleTask, loaded: LoadedSquare, key: str) -> OutputRecord:
     if not known.any():
         return OutputRecord(SAMPLES, unit, key, "", 0, "")
     rows = pa.table({name: getattr(sample, name)[known] for name in _COLUMNS})
+    rows = rows.append_column("unit", pa.array(np.full(rows.num_rows, sample.unit)))
     store = task.load.readings.store
     with store.scratch() as folder:
         path = folder / "sample.parquet"
@@ -133,7 +134,8 @@ def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str)
         if record is not None and record.path:
             rows = store.parse_table(read_recorded(store, record), record.path)
             columns = {name: rows[name].to_numpy() for name in _COLUMNS}
-            samples.append(IntensitySample(key=plan.grid.corner_m(square), sensors=plan.sensors, **columns))
+            unit = float(rows["unit"][0].as_py())
+            samples.append(IntensitySample(plan.grid.corner_m(square), plan.sensors, **columns, unit=unit))
     schema = table_schema(GAINS)
     content = parquet_bytes(gains_of(samples).cast(schema.arrow()), schema)
     target = f"{schema.location}/{GAINS}.parquet"

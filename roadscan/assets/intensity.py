@@ -150,7 +150,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
 
 
 def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
-    """Expected intensity (m,) of each row: the reflectance of its place, as all its rows tell it, times the response."""
+    """Expected intensity (m,) of each row: the reflectance of its place, as all rows of it tell, times the response."""
     weighted = weights * rows.returns
     factor = np.exp(response)
     total = np.bincount(rows.place, weights=weighted * rows.intensity)

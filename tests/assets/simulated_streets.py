@@ -22,7 +22,8 @@ from roadscan.simulate.surface import Surface
 
 Float64 = npt.NDArray[np.float64]
 
-TILE_M, HALO_M = 40.0, 8.0
+HALO_M = 8.0
+_TALL = ("facades", "fences", "trees", "lamp_posts", "guardrails", "signs", "poles")
 _PAINT_FROM = 150.0
 """Digital numbers of the simulator: paint is 190, a kerb 135."""
 
@@ -43,22 +44,30 @@ class SimulatedStreet:
 
 
 @functools.cache
-def street(name: str, station_m: float, passes: tuple[int, ...] = (0,), seed: int | None = None) -> SimulatedStreet:
-    """The tile around a station of a scene of the simulator, as the lidar saw it in some passes."""
+def street(name: str, station_m: float, tile_m: float = 40.0, *, whole: bool = False) -> SimulatedStreet:
+    """The tile around a station of a scene of the simulator, as the lidar saw it in the first pass.
+
+    Unless it is wanted whole, the pass makes no stop, and what stands beside the road is left out but for cars: that
+    takes seconds in place of minutes.
+    """
     scene = SimulatedScene.load(name)
-    scene = scene if seed is None else scene.model_copy(update={"seed": seed})
+    if not whole:
+        roadside = scene.roadside.model_copy(update={kind: [] for kind in _TALL})
+        first = scene.passes[0].model_copy(update={"stops": []})
+        scene = scene.model_copy(update={"roadside": roadside, "passes": [first]})
     surface, earth = Surface(scene), Earth(scene.map.crs)
     easting, northing, _ = surface.place(np.array([station_m]), np.array([0.0]))
-    corner = tuple(float(10.0 * math.floor((v[0] - TILE_M / 2) / 10.0)) for v in (easting, northing))
+    corner = tuple(float(10.0 * math.floor((v[0] - tile_m / 2) / 10.0)) for v in (easting, northing))
     world = World(scene, surface)
-    drives = [d for d in drives_of(scene, earth, Surface(scene, ride=True)) if d.number in passes]
-    parts = [_seen(scene, world, drive, station_m, (corner[0], corner[1])) for drive in drives]
-    arrays = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    drive = drives_of(scene, earth, Surface(scene, ride=True))[0]
+    tile = Box(0.0, 0.0, tile_m, tile_m)
+    window = Box(-HALO_M, -HALO_M, tile_m + HALO_M, tile_m + HALO_M)
+    arrays = _seen(
+        scene, world, drive, (station_m - tile_m / 2 - HALO_M, station_m + tile_m / 2 + HALO_M), window, corner
+    )
     on_paint = surface.intensity(arrays.pop("hit_e"), arrays.pop("hit_n")) > _PAINT_FROM
     on_paint &= arrays.pop("object_id") == 0
     returns = Returns(corner_m=(corner[0], corner[1]), sensors=("lidar",), **arrays)
-    tile = Box(0.0, 0.0, TILE_M, TILE_M)
-    window = Box(-HALO_M, -HALO_M, TILE_M + HALO_M, TILE_M + HALO_M)
     return SimulatedStreet(make_scene(returns, tile, window, _drives(returns)), on_paint, surface)
 
 
@@ -75,7 +84,12 @@ def faded(street: SimulatedStreet, contrast: float, worn: float) -> SimulatedStr
 
 
 def _seen(
-    scene: SimulatedScene, world: World, drive: Drive, station_m: float, corner: tuple[float, float]
+    scene: SimulatedScene,
+    world: World,
+    drive: Drive,
+    span_m: tuple[float, float],
+    window: Box,
+    corner: tuple[float, ...],
 ) -> dict[str, npt.NDArray[np.generic]]:
     """Columns of the returns of a pass within the window."""
     first = lidar.starts_gps_ns(drive)
@@ -88,18 +102,18 @@ def _seen(
         numbers = np.arange(packet, min(packet + lidar.BLOCK_PACKETS, count))
         epochs = first + numbers * lidar.PACKET_NS
         stations = drive.station_m(epochs[[0, -1]])
-        if max(stations) < station_m - TILE_M or min(stations) > station_m + TILE_M:
+        if max(stations) < span_m[0] or min(stations) > span_m[1]:
             continue
         azimuths = lidar._azimuths(scene, start_deg, numbers)
         found = lidar._measure_block(
             scene, world, drive, epochs, azimuths, key + packet * lidar.CYCLES * lidar.LASERS, block
         )
-        parts.append(_columns(scene, drive, found, corner))
+        parts.append(_columns(scene, drive, found, window, corner))
     return {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
 
 
 def _columns(
-    scene: SimulatedScene, drive: Drive, packets: lidar.Packets, corner: tuple[float, float]
+    scene: SimulatedScene, drive: Drive, packets: lidar.Packets, window: Box, corner: tuple[float, ...]
 ) -> dict[str, npt.NDArray[np.generic]]:
     seen = (packets.ranges > 0).reshape(len(packets.epoch_gps_ns), -1)
     epoch = packets.firing_gps_ns().reshape(seen.shape)
@@ -109,7 +123,7 @@ def _columns(
     share = packets.ranges.reshape(seen.shape)[seen] * lidar.RANGE_STEP_M / packets.found.range_m[seen]
     place = sensor + (hit - sensor) * share[:, None]
     x, y = place[:, 0] - corner[0], place[:, 1] - corner[1]
-    inside = Box(-HALO_M, -HALO_M, TILE_M + HALO_M, TILE_M + HALO_M).holds(x, y)
+    inside = window.holds(x, y)
     n = int(inside.sum())
     laser = np.broadcast_to(np.arange(lidar.LASERS), packets.ranges.shape).reshape(seen.shape)[seen]
     return {

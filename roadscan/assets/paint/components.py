@@ -13,10 +13,10 @@ from roadscan.assets.paint.contrast import CELL_M, Contrast
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-SEED_CONTRAST: Final = 0.35
+SEED_CONTRAST: Final = 0.45
 SEED_SIGMAS: Final = 4.0
 """Paint begins at cells of this contrast, in units of the surface's brightness and of the noise."""
-_EDGE_SHARE: Final = 0.5
+_EDGE_SHARE: Final = 0.4
 """Paint reaches to where the contrast is this share of the greatest near it."""
 _NEAR_M: Final = 0.2
 _LEAST_CONTRAST: Final = 0.10

@@ -14,7 +14,7 @@ from roadscan.assets.paint.components import Component, components_of
 from roadscan.assets.paint.contrast import CELL_M, Contrast, contrast_of
 from roadscan.assets.paint.crosswalks import Bar, crosswalk_bars, is_round
 from roadscan.assets.paint.road_direction import RoadDirection
-from roadscan.assets.paint.stripes import Stripe, lies_flat, stripes_of
+from roadscan.assets.paint.stripes import AROUND_M, Stripe, lies_flat, stripes_of
 from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
@@ -25,8 +25,10 @@ ACROSS_DEG: Final = 55.0
 _STOP_BAR_M: Final = (0.15, 1.0)
 """Narrowest band across the road that is a bar, and shortest."""
 _LEAST_AREA_M2: Final = 0.03
-_WORN_SHARE: Final = 0.3
-"""Where the contrast has fallen below this share of its stripe's, the paint is worn off."""
+_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, -2.0
+_OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0
+_SPREAD: Final = 0.25
+"""1 σ of the contrast of fresh paint from place to place, as a share of its mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,9 @@ class Patch:
     contrast: float
     evidence_sigma: float
     returns: Int64
-    """Indices of the contrast's returns."""
+    """Indices of the contrast's returns within it."""
+    around: Int64
+    """Those beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +97,22 @@ def _paint_of(scene: Scene) -> Paint:
     return Paint(found, tuple(lines), tuple(patches))
 
 
-def painted_rows(found: Contrast, returns: Int64, contrast: float) -> Int64:
-    """Rows of the scene for returns of a shape, without those where its paint is worn off."""
-    there = found.mean.ravel()[found.cell[returns]] >= _WORN_SHARE * contrast
-    return found.rows[returns[there]]
+def painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
+    """Rows of the scene for the returns of a shape that are paint, as its outline, they and those near them tell.
+
+    Logarithms of odds add up: of the outline (worn paint has holes, edges are ragged), of the return's own contrast,
+    and of the mean contrast around it, each held between bounds.
+    """
+    at = np.concatenate([shape.returns, shape.around])
+    odds = np.where(np.arange(at.size) < shape.returns.size, _INSIDE_LOGIT, _BESIDE_LOGIT)
+    level = shape.contrast
+    for value, sigma, most in (
+        (found.contrast[at], found.noise[at], _OWN_LOGIT),
+        (found.mean.ravel()[found.cell[at]], found.sigma.ravel()[found.cell[at]], _NEAR_LOGIT),
+    ):
+        spread = np.hypot(sigma, _SPREAD * level)
+        odds = odds + np.clip(level * (value - level / 2) / spread**2, -most, most)
+    return found.rows[at[odds > 0.0]]
 
 
 def _lies_across(stripe: Stripe, road_rad: float) -> bool:
@@ -110,13 +126,18 @@ def _of_stripe(stripe: Stripe, crossed: bool, road_rad: float) -> Patch:
     aside = stripe.width_m / 2 * np.array([-stripe.along[1], stripe.along[0]])
     begin, end = stripe.at(stripe.begin_m), stripe.at(stripe.end_m)
     shape = shapely.Polygon([begin - aside, end - aside, end + aside, begin + aside])
-    return Patch(shape, True, crossed, road_rad, stripe.contrast, stripe.evidence_sigma, stripe.returns)
+    return Patch(shape, True, crossed, road_rad, stripe.contrast, stripe.evidence_sigma, stripe.returns, stripe.around)
 
 
 def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: float) -> Patch:
+    from scipy.spatial import cKDTree
+
     half = CELL_M / 2
     x, y = component.cell_x_m, component.cell_y_m
     shape = shapely.union_all(shapely.box(x - half, y - half, x + half, y + half))
-    inside = component.near[component.inside]
+    inside, outside = component.near[component.inside], component.near[~component.inside]
+    away, _ = cKDTree(np.stack([x, y], axis=1)).query(
+        np.stack([found.x_m[outside], found.y_m[outside]], axis=1), distance_upper_bound=AROUND_M
+    )
     level = float(np.mean(found.contrast[inside])) if inside.size else 0.0
-    return Patch(shape, False, crossed, road_rad, level, component.evidence_sigma, inside)
+    return Patch(shape, False, crossed, road_rad, level, component.evidence_sigma, inside, outside[np.isfinite(away)])

@@ -43,7 +43,7 @@ def line_pieces(scene: Scene, paint: Paint) -> pa.Table:
 
 def line_rows(scene: Scene, paint: Paint) -> npt.NDArray[np.int64]:
     """Rows of the scene's returns that lie on lines."""
-    found = [painted_rows(paint.contrast, s.returns, s.contrast) for s in paint.lines]
+    found = [painted_rows(paint.contrast, s) for s in paint.lines]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))
 
 

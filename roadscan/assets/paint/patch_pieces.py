@@ -46,7 +46,7 @@ def patch_pieces(scene: Scene, paint: Paint) -> pa.Table:
 
 def patch_rows(scene: Scene, paint: Paint) -> npt.NDArray[np.int64]:
     """Rows of the scene's returns that lie on patches."""
-    found = [painted_rows(paint.contrast, p.returns, p.contrast) for p in paint.patches]
+    found = [painted_rows(paint.contrast, p) for p in paint.patches]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))
 
 

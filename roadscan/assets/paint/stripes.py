@@ -23,9 +23,14 @@ _SLIMMEST: Final = 2.0
 """Length over width of a band."""
 _SHORTEST_M: Final = 0.35
 _BESIDE_M: Final = 0.25
+AROUND_M: Final = 0.08
+"""Returns this near to paint may lie on it: ranges and poses are not exact, and edges not straight."""
+_SEEN_ASIDE_M: Final = 0.05
 _EDGE_M: Final = 0.03
 _BEND_M: Final = 0.02
 """A road's surface rises or falls less than this at its lines, against the mean of both sides."""
+_UNEVEN: Final = 0.5
+"""Paint lies on one surface: its sides differ by less than this share of its contrast to them."""
 _FLAT_M: Final = 0.02
 _STEEPEST: Final = 0.15
 _STEP_M: Final = 0.04
@@ -50,6 +55,8 @@ class Stripe:
     """Mean contrast of its core."""
     returns: Int64
     """(n,) returns within it, indices of the contrast's."""
+    around: Int64
+    """(m,) returns within `AROUND_M` of it."""
     sigma_across_m: float
     begin_seen: bool
     end_seen: bool
@@ -73,7 +80,7 @@ class Stripe:
 
 
 def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, float]) -> list[Stripe] | None:
-    """Bands that the component consists of, end to end; None if it is of another shape. Kerbs are left out."""
+    """Bands that the component consists of, end to end; None if it is of another shape. Edges of surfaces are left out."""
     axis = _axis(component.cell_x_m, component.cell_y_m)
     if axis is None:
         return None
@@ -83,10 +90,10 @@ def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, flo
         return _of_parts(found, component, (middle, along, length), corner_m)
     if not straight or length < _SHORTEST_M or width > WIDEST_M + 0.15 or length < _SLIMMEST * width:
         return None
-    start = Stripe(middle, along, -length / 2, length / 2, width, 0.0, component.near, 0.0, False, False,
+    start = Stripe(middle, along, -length / 2, length / 2, width, 0.0, component.near, component.near, 0.0, False, False,
                    component.evidence_sigma)  # fmt: skip
     stripe = fitted(found, start)
-    if stripe is not None and _on_a_step(found, component, stripe):
+    if stripe is not None and _is_an_edge(found, component, stripe):
         return []
     if stripe is None or stripe.width_m > WIDEST_M or stripe.length_m < max(_SHORTEST_M, _SLIMMEST * stripe.width_m):
         return None
@@ -124,13 +131,15 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     scatter = float(np.mean(noise[inside])) / max(stripe.contrast, 1e-3)
     sigma = float(np.hypot(stripe.width_m * scatter, 0.03) / np.sqrt(count) + 0.002)
     seen = [
-        bool(np.count_nonzero((np.abs(across) <= stripe.width_m / 2) & beyond) >= 2)
+        bool(np.any((np.abs(across) <= stripe.width_m / 2 + _SEEN_ASIDE_M) & beyond))
         for beyond in (
             (along < stripe.begin_m) & (along > stripe.begin_m - 0.3),
             (along > stripe.end_m) & (along < stripe.end_m + 0.3),
         )
     ]
-    return replace(stripe, returns=near[inside], sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1])
+    reach = (along >= stripe.begin_m - AROUND_M) & (along <= stripe.end_m + AROUND_M)
+    around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
+    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1])
 
 
 def lies_flat(found: Contrast, component: Component) -> bool:
@@ -144,20 +153,23 @@ def lies_flat(found: Contrast, component: Component) -> bool:
     return bool(scatter <= _FLAT_M and np.hypot(plane[0], plane[1]) <= _STEEPEST)
 
 
-def _on_a_step(found: Contrast, component: Component, stripe: Stripe) -> bool:
-    """True where the ground bends or steps across the stripe, as it does at a kerb."""
+def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
+    """True where two surfaces meet: the ground bends or steps across the stripe, or one side is much brighter."""
     near = component.near
     along, across = stripe.coordinates(found.x_m[near], found.y_m[near])
     within = (along >= stripe.begin_m) & (along <= stripe.end_m)
     beyond = np.abs(across) - stripe.width_m / 2
-    sides = []
+    heights, levels = [], []
     for mine in (beyond <= 0, (across > 0) & (beyond > _EDGE_M), (across < 0) & (beyond > _EDGE_M)):
-        height = found.height_m[near[within & mine & (beyond <= _BESIDE_M)]]
-        sides.append(float(np.median(height)) if height.size >= 3 else np.nan)
-    inside, left, right = sides
+        there = near[within & mine & (beyond <= _BESIDE_M)]
+        heights.append(float(np.median(found.height_m[there])) if there.size >= 3 else np.nan)
+        levels.append(float(np.median(found.contrast[there])) if there.size >= 3 else np.nan)
+    inside, left, right = heights
     bend, slope = abs((left + right) / 2 - inside), abs(left - right) / (stripe.width_m + _EDGE_M + _BESIDE_M)
     lone = max(np.nan_to_num(abs(left - inside)), np.nan_to_num(abs(right - inside)))
-    return bool(bend > _BEND_M or slope > _STEEPEST or lone > _STEP_M)
+    above = levels[0] - (levels[1] + levels[2]) / 2
+    uneven = abs(levels[1] - levels[2]) > _UNEVEN * above
+    return bool(bend > _BEND_M or slope > _STEEPEST or lone > _STEP_M or uneven)
 
 
 def _centred(stripe: Stripe, along: Float64, across: Float64, excess: Float64) -> Stripe | None:

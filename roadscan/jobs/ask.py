@@ -12,6 +12,7 @@ from roadscan.model.errors import RoadscanError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.products.base import SurveyProduct, products
 from roadscan.sensors.base import log_formats
+from roadscan.tables.asset_schema import asset_tables
 from roadscan.tables.schema import schema_names
 from roadscan.tables.sql import missing_table, query
 from roadscan.tables.store import Store
@@ -77,6 +78,10 @@ def not_made(name: str, survey: Survey) -> RoadscanError | None:
 
 def _way_to(table: str, survey: Survey) -> str | None:
     """What makes a table; None where no such table is known."""
+    if table in asset_tables():
+        return (
+            f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"
+        )
     if table not in schema_names() and table not in _MADE_BY:
         return None
     made = next((p for p in products().values() if isinstance(p, SurveyProduct) and p.table == table), None)

@@ -22,6 +22,7 @@ IMU_TO_VELODYNE: Final = np.array(
 )
 CARS: Final = ("Car", "Van", "Truck", "Tram", "Misc")
 OTHER, CAR, PERSON = 0, 1, 2
+_SCANS: Final = 52
 
 
 def kitti_drive_returns(
@@ -39,8 +40,12 @@ def kitti_drive_returns(
     parts, kinds, objects, drive = [], [], [], []
     registration = Registration()
     with tarfile.open(folder / "velodyne_points.tar.xz") as archive:
-        members = sorted((m for m in archive if m.name.endswith(".bin")), key=lambda m: m.name)[scans]
-        for member in members:
+        wanted = range(_SCANS)[scans]
+        for number_of_scan, member in enumerate(m for m in archive if m.name.endswith(".bin")):
+            if number_of_scan > max(wanted):
+                break
+            if number_of_scan not in wanted:
+                continue
             frame = int(member.name[-14:-4])
             stream = archive.extractfile(member)
             assert stream is not None

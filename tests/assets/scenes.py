@@ -92,11 +92,10 @@ def velodyne_returns(content: bytes, pose: npt.NDArray[np.float64]) -> Returns:
 
 
 def hdl64_laser(xyz: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
-    """Number (n,) of the laser from the top: 32 of 1/3° from +2° down, 32 of 1/2° from −8.83° down."""
-    up = np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
-    upper = np.clip(np.round((2.0 - up) * 3.0), 0, 31)
-    lower = 32 + np.clip(np.round((-8.83 - up) * 2.0), 0, 31)
-    return np.where(up > -8.58, upper, lower).astype(np.uint16)
+    """Number (n,) of the laser: the file lists laser after laser, each over a turn that begins straight ahead."""
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    begins = (azimuth[:-1] < 0) & (azimuth[:-1] > -0.6) & (azimuth[1:] >= 0) & (azimuth[1:] < 0.6)
+    return np.concatenate([[0], np.cumsum(begins)]).astype(np.uint16)
 
 
 def joined(parts: list[Returns]) -> Returns:

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.ground.grid import Grid
+from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.kernels.assets.lowest import counts
 from roadscan.model.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+
+DENSE_PER_M2: Final = 4
+"""Median number of returns of the square metres that hold any, from which the data are those of a scanner on the road:
+scanners from the air give about one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,3 +68,12 @@ def sampled(z: Float32, grid: Grid, other: Grid) -> Float32:
     u = np.clip((x_m - grid.x_min_m) / grid.cell_m - 0.5, 0, grid.columns - 1).astype(np.float32)
     v = np.clip((y_m - grid.y_min_m) / grid.cell_m - 0.5, 0, grid.rows - 1).astype(np.float32)
     return np.asarray(cv2.remap(z, *np.meshgrid(u, v), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def is_dense(place: Place) -> bool:
+    """Whether the returns of the window lie as dense as those of a scanner on the road."""
+    grid = grid_over(place.window, 1.0)
+    found = np.zeros(grid.shape, np.int32)
+    counts(place.returns.x_m, place.returns.y_m, grid.origin, 1.0, found)
+    held = found[found > 0]
+    return bool(held.size and np.median(held) >= DENSE_PER_M2)

@@ -71,7 +71,8 @@ def test_the_two_strong_signs_are_found_and_no_other() -> None:
     scene, labels = semantic_kitti_scene()
     plates = [p for p in plates_of(scene, SignOptions()) if p.probability >= 0.5]
     wanted = clusters(SIGN, 100)
-    assert len(wanted) == 2 == len(plates)
+    judged = [p for p in plates if not np.isin(labels[p.rows], NOT_JUDGED).mean() > 0.5]
+    assert len(wanted) == 2 == len(judged)
     for rows in wanted:
         assert any(np.isin(p.rows, rows).sum() >= 50 for p in plates)
 

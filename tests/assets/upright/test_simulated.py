@@ -29,7 +29,7 @@ def nearest(one: AssetObject, kinds: tuple[str, ...]) -> tuple[pd.Series, float]
 
 
 def test_each_shaft_is_found_where_it_stands_as_what_it_is() -> None:
-    scene, truth = simulated()
+    scene, _truth = simulated()
     wanted = {"pole": 5, "lighting": 1, "tree": 2, "delineator": 2, "signal": 0}
     for kind, number in wanted.items():
         found = objects_of(scene, kind)
@@ -64,7 +64,7 @@ def test_trees_have_their_height_and_crown() -> None:
 
 
 def test_signs_have_place_size_shape_and_facing() -> None:
-    scene, truth = simulated()
+    scene, _truth = simulated()
     signs = objects_of(scene, "sign")
     assert len(signs) == 2
     for sign in signs:

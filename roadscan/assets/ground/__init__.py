@@ -1,0 +1,1 @@
+"""Bare earth: which returns lie on it, its raster, its cross-sections."""

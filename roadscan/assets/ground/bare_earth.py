@@ -1,0 +1,51 @@
+"""Bare earth of a window: which returns lie on it, and its raster."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.ground.dense import dense_ground
+from roadscan.assets.ground.planes import plane_ground
+from roadscan.assets.ground.raster import ground_model
+from roadscan.assets.ground.sparse import sparse_ground
+from roadscan.assets.ground.surface import Found, Place, is_dense
+from roadscan.assets.scene import GroundModel
+from roadscan.kernels.assets.heights import heights_above
+
+Float32 = npt.NDArray[np.float32]
+
+_NOISE_M: Final = 0.3
+"""A return is noise that lies below the ground by more."""
+
+
+class BareEarth(NamedTuple):
+    """What is known of the ground of a window."""
+
+    model: GroundModel
+    above_m: Float32
+    """(n,) height of each return above bare earth (m), NaN where it is not known."""
+    on_ground: npt.NDArray[np.bool_]
+    """(n,) returns that lie on it."""
+    below: npt.NDArray[np.bool_]
+    """(n,) returns that lie below it: noise."""
+
+
+def bare_earth(place: Place) -> BareEarth:
+    """Ground of the returns of a window."""
+    found = ground_returns(place)
+    model = ground_model(place, found)
+    above = np.empty(len(place.returns), np.float32)
+    corner = np.array([model.x_min_m, model.y_min_m])
+    x, y, z = place.returns.x_m, place.returns.y_m, place.returns.height_m
+    heights_above(x, y, z, corner, 1.0 / model.cell_m, model.height_m, above)
+    return BareEarth(model, above, found.on_ground, ~found.on_ground & (above < -_NOISE_M))
+
+
+def ground_returns(place: Place) -> Found:
+    """Returns on the ground by the filter that the settings name."""
+    if place.settings.method == "planes":
+        return plane_ground(place)
+    return dense_ground(place) if is_dense(place) else sparse_ground(place)

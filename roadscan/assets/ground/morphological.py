@@ -1,0 +1,69 @@
+"""Bare earth by opening the surface of lowest returns with growing windows.
+
+After Pingel, Clarke, McBride (2013), "An improved simple morphological filter for the terrain classification of
+airborne LIDAR data", ISPRS Journal 77: 21–30.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.ground.filling import filled
+
+Float32 = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+
+_GROWTH: Final = 1.15
+"""Each window is wider than the one before by this factor, and by a cell at the least."""
+_PIT_M: Final = 8.0
+"""A lowest return is noise where it lies below the surface around by more: crowns with a gap are no deeper."""
+
+
+def disk(radius: int) -> npt.NDArray[np.uint8]:
+    """Cells (2 r + 1, 2 r + 1) whose middles lie within `radius` cells of the middle one."""
+    away = np.arange(-radius, radius + 1)
+    return (away[:, None] ** 2 + away**2 <= radius * radius).astype(np.uint8)
+
+
+def opened(z: Float32, radius: int) -> Float32:
+    """Opening of a surface (rows, columns) by a disk of so many cells; what lies outside does not count."""
+    return np.asarray(cv2.dilate(cv2.erode(z, disk(radius)), disk(radius)))
+
+
+def windows(largest_m: float, cell_m: float) -> list[int]:
+    """Radii (cells), growing to the largest."""
+    last, found, radius = max(round(largest_m / cell_m), 1), [], 1
+    while radius < last:
+        found.append(radius)
+        radius = max(radius + 1, math.floor(radius * _GROWTH))
+    return [*found, last]
+
+
+def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) -> Bools:
+    """Cells of a whole surface (rows, columns) that stand on the ground instead of being part of it (section 2.2)."""
+    found = np.zeros(surface.shape, np.bool_)
+    before = surface
+    for radius in windows(largest_m, cell_m):
+        after = opened(before, radius)
+        found |= before - after > steepest * radius * cell_m
+        before = after
+    return found
+
+
+def bare_cells(lowest_m: Float32, cell_m: float, steepest: float, largest_m: float) -> Bools:
+    """Cells (rows, columns) whose lowest return lies on the ground.
+
+    lowest_m : (rows, columns), inf where a cell holds no return.
+    """
+    known = np.isfinite(lowest_m)
+    surface = filled(lowest_m, known)
+    pits = -surface - opened(-surface, 1) > _PIT_M
+    if (pits & known).any():
+        known &= ~pits
+        surface = filled(lowest_m, known)
+    return known & ~objects(surface, cell_m, steepest, largest_m)

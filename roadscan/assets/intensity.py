@@ -1,0 +1,389 @@
+"""Intensity calibrated from the data themselves: a gain per sensor and laser, by range and by angle of incidence.
+
+Places of half a metre on the ground are seen by several lasers, from several ranges. What a place reflects is unknown,
+but the same for all of them; so differences within places tell the gains (as Levinson and Thrun, 2010, *Unsupervised
+calibration for multi-beam lasers*, do for the beams of one scanner). The logarithm of an intensity is modelled as
+
+    log I = log ρ(place) + laser(sensor, laser) + range(sensor, r) + incidence(sensor, θ),
+
+with functions of r and θ that are linear between nodes. It is fitted to the mean intensities themselves, zeros
+included, as a generalised linear model with a logarithmic link (McCullagh and Nelder, 1989, section 8), so that dark
+ground and coarse digital numbers leave no bias. What the data do not tell (the common factor, a trend that
+range and incidence could both explain) is held at the smallest gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import GroundModel, Scene
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+RANGE_NODES_M: Final = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 17.0, 23.0, 32.0, 45.0, 64.0, 90.0])
+INCIDENCE_NODES_DEG: Final = np.array([0.0, 20.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 79.0, 82.0, 85.0, 88.0, 90.0])
+PLACE_M: Final = 0.5
+ON_GROUND_M: Final = 0.1
+"""Returns within this of the ground model tell of gains, and are on the ground."""
+_MOST_PLACES: Final = 4000
+"""Places of a sample; which ones is told by a counter keyed by place."""
+_SLOPE_OVER_M: Final = 1.0
+"""The ground's normal is that of a plane of this size."""
+_ROUNDS: Final = 8
+_EXCESS: Final = (-0.9, 2.0)
+_SCATTER, _LEAST_SCATTER = 0.3, 0.02
+_LASER_PRIOR: Final = 0.7
+"""1 σ of a laser's logarithmic gain before anything is measured."""
+_LEVEL_PRIOR: Final = 1.0
+_BEND_PRIOR: Final = 0.10
+"""1 σ of the second differences of the functions of range and incidence from node to node."""
+
+GAINS_SCHEMA: Final = pa.schema(
+    [
+        pa.field("sensor", pa.string(), nullable=False),
+        pa.field("term", pa.string(), nullable=False),
+        pa.field("node", pa.float64(), nullable=False),
+        pa.field("gain", pa.float64(), nullable=False),
+        pa.field("sigma_log", pa.float64(), nullable=False),
+        pa.field("places", pa.int64(), nullable=False),
+    ]
+)
+"""Columns of the table ``intensity_gains``."""
+
+
+@dataclass(frozen=True, eq=False)
+class IntensitySample:
+    """What a piece of the map tells of gains: a row (m,) for each place that a laser of a sensor saw from one range."""
+
+    key: tuple[float, float]
+    """Corner of the piece: samples are put in the order of their keys."""
+    sensors: tuple[str, ...]
+    place: Int64
+    """(m,) number of the place within the sample."""
+    sensor: Int64
+    """(m,) index of `sensors`."""
+    laser: Int64
+    range_m: Float64
+    incidence_deg: Float64
+    intensity: Float64
+    """(m,) mean intensity."""
+    returns: Int64
+    unit: float
+    """Least positive intensity of the sample: the digital number."""
+
+
+class _Terms(NamedTuple):
+    """Unknowns of all sensors: where the terms of each begin in the vector of unknowns."""
+
+    sensors: tuple[str, ...]
+    lasers: tuple[Int64, ...]
+    first: tuple[int, ...]
+    count: int
+
+
+def intensity_sample(scene: Scene) -> IntensitySample:
+    """What the returns of a scene that lie on the ground, within its tile, tell of gains."""
+    found, tile = scene.returns, scene.tile
+    rows = np.flatnonzero((np.abs(scene.above_ground_m) <= ON_GROUND_M) & tile.holds(found.x_m, found.y_m))
+    ground = found.at(rows)
+    place = _places(ground)
+    incidence = incidence_deg(ground, scene.ground)
+    bin_of_range = np.searchsorted(RANGE_NODES_M, ground.range_m)
+    keys = (bin_of_range, ground.laser, ground.sensor, place)
+    order = np.lexsort(keys)
+    new = np.zeros(order.size, np.bool_)
+    new[:1] = True
+    for key in keys:
+        new[1:] |= np.diff(key[order].astype(np.int64)) != 0
+    first = np.flatnonzero(new)
+    size = np.diff(np.append(first, order.size))
+    one = order[first]
+    measured = (ground.range_m, incidence, ground.intensity.astype(np.float64))
+    means = [np.add.reduceat(v[order], first) / size if size.size else v[:0] for v in measured]
+    return IntensitySample(
+        key=found.corner_m,
+        sensors=found.sensors or tuple(str(i) for i in range(int(found.sensor.max(initial=0)) + 1)),
+        place=place[one],
+        sensor=ground.sensor[one].astype(np.int64),
+        laser=ground.laser[one].astype(np.int64),
+        range_m=means[0],
+        incidence_deg=means[1],
+        intensity=means[2],
+        unit=float(ground.intensity[ground.intensity > 0].min(initial=np.inf)),
+        returns=size.astype(np.int64),
+    )
+
+
+def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
+    """Gains (:data:`GAINS_SCHEMA`) that explain the samples best, the same for any order of them.
+
+    Iterated least squares: the unknown reflectance of each place is eliminated, rows that do not fit (paint that one
+    laser saw and another did not) weigh less (Geman–McClure). An empty table of no samples.
+    """
+    rows = _together(samples)
+    if not rows.place.size:
+        return GAINS_SCHEMA.empty_table()
+    terms = _terms_of(rows)
+    columns, values = _design(rows, terms)
+    solution, covariance = np.zeros(terms.count), np.zeros((terms.count, terms.count))
+    robust, scale = np.ones(rows.place.size), 1.0
+    for _ in range(_ROUNDS):
+        response = (values * solution[columns]).sum(axis=1)
+        mean = _place_means(rows, response, robust)
+        excess = np.clip(rows.intensity / mean - 1.0, *_EXCESS)
+        weights = robust * np.minimum(rows.returns, 9) / (1.0 + (rows.unit / (2.0 * _SCATTER * mean)) ** 2)
+        solution, covariance = _solved(rows, (columns, values), (np.log(mean) + excess, weights), scale, terms)
+        deviation = _without_places(rows, excess, weights)
+        scale = max(1.4826 * float(np.median(np.abs(deviation))), _LEAST_SCATTER)
+        robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
+    solution -= _common_part(rows, terms, (columns, values), solution)
+    told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.count)
+    return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
+
+
+def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
+    """Expected intensity (m,) of each row: the reflectance of its place, as all rows of it tell, times the response."""
+    weighted = weights * rows.returns
+    factor = np.exp(response)
+    total = np.bincount(rows.place, weights=weighted * rows.intensity)
+    place = total / np.maximum(np.bincount(rows.place, weights=weighted * factor), 1e-12)
+    out: Float64 = np.maximum(place, rows.unit / 10.0)[rows.place] * factor
+    return out
+
+
+def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Returns:
+    """The returns with calibrated intensity (`calibrated` true); where the table has no gain of a laser, it is 1.
+
+    The angle of incidence is known on the ground; the gain of incidence of all other returns is 1.
+    """
+    log_gain = np.zeros(len(returns))
+    on_ground = np.abs(returns.height_m - ground.height_at(returns.x_m, returns.y_m)) <= 3 * ON_GROUND_M
+    incidence, range_m = incidence_deg(returns, ground), returns.range_m
+    sensors = gains["sensor"].to_numpy(zero_copy_only=False)
+    kinds = gains["term"].to_numpy(zero_copy_only=False)
+    nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
+    for number, name in enumerate(returns.sensors):
+        mine = np.flatnonzero(returns.sensor == number)
+        if not mine.size or not (sensors == name).any():
+            continue
+
+        def of(term: str, name: str = name) -> tuple[Float64, Float64]:
+            rows = np.flatnonzero((sensors == name) & (kinds == term))
+            rows = rows[np.argsort(nodes[rows])]
+            return nodes[rows], logs[rows]
+
+        lasers, of_laser = of("laser")
+        by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
+        by_laser[lasers.astype(np.int64)] = of_laser
+        log_gain[mine] += by_laser[returns.laser[mine]]
+        log_gain[mine] += np.interp(range_m[mine], *of("range"))
+        log_gain[mine] += np.where(on_ground[mine], np.interp(incidence[mine], *of("incidence")), 0.0)
+    log_gain[np.isnan(log_gain)] = 0.0  # it is not known where the sensor stood
+    intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
+    return replace(returns, intensity=intensity, calibrated=True)
+
+
+def calibrated_scene(scene: Scene, gains: pa.Table) -> Scene:
+    """The scene with calibrated intensities."""
+    return replace(scene, returns=calibrated(scene.returns, scene.ground, gains))
+
+
+def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
+    """Angle (n,) between each beam and the normal of the ground below its return (deg), 0 to 90.
+
+    Where the ground is not known, it is taken as level.
+    """
+    from scipy import ndimage
+
+    height = ground.height_m.astype(np.float64)
+    if min(height.shape) < 2:
+        north, east = np.zeros_like(height), np.zeros_like(height)
+    else:
+        north, east = np.gradient(height, ground.cell_m)
+    size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
+    slopes = []
+    for slope in (east, north):
+        known = np.isfinite(slope)
+        share = ndimage.uniform_filter(known.astype(np.float64), size, mode="nearest")
+        mean = ndimage.uniform_filter(np.where(known, slope, 0.0), size, mode="nearest")
+        slopes.append(np.where(share > 0.0, mean / np.maximum(share, 1e-9), 0.0))
+    rows, columns = height.shape
+    row = np.clip(((returns.y_m - ground.y_min_m) / ground.cell_m).astype(np.int64), 0, rows - 1)
+    column = np.clip(((returns.x_m - ground.x_min_m) / ground.cell_m).astype(np.int64), 0, columns - 1)
+    slope_x, slope_y = slopes[0][row, column], slopes[1][row, column]
+    dx, dy = returns.sensor_x_m - returns.x_m, returns.sensor_y_m - returns.y_m
+    dz = returns.sensor_height_m - returns.height_m
+    along = (dz - slope_x * dx - slope_y * dy) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    length = np.sqrt(dx**2 + dy**2 + dz**2)
+    out: Float64 = np.degrees(np.arccos(np.clip(along / np.maximum(length, 1e-9), 0.0, 1.0)))
+    return out
+
+
+# --- the places of a sample ------------------------------------------------------------------------
+
+
+def _places(ground: Returns) -> Int64:
+    """Number (n,) of the place of each return; returns of places beyond those that a sample takes share number −1."""
+    column = np.floor((ground.corner_m[0] + ground.x_m) / PLACE_M).astype(np.int64)
+    row = np.floor((ground.corner_m[1] + ground.y_m) / PLACE_M).astype(np.int64)
+    _, place = np.unique(np.stack([row, column]), axis=1, return_inverse=True)
+    return np.asarray(place, np.int64).reshape(-1)
+
+
+def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
+    """All samples as one, in the order of their keys, without places that one group alone saw."""
+    ordered = sorted(samples, key=lambda s: s.key)
+    names = tuple(sorted({n for s in ordered for n in s.sensors}))
+    first, parts = 0, []
+    for sample in ordered:
+        kept = _chosen(sample)
+        number = np.array([names.index(n) for n in sample.sensors], np.int64)
+        _, place = np.unique(sample.place[kept], return_inverse=True)
+        parts.append((place + first, number[sample.sensor[kept]], *(v[kept] for v in _values(sample))))
+        first += int(place.max(initial=-1)) + 1
+    joined = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 7
+    unit = min((s.unit for s in ordered), default=1.0)
+    place, sensor, laser, range_m, incidence, intensity, returns = joined
+    digit = unit if np.isfinite(unit) else 1.0
+    return IntensitySample((0.0, 0.0), names, place, sensor, laser, range_m, incidence, intensity, returns, digit)
+
+
+def _values(sample: IntensitySample) -> tuple[npt.NDArray[np.generic], ...]:
+    return sample.laser, sample.range_m, sample.incidence_deg, sample.intensity, sample.returns
+
+
+def _chosen(sample: IntensitySample) -> Int64:
+    """Rows of the places that two groups or more saw; of many such places every so-manieth."""
+    if not sample.place.size:
+        return np.zeros(0, np.int64)
+    groups = np.bincount(sample.place)
+    shared = np.flatnonzero(groups > 1)
+    taken = np.zeros(groups.size, np.bool_)
+    taken[shared[:: max(1, -(-shared.size // _MOST_PLACES))]] = True
+    return np.flatnonzero(taken[sample.place])
+
+
+# --- least squares ---------------------------------------------------------------------------------
+
+
+def _terms_of(rows: IntensitySample) -> _Terms:
+    lasers, first, count = [], [], 0
+    for number in range(len(rows.sensors)):
+        mine = np.unique(rows.laser[rows.sensor == number])
+        lasers.append(mine)
+        first.append(count)
+        count += mine.size + RANGE_NODES_M.size + INCIDENCE_NODES_DEG.size if mine.size else 0
+    return _Terms(rows.sensors, tuple(lasers), tuple(first), count)
+
+
+def _design(rows: IntensitySample, terms: _Terms) -> tuple[Int64, Float64]:
+    """Columns (m, 5) of the unknowns that each row depends on, and their factors (m, 5)."""
+    size = rows.place.size
+    columns, values = np.zeros((size, 5), np.int64), np.zeros((size, 5))
+    for number, lasers in enumerate(terms.lasers):
+        mine = np.flatnonzero(rows.sensor == number)
+        start = terms.first[number]
+        columns[mine, 0] = start + np.searchsorted(lasers, rows.laser[mine])
+        values[mine, 0] = 1.0
+        start += lasers.size
+        for at, nodes, value in (
+            (1, RANGE_NODES_M, rows.range_m[mine]),
+            (3, INCIDENCE_NODES_DEG, rows.incidence_deg[mine]),
+        ):
+            place = np.clip(value, nodes[0], nodes[-1])
+            left = np.clip(np.searchsorted(nodes, place, side="right") - 1, 0, nodes.size - 2)
+            share = (place - nodes[left]) / (nodes[left + 1] - nodes[left])
+            columns[mine, at], columns[mine, at + 1] = start + left, start + left + 1
+            values[mine, at], values[mine, at + 1] = 1.0 - share, share
+            start += nodes.size
+    return columns, values
+
+
+def _without_places(rows: IntensitySample, value: Float64, weights: Float64) -> Float64:
+    """Values (m,) less the weighted mean of their place."""
+    total = np.bincount(rows.place, weights=weights)
+    mean = np.bincount(rows.place, weights=weights * value) / np.maximum(total, 1e-12)
+    out: Float64 = value - mean[rows.place]
+    return out
+
+
+def _solved(
+    rows: IntensitySample,
+    design: tuple[Int64, Float64],
+    observed: tuple[Float64, Float64],
+    scale: float,
+    terms: _Terms,
+) -> tuple[Float64, Float64]:
+    """Unknowns and their covariance: normal equations without the places' reflectances, with the priors.
+
+    observed : (m,) logarithmic intensities and their weights.
+    """
+    from scipy import sparse
+
+    (columns, values), (value, weights) = design, observed
+    size = rows.place.size
+    at = np.repeat(np.arange(size), 5)
+    matrix = sparse.csr_array((values.ravel(), (at, columns.ravel())), shape=(size, terms.count))
+    in_place = sparse.csr_array((weights, (rows.place, np.arange(size))), shape=(int(rows.place.max()) + 1, size))
+    total = np.maximum(np.bincount(rows.place, weights=weights), 1e-12)
+    sums = in_place @ matrix
+    weighted = sparse.csr_array(matrix.multiply(weights[:, None]))
+    normal = (matrix.T @ weighted - sums.T @ sums.multiply(1.0 / total[:, None])).toarray()
+    right = matrix.T @ (weights * _without_places(rows, value, weights))
+    full = normal / scale**2 + _prior(terms)
+    covariance = np.linalg.inv(full)
+    return covariance @ (right / scale**2), covariance
+
+
+def _prior(terms: _Terms) -> Float64:
+    """Information (k, k) of what is held before anything is measured: small gains, smooth in range and incidence."""
+    out = np.zeros((terms.count, terms.count))
+    for lasers, first in zip(terms.lasers, terms.first, strict=True):
+        if not lasers.size:
+            continue
+        mine = np.arange(first, first + lasers.size)
+        out[mine, mine] += 1.0 / _LASER_PRIOR**2
+        start = first + lasers.size
+        for nodes in (RANGE_NODES_M, INCIDENCE_NODES_DEG):
+            some = slice(start, start + nodes.size)
+            bends = np.diff(np.eye(nodes.size), n=2, axis=0)
+            out[some, some] += bends.T @ bends / _BEND_PRIOR**2 + np.eye(nodes.size) / (_LEVEL_PRIOR**2 * nodes.size)
+            start += nodes.size
+    return out
+
+
+def _common_part(rows: IntensitySample, terms: _Terms, design: tuple[Int64, Float64], solution: Float64) -> Float64:
+    """What to take from the unknowns (k,), of the lasers of all sensors, so that the mean gain of the rows is 1."""
+    columns, values = design
+    mean = float(np.average((values * solution[columns]).sum(axis=1), weights=rows.returns))
+    out = np.zeros(terms.count)
+    for lasers, first in zip(terms.lasers, terms.first, strict=True):
+        out[first : first + lasers.size] = mean
+    return out
+
+
+def _table(terms: _Terms, solution: Float64, sigma: Float64, told: Int64) -> pa.Table:
+    rows: list[tuple[str, str, float, float, float, int]] = []
+    for name, lasers, first in zip(terms.sensors, terms.lasers, terms.first, strict=True):
+        if not lasers.size:
+            continue
+        start = first
+        for term, nodes in (
+            ("laser", lasers.astype(np.float64)),
+            ("range", RANGE_NODES_M),
+            ("incidence", INCIDENCE_NODES_DEG),
+        ):
+            for i, node in enumerate(nodes, start):
+                rows.append((name, term, float(node), float(np.exp(-solution[i])), float(sigma[i]), int(told[i])))
+            start += len(nodes)
+    rows.sort(key=lambda r: r[:3])
+    columns = [pa.array(c, f.type) for c, f in zip(zip(*rows, strict=True), GAINS_SCHEMA, strict=True)]
+    return pa.Table.from_arrays(columns, schema=GAINS_SCHEMA)

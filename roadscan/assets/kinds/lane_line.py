@@ -1,0 +1,46 @@
+"""Lane lines: paint along the road, joined over its dashes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Final
+
+import pyarrow as pa
+from pydantic import Field
+
+from roadscan.assets.classes import MARKING
+from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.paint.detection import paint_of
+from roadscan.assets.paint.lane_lines import lane_lines
+from roadscan.assets.paint.line_pieces import LINE_PIECES, line_pieces, line_rows
+from roadscan.assets.scene import Scene
+from roadscan.model.strict import Strict
+
+_LONGEST_GAP_M: Final = 15.0
+
+
+class LaneLineOptions(Strict):
+    """Settings of `lane_line`."""
+
+    longest_gap_m: float = Field(default=_LONGEST_GAP_M, gt=0.0, le=50.0)
+    """Longest gap between two dashes of a line (m)."""
+
+
+class LaneLine(AssetKind):
+    """A row for each painted line: its pattern, its width, and its contrast to the surface."""
+
+    name = "lane_line"
+    title = "lane lines"
+    options = LaneLineOptions
+    piece_schema: ClassVar[pa.Schema] = LINE_PIECES
+
+    def evidence(self, scene: Scene, options: Any) -> Evidence:
+        """Straight pieces of lines in the tile."""
+        paint = paint_of(scene)
+        return Evidence(line_pieces(scene, paint), (Marked(line_rows(scene, paint), MARKING),))
+
+    def objects(
+        self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
+    ) -> Iterable[AssetObject]:
+        """Lines of the pieces of all tiles."""
+        return lane_lines(pieces, options.longest_gap_m)

@@ -1,0 +1,156 @@
+"""Contrast of ground returns to the surface around them, and its mean over cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.classes import PERSON, VEHICLE
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box, Scene
+from roadscan.kernels.assets.paint_levels import paint_levels
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Int64 = npt.NDArray[np.int64]
+
+CELL_M: Final = 0.05
+"""Cells of paint; they lie on a grid of the map."""
+ON_GROUND_M: Final = 0.1
+_LEVEL_CELL_M: Final = 0.5
+_LEVEL_HALF: Final = 2
+"""The surroundings are 2.5 m wide."""
+_USUAL_STEP, _USUAL_SIZE = 3, 9
+"""The usual brightness is a median over 13 m, of every third cell."""
+_DARKEST: Final = 0.9
+"""Where the surroundings are darker than this share of the usual brightness (fresh bitumen, water), that counts."""
+_ROUGHEST_M: Final = 0.03
+_ROUGH_M: Final = 0.12
+"""Paved ground scatters less than this about its own mean height, weighted within this."""
+SMOOTH_M: Final = 0.06
+"""1 σ of the weights of the returns around a cell."""
+_FEWEST_PER_M2: Final = 40.0
+"""Where fewer returns lie, a stripe would be seen by a few of them only."""
+_FLATTEST: Final = 0.1
+"""Sine of the angle between beam and road below which a beam's footprint is ten times as long as it is wide."""
+_LINE_NS: Final = 20_000_000
+_LEAST_NOISE: Final = 0.06
+_CLIP: Final = (-0.5, 2.0)
+"""Contrasts beyond this (glints) count as this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """Ground returns (n,) of a scene with their contrast, and rasters (rows, columns) of cells of the window."""
+
+    rows: Int64
+    """(n,) rows of the scene's returns."""
+    x_m: Float64
+    y_m: Float64
+    height_m: Float64
+    contrast: Float64
+    """(n,) intensity over that of the surface around, less 1; 0 on the surface, 1 where it is twice as bright."""
+    noise: Float64
+    """(n,) 1 σ of the contrast of returns on the surface around."""
+    line: Int64
+    """(n,) number of the scan line: what one laser saw within 20 ms."""
+    cell: Int64
+    """(n,) cell of each return: row · columns + column."""
+    box: Box
+    """The window, from the corner of the scene's returns."""
+    mean: Float32
+    """Contrast, as the weighted mean of the returns around each cell; 0 where there are none."""
+    sigma: Float32
+    """Its standard deviation; infinite where there are none."""
+
+    def cell_of(self, x_m: Float64, y_m: Float64) -> Int64:
+        """Cell of points (n,) within the window."""
+        rows, columns = self.mean.shape
+        column = np.clip(((x_m - self.box.x_min_m) / CELL_M).astype(np.int64), 0, columns - 1)
+        row = np.clip(((y_m - self.box.y_min_m) / CELL_M).astype(np.int64), 0, rows - 1)
+        return np.asarray(row * columns + column, np.int64)
+
+
+def contrast_of(scene: Scene) -> Contrast:
+    """Contrast of the returns of a scene that lie on the ground and on no vehicle or person."""
+    found = scene.returns
+    with np.errstate(invalid="ignore"):
+        on_ground = np.abs(scene.above_ground_m) <= ON_GROUND_M
+    window = scene.window
+    on_ground &= (scene.classes != VEHICLE) & (scene.classes != PERSON) & window.holds(found.x_m, found.y_m)
+    rows = np.flatnonzero(on_ground)
+    seen = found.at(rows)
+    rows = rows[seen.sensor_height_m - seen.height_m >= _FLATTEST * seen.range_m]
+    x, y, intensity = found.x_m[rows], found.y_m[rows], found.intensity[rows].astype(np.float64)
+    level, upper = _levels(x, y, intensity, window)
+    contrast = np.clip(intensity / level - 1.0, *_CLIP)
+    noise = np.maximum(upper / level - 1.0, _LEAST_NOISE)
+    shape = tuple(round(v / CELL_M) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
+    column = np.clip(((x - window.x_min_m) / CELL_M).astype(np.int64), 0, shape[1] - 1)
+    row = np.clip(((y - window.y_min_m) / CELL_M).astype(np.int64), 0, shape[0] - 1)
+    cell = row * shape[1] + column
+    mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows].astype(np.float64), (shape[0], shape[1]))
+    return Contrast(
+        rows, x, y, found.height_m[rows], contrast, noise, _lines(found.at(rows)), cell, window, mean, sigma
+    )
+
+
+def _lines(ground: Returns) -> Int64:
+    """Number (n,) of the scan line of each return."""
+    slot = ground.epoch_gps_ns // _LINE_NS
+    slot = slot - (slot.min() if slot.size else 0)
+    beam = ground.sensor.astype(np.int64) * (1 << 16) + ground.laser
+    return np.asarray(slot * (1 << 24) + beam, np.int64)
+
+
+def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Float64, Float64]:
+    """Brightness of the surface around each return (n,), and what 84 % of the returns on it do not reach."""
+    from scipy import ndimage
+
+    edge = _LEVEL_CELL_M
+    shape = tuple(int(np.ceil(v / edge)) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
+    u, v = (y - window.y_min_m) / edge, (x - window.x_min_m) / edge
+    own = np.clip(u.astype(np.int64), 0, shape[0] - 1) * shape[1] + np.clip(v.astype(np.int64), 0, shape[1] - 1)
+    order = np.argsort(own, kind="stable")
+    first = np.searchsorted(own[order], np.arange(shape[0] * shape[1] + 1))
+    level, upper = np.empty(shape), np.empty(shape)
+    paint_levels(intensity[order], first, _LEVEL_HALF, level, upper)
+    known = np.isfinite(level)
+    if not known.any():
+        return np.ones(x.size), np.ones(x.size)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    place = [u - 0.5, v - 0.5]
+    filled = level[tuple(nearest)]
+    usual = ndimage.median_filter(filled[::_USUAL_STEP, ::_USUAL_STEP], _USUAL_SIZE, mode="nearest")
+    usual = np.maximum(usual.repeat(_USUAL_STEP, 0).repeat(_USUAL_STEP, 1)[: shape[0], : shape[1]], 1e-6)
+    surfaces = (np.maximum(filled, _DARKEST * usual), upper[tuple(nearest)])
+    out = [ndimage.map_coordinates(a, place, order=1, mode="nearest") for a in surfaces]
+    return out[0], out[1]
+
+
+def _means(
+    cell: Int64, contrast: Float64, noise: Float64, height: Float64, shape: tuple[int, int]
+) -> tuple[Float32, Float32]:
+    """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough."""
+    import cv2
+
+    size = shape[0] * shape[1]
+
+    def raster(weights: Float64 | None, sigma_m: float) -> Float32:
+        counts = np.bincount(cell, weights=weights, minlength=size).astype(np.float32).reshape(shape)
+        reach = 2 * int(np.ceil(3 * sigma_m / CELL_M)) + 1
+        blurred = cv2.GaussianBlur(counts, (reach, reach), sigma_m / CELL_M, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(blurred, np.float32)
+
+    weight = raster(None, SMOOTH_M)
+    area = 4.0 * np.pi * (SMOOTH_M / CELL_M) ** 2
+    known = weight >= _FEWEST_PER_M2 * CELL_M**2
+    near = np.maximum(raster(None, _ROUGH_M), 1e-9)
+    middle = raster(height, _ROUGH_M) / near
+    known &= raster(height**2, _ROUGH_M) / near - middle**2 <= _ROUGHEST_M**2
+    mean = np.where(known, raster(contrast, SMOOTH_M) / np.maximum(weight, 1e-9), 0.0)
+    variance = raster(noise**2, SMOOTH_M / np.sqrt(2.0)) / area / np.maximum(weight, 1e-9) ** 2
+    return mean.astype(np.float32), np.where(known, np.sqrt(variance), np.inf).astype(np.float32)

@@ -1,0 +1,281 @@
+"""Stripes: straight bands of paint, with edges where the contrast has fallen to half."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.paint.components import Component
+from roadscan.assets.paint.contrast import CELL_M, Contrast
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+CHUNK_M: Final = 5.0
+"""Long components are cut at multiples of this in the map, so that each piece is straight."""
+_LONGEST_WHOLE_M: Final = 7.0
+WIDEST_M: Final = 0.42
+"""Widest band that counts as a line."""
+_SLIMMEST: Final = 2.0
+"""Length over width of a band."""
+_SHORTEST_M: Final = 0.35
+_BESIDE_M: Final = 0.25
+AROUND_M: Final = 0.08
+"""Returns this near to paint may lie on it: ranges and poses are not exact, and edges not straight."""
+_SEEN_ASIDE_M: Final = 0.05
+_EDGE_M: Final = 0.03
+_BEND_M: Final = 0.02
+"""A road's surface rises or falls less than this at its lines, against the mean of both sides."""
+_UNEVEN: Final = 0.5
+"""Paint lies on one surface: its sides differ by less than this share of its contrast to them."""
+_FLAT_M: Final = 0.02
+_STEEPEST: Final = 0.15
+_STEP_M: Final = 0.04
+_PIECE_M: Final = 0.7
+"""The middle of a band is sought in pieces of this length."""
+_FEWEST: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Stripe:
+    """A straight band: x, y from the corner of the scene's returns."""
+
+    middle_m: Float64
+    """(2,) point on its centre line."""
+    along: Float64
+    """(2,) unit vector along it."""
+    begin_m: float
+    end_m: float
+    """Its ends along the centre line, from `middle_m`."""
+    width_m: float
+    contrast: float
+    """Mean contrast of its core."""
+    returns: Int64
+    """(n,) returns within it, indices of the contrast's."""
+    around: Int64
+    """(m,) returns within `AROUND_M` of it."""
+    sigma_across_m: float
+    begin_seen: bool
+    end_seen: bool
+    """True where unpainted ground was seen beyond the end."""
+    evidence_sigma: float
+
+    @property
+    def length_m(self) -> float:
+        """Length of the band."""
+        return self.end_m - self.begin_m
+
+    def at(self, along_m: float) -> Float64:
+        """Point (2,) of the centre line."""
+        out: Float64 = self.middle_m + along_m * self.along
+        return out
+
+    def coordinates(self, x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:
+        """Along and across (to the left) of points (n,), from `middle_m`."""
+        dx, dy = x_m - self.middle_m[0], y_m - self.middle_m[1]
+        return dx * self.along[0] + dy * self.along[1], dy * self.along[0] - dx * self.along[1]
+
+
+def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, float]) -> list[Stripe] | None:
+    """Bands that the component consists of, end to end; None if it is of another shape. Edges of surfaces are left out."""
+    axis = _axis(component.cell_x_m, component.cell_y_m)
+    if axis is None:
+        return None
+    middle, along, length, width, rms = axis
+    straight = rms <= 1.3 * width / np.sqrt(12.0) + 0.02
+    if length > _LONGEST_WHOLE_M or (not straight and length > 4 * CELL_M + 2.5 * width):
+        return _of_parts(found, component, (middle, along, length), corner_m)
+    if not straight or length < _SHORTEST_M or width > WIDEST_M + 0.15 or length < _SLIMMEST * width:
+        return None
+    start = Stripe(middle, along, -length / 2, length / 2, width, 0.0, component.near, component.near, 0.0, False, False,
+                   component.evidence_sigma)  # fmt: skip
+    stripe = fitted(found, start)
+    if stripe is not None and _is_an_edge(found, component, stripe):
+        return []
+    if stripe is None or stripe.width_m > WIDEST_M or stripe.length_m < max(_SHORTEST_M, _SLIMMEST * stripe.width_m):
+        return None
+    return [stripe]
+
+
+def fitted(found: Contrast, start: Stripe) -> Stripe | None:
+    """The stripe with its middle, direction, width and ends fitted to the returns of `start`; None if there is none."""
+    stripe, near = start, start.returns
+    if near.size < _FEWEST:
+        return None
+    x, y, contrast, noise = found.x_m[near], found.y_m[near], found.contrast[near], found.noise[near]
+    for _ in range(2):
+        along, across = stripe.coordinates(x, y)
+        within = (along >= stripe.begin_m) & (along <= stripe.end_m)
+        core = within & (np.abs(across) <= max(stripe.width_m / 4, 0.025))
+        if np.count_nonzero(core) < 3:
+            return None
+        level = float(np.mean(contrast[core]))
+        beside = within & (np.abs(across) <= stripe.width_m / 2 + _BESIDE_M)
+        turned = _centred(stripe, along[beside], across[beside], contrast[beside] - level / 2)
+        if turned is None:
+            return None
+        stripe = turned
+        along, across = stripe.coordinates(x, y)
+        band = np.abs(across) <= max(0.4 * stripe.width_m, 0.025)
+        ends = _most(along[band], contrast[band] - level / 2)
+        if ends is None:
+            return None
+        stripe = replace(stripe, begin_m=ends[0], end_m=ends[1], contrast=level)
+    inside = (along >= stripe.begin_m) & (along <= stripe.end_m) & (np.abs(across) <= stripe.width_m / 2)
+    if np.count_nonzero(inside) < _FEWEST:
+        return None
+    count = np.count_nonzero(inside)
+    scatter = float(np.mean(noise[inside])) / max(stripe.contrast, 1e-3)
+    sigma = float(np.hypot(stripe.width_m * scatter, 0.03) / np.sqrt(count) + 0.002)
+    seen = [
+        bool(np.any((np.abs(across) <= stripe.width_m / 2 + _SEEN_ASIDE_M) & beyond))
+        for beyond in (
+            (along < stripe.begin_m) & (along > stripe.begin_m - 0.3),
+            (along > stripe.end_m) & (along < stripe.end_m + 0.3),
+        )
+    ]
+    reach = (along >= stripe.begin_m - AROUND_M) & (along <= stripe.end_m + AROUND_M)
+    around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
+    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1])
+
+
+def lies_flat(found: Contrast, component: Component) -> bool:
+    """True where the ground on and around a component is a plane, and not steep."""
+    near = component.near
+    x, y = found.x_m[near] - component.cell_x_m.mean(), found.y_m[near] - component.cell_y_m.mean()
+    design = np.stack([x, y, np.ones(x.size)], axis=1)
+    height = found.height_m[near] - np.median(found.height_m[near])
+    plane, *_ = np.linalg.lstsq(design, height, rcond=None)
+    scatter = 1.4826 * float(np.median(np.abs(height - design @ plane)))
+    return bool(scatter <= _FLAT_M and np.hypot(plane[0], plane[1]) <= _STEEPEST)
+
+
+def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
+    """True where two surfaces meet: the ground bends or steps across the stripe, or one side is much brighter."""
+    near = component.near
+    along, across = stripe.coordinates(found.x_m[near], found.y_m[near])
+    within = (along >= stripe.begin_m) & (along <= stripe.end_m)
+    beyond = np.abs(across) - stripe.width_m / 2
+    heights, levels = [], []
+    for mine in (beyond <= 0, (across > 0) & (beyond > _EDGE_M), (across < 0) & (beyond > _EDGE_M)):
+        there = near[within & mine & (beyond <= _BESIDE_M)]
+        heights.append(float(np.median(found.height_m[there])) if there.size >= 3 else np.nan)
+        levels.append(float(np.median(found.contrast[there])) if there.size >= 3 else np.nan)
+    inside, left, right = heights
+    bend, slope = abs((left + right) / 2 - inside), abs(left - right) / (stripe.width_m + _EDGE_M + _BESIDE_M)
+    lone = max(np.nan_to_num(abs(left - inside)), np.nan_to_num(abs(right - inside)))
+    above = levels[0] - (levels[1] + levels[2]) / 2
+    uneven = abs(levels[1] - levels[2]) > _UNEVEN * above
+    return bool(bend > _BEND_M or slope > _STEEPEST or lone > _STEP_M or uneven)
+
+
+def _centred(stripe: Stripe, along: Float64, across: Float64, excess: Float64) -> Stripe | None:
+    """The stripe turned and moved onto the middle of the paint, with its width."""
+    pieces = max(1, int(stripe.length_m / _PIECE_M))
+    if pieces >= 2:
+        number = np.clip(((along - stripe.begin_m) / stripe.length_m * pieces).astype(np.int64), 0, pieces - 1)
+        at, middle, weight = [], [], []
+        for k in range(pieces):
+            mine = number == k
+            edges = _most(across[mine], excess[mine])
+            if edges is not None:
+                at.append(float(np.mean(along[mine])))
+                middle.append((edges[0] + edges[1]) / 2)
+                weight.append(float(np.sqrt(np.count_nonzero(mine))))
+        if len(at) >= 2:
+            slope, offset = _line(np.array(at), np.array(middle), np.array(weight))
+            turned = stripe.along + slope * np.array([-stripe.along[1], stripe.along[0]])
+            turned /= np.hypot(*turned)
+            origin = stripe.middle_m + offset * np.array([-stripe.along[1], stripe.along[0]])
+            across = across - offset - slope * along
+            stripe = replace(stripe, middle_m=origin, along=turned)
+    edges = _most(across, excess)
+    if edges is None or edges[1] - edges[0] < 0.03:
+        return None
+    shift = (edges[0] + edges[1]) / 2
+    middle_m = stripe.middle_m + shift * np.array([-stripe.along[1], stripe.along[0]])
+    return replace(stripe, middle_m=middle_m, width_m=edges[1] - edges[0])
+
+
+def _line(at: Float64, value: Float64, weight: Float64) -> tuple[float, float]:
+    """Slope and offset at 0 of a line through values, by weighted least squares in which outliers count less."""
+    slope = offset = 0.0
+    for _ in range(3):
+        w = weight / weight.sum()
+        a, v = float(w @ at), float(w @ value)
+        spread = float(w @ (at - a) ** 2)
+        slope = float(w @ ((at - a) * (value - v))) / spread if spread > 1e-6 else 0.0
+        offset = v - slope * a
+        residual = np.abs(value - offset - slope * at)
+        weight = weight / (1.0 + (residual / max(2.0 * float(np.median(residual)), 0.01)) ** 2)
+    return slope, offset
+
+
+def _most(place: Float64, excess: Float64) -> tuple[float, float] | None:
+    """The interval over which the excess of contrast over half of the paint's sums up to the most.
+
+    Its ends are where the mean contrast passes through half, whatever the density of returns on either side.
+    """
+    if place.size < 3:
+        return None
+    order = np.argsort(place, kind="stable")
+    place, total = place[order], np.concatenate([[0.0], np.cumsum(excess[order])])
+    lowest = np.minimum.accumulate(total)
+    gain = total - lowest
+    last = int(np.argmax(gain))
+    if gain[last] <= 0.0:
+        return None
+    first = int(np.argmin(total[: last + 1]))
+    begin, end = place[first], place[last - 1]
+    if first > 0:
+        begin = (begin + place[first - 1]) / 2
+    if last < place.size:
+        end = (end + place[last]) / 2
+    return float(begin), float(end)
+
+
+def _axis(x: Float64, y: Float64) -> tuple[Float64, Float64, float, float, float] | None:
+    """Middle, direction, length, mean width and scatter across of cells."""
+    if x.size < 4:
+        return None
+    middle = np.array([x.mean(), y.mean()])
+    dx, dy = x - middle[0], y - middle[1]
+    xx, xy, yy = float(dx @ dx), float(dx @ dy), float(dy @ dy)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    s, o = dx * along[0] + dy * along[1], dy * along[0] - dx * along[1]
+    length = float(s.max() - s.min()) + CELL_M
+    middle = middle + along * float(s.max() + s.min()) / 2
+    return middle, along, length, x.size * CELL_M**2 / length, float(np.sqrt(np.mean(o**2)))
+
+
+def _of_parts(
+    found: Contrast, component: Component, axis: tuple[Float64, Float64, float], corner_m: tuple[float, float]
+) -> list[Stripe] | None:
+    """Stripes of the pieces of a component, cut at multiples of `CHUNK_M` in the map, or halved where it is short."""
+    middle, along, length = axis
+    x, y = found.x_m[component.near], found.y_m[component.near]
+    if length > _LONGEST_WHOLE_M:
+        east = abs(along[0]) >= abs(along[1])
+        corner = corner_m[0] if east else corner_m[1]
+        of_cells = np.floor((corner + (component.cell_x_m if east else component.cell_y_m)) / CHUNK_M)
+        of_returns = np.floor((corner + (x if east else y)) / CHUNK_M)
+    else:
+        of_cells = (
+            (component.cell_x_m - middle[0]) * along[0] + (component.cell_y_m - middle[1]) * along[1] >= 0
+        ).astype(np.float64)
+        of_returns = ((x - middle[0]) * along[0] + (y - middle[1]) * along[1] >= 0).astype(np.float64)
+    stripes: list[Stripe] = []
+    lost = 0
+    for number in np.unique(of_cells):
+        cells = of_cells == number
+        part = component.part(cells, of_returns == number)
+        some = stripes_of(found, part, corner_m)
+        if some is None:
+            lost += int(np.count_nonzero(cells))
+        else:
+            stripes += some
+    return stripes if lost <= 0.25 * component.cell.size else None

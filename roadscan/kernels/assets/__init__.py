@@ -1,0 +1,1 @@
+"""Loops over returns of lidars: ground, vehicles, classes."""

@@ -16,12 +16,14 @@ GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ"]
 
 _TYPES: Final = {
     "bool": pa.bool_(),
+    "date": pa.date32(),
     "float64": pa.float64(),
     "int32": pa.int32(),
     "int64": pa.int64(),
     "string": pa.string(),
 }
 _COMMON: Final = "common"
+_INVENTORY: Final = "inventory"
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class AssetSchema:
 
 def asset_kind_names() -> list[str]:
     """Names of all kinds of assets."""
-    return sorted(p.stem for p in (schema_folder() / "assets").glob("*.toml") if p.stem != _COMMON)
+    return sorted(p.stem for p in (schema_folder() / "assets").glob("*.toml") if p.stem not in (_COMMON, _INVENTORY))
 
 
 @functools.cache
@@ -94,6 +96,12 @@ def asset_schema(kind: str) -> AssetSchema:
         kind, raw["table"], raw["title"], raw["geometry"], raw["meaning"], tuple(raw["parents"]),
         own=_columns(raw), common=_columns(_read(_COMMON)),
     )  # fmt: skip
+
+
+@functools.cache
+def inventory_columns() -> tuple[AssetColumn, ...]:
+    """Columns that the inventory adds to the table of each kind."""
+    return _columns(_read(_INVENTORY))
 
 
 def _read(name: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import xarray as xr
 
+    from roadscan.inventory.inventory import Inventory
     from roadscan.jobs.status import Status
     from roadscan.jobs.tiles.selection import Selection
     from roadscan.model.gpstime import Clock
@@ -128,6 +129,13 @@ class OpenSurvey:
         from roadscan.jobs.report.page import report_page
 
         return report_page(self.session)
+
+    @property
+    def inventory(self) -> Inventory:
+        """The inventory of assets that the survey belongs to, with the home that people edit."""
+        from roadscan.jobs.inventory import open_inventory
+
+        return open_inventory(self.session)
 
     def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
         """A DuckDB connection in which each table of the survey is a view; the caller closes it.

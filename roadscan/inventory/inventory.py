@@ -22,10 +22,11 @@ from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
 from roadscan.inventory.homes.base import Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.pulling import Pulling, new_edits, now_utc, refuse
+from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
 from roadscan.model.errors import ConfigError, nearest
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
 from roadscan.tables.inventory_schema import asset_table
 from roadscan.tables.store import bytes_digest
@@ -91,8 +92,8 @@ class Inventory:
     found: Callable[[], Found | None] = field(default=lambda: None)
     """What the newest run found; None where there is nothing."""
     crs: str | None = None
-    after: Callable[[State], None] = field(default=lambda state: None)
-    """Called with the state that was published: writes what stands beside the home."""
+    rasters: Callable[[Path], Sequence[Raster]] = field(default=lambda folder: ())
+    """Products that stand behind the assets in QGIS, for a project file in a folder."""
 
     def state(self, as_of: When = None) -> State:
         """The inventory at a time."""
@@ -129,7 +130,7 @@ class Inventory:
             token = self._token(state.commit, mark)
             self.truth.keep_published(token, published_table(content))
             self.home.write(content, self._sheets(state, conflicts), Mark(self.name, token, "", state.commit, at))
-            self.after(state)
+            self._write_project()
         assets = sum(rows.num_rows for rows in content.rows.values())
         return Published(self.home.name, state.commit, assets, len(conflicts), recorded)
 
@@ -139,9 +140,8 @@ class Inventory:
 
     def _sheets(self, state: State, conflicts: list[Conflict]) -> list[Sheet]:
         sheets = [Sheet("conflicts", "Conflicts", conflict_rows(state, conflicts))]
-        found = epoch_changes(self.truth, None, None, self.rules.unit_m)
-        if found is not None:
-            sheets.append(Sheet("changes", f"Changes {found.before} to {found.after}", found.layer()))
+        found = epoch_changes(self.truth, None, None, self.rules.unit_m) or EpochChanges("", "", (), 0)
+        sheets.append(Sheet("changes", f"Changes {found.before} to {found.after}" if found.before else "Changes", found.layer()))
         return sheets
 
     def pull(
@@ -212,6 +212,21 @@ class Inventory:
             )
         content = place.read()
         return mark, compared(content, published_rows(base), mark.token), content
+
+    def _write_project(self) -> None:
+        """Write the project file of QGIS, where there is none yet: people arrange it to their liking."""
+        file = self.home.project_file
+        if file is None or file.exists():
+            return
+        kinds = asset_kind_names()
+        text = project_text(
+            f"Inventory {self.name}", kinds, lambda table: Source(*self.home.layer_address(table)), self.crs,
+            self.rasters(file.parent),
+        )  # fmt: skip
+        try:
+            file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise HomeError(f"the project file cannot be written: {error.strerror}", file=file) from error
 
     def _check_own(self, mark: Mark | None, place: Home | None = None) -> None:
         if mark is not None and mark.inventory != self.name:

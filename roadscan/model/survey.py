@@ -16,6 +16,7 @@ from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
+from roadscan.model.inventory import InventoryConfig
 from roadscan.model.rig import Rig, Sensor
 from roadscan.model.segmentation import RoadSegmentation
 from roadscan.model.smoothing import SmootherConfig, SplineConfig
@@ -408,6 +409,8 @@ class SurveyConfig(Strict):
     """Reconstruction of the road's surface; left out, there is none."""
     condition: ConditionConfig | None = None
     """The road's condition along its lanes; left out, none is computed."""
+    inventory: InventoryConfig = InventoryConfig()
+    """The inventory of assets that people edit."""
     products: ProductConfig = ProductConfig()
     """Products."""
 

@@ -76,8 +76,13 @@ def poles(count: int = 6, step_m: float = 20.0, when: dt.datetime = SPRING, **va
     ]
 
 
-def inventory(folder: Path, visibility: Visibility | None = None, file: str = "inventory.gpkg") -> Inventory:
-    """The inventory of a folder; opened anew, as by another program."""
+def inventory(
+    folder: Path,
+    visibility: Visibility | None = None,
+    file: str = "inventory.gpkg",
+    kinds: Sequence[str] | None = ("pole", "sign", "sidewalk"),
+) -> Inventory:
+    """The inventory of a folder with layers of some kinds, opened anew, as by another program."""
     truth = AssetTruth(Store(str(folder / "store"), "street"))
     rules = Rules(visibility or Unknown(), Matching())
-    return Inventory(truth, GeoPackage(folder / file, CRS), "street", rules, crs=CRS)
+    return Inventory(truth, GeoPackage(folder / file, CRS, kinds), "street", rules, crs=CRS)

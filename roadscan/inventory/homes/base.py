@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -126,6 +127,15 @@ class Home(ABC):
         HomeError
             where it cannot be written.
         """
+
+    @property
+    def project_file(self) -> Path | None:
+        """Where the project file of QGIS stands; None where the home has no folder of its own."""
+        return None
+
+    def layer_address(self, table: str) -> tuple[str, str]:
+        """Provider and address by which QGIS finds a table."""
+        raise NotImplementedError
 
     @abstractmethod
     def note(self, mark: Mark) -> None:

@@ -29,20 +29,32 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_tabl
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"
 _WKB_NAMES: Final = {"PointZ": "Point Z", "LineStringZ": "LineString Z", "PolygonZ": "Polygon Z"}
+_VERSION: Final = {"VERSION": "1.3"}
+"""Of the standard; programs of today's stable Linux systems warn of newer ones."""
 _FOREIGN: Final = "name another file, or move this one away"
 
 
 class GeoPackage(Home):
-    """A GeoPackage file."""
+    """A GeoPackage file with a layer for each kind of assets, or for some kinds alone."""
 
-    def __init__(self, file: Path, crs: str | None) -> None:
+    def __init__(self, file: Path, crs: str | None, kinds: Sequence[str] | None = None) -> None:
         self.file = file
         self.crs = crs
+        self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
 
     @property
     def name(self) -> str:
         """The file."""
         return str(self.file)
+
+    @property
+    def project_file(self) -> Path:
+        """Beside the file."""
+        return self.file.with_suffix(".qgs")
+
+    def layer_address(self, table: str) -> tuple[str, str]:
+        """The layer of a table, relative to the project file."""
+        return "ogr", f"./{self.file.name}|layername={table}"
 
     def mark(self) -> Mark | None:
         """Its last mark."""
@@ -75,7 +87,7 @@ class GeoPackage(Home):
 
         layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
         rows: dict[str, pa.Table] = {}
-        for kind in asset_kind_names():
+        for kind in self.kinds:
             table = asset_schema(kind).table
             if table not in layers:
                 raise HomeError(
@@ -161,7 +173,7 @@ class GeoPackage(Home):
     def _write_layers(
         self, file: Path, rows: Mapping[str, pa.Table], sheets: Sequence[Sheet], mark: Mark
     ) -> None:
-        for kind in asset_kind_names():
+        for kind in self.kinds:
             schema = asset_schema(kind)
             own = rows.get(kind, asset_table(kind).empty_table())
             table = own.select(asset_table(kind).names).cast(_told(kind))
@@ -169,8 +181,8 @@ class GeoPackage(Home):
         for sheet in sheets:
             self._layer(file, sheet, "Point Z" if GEOMETRY in sheet.rows.column_names else None)
         self._layer(file, Sheet(MARKS, MARKS, _mark_rows(mark)), None, "Not to be edited: what this file was made of.")
-        add_value_lists(file)
-        add_styles(file)
+        add_value_lists(file, self.kinds)
+        add_styles(file, self.kinds)
 
     def _layer(self, file: Path, sheet: Sheet, geometry: str | None, meaning: str = "") -> None:
         import pyogrio
@@ -182,7 +194,7 @@ class GeoPackage(Home):
             pyogrio.write_arrow(
                 sheet.rows, file, layer=sheet.name, driver="GPKG", append=False, geometry_type=geometry,
                 geometry_name=None if geometry is None else GEOMETRY, crs=None if geometry is None else self.crs,
-                layer_options=options,
+                layer_options=options, dataset_options=_VERSION if not file.exists() else None,
             )  # fmt: skip
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise self._unwritable(error) from error

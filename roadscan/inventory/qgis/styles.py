@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 from xml.etree.ElementTree import Element, SubElement, tostring
@@ -28,6 +30,7 @@ def style_elements(kind: str) -> list[Element]:
     return [_renderer(kind), *form_elements(kind)]
 
 
+@functools.cache
 def style_text(kind: str) -> str:
     """The same as a style file (QML)."""
     root = Element("qgis", version=QGIS_VERSION, styleCategories="Symbology|Fields|Forms")
@@ -35,11 +38,10 @@ def style_text(kind: str) -> str:
     return "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + tostring(root, encoding="unicode")
 
 
-def add_styles(file: Path) -> None:
+def add_styles(file: Path, kinds: Sequence[str]) -> None:
     """Write the table `layer_styles`, in which QGIS looks for the style of a layer of a GeoPackage."""
     import pyogrio
 
-    kinds = asset_kind_names()
     count = len(kinds)
     text = pa.string()
     rows = pa.table(

@@ -1,5 +1,7 @@
 """What changed on the road between two survey epochs: appeared, gone, moved, changed, each with its significance.
 
+Of two surveys of ten thousand assets some differ by 3 σ by chance alone. So moves, and changed values, count where the
+expected share of false ones among them stays below 1 % (Benjamini and Hochberg 1995, J. R. Stat. Soc. B 57, 289–300).
 An asset that was not seen counts as gone only where passes of the newer survey had its place in sight. The significance
 of *gone* is that of as many misses in a row as there were passes, where a pass misses at most one asset in ten.
 """
@@ -16,7 +18,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from roadscan.inventory.conflicts import SIGNIFICANT
 from roadscan.inventory.state import live_commits
 from roadscan.inventory.values import encoded, sigmas_apart
 from roadscan.model.errors import ConfigError, nearest
@@ -25,7 +26,9 @@ from roadscan.tables.asset_truth import AssetTruth, Commit
 from roadscan.tables.inventory_schema import GEOMETRY
 
 _MISSED_BY_A_PASS: Final = 0.1
+_FALSE_SHARE: Final = 0.01
 _SAMPLES: Final = 16
+_LEAST_M: Final = 0.005
 
 
 class Change(NamedTuple):
@@ -99,17 +102,21 @@ def _between(truth: AssetTruth, before: Commit, after: Commit, unit_m: float) ->
     known = set(one["asset_id"].to_pylist())
     then = {row["asset_id"]: row for row in one.filter(pc.equal(one["seen"], 1)).to_pylist()}
     found: list[Change] = []
+    compared: dict[str, list[tuple[float, Change]]] = {"moved": [], "changed": []}
     unseen = 0
     for row in other.to_pylist():
         old = then.get(row["asset_id"])
         if row["seen"] and old is not None:
-            found += _changed(old, row, unit_m)
+            for chance, change in _compared(old, row, unit_m):
+                compared[change.change].append((chance, change))
         elif row["seen"] and row["asset_id"] not in known:
             found.append(_plain("appeared", row, None, None))
         elif old is not None and row["status"] == "missing":
-            found.append(_plain("gone", old, _of_misses(row["passes_expected"]), row["passes_expected"]))
+            chance = _MISSED_BY_A_PASS ** row["passes_expected"]
+            found.append(_plain("gone", old, _sigmas(chance), row["passes_expected"]))
         elif old is not None:
             unseen += 1
+    found += [change for own in compared.values() for change in _significant(own)]
     return EpochChanges(before.epoch, after.epoch, tuple(found), unseen)
 
 
@@ -117,40 +124,52 @@ def _plain(change: str, row: dict[str, Any], significance: float | None, expecte
     return Change(change, row["asset_id"], row["kind"], "", None, None, significance, expected, None, row[GEOMETRY])
 
 
-def _of_misses(passes: int) -> float:
+def _sigmas(chance: float) -> float:
+    """σ of a normal variable that is exceeded to both sides with a probability; at most 38, where numbers end."""
     from scipy.stats import norm
 
-    return float(norm.isf(0.5 * _MISSED_BY_A_PASS**passes))
+    return min(float(norm.isf(0.5 * max(chance, 1e-300))), 38.0)
 
 
-def _changed(old: dict[str, Any], new: dict[str, Any], unit_m: float) -> Iterator[Change]:
-    kind = new["kind"]
-    sigma = {
-        name: math.hypot(old[name] or 0.0, new[name] or 0.0) for name in ("sigma_horizontal_m", "sigma_height_m")
-    }
-    away_m, significance = _moved(old[GEOMETRY], new[GEOMETRY], sigma, unit_m)
-    if significance > SIGNIFICANT:
-        yield Change("moved", new["asset_id"], kind, GEOMETRY, None, None, significance, None, away_m, new[GEOMETRY])
+def _significant(compared: list[tuple[float, Change]]) -> Iterator[Change]:
+    """Changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1), in their order."""
+    chances = np.sort([chance for chance, _ in compared])
+    holds = np.flatnonzero(chances <= _FALSE_SHARE * np.arange(1, chances.size + 1) / max(chances.size, 1))
+    if not holds.size:
+        return
+    limit = chances[holds[-1]]
+    for chance, change in compared:
+        if chance <= limit:
+            yield change._replace(significance=_sigmas(chance) if change.significance is None else None)
+
+
+def _compared(old: dict[str, Any], new: dict[str, Any], unit_m: float) -> Iterator[tuple[float, Change]]:
+    """Each comparison of an asset that both saw: the probability of so great a difference by chance, and the change."""
+    kind, one = new["kind"], new["asset_id"]
+    sigma = {name: math.hypot(old[name] or 0.0, new[name] or 0.0) for name in ("sigma_horizontal_m", "sigma_height_m")}
+    away_m = _away(old[GEOMETRY], new[GEOMETRY]) * unit_m
+    chance = math.exp(-0.5 * (away_m / max(sigma["sigma_horizontal_m"], _LEAST_M)) ** 2)  # Rayleigh, of two coordinates
+    yield chance, Change("moved", one, kind, GEOMETRY, None, None, None, None, away_m, new[GEOMETRY])
     for column in asset_schema(kind).own:
         was, now = old[column.name], new[column.name]
-        if was is None or now is None or was == now:
+        if was is None or now is None:
             continue
         by = sigmas_apart(kind, column.name, was, now, sigma)
-        if by > SIGNIFICANT:
-            values = (encoded(was), encoded(now), by if math.isfinite(by) else None)
-            yield Change("changed", new["asset_id"], kind, column.name, *values, None, None, new[GEOMETRY])
+        change = Change("changed", one, kind, column.name, encoded(was), encoded(now), None, None, None, new[GEOMETRY])
+        if math.isfinite(by):
+            yield math.erfc(by / math.sqrt(2.0)), change
+        else:
+            yield 0.0, change._replace(significance=math.inf)  # a text: it has no σ
 
 
-def _moved(old: bytes, new: bytes, sigma: dict[str, float], unit_m: float) -> tuple[float, float]:
-    """Horizontal distance (m) of two places and its significance; of lines and areas the median along them."""
+def _away(old: bytes, new: bytes) -> float:
+    """Horizontal distance of two places, of lines and areas the median along them, in the map's own unit."""
     a, b = shapely.from_wkb(old), shapely.from_wkb(new)
-    if a.geom_type != "Point":
-        a, b = (shapely.get_exterior_ring(s) if s.geom_type == "Polygon" else s for s in (a, b))
-        along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        away = float(np.median(shapely.distance(shapely.line_interpolate_point(b, along, normalized=True), a)))
-    else:
-        away = float(shapely.distance(a, b))
-    return away * unit_m, away * unit_m / max(sigma["sigma_horizontal_m"], 0.005)
+    if a.geom_type == "Point":
+        return float(shapely.distance(a, b))
+    a, b = (shapely.get_exterior_ring(s) if s.geom_type == "Polygon" else s for s in (a, b))
+    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    return float(np.median(shapely.distance(shapely.line_interpolate_point(b, along, normalized=True), a)))
 
 
 def _point(geometry: bytes) -> bytes:

@@ -72,9 +72,13 @@ class Folded:
     in_force: dict[tuple[str, str], Edit] = field(default_factory=dict)
     waiting: dict[tuple[str, str], list[Edit]] = field(default_factory=lambda: defaultdict(list))
     """Edits that met one in force which their maker had not seen."""
+    created: dict[str, Edit] = field(default_factory=dict)
+    """By asset: the edit that drew it, whatever was done to it since."""
 
     def take(self, edit: Edit) -> None:
         """Fold one more edit in."""
+        if edit.action == "create":
+            self.created.setdefault(edit.asset_id, edit)
         known = self.in_force.get(edit.key)
         blind = known is not None and known.new not in (edit.old, edit.new)
         if blind and edit.action != "withdraw":

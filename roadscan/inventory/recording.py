@@ -65,7 +65,7 @@ def record(truth: AssetTruth, found: Found, rules: Rules, who: str = "roadscan",
     known = [c for c in live_commits(truth.commits) if c.kind == "found" and c.epoch == epoch]
     if known and known[-1].run == found.key:
         return None
-    rows = _Recording(state_at(truth), tables, rules, epoch, is_again=bool(known)).rows()
+    rows = _Recording(state_at(truth, with_undone=True), tables, rules, epoch, is_again=bool(known)).rows()
     draft = Draft("found", who, why, found.source, epoch=epoch, epoch_gps_ns=began, run=found.key)
     return truth.append(draft, rows)
 
@@ -113,6 +113,7 @@ class _Recording:
             ids, valid_from = self._identified(kind, table, assets, match, taken)
             seen[kind] = self._evidence(kind, table, ids, valid_from)
             left = np.setdiff1d(np.arange(assets.rows.num_rows), match[match >= 0])
+            left = left[[str(one) not in self.state.orphans for one in assets.ids[left]]] if left.size else left
             unseen.append(_unseen(kind, assets.ids[left], expected[left]))
         placed = self._placed(seen)
         for kind in seen:

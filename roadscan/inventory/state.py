@@ -92,8 +92,12 @@ def live_commits(commits: Sequence[Commit]) -> list[Commit]:
     return [c for c in commits if c.number not in undone and c.kind != "undo"]
 
 
-def state_at(truth: AssetTruth, number: int | None = None) -> State:
+def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool = False) -> State:
     """The inventory after commit `number`, today's where it is left out.
+
+    Parameters
+    ----------
+    with_undone : whether assets count that only undone runs have found. They are known again when they are found again.
 
     Raises
     ------
@@ -104,15 +108,14 @@ def state_at(truth: AssetTruth, number: int | None = None) -> State:
     live = live_commits(commits)
     edits = folded(read_edits(truth, live))
     found, status = _evidence(truth, _newest_first([c for c in live if c.kind == "found"]))
-    edited = {asset for asset, _ in edits.in_force}
-    created = [e for e in edits.in_force.values() if e.action == "create"]
-    known = set(found["asset_id"].to_pylist()) if found is not None and edited else set()
-    lost = edited - known - {e.asset_id for e in created}
-    if lost:
-        undone = [c for c in commits if c.kind == "found" and c not in live]
-        found, lost = _with_lost(truth, _newest_first(undone), found, lost)
-        status |= {asset: ("missing", None) for asset in lost}
-    return State(len(commits), _by_kind(found, status, edits, created), edits, frozenset(lost))
+    edited = {asset for asset, _ in edits.in_force} - edits.created.keys()
+    undone = [c for c in commits if c.kind == "found" and c not in live]
+    orphans: set[str] = set()
+    if undone:
+        lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
+        found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
+        status |= {asset: ("missing", None) for asset in orphans}
+    return State(len(commits), _by_kind(found, status, edits), edits, frozenset(orphans))
 
 
 def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
@@ -187,27 +190,31 @@ def _ids(parts: Sequence[pa.Table]) -> set[str]:
 
 
 def _with_lost(
-    truth: AssetTruth, undone: Sequence[Commit], found: pa.Table | None, lost: set[str]
+    truth: AssetTruth, undone: Sequence[Commit], found: pa.Table | None, wanted: set[str] | None
 ) -> tuple[pa.Table | None, set[str]]:
-    """Evidence with that of assets which only undone commits saw; and those of them that there are."""
+    """Evidence with that of assets which only undone commits saw, of all or of wanted ones; and which these are."""
     kept: set[str] = set()
     for commit in undone:
         rows = truth.rows(commit)
-        wanted = pa.array(sorted(lost - kept), pa.string())
-        rows = rows.filter(pc.and_(pc.equal(rows["seen"], 1), pc.is_in(rows["asset_id"], value_set=wanted)))
+        mask = pc.equal(rows["seen"], 1)
+        if found is not None:
+            mask = pc.and_(mask, pc.invert(pc.is_in(rows["asset_id"], value_set=_id_array([found]))))
+        if wanted is not None:
+            mask = pc.and_(mask, pc.is_in(rows["asset_id"], value_set=pa.array(sorted(wanted), pa.string())))
+        rows = rows.filter(mask)
         kept |= set(rows["asset_id"].to_pylist())
         found = rows if found is None else pa.concat_tables([found, rows])
     return found, kept
 
 
 def _by_kind(
-    found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded, created: Sequence[Edit]
+    found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded
 ) -> dict[str, Assets]:
     changes: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits.in_force.values():
         changes[edit.kind].append(edit)
     drawn: dict[str, list[str]] = defaultdict(list)
-    for edit in created:
+    for edit in edits.created.values():
         drawn[edit.kind].append(edit.asset_id)
     assets: dict[str, Assets] = {}
     present = set() if found is None else set(pc.unique(found["kind"]).to_pylist())
@@ -223,7 +230,9 @@ def _by_kind(
         blank = pa.Table.from_pylist([{"asset_id": one} for one in own], schema)
         evidence = pa.concat_tables([evidence, blank]).sort_by("asset_id").combine_chunks()
         evidence = _with_status(evidence, status)
-        assets[kind] = Assets(kind, _edited(kind, evidence, changes.get(kind, ())), evidence)
+        own_edits = changes.get(kind, []) + _drawn_again(evidence, edits, drawn.get(kind, ()))
+        rows = _as_drawn(_edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))])
+        assets[kind] = Assets(kind, rows, evidence)
     return assets
 
 
@@ -252,13 +261,22 @@ def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
         own = sorted(by_attribute[attribute], key=lambda e: e.asset_id)
         places = _places(ids, own)
         rows = _replaced(rows, attribute, places, [decoded(kind, attribute, e.new) for e in own if _is_in(ids, e)])
-    drawn = [e for e in by_attribute.get(GEOMETRY, ()) if e.action == "create" and _is_in(ids, e)]
-    if drawn:
-        rows = _as_drawn(rows, ids, sorted(drawn, key=lambda e: e.asset_id))
     return _at_their_places(rows, moved)
 
 
-def _as_drawn(rows: pa.Table, ids: npt.NDArray[Any], drawn: Sequence[Edit]) -> pa.Table:
+def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> list[Edit]:
+    """Edits that drew assets, of which neither a later edit nor evidence says where they are."""
+    if not drawn:
+        return []
+    placed = set(evidence.filter(pc.is_valid(evidence[GEOMETRY]))["asset_id"].to_pylist())
+    return [edits.created[one] for one in drawn if one not in placed and (one, GEOMETRY) not in edits.in_force]
+
+
+def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
+    """Rows in which assets that a person drew are confirmed and say who drew them, where nothing else does."""
+    if not drawn:
+        return rows
+    ids = np.asarray(rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
     places = _places(ids, drawn)
     for name, given in (("status", lambda e: "confirmed"), ("source", lambda e: f"drawn by {e.who}")):
         held = rows[name].to_pylist()

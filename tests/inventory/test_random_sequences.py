@@ -353,7 +353,7 @@ def values_of(state: State) -> dict[str, Any]:
 def run(machine: type[Street], sequences: int, steps: int) -> None:
     chosen = settings(
         max_examples=sequences, stateful_step_count=steps, deadline=None,
-        suppress_health_check=list(HealthCheck), phases=(Phase.explicit, Phase.generate, Phase.shrink),
+        suppress_health_check=list(HealthCheck), phases=(Phase.explicit, Phase.generate),
     )  # fmt: skip
     run_state_machine_as_test(machine, settings=chosen)
 

@@ -12,7 +12,19 @@ from typing import Annotated
 import typer
 
 from roadscan import __version__
-from roadscan.cli import cameras, estimates, exports, inventory, logs, profiles, queries, reports, runs, simulations, state
+from roadscan.cli import (
+    cameras,
+    estimates,
+    exports,
+    inventory,
+    logs,
+    profiles,
+    queries,
+    reports,
+    runs,
+    simulations,
+    state,
+)
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 

@@ -92,7 +92,9 @@ def diff(
 
 def changes(
     survey_file: SurveyOption,
-    before: Annotated[str | None, typer.Argument(help="Name of an epoch; the last but one where it is left out.")] = None,
+    before: Annotated[
+        str | None, typer.Argument(help="Name of an epoch; the last but one where it is left out.")
+    ] = None,
     after: Annotated[str | None, typer.Argument(help="Name of a later one; the last where it is left out.")] = None,
 ) -> None:
     """What changed on the road between two survey epochs: appeared, gone, moved, changed."""
@@ -103,7 +105,8 @@ def changes(
     rows = [
         (
             c.change, c.asset_id, c.attribute, c.before or "", c.after or "",
-            "" if c.significance is None else f"{c.significance:.1f}", "" if c.distance_m is None else f"{c.distance_m:.2f}",
+            "" if c.significance is None else f"{c.significance:.1f}",
+            "" if c.distance_m is None else f"{c.distance_m:.2f}",
         )
         for c in found.changes[:_MOST_LINES]
     ]  # fmt: skip
@@ -120,9 +123,7 @@ def history(
 ) -> None:
     """All that was found of an asset and edited."""
     events = _opened(survey_file).history(asset)
-    rows = [
-        (str(e.commit), e.at, e.who, e.what, e.attribute, _short(e.old), _short(e.new), e.why) for e in events
-    ]
+    rows = [(str(e.commit), e.at, e.who, e.what, e.attribute, _short(e.old), _short(e.new), e.why) for e in events]
     print_table(("commit", "when", "who", "what", "attribute", "old", "new", "why"), rows)
 
 
@@ -140,7 +141,15 @@ def undo(
 def log(survey_file: SurveyFile) -> None:
     """All commits: what was found, edited and undone, by whom and why."""
     rows = [
-        (str(c.number), c.at, c.kind, c.epoch or (f"commit {c.undoes}" if c.undoes else ""), f"{c.rows:,}", c.who, c.why)
+        (
+            str(c.number),
+            c.at,
+            c.kind,
+            c.epoch or (f"commit {c.undoes}" if c.undoes else ""),
+            f"{c.rows:,}",
+            c.who,
+            c.why,
+        )
         for c in _opened(survey_file).truth.commits
     ]
     print_table(("commit", "when", "kind", "of", "rows", "who", "why"), rows)
@@ -165,7 +174,9 @@ def _opened(survey_file: Path) -> Inventory:
 
 
 def _tell_rest(count: int) -> None:
-    typer.echo(f"{count:,} in all" if count <= _MOST_LINES else f"{count:,} in all, of which the first {_MOST_LINES} are shown")
+    typer.echo(
+        f"{count:,} in all" if count <= _MOST_LINES else f"{count:,} in all, of which the first {_MOST_LINES} are shown"
+    )
 
 
 def _short(text: str | None) -> str:

@@ -89,7 +89,9 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
     names = sorted(newest, key=lambda name: (began[name], name))
     for name in (before, after):
         if name is not None and name not in newest:
-            raise ConfigError(f"there is no epoch '{name}'{nearest(name, names)}", expected=", ".join(names) or "none yet")
+            raise ConfigError(
+                f"there is no epoch '{name}'{nearest(name, names)}", expected=", ".join(names) or "none yet"
+            )
     if len(names) < 2:
         return None
     second = after or names[-1]

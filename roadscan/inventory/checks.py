@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from roadscan.inventory.comparing import Change, Changes
-from roadscan.inventory.homes.base import EditFault
+from roadscan.inventory.home import EditFault
 from roadscan.inventory.state import State
 from roadscan.tables.asset_schema import AssetColumn, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns

@@ -9,19 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from roadscan.inventory.homes.base import Content, EditFault
+from roadscan.inventory.home import FID, Content, EditFault
 from roadscan.inventory.identity import new_ids
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
-
-FID: Final = "fid"
 
 
 class Change(NamedTuple):
@@ -141,7 +139,9 @@ def _compare_kind(side: _Side, changes: Changes) -> None:
 def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> dict[int, str]:
     """Ids of rows that lost theirs, or never got one since they were first read."""
     present = {one for one in ids if one is not None}
-    by_fid = {fid: one for one, fid in zip(side.before["asset_id"].to_pylist(), side.before[FID].to_pylist(), strict=True)}
+    by_fid = {
+        fid: one for one, fid in zip(side.before["asset_id"].to_pylist(), side.before[FID].to_pylist(), strict=True)
+    }
     found: dict[int, str] = {}
     names = [n for n in side.before.column_names if n not in (FID, "asset_id", GEOMETRY)]
     for at, one in enumerate(ids):

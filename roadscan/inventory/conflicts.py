@@ -91,14 +91,14 @@ def _with_edit(state: State, waiting: Edit, known: Edit | None) -> Conflict:
 def _rejected_while_edited(state: State) -> list[Conflict]:
     """Edits of rejected assets, where neither person had seen what the other did."""
     rejected = {
-        e.asset_id: e
-        for e in state.edits.in_force.values()
-        if e.attribute == "status" and e.new == encoded("rejected")
+        e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == encoded("rejected")
     }
     if not rejected:
         return []
     return [
-        Conflict(e.asset_id, e.kind, e.attribute, "rejected", e.edit, rejected[e.asset_id].new, e.new, e.old, None, e.who)
+        Conflict(
+            e.asset_id, e.kind, e.attribute, "rejected", e.edit, rejected[e.asset_id].new, e.new, e.old, None, e.who
+        )
         for e in state.edits.in_force.values()
         if e.attribute != "status"
         and (r := rejected.get(e.asset_id)) is not None
@@ -118,9 +118,9 @@ def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
             place = shapely.to_wkb(shapely.Point(points[0]), flavor="iso")
         values = {name: _shown(one, name) for name in ("in_force", "other", "base")}
         layer = asset_schema(one.kind).table
-        rows.append(one._asdict() | values | {"layer": layer, "decision": None, "picture": None, GEOMETRY: place})
-    names = ["asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit", "picture",
-             "decision", GEOMETRY]  # fmt: skip
+        rows.append(one._asdict() | values | {"layer": layer, "decision": None, GEOMETRY: place})
+    names = ["asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit"]
+    names += ["decision", GEOMETRY]
     schema = pa.schema([pa.field(name, _TYPES.get(name, pa.string())) for name in names])
     return pa.Table.from_pylist([{name: row[name] for name in names} for row in rows], schema)
 

@@ -48,7 +48,7 @@ def _shown(assets: Assets | None, kind: str) -> pa.Table:
 
 def _of_kind(kind: str, before: pa.Table, after: pa.Table) -> Iterator[Difference]:
     ids = [np.asarray(t["asset_id"].to_numpy(zero_copy_only=False), dtype=str) for t in (before, after)]
-    _, at_before, at_after = np.intersect1d(*ids, assume_unique=True, return_indices=True)
+    _, at_before, at_after = np.intersect1d(ids[0], ids[1], assume_unique=True, return_indices=True)
     for change, own, held in (("removed", ids[0], at_before), ("added", ids[1], at_after)):
         for at in np.setdiff1d(np.arange(own.size), held):
             yield Difference(str(own[at]), kind, change, "", None, None)

@@ -71,7 +71,9 @@ def _geojson(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
     import pyogrio
 
     if crs is None:
-        raise ConfigError("the map has no CRS", expected="gpkg, csv or dxf", change="GeoJSON is in WGS 84 by its standard")
+        raise ConfigError(
+            "the map has no CRS", expected="gpkg, csv or dxf", change="GeoJSON is in WGS 84 by its standard"
+        )
     rows = _together(kinds)
     turn = _to_wgs84(crs)
     shapes = shapely.transform(_shapes(rows), turn, include_z=True)
@@ -102,7 +104,9 @@ def _csv(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
     rows = rows.set_column(rows.schema.get_field_index(GEOMETRY), GEOMETRY, wkt)
     for at, field in enumerate(rows.schema):
         if pa.types.is_string(field.type):
-            rows = rows.set_column(at, field, pa.array([_harmless(v) for v in rows[field.name].to_pylist()], pa.string()))
+            rows = rows.set_column(
+                at, field, pa.array([_harmless(v) for v in rows[field.name].to_pylist()], pa.string())
+            )
     out = io.BytesIO()
     write_csv(rows, out)
     file.write_bytes(out.getvalue())

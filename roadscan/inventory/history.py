@@ -35,7 +35,9 @@ def history_of(truth: AssetTruth, asset_id: str) -> list[Event]:
         if commit.kind == "undo":
             if commit.undoes in touched:
                 touched.add(commit.number)
-                events.append(Event(commit.number, commit.at, commit.who, "undone", "", str(commit.undoes), None, commit.why))
+                events.append(
+                    Event(commit.number, commit.at, commit.who, "undone", "", str(commit.undoes), None, commit.why)
+                )
             continue
         own = list(_events(truth, commit, asset_id))
         if own:
@@ -53,7 +55,9 @@ def _events(truth: AssetTruth, commit: Commit, asset_id: str) -> Iterator[Event]
         elif commit.kind == "found":
             expected = row["passes_expected"]
             told = "not known how many passes should have" if expected is None else f"{expected} passes should have"
-            yield Event(commit.number, commit.at, commit.who, "not seen", "", None, None, f"epoch {commit.epoch}; {told}")
+            yield Event(
+                commit.number, commit.at, commit.who, "not seen", "", None, None, f"epoch {commit.epoch}; {told}"
+            )
         else:
             what = {"create": "drawn", "set": "edited", "withdraw": "withdrawn"}[row["action"]]
             values = (row["attribute"], row["old"], row["new"], row["why"])

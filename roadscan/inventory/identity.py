@@ -124,7 +124,7 @@ def _sigmas(table: pa.Table) -> Floats:
         np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float)
         for name in ("sigma_horizontal_m", "sigma_height_m")
     ]
-    return np.nan_to_num(np.column_stack(columns))
+    return np.asarray(np.nan_to_num(np.column_stack(columns)), dtype=float)
 
 
 def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, least_m: float) -> Pairs:
@@ -140,9 +140,7 @@ def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigm
 def _overlapping(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Pairs:
     lines_a, lines_b = _outlines(a), _outlines(b)
     left, right = shapely.STRtree(lines_b).query(lines_a, predicate="dwithin", distance=within_m)
-    share = 0.5 * (
-        _share(lines_a[left], lines_b[right], within_m) + _share(lines_b[right], lines_a[left], within_m)
-    )
+    share = 0.5 * (_share(lines_a[left], lines_b[right], within_m) + _share(lines_b[right], lines_a[left], within_m))
     keep = share >= _LEAST_SHARE
     return Pairs(left[keep], right[keep], 1.0 - share[keep])
 
@@ -151,7 +149,7 @@ def _outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Lines as they are, of polygons the outer ring; of façades that is the line on the ground, there and back."""
     flat = shapely.force_2d(shapes)
     rings = shapely.get_exterior_ring(flat)
-    return np.where(shapely.is_missing(rings), flat, rings)
+    return np.asarray(np.where(shapely.is_missing(rings), flat, rings))
 
 
 def _share(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Floats:

@@ -7,7 +7,7 @@ import getpass
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -15,12 +15,12 @@ import pyarrow.compute as pc
 
 from roadscan.inventory.changes import EpochChanges, epoch_changes
 from roadscan.inventory.checks import faults_of
-from roadscan.inventory.comparing import FID, Changes, compared, published_rows, published_table
+from roadscan.inventory.comparing import Changes, compared, published_rows, published_table
 from roadscan.inventory.conflicts import Conflict, conflict_rows, conflicts_of
 from roadscan.inventory.diff import Difference, differences
 from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
-from roadscan.inventory.homes.base import Content, EditFault, Home, HomeError, Mark, Sheet
+from roadscan.inventory.home import FID, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.pulling import Pulling, new_edits, now_utc, refuse
 from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
@@ -141,12 +141,12 @@ class Inventory:
     def _sheets(self, state: State, conflicts: list[Conflict]) -> list[Sheet]:
         sheets = [Sheet("conflicts", "Conflicts", conflict_rows(state, conflicts))]
         found = epoch_changes(self.truth, None, None, self.rules.unit_m) or EpochChanges("", "", (), 0)
-        sheets.append(Sheet("changes", f"Changes {found.before} to {found.after}" if found.before else "Changes", found.layer()))
+        sheets.append(
+            Sheet("changes", f"Changes {found.before} to {found.after}" if found.before else "Changes", found.layer())
+        )
         return sheets
 
-    def pull(
-        self, *, home: Home | None = None, who: str | None = None, why: str = "", sound: bool = False
-    ) -> Pulled:
+    def pull(self, *, home: Home | None = None, who: str | None = None, why: str = "", sound: bool = False) -> Pulled:
         """Take in what people changed in a home.
 
         Parameters

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from roadscan.inventory.comparing import Changes
 from roadscan.inventory.edits import Edit, Folded, named
-from roadscan.inventory.homes.base import Author, Decision, FaultyEditsError
+from roadscan.inventory.home import Author, Decision, FaultyEditsError
 from roadscan.inventory.state import State
 from roadscan.inventory.values import encoded
 from roadscan.model.errors import ConfigError
@@ -51,7 +51,9 @@ def _changed(changes: Changes, pulling: Pulling) -> Iterator[Edit]:
     for change in changes.drawn:
         yield _edit(pulling, change.kind, change.asset_id, GEOMETRY, ("create", None, change.new), change.fid)
     for change in changes.changed:
-        yield _edit(pulling, change.kind, change.asset_id, change.attribute, ("set", change.old, change.new), change.fid)
+        yield _edit(
+            pulling, change.kind, change.asset_id, change.attribute, ("set", change.old, change.new), change.fid
+        )
     for kind, one in changes.deleted:
         row = pulling.base.row(one) or pulling.now.row(one) or {}
         yield _edit(pulling, kind, one, "status", ("set", row.get("status"), "rejected"), None)
@@ -93,15 +95,16 @@ def _decided(decisions: Sequence[Decision], pulling: Pulling) -> Iterator[Edit]:
             new: str | None = waiting[one.edit].new
         else:
             new = old if one.choice == "edit" and known is not None else encoded(evidence)
-        action = "withdraw" if one.choice == "evidence" or known is None and one.choice == "edit" else "set"
+        action = "withdraw" if one.choice == "evidence" or (known is None and one.choice == "edit") else "set"
         yield Edit(
             "", 0, one.asset_id, kind, one.attribute, action, old, new, None if evidence is None else encoded(evidence),
-            pulling.now.commit, pulling.who, pulling.at, pulling.why or f"conflict settled: {one.choice}", pulling.source,
+            pulling.now.commit, pulling.who, pulling.at, pulling.why or f"conflict settled: {one.choice}",
+            pulling.source,
         )  # fmt: skip
 
 
 def now_utc() -> str:
-    """This instant (UTC), ISO 8601 to the second."""
+    """Today's instant (UTC), ISO 8601 to the second."""
     return dt.datetime.now(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 

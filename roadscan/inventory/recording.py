@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -46,7 +46,7 @@ class Rules:
     """What assets are known again by."""
 
     visibility: Visibility
-    matching: Matching = Matching()
+    matching: Matching = field(default_factory=Matching)
     unit_m: float = 1.0
     """Metres of a unit of the map."""
 
@@ -116,17 +116,17 @@ class _Recording:
             left = left[[str(one) not in self.state.orphans for one in assets.ids[left]]] if left.size else left
             unseen.append(_unseen(kind, assets.ids[left], expected[left]))
         placed = self._placed(seen)
-        for kind in seen:
-            parents = pa.array(parents_of(kind, placed)[: seen[kind].num_rows], pa.string())
-            at = seen[kind].schema.get_field_index("parent")
-            seen[kind] = seen[kind].set_column(at, seen[kind].schema.field(at), parents)
+        for kind, rows in list(seen.items()):
+            parents = pa.array(parents_of(kind, placed)[: rows.num_rows], pa.string())
+            at = rows.schema.get_field_index("parent")
+            seen[kind] = rows.set_column(at, rows.schema.field(at), parents)
         parts = [_wide(kind, rows, 1) for kind, rows in seen.items()] + unseen
         if not parts:
             return evidence_table().empty_table()
         return pa.concat_tables(parts).sort_by([("kind", "ascending"), ("asset_id", "ascending")])
 
     def _expected(self, kind: str, assets: Assets) -> npt.NDArray[np.int64]:
-        """Passes that should have seen each known asset; of an epoch that is processed again at least those that did."""
+        """Passes that should have seen each known asset; of an epoch processed again at least those that did."""
         table = assets.evidence
         count = table.num_rows
         columns = [
@@ -219,5 +219,3 @@ def _unseen(kind: str, ids: npt.NDArray[Any], expected: npt.NDArray[np.int64]) -
         }
     )
     return _wide(kind, rows, 0)
-
-

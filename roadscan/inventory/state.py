@@ -114,7 +114,7 @@ def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool 
     if undone:
         lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
         found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
-        status |= {asset: ("missing", None) for asset in orphans}
+        status |= dict.fromkeys(orphans, ("missing", None))
     return State(len(commits), _by_kind(found, status, edits), edits, frozenset(orphans))
 
 
@@ -207,9 +207,7 @@ def _with_lost(
     return found, kept
 
 
-def _by_kind(
-    found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded
-) -> dict[str, Assets]:
+def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded) -> dict[str, Assets]:
     changes: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits.in_force.values():
         changes[edit.kind].append(edit)
@@ -231,7 +229,9 @@ def _by_kind(
         evidence = pa.concat_tables([evidence, blank]).sort_by("asset_id").combine_chunks()
         evidence = _with_status(evidence, status)
         own_edits = changes.get(kind, []) + _drawn_again(evidence, edits, drawn.get(kind, ()))
-        rows = _as_drawn(_edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))])
+        rows = _as_drawn(
+            _edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
+        )
         assets[kind] = Assets(kind, rows, evidence)
     return assets
 
@@ -278,9 +278,10 @@ def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
         return rows
     ids = np.asarray(rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
     places = _places(ids, drawn)
-    for name, given in (("status", lambda e: "confirmed"), ("source", lambda e: f"drawn by {e.who}")):
+    said = {"status": ["confirmed"] * len(drawn), "source": [f"drawn by {e.who}" for e in drawn]}
+    for name, values in said.items():
         held = rows[name].to_pylist()
-        missing = [(at, given(e)) for at, e in zip(places, drawn, strict=True) if held[at] is None]
+        missing = [(at, value) for at, value in zip(places, values, strict=True) if held[at] is None]
         rows = _replaced(rows, name, [at for at, _ in missing], [value for _, value in missing])
     return rows
 

@@ -73,7 +73,7 @@ def sigmas_apart(kind: str, attribute: str, one: Any, other: Any, row: Mapping[s
     sigma = _sigma_of(kind, attribute)
     if sigma is None or isinstance(one, str):
         return math.inf
-    return abs(one - other) / sigma(horizontal, height, max(abs(one), abs(other)))
+    return float(abs(one - other) / sigma(horizontal, height, max(abs(one), abs(other))))
 
 
 def geometries_apart(one: bytes, other: bytes, horizontal_m: float, height_m: float) -> float:

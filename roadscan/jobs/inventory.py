@@ -9,7 +9,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from roadscan.inventory.homes.base import Home
+from roadscan.inventory.home import Home
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
@@ -39,6 +39,15 @@ def open_inventory(session: Session) -> Inventory:
     ConfigError
         where PostGIS is asked for and its driver is missing.
     """
+    return _opened(session, home_of(session))
+
+
+def truth_of(session: Session) -> Inventory:
+    """The same to look at alone: its home is a file that is not opened."""
+    return _opened(session, GeoPackage(Path("inventory.gpkg"), None))
+
+
+def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
     url = survey.store_url
     if settings.store is not None:
@@ -48,7 +57,7 @@ def open_inventory(session: Session) -> Inventory:
     own = session.store
     rules = Rules(_visibility(own), settings.matching, frame.horizontal_unit_m)
     return Inventory(
-        AssetTruth(Store(url, name)), home_of(session), name, rules, lambda: found_assets(session), frame.crs,
+        AssetTruth(Store(url, name)), home, name, rules, lambda: found_assets(session), frame.crs,
         lambda folder: _rasters(session, folder),
     )  # fmt: skip
 

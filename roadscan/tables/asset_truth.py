@@ -138,7 +138,7 @@ class AssetTruth:
         StoreError
             where another one is still at work after `wait_s`.
         """
-        if fcntl is None or not self.store.is_folder:
+        if not self.store.is_folder or fcntl is None:
             yield
             return
         file = Path(self.store.path(_LOCK))
@@ -176,7 +176,9 @@ class AssetTruth:
         schema = table_schema("asset_commits").arrow()
         name = f"{COMMITS}/{number:08d}.parquet"
         if self.store.exists(name):
-            raise StoreError("another program appended to the inventory", change="try again", file=self.store.path(name))
+            raise StoreError(
+                "another program appended to the inventory", change="try again", file=self.store.path(name)
+            )
         self.store.write_bytes(name, parquet_bytes(pa.Table.from_pylist([asdict(commit)], schema)))
         self._commits = (*self.commits, commit)
         return commit

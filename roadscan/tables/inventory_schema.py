@@ -1,4 +1,4 @@
-"""Schemas of the inventory: the table of a kind as people see it, and the rows of evidence and edits that it is made of."""
+"""Schemas of the inventory: the table of a kind as people see it, and the rows of evidence behind it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def kinds_by_table() -> dict[str, str]:
 
 @functools.cache
 def asset_columns(kind: str) -> tuple[AssetColumn, ...]:
-    """Columns of the inventory's table of a kind, without the geometry: the inventory's, the kind's, the common ones."""
+    """Columns of a kind's table, without the geometry: the inventory's, the kind's, the common ones."""
     schema = asset_schema(kind)
     return (*inventory_columns(), *schema.own, *schema.common)
 

@@ -37,7 +37,9 @@ def server() -> Iterator[str]:
             port = free.getsockname()[1]
 
         def call(*words: str) -> None:
-            subprocess.run([str(programs / words[0]), *words[1:]], check=True, capture_output=True, user=user, cwd=folder)
+            subprocess.run(
+                [str(programs / words[0]), *words[1:]], check=True, capture_output=True, user=user, cwd=folder
+            )
 
         data = str(folder / "data")
         call("initdb", "-D", data, "-U", "admin", "--auth=trust", "--no-sync", "-E", "UTF8")

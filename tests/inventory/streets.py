@@ -53,13 +53,15 @@ def asset(kind: str, *places: tuple[float, float, float], when: dt.datetime = SP
         "object": f"{kind}-{bytes_digest(repr(points).encode())[-10:]}", "easting_m": points[0][0],
         "northing_m": points[0][1], "height_m": points[0][2], "sigma_horizontal_m": 0.02, "sigma_height_m": 0.02,
         "probability": 0.95, "returns": 250, "passes": 2, "first_epoch_gps_ns": first,
-        "last_epoch_gps_ns": first + 60_000_000_000, "road": "main", "station_m": places[0][0], "offset_m": places[0][1],
-        "geometry": shapely.to_wkb(shape),
+        "last_epoch_gps_ns": first + 60_000_000_000, "road": "main", "station_m": places[0][0],
+        "offset_m": places[0][1], "geometry": shapely.to_wkb(shape),
     }  # fmt: skip
     return {"kind": kind, **row, **values}
 
 
-def found(rows: Sequence[Mapping[str, Any]], epoch: str | None = None, kinds: Iterable[str] = ("pole", "sign")) -> Found:
+def found(
+    rows: Sequence[Mapping[str, Any]], epoch: str | None = None, kinds: Iterable[str] = ("pole", "sign")
+) -> Found:
     """What a run found, as it hands it on."""
     tables = {}
     for kind in {*kinds, *(r["kind"] for r in rows)}:
@@ -71,7 +73,12 @@ def found(rows: Sequence[Mapping[str, Any]], epoch: str | None = None, kinds: It
 def poles(count: int = 6, step_m: float = 20.0, when: dt.datetime = SPRING, **values: Any) -> list[dict[str, Any]]:
     """Poles along the road."""
     return [
-        asset("pole", (step_m * n, 4.0, 100.0 + n), when=when, **{"asset_height_m": 5.0 + 0.1 * n, "diameter_m": 0.1} | values)
+        asset(
+            "pole",
+            (step_m * n, 4.0, 100.0 + n),
+            when=when,
+            **{"asset_height_m": 5.0 + 0.1 * n, "diameter_m": 0.1} | values,
+        )
         for n in range(count)
     ]
 

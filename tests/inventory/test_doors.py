@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 import roadscan
 from roadscan.cli import app
 from roadscan.jobs.inventory import FOUND
+from roadscan.jobs.report.section import Material, sections
 from roadscan.model.errors import ConfigError, DamagedError, StoreError
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth
@@ -84,8 +85,8 @@ def test_the_commands_from_publication_to_export(survey_file: Path, tmp_path: Pa
     assert "as of commit 1" in run("status", survey_file, "--as-of", "1")
     for form in ("gpkg", "geojson", "csv", "dxf"):
         assert "7 assets" in run("export", survey_file, "--out", tmp_path / f"out.{form}", "--as", form)
-    assert isinstance(CliRunner().invoke(app, ["inventory", "export", str(survey_file), "--out", "x", "--as", "shp"]).exception,
-                      ConfigError)  # fmt: skip
+    wrong = CliRunner().invoke(app, ["inventory", "export", str(survey_file), "--out", "x", "--as", "shp"])
+    assert isinstance(wrong.exception, ConfigError)
 
 
 def test_python_says_the_same(survey_file: Path) -> None:
@@ -104,7 +105,9 @@ def test_python_says_the_same(survey_file: Path) -> None:
 
 def test_files_for_others_hold_what_the_inventory_holds(tmp_path: Path) -> None:
     street = inventory(tmp_path, Everywhere())
-    street.record(found([*poles(), asset("sign", (20.1, 4.0, 103.0), message="=1+1"), asset("kerb", (0, 3, 9), (9, 3, 9))]))
+    street.record(
+        found([*poles(), asset("sign", (20.1, 4.0, 103.0), message="=1+1"), asset("kerb", (0, 3, 9), (9, 3, 9))])
+    )
     for form in ("geojson", "csv", "dxf", "gpkg"):
         assert street.export(tmp_path / f"o.{form}", form) == 8
     features = json.loads((tmp_path / "o.geojson").read_text())["features"]
@@ -136,7 +139,12 @@ def test_the_project_of_qgis_has_a_form_for_every_column(tmp_path: Path) -> None
         layer = layers[schema.title]
         assert layer.findtext("datasource") == f"./inventory.gpkg|layername={schema.table}"
         names = [c.name for c in asset_columns(kind)]
-        for path in ("fieldConfiguration/field", "editable/field", "constraints/constraint", "constraintExpressions/constraint"):
+        for path in (
+            "fieldConfiguration/field",
+            "editable/field",
+            "constraints/constraint",
+            "constraintExpressions/constraint",
+        ):
             assert [f.get("name") or f.get("field") for f in layer.findall(path)] == names, path
         shown = {f.get("name") for f in layer.iter("attributeEditorField")}
         assert shown == set(names)
@@ -200,7 +208,9 @@ def test_two_surveys_share_an_inventory(tmp_path: Path) -> None:
     for name, when in (("spring", None), ("autumn", AUTUMN)):
         folder = tmp_path / name
         folder.mkdir()
-        text = SURVEY.replace('epoch = "2026-spring"', f'epoch = "{name}"\nstore = "../shared"\nname = "town"\nhome = "../town.gpkg"')
+        text = SURVEY.replace(
+            'epoch = "2026-spring"', f'epoch = "{name}"\nstore = "../shared"\nname = "town"\nhome = "../town.gpkg"'
+        )
         (folder / "SURVEY.toml").write_text(text)
         write_found(folder / "SURVEY.toml", poles() if when is None else poles(when=when))
         roadscan.open_survey(folder / "SURVEY.toml").inventory.publish()
@@ -208,3 +218,25 @@ def test_two_surveys_share_an_inventory(tmp_path: Path) -> None:
     assert ids[0] == ids[1]
     shown = person.layer(tmp_path / "town.gpkg", "poles")
     assert set(shown["source"]) == {"autumn"} and pd.to_datetime(shown["valid_from"]).dt.month.eq(5).all()
+
+
+def test_the_report_tells_of_assets_conflicts_and_changes(survey_file: Path) -> None:
+    survey = roadscan.open_survey(survey_file)
+    section = next(one for one in sections() if one.name == "inventory")
+    assert list(section.blocks(Material(survey.session))) == []
+    survey.inventory.publish()
+    first = person.ids(survey_file.parent / "inventory.gpkg", "poles")[0]
+    person.edit(survey_file.parent / "inventory.gpkg", "poles", first, asset_height_m=9.0)
+    survey.inventory.pull(who="<eva>")
+    survey_file.write_text(SURVEY.replace("2026-spring", "2026-autumn"))
+    later = roadscan.open_survey(survey_file)
+    street = [*poles(when=AUTUMN, asset_height_m=6.0), asset("pole", (200, 4, 100), when=AUTUMN)]
+    later.inventory.record(found(street, "2026-autumn"))
+    blocks = list(section.blocks(Material(later.session)))
+    counts, warning, conflicts, told, changes, drawing = blocks
+    assert ("Pole", "7", "0", "0", "0") in counts.rows
+    assert warning.is_warning and conflicts.rows[0][:3] == (first, "asset_height_m", "evidence")
+    assert told.text.startswith("From 2026-spring to 2026-autumn: 1 appeared, 0 gone, 0 moved, 6 changed.")
+    assert len(changes.rows) == len(drawing.marks) == 7
+    page = later.report()
+    assert "&lt;eva&gt;" in page and "<eva>" not in page

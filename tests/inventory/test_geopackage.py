@@ -14,7 +14,7 @@ import pyogrio
 import pytest
 import shapely
 
-from roadscan.inventory.homes.base import FaultyEditsError, HomeError
+from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
@@ -52,7 +52,8 @@ def test_table_1_is_there_with_its_attributes_and_types(tmp_path: Path) -> None:
         "delineators": {"Height": "REAL", "Type of delineator": "TEXT"}, "lanes": {"Type of striping": "TEXT"},
     }  # fmt: skip
     shapes = {"sidewalks": "POLYGON", "medians": "POLYGON", "guard_rails": "LINESTRING", "fencing": "LINESTRING",
-              "lighting": "POINT", "landscape_areas": "POLYGON", "delineators": "POINT", "lanes": "LINESTRING"}  # fmt: skip
+              "lighting": "POINT", "landscape_areas": "POLYGON", "delineators": "POINT",
+              "lanes": "LINESTRING"}  # fmt: skip
     with sqlite3.connect(file_of(made)) as db:
         for table, attributes in paper.items():
             types = {name: kind for _, name, kind, *_ in db.execute(f"PRAGMA table_info({table})")}
@@ -159,7 +160,9 @@ def test_two_editors_on_two_copies(street: Inventory, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("choice", "value"), [("edit", 3), ("other", 8), ("evidence", None)])
-def test_a_person_settles_a_conflict_in_its_layer(street: Inventory, tmp_path: Path, choice: str, value: object) -> None:
+def test_a_person_settles_a_conflict_in_its_layer(
+    street: Inventory, tmp_path: Path, choice: str, value: object
+) -> None:
     test_two_editors_on_two_copies(street, tmp_path)
     street.publish()
     layer = pyogrio.read_dataframe(file_of(street), layer="conflicts")

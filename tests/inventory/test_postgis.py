@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import shapely
 
-from roadscan.inventory.homes.base import FaultyEditsError, HomeError
+from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, RoadscanError
 from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
@@ -87,7 +87,9 @@ def test_an_edit_survives_a_new_epoch_and_conflicts_are_shown(street: Inventory,
     street.record(found(poles(when=AUTUMN, asset_height_m=6.0), "autumn"))
     street.publish()
     assert execute(address, f"SELECT asset_height_m FROM street.poles WHERE asset_id = '{one}'") == [(7.5,)]
-    assert execute(address, "SELECT asset_id, attribute, other FROM street.conflicts") == [(one, "asset_height_m", "6.0")]
+    assert execute(address, "SELECT asset_id, attribute, other FROM street.conflicts") == [
+        (one, "asset_height_m", "6.0")
+    ]
     execute(address, "UPDATE street.conflicts SET decision = 'evidence'", role="street_editor")
     street.pull()
     assert street.state().row(one)["asset_height_m"] == 6.0
@@ -128,7 +130,7 @@ def test_a_lost_connection_leaves_the_old_state_whole(
         fill(self, cursor, kind, rows)
 
     monkeypatch.setattr(PostGis, "_fill", cut)
-    with pytest.raises(HomeError, match="the connection was lost.*it is as it was") as error:
+    with pytest.raises(HomeError, match=r"the connection was lost.*it is as it was") as error:
         street.publish()
     assert "secret" not in str(error.value)
     assert execute(address, "SELECT * FROM street.poles ORDER BY fid") == before
@@ -160,7 +162,7 @@ def test_two_programs_at_once_wait_for_one_another(street: Inventory, tmp_path: 
         one.home = PostGis(address, "street", 32632)
         try:
             one.publish()
-        except Exception as error:
+        except RoadscanError as error:
             failures.append(error)
 
     threads = [threading.Thread(target=publish, args=[one]) for one in others]

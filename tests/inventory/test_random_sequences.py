@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import shutil
 import tempfile
@@ -17,18 +18,15 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from roadscan.inventory.homes.base import Content, Home, Mark, Sheet
+from roadscan.inventory.home import Content, Home, Mark, Sheet
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Rules
 from roadscan.inventory.state import State, live_commits, state_at
-from roadscan.model.errors import RoadscanError
 from roadscan.model.inventory import Matching
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.inventory_schema import asset_table
 from roadscan.tables.store import Store
-from tests.inventory.streets import CRS, EAST, NORTH, SPRING, Everywhere, asset, found
-from roadscan.inventory.homes.geopackage import GeoPackage
-import datetime as dt
+from tests.inventory.streets import EAST, NORTH, SPRING, Everywhere, asset, found
 
 KINDS = ("pole", "sign")
 COUNT = 8
@@ -120,7 +118,9 @@ class Memory(Home):
         del self.rows[kind][at]
 
     def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
-        fid = 1 + max((r["fid"] for r in self.rows[kind]), default=0)  # the highest number is given again, as SQLite does
+        fid = 1 + max(
+            (r["fid"] for r in self.rows[kind]), default=0
+        )  # the highest number is given again, as SQLite does
         row = dict.fromkeys(asset_table(kind).names) | {"fid": fid, "geometry": geometry} | values
         self.rows[kind].append(row)
 
@@ -206,7 +206,10 @@ class Street(RuleBasedStateMachine):
                 self.stable += now == before[n]
             self.names[n] = now
 
-    @rule(seen=st.sets(st.integers(0, COUNT - 1), min_size=COUNT - 2, max_size=COUNT), dies_at=st.none() | st.integers(0, 5))
+    @rule(
+        seen=st.sets(st.integers(0, COUNT - 1), min_size=COUNT - 2, max_size=COUNT),
+        dies_at=st.none() | st.integers(0, 5),
+    )
     def new_epoch(self, seen: set[int], dies_at: int | None) -> None:
         """A survey a year later."""
         self.year += 1
@@ -338,8 +341,9 @@ class Street(RuleBasedStateMachine):
 def nearest_pole(state: State, x: float, y: float) -> str:
     """Id of the pole that stands at a place of the street."""
     assets = state.assets["pole"]
-    evidence = assets.evidence["easting_m"].to_numpy(zero_copy_only=False), assets.evidence["northing_m"].to_numpy(
-        zero_copy_only=False
+    evidence = (
+        assets.evidence["easting_m"].to_numpy(zero_copy_only=False),
+        assets.evidence["northing_m"].to_numpy(zero_copy_only=False),
     )
     away = np.hypot(evidence[0] - EAST - x, evidence[1] - NORTH - y)
     return str(assets.ids[int(np.nanargmin(away))])

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pytest
 
 from roadscan.inventory.identity import new_ids
+from roadscan.inventory.recording import Found
 from roadscan.inventory.visibility import VisibilityGrid
 from roadscan.model.errors import ConfigError, SchemaError
-from roadscan.inventory.recording import Found
 from tests.inventory.streets import AUTUMN, EAST, NORTH, SPRING, Everywhere, asset, found, inventory, poles
 
 COUNT = 400
@@ -93,7 +93,8 @@ def test_ids_stay_when_the_same_drives_are_processed_again(tmp_path: Path) -> No
 def test_lines_and_areas_are_known_again_though_their_ends_differ(tmp_path: Path) -> None:
     def kerbs(shift: float, end: float) -> list[dict[str, Any]]:
         return [
-            asset("kerb", *[(40.0 * n + x, 3.5 + shift, 100.0) for x in (0.0, 10.0, end)], step_m=0.12) for n in range(5)
+            asset("kerb", *[(40.0 * n + x, 3.5 + shift, 100.0) for x in (0.0, 10.0, end)], step_m=0.12)
+            for n in range(5)
         ] + [asset("sidewalk", *[(40.0 * n + x, y + shift, 100.1) for x, y in ((0, 4), (end, 4), (end, 6), (0, 6))])
              for n in range(5)]  # fmt: skip
 

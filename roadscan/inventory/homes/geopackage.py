@@ -18,8 +18,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from roadscan.inventory.comparing import FID
-from roadscan.inventory.homes.base import CHOICES, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.home import CHOICES, FID, Content, Decision, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.value_lists import add_value_lists
 from roadscan.inventory.qgis.styles import add_styles
 from roadscan.inventory.values import iso_column
@@ -79,7 +78,10 @@ class GeoPackage(Home):
         rows = table.to_pylist()
         if not rows:
             raise HomeError(f"the table '{MARKS}' is empty", change=_FOREIGN, file=self.file)
-        return Mark(**{name: rows[-1][name] or ("" if name != "commit" else 0) for name in Mark._fields})
+        last = rows[-1]
+        return Mark(
+            last["inventory"] or "", last["token"] or "", last["pending"] or "", last["commit"] or 0, last["at"] or ""
+        )
 
     def read(self) -> Content:
         """Rows of all layers."""
@@ -116,7 +118,7 @@ class GeoPackage(Home):
         if added:
             raise HomeError(
                 f"the column '{added[0]}' of the layer '{table}' does not belong to the inventory",
-                change="keep what it says in `comments` and remove it: it would be lost when the file is published anew",
+                change="keep what it says in `comments` and remove it: it would be lost",
                 file=self.file,
             )
         return pa.table(
@@ -170,9 +172,7 @@ class GeoPackage(Home):
             for left in self.file.parent.glob(f"{scratch.name}*"):
                 left.unlink(missing_ok=True)
 
-    def _write_layers(
-        self, file: Path, rows: Mapping[str, pa.Table], sheets: Sequence[Sheet], mark: Mark
-    ) -> None:
+    def _write_layers(self, file: Path, rows: Mapping[str, pa.Table], sheets: Sequence[Sheet], mark: Mark) -> None:
         for kind in self.kinds:
             schema = asset_schema(kind)
             own = rows.get(kind, asset_table(kind).empty_table())

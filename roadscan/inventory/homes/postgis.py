@@ -16,8 +16,7 @@ import pyarrow as pa
 import pyarrow.csv
 import shapely
 
-from roadscan.inventory.comparing import FID
-from roadscan.inventory.homes.base import CHOICES, Author, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.postgis_schema import ROLES, statements
 from roadscan.inventory.values import iso_wkb
 from roadscan.model.errors import ConfigError
@@ -48,11 +47,15 @@ class PostGis(Home):
         try:
             import psycopg
         except ImportError as error:
-            raise ConfigError("the driver of PostgreSQL is missing", change="`pip install 'roadscan[postgis]'`") from error
+            raise ConfigError(
+                "the driver of PostgreSQL is missing", change="`pip install 'roadscan[postgis]'`"
+            ) from error
         try:
             self._parts = psycopg.conninfo.conninfo_to_dict(address)
         except psycopg.Error:
-            raise ConfigError("the address of the PostGIS database is none", expected="postgresql://user@host/database") from None
+            raise ConfigError(
+                "the address of the PostGIS database is none", expected="postgresql://user@host/database"
+            ) from None
         self._address = address
         self.schema = schema
         self.srid = srid or 0
@@ -69,7 +72,7 @@ class PostGis(Home):
     def layer_address(self, table: str) -> tuple[str, str]:
         """The table, without user and password: QGIS asks for them, or takes them from its own store."""
         shown = " ".join(f"{k}='{self._parts[k]}'" for k in ("dbname", "host", "port") if self._parts.get(k))
-        return "postgres", f"{shown} key='fid' srid={self.srid} table=\"{self.schema}\".\"{table}\" (geom)"
+        return "postgres", f'{shown} key=\'fid\' srid={self.srid} table="{self.schema}"."{table}" (geom)'
 
     @contextlib.contextmanager
     def _transaction(self, isolation: str = "REPEATABLE READ") -> Iterator[Any]:
@@ -132,11 +135,16 @@ class PostGis(Home):
         self._check_columns(cursor, table, [n for n in schema.names if n != GEOMETRY])
         names = ", ".join(f'"{n}"' for n in schema.names if n != GEOMETRY)
         out = io.BytesIO()
-        query = f"COPY (SELECT fid, {names}, geom FROM {self.schema}.{table} ORDER BY fid) TO STDOUT (FORMAT csv, HEADER)"
+        query = (
+            f"COPY (SELECT fid, {names}, geom FROM {self.schema}.{table} ORDER BY fid) TO STDOUT (FORMAT csv, HEADER)"
+        )
         with cursor.copy(query) as copy:
             for chunk in copy:
                 out.write(chunk)
-        types: dict[str, Any] = {f.name: f.type for f in schema if f.name != GEOMETRY} | {FID: pa.int64(), "geom": pa.string()}
+        types: dict[str, Any] = {f.name: f.type for f in schema if f.name != GEOMETRY} | {
+            FID: pa.int64(),
+            "geom": pa.string(),
+        }
         out.seek(0)
         read = pyarrow.csv.read_csv(
             out,
@@ -219,7 +227,9 @@ class PostGis(Home):
         names = [n for n in rows.column_names if n != GEOMETRY]
         plain = rows.select(names).append_column("geom", self._hexadecimal(rows))
         self._copy(cursor, table, plain)
-        cursor.execute(f"SELECT setval(pg_get_serial_sequence('{self.schema}.{table}', 'fid'), {rows.num_rows + 1}, false)")
+        cursor.execute(
+            f"SELECT setval(pg_get_serial_sequence('{self.schema}.{table}', 'fid'), {rows.num_rows + 1}, false)"
+        )
 
     def _hexadecimal(self, rows: pa.Table) -> pa.Array:
         shapes = shapely.set_srid(shapely.from_wkb(rows[GEOMETRY].to_numpy(zero_copy_only=False)), self.srid)
@@ -258,5 +268,3 @@ class PostGis(Home):
             "VALUES (%s, %s, %s, %s, %s, %s)",
             [*mark, history_id],
         )
-
-

@@ -20,7 +20,8 @@ CREATE TABLE {s}.history (
   at timestamptz NOT NULL DEFAULT clock_timestamp(),
   who text NOT NULL DEFAULT session_user,
   layer text NOT NULL, action text NOT NULL, fid bigint, asset_id text, old jsonb, new jsonb);
-CREATE FUNCTION {s}.note_change() RETURNS trigger LANGUAGE plpgsql SECURITY DEFINER SET search_path = pg_catalog, public AS $$
+CREATE FUNCTION {s}.note_change() RETURNS trigger LANGUAGE plpgsql
+  SECURITY DEFINER SET search_path = pg_catalog, public AS $$
 BEGIN
   IF current_setting('roadscan.publishing', true) = 'yes' THEN RETURN NULL; END IF;
   INSERT INTO {s}.history (layer, action, fid, asset_id, old, new) VALUES (

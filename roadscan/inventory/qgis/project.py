@@ -1,4 +1,4 @@
-"""A project file of QGIS: the layers of the inventory with their styles and forms, and products of the survey behind."""
+"""A project file of QGIS: the layers of the inventory with styles and forms, and products of the survey behind."""
 
 from __future__ import annotations
 

@@ -78,7 +78,13 @@ def _symbol(name: str, symbol: str, kind: str, opacity: float) -> Element:
     layer = SubElement(held, "layer", {"class": _LAYERS[symbol], "enabled": "1", "locked": "0", "pass": "0"})
     colour = f"{_COLOURS[asset_kind_names().index(kind) % len(_COLOURS)]},255"
     options = {
-        "marker": {"color": colour, "name": "circle", "size": "2.4", "size_unit": "MM", "outline_color": "35,35,35,255"},
+        "marker": {
+            "color": colour,
+            "name": "circle",
+            "size": "2.4",
+            "size_unit": "MM",
+            "outline_color": "35,35,35,255",
+        },
         "line": {"line_color": colour, "line_width": "0.66", "line_width_unit": "MM"},
         "fill": {"color": colour.replace(",255", ",96"), "style": "solid", "outline_color": colour},
     }[symbol]

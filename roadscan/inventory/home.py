@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pyarrow as pa
 
@@ -67,7 +67,9 @@ class Decision(NamedTuple):
     """`edit`: it holds; `evidence`: what was found counts; `other`: the edit that waits."""
 
 
-CHOICES = ("edit", "evidence", "other")
+CHOICES: Final = ("edit", "evidence", "other")
+FID: Final = "fid"
+"""Number of a row in its home; it may be given again."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,13 @@ from roadscan.inventory.values import encoded
 from roadscan.tables.asset_schema import asset_kind_names
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 
-_OF_THE_EVIDENCE: Final = frozenset({"object", "asset_id"})
-"""Columns whose changes say nothing about the asset."""
+_OF_THE_EVIDENCE: Final = frozenset(
+    {
+        "asset_id", "object", "easting_m", "northing_m", "height_m", "sigma_horizontal_m", "sigma_height_m",
+        "probability", "returns", "passes", "first_epoch_gps_ns", "last_epoch_gps_ns",
+    }
+)  # fmt: skip
+"""Columns that tell of the evidence alone, or what the geometry tells."""
 
 
 class Difference(NamedTuple):
@@ -60,9 +65,10 @@ def _of_kind(kind: str, before: pa.Table, after: pa.Table) -> Iterator[Differenc
             continue
         same = pc.fill_null(pc.equal(then[name], now[name]), False)
         both_null = pc.and_(pc.is_null(then[name]), pc.is_null(now[name]))
-        for at in np.flatnonzero(~np.asarray(pc.or_(same, both_null))):
-            one = str(then["asset_id"][at].as_py())
-            yield Difference(one, kind, "changed", name, _text(then[name][at].as_py()), _text(now[name][at].as_py()))
+        places = pa.array(np.flatnonzero(~np.asarray(pc.or_(same, both_null))))
+        differing = [t.take(places).to_pylist() for t in (then["asset_id"], then[name], now[name])]
+        for one, was, is_ in zip(*differing, strict=True):
+            yield Difference(one, kind, "changed", name, _text(was), _text(is_))
 
 
 def _text(value: Any) -> str | None:

@@ -7,7 +7,7 @@ import functools
 import json
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ import shapely
 
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
 
-_SIGMA_LEAST_M: Final = 0.005
+SIGMA_LEAST_M: Final = 0.005
 """No evidence is taken as better than that."""
 _SIGMA_DEG: Final = 2.0
 _SIGMA_SLOPE: Final = 0.005
@@ -66,11 +66,11 @@ def sigmas_apart(kind: str, attribute: str, one: Any, other: Any, row: Mapping[s
         return 0.0
     if one is None or other is None:
         return math.inf
-    horizontal = max(row.get("sigma_horizontal_m") or 0.0, _SIGMA_LEAST_M)
-    height = max(row.get("sigma_height_m") or 0.0, _SIGMA_LEAST_M)
+    horizontal = max(row.get("sigma_horizontal_m") or 0.0, SIGMA_LEAST_M)
+    height = max(row.get("sigma_height_m") or 0.0, SIGMA_LEAST_M)
     if attribute == GEOMETRY:
         return geometries_apart(one, other, horizontal, height)
-    sigma = _sigma_of(kind, attribute)
+    sigma = sigma_of(kind, attribute)
     if sigma is None or isinstance(one, str):
         return math.inf
     return float(abs(one - other) / sigma(horizontal, height, max(abs(one), abs(other))))
@@ -85,15 +85,19 @@ def geometries_apart(one: bytes, other: bytes, horizontal_m: float, height_m: fl
     return float(shapely.hausdorff_distance(first, second)) / horizontal_m
 
 
+Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
+"""σ of an attribute from σ in the horizontal, σ in height and the value, each a number or an array."""
+
+
 @functools.cache
-def _sigma_of(kind: str, attribute: str) -> Callable[[float, float, float], float] | None:
-    """σ of an attribute from σ in the horizontal, in height, and the value; None where any difference counts."""
+def sigma_of(kind: str, attribute: str) -> Sigma | None:
+    """How σ of a number follows from those of the place; None for texts, and where any difference counts."""
     unit = next((c.unit for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), "")
-    of_unit: dict[str, Callable[[float, float, float], float]] = {
-        "m": lambda horizontal, height, _: math.hypot(horizontal, height),
-        "m²": lambda horizontal, _, area: max(2.0 * math.sqrt(area) * horizontal, _SIGMA_LEAST_M),
-        "deg": lambda *_: _SIGMA_DEG,
-        "m/m": lambda *_: _SIGMA_SLOPE,
-        "1": lambda *_: _SIGMA_RATIO,
+    of_unit: dict[str, Sigma] = {
+        "m": lambda horizontal, height, _: np.hypot(horizontal, height),
+        "m²": lambda horizontal, _, area: np.maximum(2.0 * np.sqrt(area) * horizontal, SIGMA_LEAST_M),
+        "deg": lambda horizontal, *_: _SIGMA_DEG + 0.0 * horizontal,
+        "m/m": lambda horizontal, *_: _SIGMA_SLOPE + 0.0 * horizontal,
+        "1": lambda horizontal, *_: _SIGMA_RATIO + 0.0 * horizontal,
     }
     return of_unit.get(unit)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import xarray as xr
 
+    from roadscan.inventory.inventory import Inventory
     from roadscan.jobs.status import Status
     from roadscan.jobs.tiles.selection import Selection
     from roadscan.model.gpstime import Clock
@@ -145,6 +146,13 @@ class OpenSurvey:
 
         found = compare_surveys(earlier.session, self.session)
         return geopandas.GeoDataFrame(found.table.to_pandas(), geometry=found.lines, crs=self.crs)
+
+    @property
+    def inventory(self) -> Inventory:
+        """The inventory of assets that the survey belongs to, with the home that people edit."""
+        from roadscan.jobs.inventory import open_inventory
+
+        return open_inventory(self.session)
 
     def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
         """A DuckDB connection in which each table of the survey is a view; the caller closes it.

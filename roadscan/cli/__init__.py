@@ -12,7 +12,19 @@ from typing import Annotated
 import typer
 
 from roadscan import __version__
-from roadscan.cli import cameras, estimates, exports, logs, profiles, queries, reports, runs, simulations, state
+from roadscan.cli import (
+    cameras,
+    estimates,
+    exports,
+    inventory,
+    logs,
+    profiles,
+    queries,
+    reports,
+    runs,
+    simulations,
+    state,
+)
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
@@ -71,6 +83,14 @@ camera = typer.Typer(help="Interior orientation and mounting of cameras.", no_ar
 camera.command("interior")(cameras.camera_interior)
 camera.command("resect")(cameras.camera_resect)
 app.add_typer(camera, name="camera")
+
+assets = typer.Typer(help="The inventory of assets: what was found, and what people changed.", no_args_is_help=True)
+for command in (
+    inventory.publish, inventory.pull, inventory.status, inventory.diff, inventory.changes, inventory.history,
+    inventory.undo, inventory.log, inventory.export,
+):  # fmt: skip
+    assets.command(command.__name__)(command)
+app.add_typer(assets, name="inventory")
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
+from roadscan.model.inventory import InventoryConfig
 from roadscan.model.rig import Rig, Sensor
 from roadscan.model.segmentation import RoadSegmentation
 from roadscan.model.smoothing import SmootherConfig, SplineConfig
@@ -411,6 +412,8 @@ class SurveyConfig(Strict):
     """The road's condition along its lanes; left out, none is computed."""
     assets: AssetsConfig | None = None
     """Assets on, beside and over the road; left out, none are sought."""
+    inventory: InventoryConfig = InventoryConfig()
+    """The inventory of assets that people edit."""
     products: ProductConfig = ProductConfig()
     """Products."""
 

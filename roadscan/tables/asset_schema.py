@@ -17,6 +17,7 @@ GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ"]
 
 _TYPES: Final = {
     "bool": pa.bool_(),
+    "date": pa.date32(),
     "float64": pa.float64(),
     "int32": pa.int32(),
     "int64": pa.int64(),
@@ -25,6 +26,7 @@ _TYPES: Final = {
 _COMMON: Final = "common"
 ASSET_FOLDER: Final = "products/assets"
 """Folder of the tables, relative to the survey's root: a file a table."""
+_INVENTORY: Final = "inventory"
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class AssetSchema:
 
 def asset_kind_names() -> list[str]:
     """Names of all kinds of assets."""
-    return sorted(set(_files()) - {_COMMON})
+    return sorted(set(_files()) - {_COMMON, _INVENTORY})
 
 
 @functools.cache
@@ -110,6 +112,12 @@ def asset_schema(kind: str) -> AssetSchema:
         kind, raw["table"], raw["title"], raw["geometry"], raw["meaning"], tuple(raw["parents"]),
         own=_columns(raw), common=_columns(_read(_COMMON)),
     )  # fmt: skip
+
+
+@functools.cache
+def inventory_columns() -> tuple[AssetColumn, ...]:
+    """Columns that the inventory adds to the table of each kind."""
+    return _columns(_read(_INVENTORY))
 
 
 def _read(name: str) -> dict[str, Any]:

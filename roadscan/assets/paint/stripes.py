@@ -139,7 +139,9 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     ]
     reach = (along >= stripe.begin_m - AROUND_M) & (along <= stripe.end_m + AROUND_M)
     around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
-    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1])
+    return replace(
+        stripe, returns=near[inside], around=around, sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1]
+    )
 
 
 def lies_flat(found: Contrast, component: Component) -> bool:

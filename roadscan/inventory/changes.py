@@ -1,0 +1,253 @@
+"""What changed on the road between two survey epochs: appeared, gone, moved, changed, each with its significance.
+
+Of two surveys of ten thousand assets some differ by 3 σ by chance alone. So moves, and changed values, count where the
+expected share of false ones among them stays below 1 % (Benjamini and Hochberg 1995, J. R. Stat. Soc. B 57, 289–300).
+An asset that was not seen counts as gone only where passes of the newer survey had its place in sight. The significance
+of *gone* is that of as many misses in a row as there were passes, where a pass misses at most one asset in ten.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import scipy.special
+import shapely
+
+from roadscan.inventory.state import live_commits
+from roadscan.inventory.values import SIGMA_LEAST_M, encoded, sigma_of
+from roadscan.model.errors import ConfigError, nearest
+from roadscan.tables.asset_schema import asset_schema
+from roadscan.tables.asset_truth import AssetTruth, Commit
+from roadscan.tables.inventory_schema import GEOMETRY, asset_table
+
+_MISSED_BY_A_PASS: Final = 0.1
+_FALSE_SHARE: Final = 0.01
+_SAMPLES: Final = 16
+_POLYGON: Final = 3
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Change(NamedTuple):
+    """One change of the road."""
+
+    change: str
+    """`appeared`, `gone`, `moved` or `changed`."""
+    asset_id: str
+    kind: str
+    attribute: str
+    before: str | None
+    after: str | None
+    significance: float | None
+    """σ; of gone the two-sided normal equivalent of its probability. Null where it has none."""
+    passes_expected: int | None
+    distance_m: float | None
+    """How far a moved asset went, horizontally."""
+    geometry: bytes
+    """Where it is; of what is gone where it was."""
+
+
+@dataclass(frozen=True)
+class EpochChanges:
+    """Changes between two epochs."""
+
+    before: str
+    after: str
+    changes: tuple[Change, ...]
+    unseen: int
+    """Assets of the first epoch that the second did not see and may not have had in sight: they say nothing."""
+
+    def layer(self) -> pa.Table:
+        """The changes at points, as a layer; geometries are left out of the values."""
+        fields = [pa.field(name, _TYPES.get(name, pa.string())) for name in Change._fields]
+        rows = [c._asdict() | {GEOMETRY: _point(c.geometry)} for c in self.changes]
+        return pa.Table.from_pylist(rows, pa.schema(fields))
+
+
+_TYPES: Final = {
+    "significance": pa.float64(), "passes_expected": pa.int32(), "distance_m": pa.float64(), GEOMETRY: pa.binary(),
+}  # fmt: skip
+
+
+def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit_m: float) -> EpochChanges | None:
+    """Changes between two epochs by name, the last two where they are left out; None where there are less than two.
+
+    Raises
+    ------
+    ConfigError
+        where there is no such epoch.
+    """
+    newest: dict[str, Commit] = {}
+    began: dict[str, int] = {}
+    for commit in live_commits(truth.commits):
+        if commit.kind == "found":
+            newest[commit.epoch] = commit
+            began.setdefault(commit.epoch, commit.epoch_gps_ns)
+    names = sorted(newest, key=lambda name: (began[name], name))
+    for name in (before, after):
+        if name is not None and name not in newest:
+            raise ConfigError(
+                f"there is no epoch '{name}'{nearest(name, names)}", expected=", ".join(names) or "none yet"
+            )
+    if len(names) < 2:
+        return None
+    second = after or names[-1]
+    first = before or names[max(names.index(second) - 1, 0)]
+    return _between(truth, newest[first], newest[second], unit_m)
+
+
+def _between(truth: AssetTruth, before: Commit, after: Commit, unit_m: float) -> EpochChanges:
+    one, other = truth.rows(before), truth.rows(after)
+    found: list[Change] = []
+    moved, changed = _Compared(), _Compared()
+    unseen = 0
+    for kind in pc.unique(other["kind"]).to_pylist():
+        pair = _pair(kind, one, other)
+        found += [_plain("appeared", row, None, None) for row in pair.appeared.to_pylist()]
+        missing = pair.unseen.filter(pc.equal(pair.unseen["status"], "missing"))
+        passes = dict(zip(missing["asset_id"].to_pylist(), missing["passes_expected"].to_pylist(), strict=True))
+        gone = pair.then_alone.filter(
+            pc.is_in(pair.then_alone["asset_id"], value_set=missing["asset_id"].combine_chunks())
+        )
+        for row in gone.to_pylist():
+            expected = passes[row["asset_id"]]
+            found.append(_plain("gone", row, _sigmas(_MISSED_BY_A_PASS**expected), expected))
+        unseen += pair.then_alone.num_rows - gone.num_rows
+        _compare_places(pair, unit_m, moved)
+        _compare_values(pair, changed)
+    return EpochChanges(before.epoch, after.epoch, (*found, *moved.significant(), *changed.significant()), unseen)
+
+
+class _Pair(NamedTuple):
+    """Assets of a kind in two epochs."""
+
+    kind: str
+    then: pa.Table
+    now: pa.Table
+    """Rows of those that both saw, in the same order as `then`."""
+    then_alone: pa.Table
+    appeared: pa.Table
+    unseen: pa.Table
+    sigma_horizontal_m: Floats
+    sigma_height_m: Floats
+
+
+def _pair(kind: str, one: pa.Table, other: pa.Table) -> _Pair:
+    names = ["asset_id", "seen", *asset_table(kind).names]
+    names = ["kind", *dict.fromkeys(names)]
+    one, other = (t.filter(pc.equal(t["kind"], kind)).select(names) for t in (one, other))
+    then, now = (t.filter(pc.equal(t["seen"], 1)) for t in (one, other))
+    ids = [np.asarray(t["asset_id"].to_numpy(zero_copy_only=False), dtype=str) for t in (then, now)]
+    _, at_then, at_now = np.intersect1d(ids[0], ids[1], assume_unique=True, return_indices=True)
+    alone = then.take(pa.array(np.setdiff1d(np.arange(ids[0].size), at_then)))
+    is_known = pc.is_in(now["asset_id"], value_set=one["asset_id"].combine_chunks())
+    both = then.take(pa.array(at_then)), now.take(pa.array(at_now))
+    horizontal, height = (
+        np.maximum(np.hypot(_numbers(both[0][name], 0.0), _numbers(both[1][name], 0.0)), SIGMA_LEAST_M)
+        for name in ("sigma_horizontal_m", "sigma_height_m")
+    )
+    unseen = other.filter(pc.equal(other["seen"], 0))
+    return _Pair(kind, *both, alone, now.filter(pc.invert(is_known)), unseen, horizontal, height)
+
+
+def _numbers(column: pa.ChunkedArray, missing: float = math.nan) -> Floats:
+    return np.asarray(pc.fill_null(column.cast(pa.float64()), missing).to_numpy(zero_copy_only=False), dtype=float)
+
+
+def _plain(change: str, row: dict[str, Any], significance: float | None, expected: int | None) -> Change:
+    return Change(change, row["asset_id"], row["kind"], "", None, None, significance, expected, None, row[GEOMETRY])
+
+
+def _sigmas(chance: float) -> float:
+    """σ of a normal variable that is exceeded to both sides with a probability; at most 38, where numbers end."""
+    from scipy.stats import norm
+
+    return min(float(norm.isf(0.5 * max(chance, 1e-300))), 38.0)
+
+
+class _Compared:
+    """Comparisons of one sort: the probability of so great a difference by chance, and what makes a change of it."""
+
+    def __init__(self) -> None:
+        self.chances: list[Floats] = []
+        self.makers: list[Callable[[int], Change]] = []
+
+    def add(self, chances: Floats, maker: Callable[[int], Change]) -> None:
+        """Comparisons in a row; `maker` gets the place of one."""
+        self.chances.append(chances)
+        self.makers.append(maker)
+
+    def significant(self) -> Iterator[Change]:
+        """Changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1), in their order."""
+        ordered = np.sort(np.concatenate([np.empty(0), *self.chances]))
+        holds = np.flatnonzero(ordered <= _FALSE_SHARE * np.arange(1, ordered.size + 1) / max(ordered.size, 1))
+        limit = ordered[holds[-1]] if holds.size else -1.0
+        for chances, maker in zip(self.chances, self.makers, strict=True):
+            for at in np.flatnonzero(chances <= limit):
+                change = maker(int(at))
+                yield change if chances[at] == 0.0 else change._replace(significance=_sigmas(float(chances[at])))
+
+
+def _compare_places(pair: _Pair, unit_m: float, compared: _Compared) -> None:
+    away_m = unit_m * _away(
+        *(shapely.from_wkb(t[GEOMETRY].to_numpy(zero_copy_only=False)) for t in (pair.then, pair.now))
+    )
+    chance = np.exp(-0.5 * (away_m / pair.sigma_horizontal_m) ** 2)  # Rayleigh, of two coordinates
+
+    def change(at: int) -> Change:
+        row = pair.now.slice(at, 1)
+        place = (38.0, None, float(away_m[at]), row[GEOMETRY][0].as_py())
+        return Change("moved", row["asset_id"][0].as_py(), pair.kind, GEOMETRY, None, None, *place)
+
+    compared.add(chance, change)
+
+
+def _compare_values(pair: _Pair, compared: _Compared) -> None:
+    for column in asset_schema(pair.kind).own:
+        was, now = pair.then[column.name], pair.now[column.name]
+        sigma = sigma_of(pair.kind, column.name)
+        both = np.asarray(pc.and_(pc.is_valid(was), pc.is_valid(now)))
+        if sigma is None:
+            differs = both & np.asarray(pc.fill_null(pc.not_equal(was, now), False))
+            chance = np.where(differs, 0.0, 1.0)[both]
+        else:
+            a, b = _numbers(was)[both], _numbers(now)[both]
+            width = sigma(pair.sigma_horizontal_m[both], pair.sigma_height_m[both], np.maximum(np.abs(a), np.abs(b)))
+            chance = scipy.special.erfc(np.abs(a - b) / (math.sqrt(2.0) * width))
+        compared.add(chance, _value_changes(pair, column.name, np.flatnonzero(both), is_text=sigma is None))
+
+
+def _value_changes(pair: _Pair, name: str, places: Ints, *, is_text: bool) -> Callable[[int], Change]:
+    def change(at: int) -> Change:
+        row = int(places[at])
+        values = encoded(pair.then[name][row].as_py()), encoded(pair.now[name][row].as_py())
+        place = (None if is_text else 38.0, None, None, pair.now[GEOMETRY][row].as_py())
+        return Change("changed", pair.now["asset_id"][row].as_py(), pair.kind, name, *values, *place)
+
+    return change
+
+
+def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Floats:
+    """Horizontal distances of places, of lines and areas the median along them, in the map's own unit."""
+    if not len(old) or shapely.get_type_id(old[0]) == 0:
+        return np.asarray(shapely.distance(old, new), dtype=float)
+    lines = [np.where(shapely.get_type_id(s) == _POLYGON, shapely.get_exterior_ring(s), s) for s in (old, new)]
+    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    points = shapely.line_interpolate_point(lines[1][:, np.newaxis], along[np.newaxis, :], normalized=True)
+    return np.asarray(np.median(shapely.distance(points, lines[0][:, np.newaxis]), axis=1), dtype=float)
+
+
+def _point(geometry: bytes) -> bytes:
+    shape = shapely.from_wkb(geometry)
+    if shape.geom_type == "Point":
+        return geometry
+    first = shapely.get_coordinates(shape, include_z=True)[0]
+    return bytes(shapely.to_wkb(shapely.Point(first), flavor="iso"))

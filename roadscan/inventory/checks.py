@@ -1,0 +1,155 @@
+"""What is wrong with rows that people changed: each fault names its table, row and reason."""
+
+from __future__ import annotations
+
+import datetime as dt
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+import shapely
+
+from roadscan.inventory.comparing import Change, Changes
+from roadscan.inventory.home import EditFault
+from roadscan.inventory.state import State
+from roadscan.tables.asset_schema import AssetColumn, asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
+
+_FORMULA: Final = re.compile(r"^[=@\t\r]|^[+-](?![\s\d.,])")
+"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none."""
+_SAME_PLACE_M: Final = 0.05
+_TYPES: Final = {"PointZ": "Point", "LineStringZ": "LineString", "PolygonZ": "Polygon"}
+
+
+def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditFault]:
+    """Faults of all changes, those that the comparison found first.
+
+    Parameters
+    ----------
+    state : the inventory that the changes are to be taken into; unit_m : metres of a unit of its map.
+    """
+    found = list(changes.faults)
+    drawn = {change.asset_id for change in changes.drawn}
+    kinds = state.kind_of | {change.asset_id: change.kind for change in changes.drawn}
+    for change in (*changes.drawn, *changes.changed):
+        reason = _fault(change, kinds, is_new=change.asset_id in drawn)
+        if reason is not None:
+            found.append(EditFault(asset_schema(change.kind).table, change.record, reason))
+    found += _doubles(changes, state, unit_m)
+    found += _circles(changes, state)
+    found += _spans(changes, state)
+    return found
+
+
+def _fault(change: Change, kinds: Mapping[str, str], *, is_new: bool) -> str | None:
+    if change.attribute == GEOMETRY:
+        return _geometry_fault(change.kind, change.new)
+    if change.attribute not in editable_columns(change.kind):
+        return None if is_new else f"{change.attribute} was measured and is not edited: give it back {change.old!r}"
+    if change.attribute == "parent":
+        return _parent_fault(change, kinds)
+    column = next(c for c in asset_columns(change.kind) if c.name == change.attribute)
+    return _value_fault(column, change.new)
+
+
+def _geometry_fault(kind: str, content: bytes | None) -> str | None:
+    wanted = _TYPES[asset_schema(kind).geometry]
+    if content is None:
+        return "it has no geometry"
+    try:
+        shape = shapely.from_wkb(content)
+    except shapely.errors.ShapelyError as error:
+        return f"its geometry cannot be read: {error}"
+    if shape.is_empty:
+        return "its geometry is empty"
+    if shape.geom_type != wanted:
+        return f"its geometry is a {shape.geom_type}, where a {wanted} is expected"
+    coordinates = shapely.get_coordinates(shape, include_z=True)
+    if not np.isfinite(coordinates[:, :2]).all():
+        return "its geometry has a coordinate that is no number"
+    if not shape.has_z or not np.isfinite(coordinates[:, 2]).all():
+        return "its geometry has no height: give each point its Z"
+    if kind != "facade" and not shape.is_valid:  # a façade stands upright
+        return f"its geometry is not valid: {shapely.is_valid_reason(shape)}"
+    return None
+
+
+def _value_fault(column: AssetColumn, value: Any) -> str | None:
+    if value is None:
+        return "status is empty" if column.name == "status" else None
+    if column.values and value not in column.values:
+        return f"{column.name} is '{value}', expected one of {', '.join(column.values)}"
+    if column.min is not None and value < column.min:
+        return f"{column.name} is {value:g}, below {column.min:g}"
+    if column.max is not None and value > column.max:
+        return f"{column.name} is {value:g}, above {column.max:g}"
+    if isinstance(value, float) and not np.isfinite(value):
+        return f"{column.name} is no finite number"
+    if isinstance(value, str) and _FORMULA.match(value):
+        return f"{column.name} begins as a spreadsheet's formula does ({value[:20]!r}): write it otherwise"
+    return None
+
+
+def _parent_fault(change: Change, kinds: Mapping[str, str]) -> str | None:
+    if change.new is None:
+        return None
+    kind = kinds.get(change.new)
+    allowed = asset_schema(change.kind).parents
+    if kind is None:
+        return f"its parent '{change.new}' is not known"
+    if kind not in allowed:
+        return f"its parent '{change.new}' is a {kind}, expected {' or '.join(allowed) or 'none'}"
+    return None
+
+
+def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
+    """New points on an asset of their kind, and new shapes that equal one."""
+    for change in changes.drawn:
+        assets = state.assets.get(change.kind)
+        if assets is None or not assets.ids.size or _geometry_fault(change.kind, change.new) is not None:
+            continue
+        shape = shapely.from_wkb(change.new)
+        if shape.geom_type == "Point":
+            away = shapely.distance(assets.shapes, shape) * unit_m
+        else:
+            equal = shapely.equals(assets.shapes, shape)
+            away = np.where(equal, 0.0, np.inf)
+        near = np.flatnonzero((away <= _SAME_PLACE_M) & (assets.ids != change.asset_id))
+        if near.size:
+            other = str(assets.ids[near[0]])
+            yield EditFault(asset_schema(change.kind).table, change.record, f"it stands where {other} is: one of them")
+
+
+def _circles(changes: Changes, state: State) -> Iterator[EditFault]:
+    """Assets that are their own parents in the end."""
+    given = {c.asset_id: c for c in changes.changed if c.attribute == "parent" and c.new is not None}
+    if not given:
+        return
+    parents = {
+        str(one): parent
+        for assets in state.assets.values()
+        for one, parent in zip(assets.ids, assets.rows["parent"].to_pylist(), strict=True)
+    } | {one: change.new for one, change in given.items()}
+    for one, change in given.items():
+        seen, at = {one}, change.new
+        while at is not None and at not in seen:
+            seen.add(at)
+            at = parents.get(at)
+        if at == one:
+            yield EditFault(asset_schema(change.kind).table, change.record, "it would be its own parent")
+
+
+def _spans(changes: Changes, state: State) -> Iterator[EditFault]:
+    dates: dict[str, dict[str, Change]] = {}
+    for change in changes.changed:
+        if change.attribute in ("valid_from", "valid_to"):
+            dates.setdefault(change.asset_id, {})[change.attribute] = change
+    for one, own in dates.items():
+        row: Mapping[str, Any] = state.row(one) or {}
+        value: Callable[[str], dt.date | None] = lambda name: own[name].new if name in own else row.get(name)  # noqa: B023, E731
+        start, end = value("valid_from"), value("valid_to")
+        if start is not None and end is not None and end < start:
+            change = next(iter(own.values()))
+            reason = f"valid_to {end} lies before valid_from {start}"
+            yield EditFault(asset_schema(change.kind).table, change.record, reason)

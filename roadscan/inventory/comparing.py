@@ -1,0 +1,201 @@
+"""What people changed in a home: its rows against those that it held when it was published or last read.
+
+Rows are known by their id. One without an id that has the number and the geometry, or the number and all values, of a
+row that is otherwise gone is that row; any other one was just drawn. Numbers alone say nothing: they are given again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from roadscan.inventory.home import FID, Content, EditFault
+from roadscan.inventory.identity import new_ids
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
+
+
+class Change(NamedTuple):
+    """A value that differs from the one that was published."""
+
+    kind: str
+    asset_id: str
+    attribute: str
+    old: Any
+    new: Any
+    record: str
+    fid: int
+
+
+@dataclass(eq=False)
+class Changes:
+    """All that differs, and what cannot be told apart."""
+
+    changed: list[Change] = field(default_factory=list)
+    drawn: list[Change] = field(default_factory=list)
+    """New assets: their geometries; their other values stand among `changed`."""
+    deleted: list[tuple[str, str]] = field(default_factory=list)
+    """Kind and id."""
+    faults: list[EditFault] = field(default_factory=list)
+    rows: dict[str, pa.Table] = field(default_factory=dict)
+    """Rows of the home by kind, each with its id."""
+    before: dict[str, pa.Table] = field(default_factory=dict)
+    """Rows that it was compared with."""
+
+
+def published_table(content: Content) -> pa.Table:
+    """Rows of all kinds in one table, to be kept."""
+    parts = []
+    schema = pa.schema([pa.field(FID, pa.int64()), *evidence_table()])
+    for kind, rows in sorted(content.rows.items()):
+        own: dict[str, Any] = {name: rows[name] for name in rows.column_names}
+        own["kind"] = pa.array([kind] * rows.num_rows, pa.string())
+        arrays = [own.get(f.name, pa.nulls(rows.num_rows, f.type)) for f in schema]
+        parts.append(pa.table(dict(zip(schema.names, arrays, strict=True))).cast(_nullable(schema)))
+    return pa.concat_tables(parts) if parts else _nullable(schema).empty_table()
+
+
+def published_rows(table: pa.Table) -> dict[str, pa.Table]:
+    """The same by kind again; columns that this version does not know are left out, others are null."""
+    rows = {}
+    for kind in pc.unique(table["kind"]).to_pylist():
+        own = table.filter(pc.equal(table["kind"], kind))
+        schema = pa.schema([pa.field(FID, pa.int64()), *asset_table(kind)])
+        arrays = [own[f.name] if f.name in own.column_names else pa.nulls(own.num_rows, f.type) for f in schema]
+        rows[kind] = pa.table(dict(zip(schema.names, arrays, strict=True))).cast(schema)
+    return rows
+
+
+def _nullable(schema: pa.Schema) -> pa.Schema:
+    return pa.schema([f.with_nullable(True) for f in schema])
+
+
+def compared(content: Content, base: Mapping[str, pa.Table], token: str) -> Changes:
+    """What differs between a home and what it held under `token`."""
+    changes = Changes()
+    homes = {str(one): kind for kind, rows in base.items() for one in rows["asset_id"].to_pylist()}
+    for kind in asset_kind_names():
+        rows, before = content.rows.get(kind), base.get(kind)
+        if rows is None:
+            continue
+        if before is None:
+            before = rows.slice(0, 0)
+        changes.before[kind] = before
+        _compare_kind(_Side(kind, rows, before, token, homes), changes)
+    return changes
+
+
+class _Side(NamedTuple):
+    kind: str
+    rows: pa.Table
+    before: pa.Table
+    token: str
+    homes: Mapping[str, str]
+
+
+def _compare_kind(side: _Side, changes: Changes) -> None:
+    kind, table = side.kind, asset_schema(side.kind).table
+    ids = [one or None for one in side.rows["asset_id"].to_pylist()]
+    fids = side.rows[FID].to_pylist()
+    place = {one: at for at, one in enumerate(side.before["asset_id"].to_pylist())}
+    bad: set[int] = set()
+    seen: dict[str, int] = {}
+    for at, one in enumerate(ids):
+        if one is None:
+            continue
+        if one in seen:
+            bad |= {at, seen[one]}
+            reason = f"the id stands in two rows (fid {fids[seen[one]]} and {fids[at]}): empty it in the copy"
+            changes.faults.append(EditFault(table, one, reason))
+        elif one not in place:
+            bad.add(at)
+            there = side.homes.get(one)
+            reason = f"the id belongs to the layer {asset_schema(there).table}" if there else "the id is not known"
+            changes.faults.append(EditFault(table, one, f"{reason}: leave it empty for a new asset"))
+        seen.setdefault(one, at)
+    for at, one in _recovered(side, ids, place).items():
+        ids[at] = one
+        seen[one] = at
+    drawn = [at for at, one in enumerate(ids) if one is None]
+    names = [f"{side.token}/{_hex(side.rows[GEOMETRY][at].as_py())}" for at in drawn]
+    for at, one in zip(drawn, new_ids(kind, names, set(side.homes)), strict=True):
+        ids[at] = one
+        changes.drawn += _drawn(side, at, one)
+        changes.changed += _values_of(side, at, one)
+    changes.deleted += [(kind, one) for one in place if one not in seen]
+    at_rows = [at for at, one in enumerate(ids) if one in place and at not in bad]
+    changes.changed += _differences(side, at_rows, [place[ids[at]] for at in at_rows], ids)
+    column = side.rows.schema.get_field_index("asset_id")
+    changes.rows[kind] = side.rows.set_column(column, "asset_id", pa.array(ids, pa.string()))
+
+
+def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> dict[int, str]:
+    """Ids of rows that lost theirs, or never got one since they were first read."""
+    present = {one for one in ids if one is not None}
+    by_fid = {
+        fid: one for one, fid in zip(side.before["asset_id"].to_pylist(), side.before[FID].to_pylist(), strict=True)
+    }
+    found: dict[int, str] = {}
+    names = [n for n in side.before.column_names if n not in (FID, "asset_id", GEOMETRY)]
+    for at, one in enumerate(ids):
+        candidate = by_fid.get(side.rows[FID][at].as_py())
+        if one is not None or candidate is None or candidate in present:
+            continue
+        row, before = side.rows.slice(at, 1), side.before.slice(place[candidate], 1)
+        same_place = row[GEOMETRY].equals(before[GEOMETRY])
+        if same_place or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names):
+            found[at] = candidate
+            present.add(candidate)
+    return found
+
+
+def _drawn(side: _Side, at: int, one: str) -> Iterator[Change]:
+    fid = side.rows[FID][at].as_py()
+    yield Change(side.kind, one, GEOMETRY, None, side.rows[GEOMETRY][at].as_py(), f"fid {fid}", fid)
+
+
+def _values_of(side: _Side, at: int, one: str) -> Iterator[Change]:
+    row = side.rows.slice(at, 1)
+    fid = row[FID][0].as_py()
+    for name in side.rows.column_names:
+        value = _plain(row[name][0].as_py())
+        if name not in (FID, "asset_id", GEOMETRY) and value is not None:
+            yield Change(side.kind, one, name, None, value, f"fid {fid}", fid)
+
+
+def _differences(side: _Side, rows: list[int], before: list[int], ids: list[str | None]) -> Iterator[Change]:
+    now, then = side.rows.take(pa.array(rows, pa.int64())), side.before.take(pa.array(before, pa.int64()))
+    fids = now[FID].to_pylist()
+    for name in side.before.column_names:
+        if name in (FID, "asset_id"):
+            continue
+        for at in _differing(now[name], then[name]):
+            old, new = _plain(then[name][at].as_py()), _plain(now[name][at].as_py())
+            if old != new:
+                one = str(ids[rows[at]])
+                yield Change(side.kind, one, name, old, new, one, fids[at])
+
+
+def _differing(now: pa.ChunkedArray, then: pa.ChunkedArray) -> npt.NDArray[np.int64]:
+    """Rows of which one is null and the other is not, or whose values are not equal."""
+    same = pc.fill_null(pc.equal(now, then), False)
+    neither = pc.and_(pc.is_null(now), pc.is_null(then))
+    return np.flatnonzero(~np.asarray(pc.or_(same, neither)))
+
+
+def _plain(value: Any) -> Any:
+    """A value as it counts: an empty text and a number that is none are nothing."""
+    if value == "" or (isinstance(value, float) and math.isnan(value)):
+        return None
+    return value
+
+
+def _hex(geometry: bytes | None) -> str:
+    return "" if geometry is None else geometry.hex()

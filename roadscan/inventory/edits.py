@@ -1,0 +1,110 @@
+"""Edits: what people changed, and which of their changes is in force.
+
+Merging goes value by value. An edit is in force from its commit on, whatever later evidence says. An edit by somebody
+who had another value before them than the one that an edit has put in force meanwhile waits among the conflicts:
+neither is dropped.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from roadscan.tables.asset_truth import AssetTruth, Commit
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import bytes_digest
+
+
+class Edit(NamedTuple):
+    """One change; `schemas/asset_edits.toml` says what each field is."""
+
+    edit: str
+    commit: int
+    asset_id: str
+    kind: str
+    attribute: str
+    action: str
+    old: str | None
+    new: str | None
+    evidence: str | None
+    base_commit: int
+    who: str
+    made_at: str
+    why: str
+    source: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """The value that it changes."""
+        return self.asset_id, self.attribute
+
+
+def named(edit: Edit) -> Edit:
+    """The same edit with its name: a digest of what it says, of the state that it was made on and of its place."""
+    said = (edit.asset_id, edit.attribute, edit.action, edit.old, edit.new, edit.base_commit, edit.who, edit.made_at)
+    return edit._replace(edit=bytes_digest(repr(said).encode()).rpartition(":")[2][:16])
+
+
+def edit_rows(edits: Sequence[Edit]) -> pa.Table:
+    """Edits as rows of the table `asset_edits`."""
+    ordered = sorted(edits, key=lambda e: (e.asset_id, e.attribute))
+    return pa.Table.from_pylist([e._asdict() for e in ordered], table_schema("asset_edits").arrow())
+
+
+def read_edits(truth: AssetTruth, commits: Iterable[Commit]) -> list[Edit]:
+    """Edits of some commits, in their order."""
+    return [
+        Edit(**row)
+        for commit in commits
+        if commit.kind == "edits"
+        for row in truth.rows(commit).select(list(Edit._fields)).to_pylist()
+    ]
+
+
+@dataclass
+class Folded:
+    """What is left of a sequence of edits."""
+
+    in_force: dict[tuple[str, str], Edit] = field(default_factory=dict)
+    waiting: dict[tuple[str, str], list[Edit]] = field(default_factory=lambda: defaultdict(list))
+    """Edits that met one in force which their maker had not seen."""
+    created: dict[str, Edit] = field(default_factory=dict)
+    """By asset: the edit that drew it, whatever was done to it since."""
+
+    def take(self, edit: Edit) -> None:
+        """Fold one more edit in."""
+        if edit.action == "create":
+            self.created.setdefault(edit.asset_id, edit)
+        known = self.in_force.get(edit.key)
+        blind = known is not None and known.new not in (edit.old, edit.new)
+        if blind and edit.action != "withdraw":
+            self.waiting[edit.key].append(edit)
+            return
+        if edit.action == "withdraw":
+            self.in_force.pop(edit.key, None)
+        else:
+            self.in_force[edit.key] = edit
+        seen = [e for e in self.waiting.pop(edit.key, []) if e.commit > edit.base_commit]
+        if seen:
+            self.waiting[edit.key] = seen
+
+    def holds(self, edit: Edit) -> bool:
+        """True if it says nothing new: the value is in force, or waits already."""
+        known = self.in_force.get(edit.key)
+        if edit.action == "withdraw":
+            return known is None
+        if known is not None and known.new == edit.new:
+            return True
+        return any(e.new == edit.new and e.old == edit.old for e in self.waiting.get(edit.key, ()))
+
+
+def folded(edits: Iterable[Edit]) -> Folded:
+    """Edits in force, and those that wait, after a sequence of commits."""
+    state = Folded()
+    for edit in edits:
+        state.take(edit)
+    return state

@@ -1,0 +1,1 @@
+"""Where people see and edit the inventory: a GeoPackage, or a PostGIS database."""

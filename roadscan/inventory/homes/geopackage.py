@@ -1,0 +1,290 @@
+"""A GeoPackage as the home of the inventory: a layer a kind, value lists, styles, and its mark in a table of its own.
+
+Layers are written and read through OGR alone: triggers of a layer's spatial index call functions that SQLite by itself
+does not have. A new state is written beside the file and takes its place at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import os
+import sqlite3
+import stat
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+
+from roadscan.inventory.home import CHOICES, FID, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.homes.value_lists import add_value_lists
+from roadscan.inventory.qgis.styles import add_styles
+from roadscan.inventory.values import iso_column
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
+
+MARKS: Final = "roadscan_inventory"
+CONFLICTS: Final = "conflicts"
+_WKB_NAMES: Final = {"PointZ": "Point Z", "LineStringZ": "LineString Z", "PolygonZ": "Polygon Z"}
+_VERSION: Final = {"VERSION": "1.3"}
+"""Of the standard; programs of today's stable Linux systems warn of newer ones."""
+_FOREIGN: Final = "name another file, or move this one away"
+
+
+class GeoPackage(Home):
+    """A GeoPackage file with a layer for each kind of assets, or for some kinds alone."""
+
+    def __init__(self, file: Path, crs: str | None, kinds: Sequence[str] | None = None) -> None:
+        self.file = file
+        self.crs = crs
+        self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
+
+    @property
+    def name(self) -> str:
+        """The file."""
+        return str(self.file)
+
+    @property
+    def project_file(self) -> Path:
+        """Beside the file."""
+        return self.file.with_suffix(".qgs")
+
+    def layer_address(self, table: str) -> tuple[str, str]:
+        """The layer of a table, relative to the project file."""
+        return "ogr", f"./{self.file.name}|layername={table}"
+
+    def mark(self) -> Mark | None:
+        """Its last mark."""
+        import pyogrio
+
+        if not self.file.exists():
+            return None
+        try:
+            layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            raise HomeError(
+                f"the file is no GeoPackage that can be read: {error}", change=_FOREIGN, file=self.file
+            ) from error
+        if MARKS not in layers:
+            raise HomeError(
+                "the GeoPackage is that of another program",
+                expected=f"one that `roadscan inventory publish` wrote, with its table '{MARKS}'",
+                change=_FOREIGN,
+                file=self.file,
+            )
+        _, table = pyogrio.read_arrow(self.file, layer=MARKS)
+        rows = table.to_pylist()
+        if not rows:
+            raise HomeError(f"the table '{MARKS}' is empty", change=_FOREIGN, file=self.file)
+        last = rows[-1]
+        return Mark(
+            last["inventory"] or "", last["token"] or "", last["pending"] or "", last["commit"] or 0, last["at"] or ""
+        )
+
+    def read(self) -> Content:
+        """Rows of all layers."""
+        import pyogrio
+
+        layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
+        rows: dict[str, pa.Table] = {}
+        for kind in self.kinds:
+            table = asset_schema(kind).table
+            if table not in layers:
+                raise HomeError(
+                    f"the layer '{table}' is missing",
+                    change="undo its deletion, or pull from a copy: an emptied layer would say that all are gone",
+                    file=self.file,
+                )
+            rows[kind] = self._read_layer(kind, table)
+        return Content(rows, self._decisions(layers))
+
+    def _read_layer(self, kind: str, table: str) -> pa.Table:
+        meta, found = _read(self.file, table)
+        if meta["geometry_name"] in found.column_names:
+            at = found.column_names.index(meta["geometry_name"])
+            found = found.rename_columns([GEOMETRY if n == at else name for n, name in enumerate(found.column_names)])
+        schema = asset_table(kind)
+        missing = [name for name in schema.names if name not in found.column_names]
+        if missing:
+            raise HomeError(
+                f"the column '{missing[0]}' of the layer '{table}' is missing",
+                expected=", ".join(schema.names),
+                change="undo its deletion, or pull from a copy that has it",
+                file=self.file,
+            )
+        added = [name for name in found.column_names if name not in (FID, *schema.names)]
+        if added:
+            raise HomeError(
+                f"the column '{added[0]}' of the layer '{table}' does not belong to the inventory",
+                change="keep what it says in `comments` and remove it: it would be lost",
+                file=self.file,
+            )
+        return pa.table(
+            {FID: found[FID].cast(pa.int64())}
+            | {field.name: self._cast(found[field.name], field, table) for field in schema}
+        )
+
+    def _cast(self, column: pa.ChunkedArray, field: pa.Field, table: str) -> pa.Array | pa.ChunkedArray:
+        try:
+            if field.name == GEOMETRY:
+                return iso_column(column)
+            return column.cast(field.type)
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+            raise HomeError(
+                f"the column '{field.name}' of the layer '{table}' is {column.type}: {error}",
+                expected=str(field.type),
+                file=self.file,
+            ) from error
+
+    def _decisions(self, layers: set[str]) -> list[Decision]:
+        if CONFLICTS not in layers:
+            return []
+        _, table = _read(self.file, CONFLICTS)
+        if any(name not in table.column_names for name in (*Decision._fields[:3], "decision")):
+            return []
+        given = [row for row in table.to_pylist() if row["decision"]]
+        odd = [row for row in given if row["decision"] not in CHOICES]
+        if odd:
+            raise HomeError(
+                f"the decision '{odd[0]['decision']}' of a conflict is unknown",
+                expected=", ".join(CHOICES),
+                file=self.file,
+                record=f"{CONFLICTS}, {odd[0]['asset_id']}, {odd[0]['attribute']}",
+            )
+        return [Decision(row["asset_id"], row["attribute"], row["edit"], row["decision"]) for row in given]
+
+    def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
+        """Write all layers beside the file, then take its place."""
+        self._check_free()
+        scratch = self.file.with_name(f".{self.file.stem}-{os.getpid()}.gpkg")
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            with _dated(mark.at):
+                self._write_layers(scratch, content.rows, sheets, mark)
+            with scratch.open("rb+") as stream:
+                os.fsync(stream.fileno())
+            scratch.replace(self.file)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        finally:
+            for left in self.file.parent.glob(f"{scratch.name}*"):
+                left.unlink(missing_ok=True)
+
+    def _write_layers(self, file: Path, rows: Mapping[str, pa.Table], sheets: Sequence[Sheet], mark: Mark) -> None:
+        for kind in self.kinds:
+            schema = asset_schema(kind)
+            own = rows.get(kind, asset_table(kind).empty_table())
+            table = own.select(asset_table(kind).names).cast(_told(kind))
+            self._layer(file, Sheet(schema.table, schema.title, table), _WKB_NAMES[schema.geometry], schema.meaning)
+        for sheet in sheets:
+            self._layer(file, sheet, "Point Z" if GEOMETRY in sheet.rows.column_names else None)
+        self._layer(file, Sheet(MARKS, MARKS, _mark_rows(mark)), None, "Not to be edited: what this file was made of.")
+        add_value_lists(file, self.kinds)
+        add_styles(file, self.kinds)
+
+    def _layer(self, file: Path, sheet: Sheet, geometry: str | None, meaning: str = "") -> None:
+        import pyogrio
+
+        options = {"IDENTIFIER": sheet.title, "DESCRIPTION": meaning}
+        if geometry is not None:
+            options["GEOMETRY_NAME"] = "geom"
+        try:
+            pyogrio.write_arrow(
+                sheet.rows, file, layer=sheet.name, driver="GPKG", append=False, geometry_type=geometry,
+                geometry_name=None if geometry is None else GEOMETRY, crs=None if geometry is None else self.crs,
+                layer_options=options, dataset_options=_VERSION if not file.exists() else None,
+            )  # fmt: skip
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            raise self._unwritable(error) from error
+
+    def note(self, mark: Mark) -> None:
+        """Append a mark: one row, one transaction."""
+        import pyogrio
+
+        self._check_writable()
+        try:
+            pyogrio.write_arrow(_mark_rows(mark), self.file, layer=MARKS, driver="GPKG", append=True)
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, RuntimeError) as error:
+            raise self._unwritable(error) from error
+
+    def _check_writable(self) -> None:
+        """HomeError for a file without a right to write; the system does not hold its administrator to that."""
+        if self.file.exists():
+            mode = self.file.stat().st_mode
+            if not mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH) or not os.access(self.file, os.W_OK):
+                raise self._unwritable(PermissionError("it is read-only"))
+
+    def _check_free(self) -> None:
+        """HomeError while another program has the file open with changes that are not in it yet."""
+        self._check_writable()
+        if not Path(f"{self.file}-wal").exists():
+            return
+        try:
+            with contextlib.closing(sqlite3.connect(self.file, timeout=0.5)) as connection:
+                connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+        except sqlite3.Error as error:
+            raise HomeError(
+                f"another program has the GeoPackage open ({error})",
+                change="close it there (in QGIS remove its layers or close the project), then try again",
+                file=self.file,
+            ) from error
+
+    def _unwritable(self, error: Exception) -> HomeError:
+        return HomeError(
+            f"the GeoPackage cannot be written: {error}",
+            change="see to its rights and its disk; it is as it was",
+            file=self.file,
+        )
+
+
+def _read(file: Path, layer: str) -> tuple[dict[str, Any], pa.Table]:
+    import pyogrio
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of heights and types that are checked here
+            meta, table = pyogrio.read_arrow(file, layer=layer, return_fids=True)
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise HomeError(f"the layer '{layer}' cannot be read: {error}", file=file) from error
+    return meta, table
+
+
+def _told(kind: str) -> pa.Schema:
+    """The kind's columns with what QGIS and others show of them: title, meaning."""
+    fields = [
+        pa.field(
+            c.name,
+            asset_table(kind).field(c.name).type,
+            metadata={"GDAL:OGR:alternative_name": _title(kind, c.name), "GDAL:OGR:comment": c.meaning},
+        )
+        for c in asset_columns(kind)
+    ]
+    return pa.schema([*fields, asset_table(kind).field(GEOMETRY)])
+
+
+def _title(kind: str, name: str) -> str:
+    """Title of a column with its unit; GeoPackage asks for titles that differ within a layer."""
+    column = next(c for c in asset_columns(kind) if c.name == name)
+    same = [c.name for c in asset_columns(kind) if c.title == column.title]
+    return column.title if len(same) == 1 else f"{column.title} ({name})"
+
+
+def _mark_rows(mark: Mark) -> pa.Table:
+    types = {name: pa.int32() if name == "commit" else pa.string() for name in Mark._fields}
+    return pa.table({name: pa.array([value], types[name]) for name, value in mark._asdict().items()})
+
+
+@contextlib.contextmanager
+def _dated(at: str) -> Iterator[None]:
+    """Let OGR write an instant of ours in place of its clock's: same state, same bytes."""
+    import pyogrio
+
+    moment = dt.datetime.fromisoformat(at).strftime("%Y-%m-%dT%H:%M:%S.000Z")
+    options = {"OGR_CURRENT_DATE": moment, "OGR_SQLITE_SYNCHRONOUS": "OFF"}  # it is synchronised once, as a whole
+    pyogrio.set_gdal_config_options(options)
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options(dict.fromkeys(options))

@@ -1,0 +1,270 @@
+"""A PostGIS database as the home of the inventory, for many people at once.
+
+A publication is one transaction: others see the old state until it ends, and for ever where it is cut off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import io
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import shapely
+
+from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.homes.postgis_schema import ROLES, statements
+from roadscan.inventory.values import iso_wkb
+from roadscan.model.errors import ConfigError
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY, asset_table, kinds_by_table
+
+MARKS: Final = "roadscan_inventory"
+_WAIT_MS: Final = 10_000
+_TYPES: Final = {"geometry": "geometry", "sigmas": "double precision", "significance": "double precision",
+                 "distance_m": "double precision", "passes_expected": "integer"}  # fmt: skip
+
+
+class PostGis(Home):
+    """A schema of a PostGIS database.
+
+    Parameters
+    ----------
+    address : as libpq takes it; its password is told to nobody else.
+    srid : EPSG number of the map; 0 for a local one.
+
+    Raises
+    ------
+    ConfigError
+        where the driver is missing, or the address is none.
+    """
+
+    def __init__(self, address: str, schema: str = "inventory", srid: int | None = None) -> None:
+        try:
+            import psycopg
+        except ImportError as error:
+            raise ConfigError(
+                "the driver of PostgreSQL is missing", change="`pip install 'roadscan[postgis]'`"
+            ) from error
+        try:
+            self._parts = psycopg.conninfo.conninfo_to_dict(address)
+        except psycopg.Error:
+            raise ConfigError(
+                "the address of the PostGIS database is none", expected="postgresql://user@host/database"
+            ) from None
+        self._address = address
+        self.schema = schema
+        self.srid = srid or 0
+        self._seen: int | None = None
+        """Last entry of the history when the rows were read."""
+
+    @property
+    def name(self) -> str:
+        """Host, database and schema."""
+        host, port = self._parts.get("host") or "local", self._parts.get("port")
+        place = f"{host}:{port}" if port else host
+        return f"postgis {place}/{self._parts.get('dbname') or ''} {self.schema}"
+
+    def layer_address(self, table: str) -> tuple[str, str]:
+        """The table, without user and password: QGIS asks for them, or takes them from its own store."""
+        shown = " ".join(f"{k}='{self._parts[k]}'" for k in ("dbname", "host", "port") if self._parts.get(k))
+        return "postgres", f'{shown} key=\'fid\' srid={self.srid} table="{self.schema}"."{table}" (geom)'
+
+    @contextlib.contextmanager
+    def _transaction(self, isolation: str = "REPEATABLE READ") -> Iterator[Any]:
+        """A cursor in a transaction, which holds wholly or not at all; errors of the database in words."""
+        import psycopg
+
+        try:
+            with psycopg.connect(self._address, connect_timeout=10) as connection, connection.cursor() as cursor:
+                cursor.execute(f"SET TRANSACTION ISOLATION LEVEL {isolation}")
+                cursor.execute(f"SET LOCAL lock_timeout = {_WAIT_MS}")
+                yield cursor
+        except psycopg.errors.LockNotAvailable as error:
+            raise HomeError("others are changing the tables", change="try again in a minute", file=self.name) from error
+        except psycopg.OperationalError as error:
+            raise HomeError(
+                f"the database does not answer, or the connection was lost: {self._told(error)}",
+                change="see to its address and the network, and try again: it is as it was",
+                file=self.name,
+            ) from None
+        except psycopg.Error as error:
+            raise HomeError(f"the database refused: {self._told(error)}; it is as it was", file=self.name) from None
+
+    def _told(self, error: Exception) -> str:
+        text = " ".join(str(error).split())
+        password = self._parts.get("password")
+        return text.replace(str(password), "…") if password else text
+
+    def mark(self) -> Mark | None:
+        """Its last mark."""
+        with self._transaction() as cursor:
+            return self._mark(cursor)
+
+    def _mark(self, cursor: Any) -> Mark | None:
+        cursor.execute("SELECT to_regnamespace(%s) IS NOT NULL", [self.schema])
+        if not cursor.fetchone()[0]:
+            return None
+        cursor.execute("SELECT to_regclass(%s) IS NOT NULL", [f"{self.schema}.{MARKS}"])
+        if not cursor.fetchone()[0]:
+            raise HomeError(
+                f"the schema '{self.schema}' is that of another program",
+                change="name another one (`inventory.schema_name`)",
+                file=self.name,
+            )
+        cursor.execute(
+            f'SELECT inventory, token, pending, "commit", at FROM {self.schema}.{MARKS} ORDER BY id DESC LIMIT 1'
+        )
+        row = cursor.fetchone()
+        return None if row is None else Mark(*row)
+
+    def read(self) -> Content:
+        """Rows of all tables at one instant, and who changed them since they were read last."""
+        with self._transaction() as cursor:
+            rows = {kind: self._read_table(cursor, kind) for kind in asset_kind_names()}
+            cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")
+            self._seen = int(cursor.fetchone()[0])
+            return Content(rows, self._decisions(cursor), self._authors(cursor))
+
+    def _read_table(self, cursor: Any, kind: str) -> pa.Table:
+        schema, table = asset_table(kind), asset_schema(kind).table
+        self._check_columns(cursor, table, [n for n in schema.names if n != GEOMETRY])
+        names = ", ".join(f'"{n}"' for n in schema.names if n != GEOMETRY)
+        out = io.BytesIO()
+        query = (
+            f"COPY (SELECT fid, {names}, geom FROM {self.schema}.{table} ORDER BY fid) TO STDOUT (FORMAT csv, HEADER)"
+        )
+        with cursor.copy(query) as copy:
+            for chunk in copy:
+                out.write(chunk)
+        types: dict[str, Any] = {f.name: f.type for f in schema if f.name != GEOMETRY} | {
+            FID: pa.int64(),
+            "geom": pa.string(),
+        }
+        out.seek(0)
+        read = pyarrow.csv.read_csv(
+            out,
+            parse_options=pyarrow.csv.ParseOptions(newlines_in_values=True),
+            convert_options=pyarrow.csv.ConvertOptions(
+                column_types=types, null_values=[""], strings_can_be_null=True, quoted_strings_can_be_null=False,
+                true_values=["t"], false_values=["f"],
+            ),
+        )  # fmt: skip
+        shapes = shapely.from_wkb(np.asarray(read["geom"].to_pylist(), dtype=object))
+        return pa.table(
+            {FID: read[FID]}
+            | {f.name: read[f.name] for f in schema if f.name != GEOMETRY}
+            | {GEOMETRY: pa.array(iso_wkb(shapes), pa.binary())}
+        )
+
+    def _check_columns(self, cursor: Any, table: str, wanted: Sequence[str]) -> None:
+        cursor.execute(
+            "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
+            [self.schema, table],
+        )
+        there = {name for (name,) in cursor.fetchall()}
+        if not there:
+            raise HomeError(f"the table '{table}' is missing", change="restore it from a backup", file=self.name)
+        missing = [name for name in (*wanted, "fid", "geom") if name not in there]
+        if missing:
+            raise HomeError(f"the column '{missing[0]}' of the table '{table}' is missing", file=self.name)
+        added = sorted(there - {*wanted, "fid", "geom"})
+        if added:
+            raise HomeError(f"the column '{added[0]}' of the table '{table}' does not belong to the inventory",
+                            change="remove it: it would be lost", file=self.name)  # fmt: skip
+
+    def _decisions(self, cursor: Any) -> list[Decision]:
+        cursor.execute("SELECT to_regclass(%s) IS NOT NULL", [f"{self.schema}.conflicts"])
+        if not cursor.fetchone()[0]:
+            return []
+        cursor.execute(f"SELECT asset_id, attribute, edit, decision FROM {self.schema}.conflicts WHERE decision <> ''")
+        found = [Decision(*row) for row in cursor.fetchall()]
+        for one in found:
+            if one.choice not in CHOICES:
+                raise HomeError(f"the decision '{one.choice}' of a conflict is unknown", expected=", ".join(CHOICES),
+                                file=self.name)  # fmt: skip
+        return found
+
+    def _authors(self, cursor: Any) -> dict[tuple[str, str], Author]:
+        cursor.execute(
+            f"SELECT layer, fid, asset_id, who, at FROM {self.schema}.history "
+            f"WHERE id > (SELECT coalesce(max(history_id), 0) FROM {self.schema}.{MARKS}) ORDER BY id"
+        )
+        found: dict[tuple[str, str], Author] = {}
+        for layer, fid, asset_id, who, at in cursor.fetchall():
+            kind = kinds_by_table().get(layer)
+            if kind is not None:
+                moment = at.astimezone(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+                found[kind, asset_id or f"fid {fid}"] = Author(who, moment)
+        return found
+
+    def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
+        """Replace all rows in one transaction."""
+        with self._transaction("READ COMMITTED") as cursor:
+            if self._mark(cursor) is None:
+                for statement in statements(self.schema, self.srid):
+                    cursor.execute(statement)
+            tables = ", ".join(f"{self.schema}.{asset_schema(kind).table}" for kind in asset_kind_names())
+            cursor.execute(f"LOCK TABLE {tables} IN ACCESS EXCLUSIVE MODE")
+            cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")
+            last = int(cursor.fetchone()[0])
+            if self._seen is not None and last > self._seen:
+                raise HomeError("it was edited in this moment", change="pull, and publish again", file=self.name)
+            cursor.execute("SET LOCAL roadscan.publishing = 'yes'")
+            cursor.execute(f"TRUNCATE {tables} RESTART IDENTITY")
+            for kind, rows in content.rows.items():
+                self._fill(cursor, kind, rows)
+            for sheet in sheets:
+                self._sheet(cursor, sheet)
+            self._note(cursor, mark, last)
+
+    def _fill(self, cursor: Any, kind: str, rows: pa.Table) -> None:
+        table = asset_schema(kind).table
+        names = [n for n in rows.column_names if n != GEOMETRY]
+        plain = rows.select(names).append_column("geom", self._hexadecimal(rows))
+        self._copy(cursor, table, plain)
+        cursor.execute(
+            f"SELECT setval(pg_get_serial_sequence('{self.schema}.{table}', 'fid'), {rows.num_rows + 1}, false)"
+        )
+
+    def _hexadecimal(self, rows: pa.Table) -> pa.Array:
+        shapes = shapely.set_srid(shapely.from_wkb(rows[GEOMETRY].to_numpy(zero_copy_only=False)), self.srid)
+        return pa.array(shapely.to_wkb(shapes, hex=True, include_srid=True), pa.string())
+
+    def _copy(self, cursor: Any, table: str, rows: pa.Table) -> None:
+        out = io.BytesIO()
+        pyarrow.csv.write_csv(rows, out, pyarrow.csv.WriteOptions(include_header=False))
+        names = ", ".join(f'"{n}"' for n in rows.column_names)
+        with cursor.copy(f"COPY {self.schema}.{table} ({names}) FROM STDIN (FORMAT csv)") as copy:
+            copy.write(out.getbuffer())
+
+    def _sheet(self, cursor: Any, sheet: Sheet) -> None:
+        columns = ", ".join(
+            f'"{n}" {_TYPES.get(n, "text")}' if n != GEOMETRY else f"geom geometry(PointZ, {self.srid})"
+            for n in sheet.rows.column_names
+        )
+        place = f"{self.schema}.{sheet.name}"
+        cursor.execute(f"DROP TABLE IF EXISTS {place}")
+        cursor.execute(f"CREATE TABLE {place} (fid bigint GENERATED BY DEFAULT AS IDENTITY PRIMARY KEY, {columns})")
+        cursor.execute(f"GRANT SELECT ON {place} TO {', '.join(f'{self.schema}_{role}' for role in ROLES)}")
+        if "decision" in sheet.rows.column_names:
+            cursor.execute(f"GRANT UPDATE (decision) ON {place} TO {self.schema}_editor")
+        if sheet.rows.num_rows:
+            plain = sheet.rows.drop_columns([GEOMETRY]).append_column("geom", self._hexadecimal(sheet.rows))
+            self._copy(cursor, sheet.name, plain)
+
+    def note(self, mark: Mark) -> None:
+        """Append a mark; one that is no longer pending closes the history that was read."""
+        with self._transaction("READ COMMITTED") as cursor:
+            self._note(cursor, mark, 0 if mark.pending else self._seen or 0)
+
+    def _note(self, cursor: Any, mark: Mark, history_id: int) -> None:
+        cursor.execute(
+            f'INSERT INTO {self.schema}.{MARKS} (inventory, token, pending, "commit", at, history_id) '
+            "VALUES (%s, %s, %s, %s, %s, %s)",
+            [*mark, history_id],
+        )

@@ -1,0 +1,225 @@
+"""Which known asset each newly found object is: one to one, by kind, place, σ and size.
+
+Three rounds, each with what the rounds before left: at the place of the evidence; at the place that a person gave; and
+farther away, where the known asset should have been seen at its place and was not: it was moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import scipy.sparse
+import shapely
+
+from roadscan.model.inventory import Matching
+from roadscan.tables.asset_schema import asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY
+from roadscan.tables.store import bytes_digest
+
+_SIGMAS: Final = 4.0
+"""Gate of a match, in σ of the difference of two places."""
+_SAMPLES: Final = 16
+"""Points along a line or outline that tell how much of it another one covers."""
+_LEAST_SHARE: Final = 0.35
+"""Share, the mean of both ways, from which on two lines or outlines are one asset."""
+_SIZE_WEIGHT: Final = 0.5
+"""Cost of wholly different sizes, where 1 is a distance at the gate."""
+_SIZE_OF_MOVED: Final = 0.25
+"""Mean relative difference of sizes up to which a moved asset is still itself."""
+_DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"  # Crockford's: no i, l, o, u
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class Pairs(NamedTuple):
+    """Candidates: rows of the known and of the found assets, and what taking both for one costs (0 to 1)."""
+
+    known: Ints
+    found: Ints
+    cost: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What the inventory knows of a kind, by ascending id."""
+
+    evidence: pa.Table
+    rows: pa.Table
+    """With edits."""
+    is_visible: npt.NDArray[np.bool_]
+    """(n,) whether the newest survey should have seen it at its place."""
+
+
+def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m: float = 1.0) -> Ints:
+    """For each found object the row of the known asset that it is, -1 for none.
+
+    Parameters
+    ----------
+    found : rows of the kind's table of found assets, in an order that depends on the objects alone.
+    unit_m : metres of a unit of the map.
+    """
+    result = np.full(found.num_rows, -1, dtype=np.int64)
+    if not (found.num_rows and known.rows.num_rows):
+        return result
+    there = _shapes(found, unit_m)
+    is_point = asset_schema(kind).geometry == "PointZ"
+    sizes = _sizes(kind, known.evidence), _sizes(kind, found)
+    for table in (known.evidence, known.rows):
+        here = _shapes(table, unit_m)
+        free_known, free_found = _free(result, known.rows.num_rows)
+        free_known = free_known[~shapely.is_missing(here[free_known])]
+        if not (free_known.size and free_found.size):
+            continue
+        ends = here[free_known], there[free_found]
+        if is_point:
+            sigma = _sigmas(known.evidence)[free_known], _sigmas(found)[free_found]
+            pairs = _near_points(*ends, *sigma, settings.distance_m)
+        else:
+            pairs = _overlapping(*ends, settings.distance_m)
+        pairs = Pairs(free_known[pairs.known], free_found[pairs.found], pairs.cost)
+        cost = pairs.cost + _SIZE_WEIGHT * _size_difference(*sizes, pairs)
+        _assign(pairs._replace(cost=cost), result)
+    if is_point:
+        _find_moved(known, there, sizes, settings, unit_m, result)
+    return result
+
+
+def _find_moved(
+    known: Known, there: npt.NDArray[Any], sizes: tuple[Floats, Floats], settings: Matching, unit_m: float, result: Ints
+) -> None:
+    """Take the nearest object of about the same size for the asset, where that should have been seen and was not."""
+    free_known, free_found = _free(result, known.rows.num_rows)
+    here = _shapes(known.evidence, unit_m)
+    free_known = free_known[known.is_visible[free_known] & ~shapely.is_missing(here[free_known])]
+    if not (free_known.size and free_found.size):
+        return
+    a, b = here[free_known], there[free_found]
+    left, right = shapely.STRtree(b).query(a, predicate="dwithin", distance=settings.moved_m)
+    pairs = Pairs(free_known[left], free_found[right], shapely.distance(a[left], b[right]) / settings.moved_m)
+    difference = _size_difference(*sizes, pairs)
+    keep = difference <= _SIZE_OF_MOVED
+    _assign(Pairs(pairs.known[keep], pairs.found[keep], (pairs.cost + difference)[keep]), result)
+
+
+def _free(result: Ints, known: int) -> tuple[Ints, Ints]:
+    taken = np.zeros(known, dtype=bool)
+    taken[result[result >= 0]] = True
+    return np.flatnonzero(~taken), np.flatnonzero(result < 0)
+
+
+def _shapes(table: pa.Table, unit_m: float) -> npt.NDArray[Any]:
+    shapes = np.asarray(shapely.from_wkb(table[GEOMETRY].to_numpy(zero_copy_only=False)))
+    return shapes if unit_m == 1.0 else np.asarray(shapely.transform(shapes, lambda xy: xy * unit_m))
+
+
+def _sigmas(table: pa.Table) -> Floats:
+    """(n, 2) σ in the horizontal and in height; 0 where it is not known."""
+    columns = [
+        np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float)
+        for name in ("sigma_horizontal_m", "sigma_height_m")
+    ]
+    return np.asarray(np.nan_to_num(np.column_stack(columns)), dtype=float)
+
+
+def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, least_m: float) -> Pairs:
+    widest = max(least_m, _SIGMAS * float(np.hypot(sigma_a.max(), sigma_b.max())))
+    left, right = shapely.STRtree(b).query(a, predicate="dwithin", distance=widest)
+    gate = np.maximum(least_m, _SIGMAS * np.hypot(sigma_a[left], sigma_b[right]))
+    rise = np.abs(shapely.get_z(a[left]) - shapely.get_z(b[right]))
+    ratio = np.hypot(shapely.distance(a[left], b[right]) / gate[:, 0], np.nan_to_num(rise) / gate[:, 1])
+    keep = ratio <= 1.0
+    return Pairs(left[keep], right[keep], ratio[keep])
+
+
+def _overlapping(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Pairs:
+    lines_a, lines_b = _outlines(a), _outlines(b)
+    left, right = shapely.STRtree(lines_b).query(lines_a, predicate="dwithin", distance=within_m)
+    share = 0.5 * (_share(lines_a[left], lines_b[right], within_m) + _share(lines_b[right], lines_a[left], within_m))
+    keep = share >= _LEAST_SHARE
+    return Pairs(left[keep], right[keep], 1.0 - share[keep])
+
+
+def _outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Lines as they are, of polygons the outer ring; of façades that is the line on the ground, there and back."""
+    flat = shapely.force_2d(shapes)
+    rings = shapely.get_exterior_ring(flat)
+    return np.asarray(np.where(shapely.is_missing(rings), flat, rings))
+
+
+def _share(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Floats:
+    """Share of points along `a` that lie within a distance of `b`."""
+    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    points = shapely.line_interpolate_point(a[:, np.newaxis], along[np.newaxis, :], normalized=True)
+    near = shapely.distance(points, b[:, np.newaxis]) <= within_m
+    return np.asarray(near.mean(axis=1), dtype=float) if len(a) else np.empty(0)
+
+
+def _sizes(kind: str, table: pa.Table) -> Floats:
+    """(n, m) lengths of the assets in all their own columns that have the unit m; NaN where not known."""
+    names = [c.name for c in asset_schema(kind).own if c.unit == "m"]
+    columns = [np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float) for name in names]
+    return np.column_stack(columns) if columns else np.empty((table.num_rows, 0))
+
+
+def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
+    """Mean relative difference of the lengths that both have, 0 to 1; 0 where they share none."""
+    a, b = known[pairs.known], found[pairs.found]
+    relative = np.minimum(np.abs(a - b) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 0.1), 1.0)
+    count = np.isfinite(relative).sum(axis=1)
+    return np.asarray(np.nansum(relative, axis=1) / np.maximum(count, 1), dtype=float)
+
+
+def _assign(pairs: Pairs, result: Ints) -> None:
+    """Choose pairs so that the sum of their costs is least and as many as can be are made, one to one."""
+    if not pairs.known.size:
+        return
+    known, a = np.unique(pairs.known, return_inverse=True)
+    found, b = np.unique(pairs.found, return_inverse=True)
+    graph = scipy.sparse.coo_matrix((np.ones(a.size), (a, b + known.size)), shape=(known.size + found.size,) * 2)
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    order = np.argsort(label[a], kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(label[a][order])) + 1):
+        if rows.size == 1:
+            result[pairs.found[rows[0]]] = pairs.known[rows[0]]
+        else:
+            _assign_together(Pairs(pairs.known[rows], pairs.found[rows], pairs.cost[rows]), result)
+
+
+def _assign_together(pairs: Pairs, result: Ints) -> None:
+    from scipy.optimize import linear_sum_assignment
+
+    known, a = np.unique(pairs.known, return_inverse=True)
+    found, b = np.unique(pairs.found, return_inverse=True)
+    no_pair = 4.0 * min(known.size, found.size)
+    cost = np.full((known.size, found.size), no_pair)
+    cost[a, b] = pairs.cost
+    for i, j in zip(*linear_sum_assignment(cost), strict=True):
+        if cost[i, j] < no_pair:
+            result[found[j]] = known[i]
+
+
+def new_ids(kind: str, names: Sequence[str], taken: frozenset[str] | set[str]) -> list[str]:
+    """Ids of new assets: the kind and eight letters and digits of a digest of what they were first found as.
+
+    `taken` are the ids that there are; names that would give one of them, or one id twice, are counted.
+    """
+    used = set(taken)
+    ids = []
+    for name in names:
+        number = 0
+        while (one := _id(kind, name, number)) in used:
+            number += 1
+        used.add(one)
+        ids.append(one)
+    return ids
+
+
+def _id(kind: str, name: str, number: int) -> str:
+    digest = int(bytes_digest(f"{kind}/{name}/{number}".encode()).rpartition(":")[2], 16)
+    return f"{kind}-" + "".join(_DIGITS[digest >> 5 * at & 31] for at in range(8))

@@ -1,0 +1,115 @@
+"""A project file of QGIS: the layers of the inventory with styles and forms, and products of the survey behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from roadscan.inventory.qgis.styles import QGIS_VERSION, style_elements
+from roadscan.model.crs import crs_from_text
+from roadscan.tables.asset_schema import asset_schema
+
+_GEOMETRY: Final = {
+    "PointZ": ("Point", "PointZ"),
+    "LineStringZ": ("Line", "LineStringZ"),
+    "PolygonZ": ("Polygon", "PolygonZ"),
+}
+_ORDER: Final = tuple(_GEOMETRY)
+"""From the uppermost layer down."""
+
+
+class Source(NamedTuple):
+    """Where QGIS finds a layer."""
+
+    provider: str
+    address: str
+
+
+class Raster(NamedTuple):
+    """A product that stands behind the assets."""
+
+    title: str
+    path: str
+    """Relative to the project file, or absolute."""
+
+
+def project_text(
+    title: str, kinds: Sequence[str], source: Callable[[str], Source], crs: str | None, rasters: Sequence[Raster] = ()
+) -> str:
+    """A project of QGIS 3 as XML; the same for the same arguments.
+
+    Parameters
+    ----------
+    source : where the table of this name is found; tables beside those of the kinds are `conflicts` and `changes`.
+    """
+    root = Element("qgis", projectname=title, version=QGIS_VERSION)
+    SubElement(root, "title").text = title
+    project_crs = SubElement(root, "projectCrs")
+    project_crs.append(_crs(crs))
+    tree = SubElement(root, "layer-tree-group")
+    layers = SubElement(root, "projectlayers")
+    order = SubElement(root, "layerorder")
+    held: list[tuple[str, str, Source, Element]] = []
+    for name, shown in (("conflicts", "Conflicts"), ("changes", "Changes")):
+        held.append((name, shown, source(name), _vector(name, shown, "PointZ", source(name), crs)))
+    for kind in sorted(kinds, key=lambda k: (_ORDER.index(asset_schema(k).geometry), k)):
+        schema = asset_schema(kind)
+        layer = _vector(schema.table, schema.title, schema.geometry, source(schema.table), crs)
+        layer.extend(style_elements(kind))
+        held.append((schema.table, schema.title, source(schema.table), layer))
+    for raster in rasters:
+        name = f"raster_{len(held)}"
+        address = Source("gdal", raster.path)
+        held.append((name, raster.title, address, _raster(name, raster, crs)))
+    for name, shown, address, layer in held:
+        SubElement(tree, "layer-tree-layer", id=_id(name), name=shown, providerKey=address.provider,
+                   source=address.address, checked="Qt::Checked", expanded="0")  # fmt: skip
+        layers.append(layer)
+        SubElement(order, "layer", id=_id(name))
+    properties = SubElement(root, "properties")
+    SubElement(SubElement(properties, "Paths"), "Absolute", type="bool").text = "false"
+    indent(root, space=" ")
+    return "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + tostring(root, encoding="unicode") + "\n"
+
+
+def _id(name: str) -> str:
+    return f"roadscan_{name}"
+
+
+def _layer(name: str, title: str, source: Source, crs: str | None) -> Element:
+    layer = Element("maplayer")
+    SubElement(layer, "id").text = _id(name)
+    SubElement(layer, "datasource").text = source.address
+    SubElement(layer, "layername").text = title
+    SubElement(layer, "srs").append(_crs(crs))
+    provider = SubElement(layer, "provider", encoding="UTF-8")
+    provider.text = source.provider
+    return layer
+
+
+def _vector(name: str, title: str, geometry: str, source: Source, crs: str | None) -> Element:
+    layer = _layer(name, title, source, crs)
+    shape, wkb = _GEOMETRY[geometry]
+    layer.attrib |= {"type": "vector", "geometry": shape, "wkbType": wkb, "readOnly": "0"}
+    return layer
+
+
+def _raster(name: str, raster: Raster, crs: str | None) -> Element:
+    layer = _layer(name, raster.title, Source("gdal", raster.path), crs)
+    layer.attrib |= {"type": "raster"}
+    return layer
+
+
+def _crs(crs: str | None) -> Element:
+    held = Element("spatialrefsys")
+    if crs is None:
+        return held
+    found = crs_from_text(crs)
+    SubElement(held, "wkt").text = found.to_wkt()
+    authority = found.to_authority()
+    if authority is not None:
+        SubElement(held, "srid").text = authority[1]
+        SubElement(held, "authid").text = ":".join(authority)
+    SubElement(held, "description").text = found.name
+    return held

@@ -1,0 +1,221 @@
+"""Taking what a run found into the inventory: who is who, what was not seen, and what stands on what."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.inventory.identity import Known, matched, new_ids
+from roadscan.inventory.parents import Placed, parents_of
+from roadscan.inventory.state import Assets, State, live_commits, state_at
+from roadscan.inventory.values import iso_column
+from roadscan.inventory.visibility import NOT_KNOWN, Visibility
+from roadscan.model.errors import SchemaError
+from roadscan.model.gpstime import utc_from_gps_ns
+from roadscan.model.inventory import Matching
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
+from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
+
+_EPOCH: Final = "first_epoch_gps_ns"
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a run found."""
+
+    tables: Mapping[str, pa.Table]
+    """By kind, columns as `asset_schema(kind).arrow()`; a kind that is absent was not looked for."""
+    key: str
+    """Digest of the tables: what was taken in once is not taken in again."""
+    source: str
+    """Survey and stage."""
+    epoch: str | None = None
+    """Name of the survey's epoch; the day (UTC) of the first return where it is None."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What assets are known again by."""
+
+    visibility: Visibility
+    matching: Matching = field(default_factory=Matching)
+    unit_m: float = 1.0
+    """Metres of a unit of the map."""
+
+
+def record(truth: AssetTruth, found: Found, rules: Rules, who: str = "roadscan", why: str = "") -> Commit | None:
+    """The commit that takes in what a run found, None where that is in already; to be called within `truth.alone()`.
+
+    Raises
+    ------
+    SchemaError
+        where a table is not that of its kind.
+    """
+    tables = {kind: _checked(kind, found.tables[kind]) for kind in asset_kind_names() if kind in found.tables}
+    began = min((int(np.min(t[_EPOCH].to_numpy())) for t in tables.values() if t.num_rows), default=0)
+    epoch = found.epoch or (utc_from_gps_ns(began).date().isoformat() if began else "no returns")
+    known = [c for c in live_commits(truth.commits) if c.kind == "found" and c.epoch == epoch]
+    if known and known[-1].run == found.key:
+        return None
+    rows = _Recording(state_at(truth, with_undone=True), tables, rules, epoch, is_again=bool(known)).rows()
+    draft = Draft("found", who, why, found.source, epoch=epoch, epoch_gps_ns=began, run=found.key)
+    return truth.append(draft, rows)
+
+
+def _checked(kind: str, table: pa.Table) -> pa.Table:
+    schema = asset_schema(kind).arrow()
+    missing = [name for name in schema.names if name not in table.column_names]
+    if missing:
+        raise SchemaError(
+            f"the table of found assets '{asset_schema(kind).table}' has no column '{missing[0]}'",
+            expected=", ".join(schema.names),
+            change="run the stage `assets` of this version again",
+        )
+    try:
+        rows = table.select(schema.names).cast(schema)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, ValueError) as error:
+        raise SchemaError(f"the table of found assets '{asset_schema(kind).table}': {error}") from error
+    place = rows.schema.get_field_index(GEOMETRY)
+    rows = rows.set_column(place, rows.schema.field(place), iso_column(rows[GEOMETRY]))
+    return rows.sort_by([("object", "ascending"), ("easting_m", "ascending"), ("northing_m", "ascending")])
+
+
+class _Recording:
+    """The rows of one commit of evidence."""
+
+    def __init__(
+        self, state: State, tables: Mapping[str, pa.Table], rules: Rules, epoch: str, *, is_again: bool
+    ) -> None:
+        self.state = state
+        self.tables = tables
+        self.rules = rules
+        self.epoch = epoch
+        self.is_again = is_again
+
+    def rows(self) -> pa.Table:
+        """Rows of all kinds, in the order of the table."""
+        seen: dict[str, pa.Table] = {}
+        unseen: list[pa.Table] = []
+        taken = set(self.state.kind_of)
+        for kind, table in self.tables.items():
+            assets = self.state.assets.get(kind) or _none(kind)
+            expected = self._expected(kind, assets)
+            known = Known(assets.evidence, assets.rows, expected > 0)
+            match = matched(kind, known, table, self.rules.matching, self.rules.unit_m)
+            ids, valid_from = self._identified(kind, table, assets, match, taken)
+            seen[kind] = self._evidence(kind, table, ids, valid_from)
+            left = np.setdiff1d(np.arange(assets.rows.num_rows), match[match >= 0])
+            left = left[[str(one) not in self.state.orphans for one in assets.ids[left]]] if left.size else left
+            unseen.append(_unseen(kind, assets.ids[left], expected[left]))
+        placed = self._placed(seen)
+        for kind, rows in list(seen.items()):
+            parents = pa.array(parents_of(kind, placed)[: rows.num_rows], pa.string())
+            at = rows.schema.get_field_index("parent")
+            seen[kind] = rows.set_column(at, rows.schema.field(at), parents)
+        parts = [_wide(kind, rows, 1) for kind, rows in seen.items()] + unseen
+        if not parts:
+            return evidence_table().empty_table()
+        return pa.concat_tables(parts).sort_by([("kind", "ascending"), ("asset_id", "ascending")])
+
+    def _expected(self, kind: str, assets: Assets) -> npt.NDArray[np.int64]:
+        """Passes that should have seen each known asset; of an epoch processed again at least those that did."""
+        table = assets.evidence
+        count = table.num_rows
+        columns = [
+            np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float)
+            for name in ("easting_m", "northing_m", "height_m")
+        ]
+        places = np.column_stack(columns) if count else np.empty((0, 3))
+        has_place = np.isfinite(places).all(axis=1)
+        expected = np.full(count, NOT_KNOWN, dtype=np.int64)
+        expected[has_place] = self.rules.visibility.expected_passes(kind, places[has_place])
+        if self.is_again:
+            saw = np.array([p or 0 for p in table["passes"].to_pylist()], dtype=np.int64)
+            same = np.array([s == self.epoch for s in table["source"].to_pylist()], dtype=bool)
+            expected = np.where(same, np.maximum(expected, saw), expected)
+        return expected
+
+    def _identified(
+        self, kind: str, table: pa.Table, assets: Assets, match: npt.NDArray[np.int64], taken: set[str]
+    ) -> tuple[list[str], list[dt.date]]:
+        names = table["object"].to_pylist()
+        fresh = [at for at in range(table.num_rows) if match[at] < 0]
+        made = dict(zip(fresh, new_ids(kind, [f"{names[at]}/{self.epoch}" for at in fresh], taken), strict=True))
+        taken.update(made.values())
+        ids = [made[at] if at in made else str(assets.ids[match[at]]) for at in range(table.num_rows)]
+        held = assets.evidence["valid_from"].to_pylist()
+        days = [utc_from_gps_ns(one).date() for one in table[_EPOCH].to_pylist()]
+        firsts = [held[match[at]] if match[at] >= 0 else None for at in range(table.num_rows)]
+        return ids, [min(day, first or day) for day, first in zip(days, firsts, strict=True)]
+
+    def _evidence(self, kind: str, table: pa.Table, ids: list[str], valid_from: list[dt.date]) -> pa.Table:
+        count = table.num_rows
+        columns: dict[str, Any] = {name: table[name] for name in table.column_names}
+        columns |= {
+            "asset_id": pa.array(ids, pa.string()),
+            "status": pa.array(["found"] * count, pa.string()),
+            "valid_from": pa.array(valid_from, pa.date32()),
+            "source": pa.array([self.epoch] * count, pa.string()),
+            "passes_expected": table["passes"],
+        }
+        schema = asset_table(kind)
+        arrays = [columns.get(f.name, pa.nulls(count, f.type)) for f in schema]
+        return pa.table(dict(zip(schema.names, arrays, strict=True))).cast(schema)
+
+    def _placed(self, seen: Mapping[str, pa.Table]) -> dict[str, Placed]:
+        """Assets of all kinds: those that were just found first, then those that are known besides."""
+        placed: dict[str, Placed] = {}
+        for kind in {*seen, *self.state.assets}:
+            ids: list[Any] = []
+            shapes: list[Any] = []
+            if kind in seen:
+                ids += seen[kind]["asset_id"].to_pylist()
+                shapes += list(shapely.from_wkb(seen[kind][GEOMETRY].to_numpy(zero_copy_only=False)))
+            assets = self.state.assets.get(kind)
+            if assets is not None:
+                found = set(ids)
+                others = [at for at, one in enumerate(assets.ids) if str(one) not in found]
+                ids += [str(assets.ids[at]) for at in others]
+                shapes += [assets.shapes[at] for at in others]
+            array = np.array(shapes, dtype=object)
+            if self.rules.unit_m != 1.0:
+                array = shapely.transform(array, lambda xy: xy * self.rules.unit_m)
+            placed[kind] = Placed(np.array(ids, dtype=str), array)
+        return placed
+
+
+def _none(kind: str) -> Assets:
+    return Assets(kind, asset_table(kind).empty_table(), asset_table(kind).empty_table())
+
+
+def _wide(kind: str, rows: pa.Table, seen: int) -> pa.Table:
+    """Rows of a kind as rows of the table `assets_found`."""
+    schema, count = evidence_table(), rows.num_rows
+    own: dict[str, Any] = {name: rows[name] for name in rows.column_names}
+    own |= {
+        "commit": pa.array([0] * count, pa.int32()),
+        "kind": pa.array([kind] * count, pa.string()),
+        "seen": pa.array([seen] * count, pa.uint8()),
+    }
+    arrays = [own.get(f.name, pa.nulls(count, f.type)) for f in schema]
+    return pa.table(dict(zip(schema.names, arrays, strict=True))).cast(schema)
+
+
+def _unseen(kind: str, ids: npt.NDArray[Any], expected: npt.NDArray[np.int64]) -> pa.Table:
+    """Rows of assets that the run did not find; without a status where it is not known that it should have."""
+    rows = pa.table(
+        {
+            "asset_id": pa.array([str(one) for one in ids], pa.string()),
+            "status": pa.array(["missing" if n > 0 else None for n in expected], pa.string()),
+            "passes_expected": pa.array([int(n) if n >= 0 else None for n in expected], pa.int32()),
+        }
+    )
+    return _wide(kind, rows, 0)

@@ -1,0 +1,335 @@
+"""The inventory as it was after any commit: found ⊕ edited.
+
+Of each asset the evidence of the newest survey epoch that saw it counts, of an epoch that was processed several times
+the newest processing. Then edits in force replace single values.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from roadscan.inventory.edits import Edit, Folded, folded, read_edits
+from roadscan.inventory.values import decoded
+from roadscan.model.errors import ConfigError
+from roadscan.tables.asset_schema import asset_kind_names
+from roadscan.tables.asset_truth import AssetTruth, Commit
+from roadscan.tables.inventory_schema import GEOMETRY, asset_table
+
+_OF_THE_PLACE: Final = ("station_m", "offset_m", "lane")
+"""Columns that the evidence measured at its own place; unknown where a person moved the asset."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assets:
+    """Assets of a kind, by ascending id."""
+
+    kind: str
+    rows: pa.Table
+    """As people see them, with edits."""
+    evidence: pa.Table
+    """As they were found: the same assets in the same order; all but the id is null where there is no evidence."""
+
+    @cached_property
+    def ids(self) -> npt.NDArray[Any]:
+        """Ids of the assets, ascending."""
+        return np.asarray(self.rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
+
+    def place(self, asset_id: str) -> int | None:
+        """Row of an asset; None where there is none."""
+        at = int(np.searchsorted(self.ids, asset_id))
+        return at if at < self.ids.size and self.ids[at] == asset_id else None
+
+    @cached_property
+    def shapes(self) -> npt.NDArray[Any]:
+        """Geometries as people see them, in the map's own unit."""
+        return np.asarray(shapely.from_wkb(self.rows[GEOMETRY].to_numpy(zero_copy_only=False)))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The inventory after a commit."""
+
+    commit: int
+    assets: Mapping[str, Assets]
+    """By kind; only kinds that have any."""
+    edits: Folded
+    orphans: frozenset[str]
+    """Edited assets whose evidence was undone; they keep it, and are said to be missing."""
+
+    @cached_property
+    def kind_of(self) -> dict[str, str]:
+        """Kind of each asset."""
+        return {str(one): kind for kind, assets in self.assets.items() for one in assets.ids}
+
+    def row(self, asset_id: str, *, evidence: bool = False) -> dict[str, Any] | None:
+        """An asset as people see it, or as it was found; None where there is none."""
+        kind = self.kind_of.get(asset_id)
+        at = None if kind is None else self.assets[kind].place(asset_id)
+        if kind is None or at is None:
+            return None
+        table = self.assets[kind].evidence if evidence else self.assets[kind].rows
+        found: dict[str, Any] = table.slice(at, 1).to_pylist()[0]
+        return found
+
+
+def live_commits(commits: Sequence[Commit]) -> list[Commit]:
+    """Commits that are not undone; an undoing that was undone itself does not count."""
+    undone: set[int] = set()
+    for commit in reversed(commits):
+        if commit.kind == "undo" and commit.number not in undone:
+            undone.add(commit.undoes)
+    return [c for c in commits if c.number not in undone and c.kind != "undo"]
+
+
+def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool = False) -> State:
+    """The inventory after commit `number`, today's where it is left out.
+
+    Parameters
+    ----------
+    with_undone : whether assets count that only undone runs have found. They are known again when they are found again.
+
+    Raises
+    ------
+    DamagedError
+        where rows of the truth are damaged.
+    """
+    commits = truth.commits[: len(truth.commits) if number is None else number]
+    live = live_commits(commits)
+    edits = folded(read_edits(truth, live))
+    found, status = _evidence(truth, _newest_first([c for c in live if c.kind == "found"]))
+    edited = {asset for asset, _ in edits.in_force} - edits.created.keys()
+    undone = [c for c in commits if c.kind == "found" and c not in live]
+    orphans: set[str] = set()
+    if undone:
+        lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
+        found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
+        status |= dict.fromkeys(orphans, ("missing", None))
+    return State(len(commits), _by_kind(found, status, edits), edits, frozenset(orphans))
+
+
+def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
+    """Number of the last commit at an instant, a day (UTC, its end) or by its own number; 0 before the first.
+
+    Raises
+    ------
+    ConfigError
+        where `when` is none of them.
+    """
+    if when is None:
+        return len(truth.commits)
+    text = str(when).removeprefix("#")
+    if text.isdigit() and len(text) < 8:
+        if int(text) > len(truth.commits):
+            raise ConfigError(f"commit {text}", expected=f"1 to {len(truth.commits)}")
+        return int(text)
+    try:
+        moment = dt.datetime.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(
+            f"'{when}' is no date", expected="a day such as 2026-05-04, an instant with zone, or the number of a commit"
+        ) from None
+    if "T" not in text and " " not in text:
+        moment = moment.replace(tzinfo=dt.UTC) + dt.timedelta(days=1) - dt.timedelta(microseconds=1)
+    if moment.tzinfo is None:
+        raise ConfigError(f"{when} has no zone", expected="UTC, such as 2026-05-04T09:30:00Z")
+    return sum(dt.datetime.fromisoformat(c.at) <= moment for c in truth.commits)
+
+
+def _newest_first(found: Sequence[Commit]) -> list[Commit]:
+    """Commits of evidence by the epoch of their survey, then by their own order, the newest first."""
+    began: dict[str, int] = {}
+    for commit in found:
+        began.setdefault(commit.epoch, commit.epoch_gps_ns)
+    return sorted(found, key=lambda c: (began[c.epoch], c.epoch, c.number), reverse=True)
+
+
+def _evidence(truth: AssetTruth, commits: Sequence[Commit]) -> tuple[pa.Table | None, dict[str, Any]]:
+    """Rows of evidence that count, and of assets that newer evidence did not see: status and passes expected."""
+    parts: list[pa.Table] = []
+    status: dict[str, tuple[str, int | None]] = {}
+    for commit in commits:
+        if parts and not _fresh(truth, commit, parts):
+            continue
+        rows = truth.rows(commit)
+        seen = pc.equal(rows["seen"], 1)
+        unseen = rows.filter(pc.invert(seen)).select(["asset_id", "status", "passes_expected"])
+        known = _ids(parts) if unseen.num_rows and parts else set()
+        for asset, state, expected in zip(*(c.to_pylist() for c in unseen.columns), strict=True):
+            if asset not in known and asset not in status and state is not None:
+                status[asset] = (state, expected)
+        rows = rows.filter(seen)
+        if parts:
+            rows = rows.filter(pc.invert(pc.is_in(rows["asset_id"], value_set=_id_array(parts))))
+        parts.append(rows)
+    return (pa.concat_tables(parts) if parts else None), status
+
+
+def _fresh(truth: AssetTruth, commit: Commit, parts: Sequence[pa.Table]) -> bool:
+    """True if a commit tells of an asset that the newer ones did not see."""
+    ids = truth.rows(commit, ["asset_id"])["asset_id"]
+    return not pc.all(pc.is_in(ids, value_set=_id_array(parts))).as_py()
+
+
+def _id_array(parts: Sequence[pa.Table]) -> pa.Array:
+    return pa.concat_arrays([chunk for part in parts for chunk in part["asset_id"].chunks])
+
+
+def _ids(parts: Sequence[pa.Table]) -> set[str]:
+    return set(_id_array(parts).to_pylist())
+
+
+def _with_lost(
+    truth: AssetTruth, undone: Sequence[Commit], found: pa.Table | None, wanted: set[str] | None
+) -> tuple[pa.Table | None, set[str]]:
+    """Evidence with that of assets which only undone commits saw, of all or of wanted ones; and which these are."""
+    kept: set[str] = set()
+    for commit in undone:
+        rows = truth.rows(commit)
+        mask = pc.equal(rows["seen"], 1)
+        if found is not None:
+            mask = pc.and_(mask, pc.invert(pc.is_in(rows["asset_id"], value_set=_id_array([found]))))
+        if wanted is not None:
+            mask = pc.and_(mask, pc.is_in(rows["asset_id"], value_set=pa.array(sorted(wanted), pa.string())))
+        rows = rows.filter(mask)
+        kept |= set(rows["asset_id"].to_pylist())
+        found = rows if found is None else pa.concat_tables([found, rows])
+    return found, kept
+
+
+def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded) -> dict[str, Assets]:
+    changes: dict[str, list[Edit]] = defaultdict(list)
+    for edit in edits.in_force.values():
+        changes[edit.kind].append(edit)
+    drawn: dict[str, list[str]] = defaultdict(list)
+    for edit in edits.created.values():
+        drawn[edit.kind].append(edit.asset_id)
+    assets: dict[str, Assets] = {}
+    present = set() if found is None else set(pc.unique(found["kind"]).to_pylist())
+    for kind in asset_kind_names():
+        if kind not in present and kind not in drawn:
+            continue
+        schema = asset_table(kind)
+        evidence = schema.empty_table()
+        if found is not None and kind in present:
+            evidence = found.filter(pc.equal(found["kind"], kind)).select(schema.names).cast(schema)
+        known = set(evidence["asset_id"].to_pylist()) if kind in drawn else set()
+        own = sorted(set(drawn[kind]) - known) if kind in drawn else []
+        blank = pa.Table.from_pylist([{"asset_id": one} for one in own], schema)
+        evidence = pa.concat_tables([evidence, blank]).sort_by("asset_id").combine_chunks()
+        evidence = _with_status(evidence, status)
+        own_edits = changes.get(kind, []) + _drawn_again(evidence, edits, drawn.get(kind, ()))
+        rows = _as_drawn(
+            _edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
+        )
+        assets[kind] = Assets(kind, rows, evidence)
+    return assets
+
+
+def _with_status(rows: pa.Table, status: Mapping[str, tuple[str, int | None]]) -> pa.Table:
+    if not status:
+        return rows
+    ids = rows["asset_id"].to_pylist()
+    places = [at for at, one in enumerate(ids) if one in status]
+    rows = _replaced(rows, "status", places, [status[ids[at]][0] for at in places])
+    return _replaced(rows, "passes_expected", places, [status[ids[at]][1] for at in places])
+
+
+def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
+    """Rows with the values that people gave."""
+    by_attribute: dict[str, list[Edit]] = defaultdict(list)
+    for edit in edits:
+        by_attribute[edit.attribute].append(edit)
+    if not by_attribute:
+        return evidence
+    ids = np.asarray(evidence["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
+    rows = evidence
+    moved = _places(ids, by_attribute.get(GEOMETRY, ()))
+    for name in _OF_THE_PLACE if moved else ():
+        rows = _replaced(rows, name, moved, [None] * len(moved))
+    for attribute in sorted(by_attribute):
+        own = sorted(by_attribute[attribute], key=lambda e: e.asset_id)
+        places = _places(ids, own)
+        rows = _replaced(rows, attribute, places, [decoded(kind, attribute, e.new) for e in own if _is_in(ids, e)])
+    return _at_their_places(rows, moved)
+
+
+def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> list[Edit]:
+    """Edits that drew assets, of which neither a later edit nor evidence says where they are."""
+    if not drawn:
+        return []
+    placed = set(evidence.filter(pc.is_valid(evidence[GEOMETRY]))["asset_id"].to_pylist())
+    return [edits.created[one] for one in drawn if one not in placed and (one, GEOMETRY) not in edits.in_force]
+
+
+def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
+    """Rows in which assets that a person drew are confirmed and say who drew them, where nothing else does."""
+    if not drawn:
+        return rows
+    ids = np.asarray(rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
+    places = _places(ids, drawn)
+    said = {"status": ["confirmed"] * len(drawn), "source": [f"drawn by {e.who}" for e in drawn]}
+    for name, values in said.items():
+        held = rows[name].to_pylist()
+        missing = [(at, value) for at, value in zip(places, values, strict=True) if held[at] is None]
+        rows = _replaced(rows, name, [at for at, _ in missing], [value for _, value in missing])
+    return rows
+
+
+def _at_their_places(rows: pa.Table, moved: Sequence[int]) -> pa.Table:
+    """Reference points of moved assets, from their geometry."""
+    if not moved:
+        return rows
+    shapes = shapely.from_wkb(rows[GEOMETRY].take(pa.array(moved)).to_numpy(zero_copy_only=False))
+    points = reference_points(np.asarray(shapes))
+    for column, name in enumerate(("easting_m", "northing_m", "height_m")):
+        rows = _replaced(rows, name, moved, points[:, column].tolist())
+    return rows
+
+
+def reference_points(shapes: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """(n, 3) reference points: the point itself, the middle of a line, a point within an area at its mean height."""
+    out = np.empty((len(shapes), 3))
+    for at, shape in enumerate(shapes):
+        if shape.geom_type == "LineString":
+            point = shape.interpolate(0.5, normalized=True)
+        else:
+            point = shape if shape.geom_type == "Point" else shapely.force_2d(shape).representative_point()
+        heights = shapely.get_coordinates(shape, include_z=True)[:, 2]
+        out[at] = point.x, point.y, point.z if point.has_z else float(np.mean(heights))
+    return out
+
+
+def _is_in(ids: npt.NDArray[Any], edit: Edit) -> bool:
+    at = int(np.searchsorted(ids, edit.asset_id))
+    return at < ids.size and bool(ids[at] == edit.asset_id)
+
+
+def _places(ids: npt.NDArray[Any], edits: Iterable[Edit]) -> list[int]:
+    wanted = sorted(e.asset_id for e in edits if _is_in(ids, e))
+    return [int(at) for at in np.searchsorted(ids, wanted)] if wanted else []
+
+
+def _replaced(rows: pa.Table, name: str, places: Sequence[int], values: Sequence[Any]) -> pa.Table:
+    """Rows with other values of a column at some places, which ascend."""
+    if not places:
+        return rows
+    at = rows.schema.get_field_index(name)
+    field = rows.schema.field(at)
+    mask = np.zeros(rows.num_rows, dtype=bool)
+    mask[list(places)] = True
+    column = rows[name].combine_chunks()
+    if isinstance(column, pa.ChunkedArray):
+        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], field.type)
+    changed = pc.replace_with_mask(column, pa.array(mask), pa.array(values, field.type))
+    return rows.set_column(at, field, changed)

@@ -1,0 +1,103 @@
+"""Values of assets as edits hold them, and how many σ two of them differ by."""
+
+from __future__ import annotations
+
+import datetime as dt
+import functools
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
+
+SIGMA_LEAST_M: Final = 0.005
+"""No evidence is taken as better than that."""
+_SIGMA_DEG: Final = 2.0
+_SIGMA_SLOPE: Final = 0.005
+_SIGMA_RATIO: Final = 0.1
+
+
+def encoded(value: Any) -> str:
+    """A value as JSON: dates as ISO 8601, geometries (bytes) as hexadecimal WKB."""
+    if isinstance(value, bytes):
+        value = value.hex()
+    elif isinstance(value, dt.date):
+        value = value.isoformat()
+    elif isinstance(value, np.generic):
+        value = value.item()
+    return json.dumps(value, ensure_ascii=False)
+
+
+def decoded(kind: str, attribute: str, text: str | None) -> Any:
+    """The value that :func:`encoded` wrote, as the column of the kind holds it."""
+    value = None if text is None else json.loads(text)
+    if value is None:
+        return None
+    if attribute == GEOMETRY:
+        return bytes.fromhex(value)
+    return dt.date.fromisoformat(value) if pa.types.is_date(asset_table(kind).field(attribute).type) else value
+
+
+def iso_wkb(geometries: npt.NDArray[Any]) -> list[bytes | None]:
+    """Geometries as ISO WKB, little-endian, with heights where they have them: same place, same bytes."""
+    return list(shapely.to_wkb(geometries, flavor="iso", byte_order=1))
+
+
+def iso_column(column: pa.ChunkedArray) -> pa.Array:
+    """A column of WKB of any flavour as ISO WKB."""
+    return pa.array(iso_wkb(shapely.from_wkb(column.to_numpy(zero_copy_only=False))), pa.binary())
+
+
+def sigmas_apart(kind: str, attribute: str, one: Any, other: Any, row: Mapping[str, Any]) -> float:
+    """By how many σ two values of an attribute differ; infinity where they differ and have no σ.
+
+    Parameters
+    ----------
+    row : the asset, whose `sigma_horizontal_m` and `sigma_height_m` are those of its evidence. Lengths are differences
+        of two of its points; of angles, slopes and ratios the σ is that of the method (2°, 0.005, 0.1).
+    """
+    if one == other:
+        return 0.0
+    if one is None or other is None:
+        return math.inf
+    horizontal = max(row.get("sigma_horizontal_m") or 0.0, SIGMA_LEAST_M)
+    height = max(row.get("sigma_height_m") or 0.0, SIGMA_LEAST_M)
+    if attribute == GEOMETRY:
+        return geometries_apart(one, other, horizontal, height)
+    sigma = sigma_of(kind, attribute)
+    if sigma is None or isinstance(one, str):
+        return math.inf
+    return float(abs(one - other) / sigma(horizontal, height, max(abs(one), abs(other))))
+
+
+def geometries_apart(one: bytes, other: bytes, horizontal_m: float, height_m: float) -> float:
+    """By how many σ two places differ: of points horizontally and in height, of others by their Hausdorff distance."""
+    first, second = shapely.from_wkb(one), shapely.from_wkb(other)
+    if first.geom_type == second.geom_type == "Point":
+        rise = abs(first.z - second.z) if first.has_z and second.has_z else 0.0
+        return max(math.hypot(first.x - second.x, first.y - second.y) / horizontal_m, rise / height_m)
+    return float(shapely.hausdorff_distance(first, second)) / horizontal_m
+
+
+Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
+"""σ of an attribute from σ in the horizontal, σ in height and the value, each a number or an array."""
+
+
+@functools.cache
+def sigma_of(kind: str, attribute: str) -> Sigma | None:
+    """How σ of a number follows from those of the place; None for texts, and where any difference counts."""
+    unit = next((c.unit for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), "")
+    of_unit: dict[str, Sigma] = {
+        "m": lambda horizontal, height, _: np.hypot(horizontal, height),
+        "m²": lambda horizontal, _, area: np.maximum(2.0 * np.sqrt(area) * horizontal, SIGMA_LEAST_M),
+        "deg": lambda horizontal, *_: _SIGMA_DEG + 0.0 * horizontal,
+        "m/m": lambda horizontal, *_: _SIGMA_SLOPE + 0.0 * horizontal,
+        "1": lambda horizontal, *_: _SIGMA_RATIO + 0.0 * horizontal,
+    }
+    return of_unit.get(unit)

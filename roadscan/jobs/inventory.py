@@ -1,0 +1,116 @@
+"""The inventory of a survey: its store, its home, and what the stage `assets` found."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+
+from roadscan.inventory.home import Home
+from roadscan.inventory.homes.geopackage import GeoPackage
+from roadscan.inventory.inventory import Inventory
+from roadscan.inventory.qgis.project import Raster
+from roadscan.inventory.recording import Found, Rules
+from roadscan.inventory.visibility import Unknown, Visibility, VisibilityGrid
+from roadscan.jobs.session import Session
+from roadscan.model.crs import crs_from_text
+from roadscan.model.errors import SchemaError
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.asset_truth import AssetTruth
+from roadscan.tables.store import Store, bytes_digest
+
+FOUND: Final = "products/assets"
+"""Folder of the tables of found assets, one a kind."""
+VISIBILITY: Final = f"{FOUND}/visibility.parquet"
+"""Passes by cell of the map; its schema metadata `edge_m` states the edge of a cell."""
+ADDRESS: Final = "ROADSCAN_POSTGIS"
+_BEHIND: Final = ("hillshade", "mosaic", "bare_earth")
+"""Products that stand behind the assets in QGIS, the uppermost first."""
+
+
+def open_inventory(session: Session) -> Inventory:
+    """The inventory that a survey belongs to.
+
+    Raises
+    ------
+    ConfigError
+        where PostGIS is asked for and its driver is missing.
+    """
+    return _opened(session, home_of(session))
+
+
+def truth_of(session: Session) -> Inventory:
+    """The same to look at alone: its home is a file that is not opened."""
+    return _opened(session, GeoPackage(Path("inventory.gpkg"), None))
+
+
+def _opened(session: Session, home: Home) -> Inventory:
+    settings, survey = session.survey.config.inventory, session.survey
+    url = survey.store_url
+    if settings.store is not None:
+        url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
+    name = settings.name or survey.config.id
+    frame = survey.config.map.frame()
+    own = session.store
+    rules = Rules(_visibility(own), settings.matching, frame.horizontal_unit_m)
+    return Inventory(
+        AssetTruth(Store(url, name)), home, name, rules, lambda: found_assets(session), frame.crs,
+        lambda folder: _rasters(session, folder),
+    )  # fmt: skip
+
+
+def home_of(session: Session, given: str | None = None) -> Home:
+    """The home that the survey file states, or another one: a GeoPackage or the address of a PostGIS database."""
+    settings, survey = session.survey.config.inventory, session.survey
+    crs = survey.config.map.frame().crs
+    address = given if given is not None else os.environ.get(ADDRESS) or settings.postgis
+    if address is not None and (given is None or "://" in given):
+        from roadscan.inventory.homes.postgis import PostGis
+
+        srid = None if crs is None else crs_from_text(crs).to_epsg()
+        return PostGis(address, settings.schema_name, srid)
+    return GeoPackage(Path(given) if given is not None else survey.resolve(settings.home), crs)
+
+
+def found_assets(session: Session) -> Found | None:
+    """What the newest run found; None before the stage `assets` has run."""
+    store = session.store
+    tables: dict[str, pa.Table] = {}
+    digests: list[str] = []
+    for kind in asset_kind_names():
+        file = f"{FOUND}/{asset_schema(kind).table}.parquet"
+        if store.exists(file):
+            content = store.read_bytes(file)
+            tables[kind] = store.parse_table(content, file)
+            digests.append(f"{kind}:{bytes_digest(content)}")
+    if not tables:
+        return None
+    key = bytes_digest("\n".join(digests).encode())
+    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch)
+
+
+def _visibility(store: Store) -> Visibility:
+    if not store.exists(VISIBILITY):
+        return Unknown()
+    cells = store.read_table(VISIBILITY)
+    edge = (cells.schema.metadata or {}).get(b"edge_m")
+    if edge is None:
+        raise SchemaError("the table of visibility does not state the edge of its cells", file=store.path(VISIBILITY))
+    return VisibilityGrid(cells, float(edge))
+
+
+def _rasters(session: Session, folder: Path) -> Sequence[Raster]:
+    """Mosaics of the survey, relative to a folder; none of a store that is no folder."""
+    if not session.store.is_folder:
+        return ()
+    found = []
+    for product in _BEHIND:
+        records = session.manifest.of(product).values()
+        paths = sorted(r.path for r in records if r.path and r.path.startswith("products/") and r.path.endswith(".tif"))
+        found += [
+            Raster(f"{product} {Path(path).stem}", os.path.relpath(session.store.path(path), folder)) for path in paths
+        ]
+    return found

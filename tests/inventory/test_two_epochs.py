@@ -1,0 +1,168 @@
+"""Two surveys of a street on which the test itself added, removed, moved and hid things."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+
+from roadscan.inventory.identity import new_ids
+from roadscan.inventory.recording import Found
+from roadscan.inventory.visibility import VisibilityGrid
+from roadscan.model.errors import ConfigError, SchemaError
+from tests.inventory.streets import AUTUMN, EAST, NORTH, SPRING, Everywhere, asset, found, inventory, poles
+
+COUNT = 400
+
+
+class Town:
+    """Poles and signs along both sides of a road, and what became of each."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+        self.kinds = ["pole" if n % 2 else "sign" for n in range(COUNT)]
+        self.places = np.column_stack([
+            np.arange(COUNT) * 4.0 + self.random.uniform(-1, 1, COUNT),
+            np.where(np.arange(COUNT) % 4 < 2, 5.0, -5.0) + self.random.uniform(-0.5, 0.5, COUNT),
+        ])  # fmt: skip
+        self.sizes = self.random.uniform(0.4, 6.0, COUNT)
+        fate = self.random.permutation(COUNT)
+        self.removed, self.moved = set(fate[:25].tolist()), set(fate[25:50].tolist())
+        self.hidden, self.added = set(fate[50:80].tolist()), set(fate[80:105].tolist())
+        turn = self.random.uniform(0, 2 * np.pi, COUNT)
+        self.shift = np.column_stack([np.cos(turn), np.sin(turn)]) * self.random.uniform(0.3, 1.5, (COUNT, 1))
+
+    def survey(self, when: dt.datetime) -> list[dict[str, Any]]:
+        """What a survey finds: each place with its σ, a lost asset now and then."""
+        is_second = when == AUTUMN
+        rows = []
+        for n in range(COUNT):
+            if n in (self.removed | self.hidden if is_second else self.added):
+                continue
+            x, y = self.places[n] + (self.shift[n] if is_second and n in self.moved else 0.0)
+            x, y = np.array([x, y]) + self.random.normal(0, 0.02, 2)
+            size = {"pole": "asset_height_m", "sign": "width_m"}[self.kinds[n]]
+            value = float(self.sizes[n] + self.random.normal(0, 0.02))
+            rows.append(asset(self.kinds[n], (x, y, 100.0), when=when, **{size: value}))
+        return rows
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_changes_of_the_road_are_found_and_what_is_hidden_is_never_gone(seed: int, tmp_path: Path) -> None:
+    town = Town(seed)
+    street = inventory(tmp_path, Everywhere(hidden=[tuple(town.places[n]) for n in town.hidden]))
+    street.record(found(town.survey(SPRING)))
+    first = {kind: street.assets(kind) for kind in ("pole", "sign")}
+    street.record(found(town.survey(AUTUMN)))
+    changes = street.changes()
+    assert changes is not None
+    assert changes.unseen == len(town.hidden)
+    told: dict[str, set[int]] = {"appeared": set(), "gone": set(), "moved": set()}
+    for one in changes.changes:
+        frame = first[one.kind] if one.change == "gone" or one.change == "moved" else street.assets(one.kind)
+        row = frame[frame["asset_id"] == one.asset_id].iloc[0]
+        place = np.array([row["easting_m"] - EAST, row["northing_m"] - NORTH])
+        told[one.change].add(int(np.argmin(np.hypot(*(town.places - place).T))))
+    for change, truth in (("appeared", town.added), ("gone", town.removed), ("moved", town.moved)):
+        right = len(told[change] & truth)
+        f1 = 2 * right / (len(told[change]) + len(truth))
+        assert f1 >= 0.95, (change, f1, sorted(told[change] ^ truth))
+    assert not told["gone"] & town.hidden
+    moved = [c for c in changes.changes if c.change == "moved"]
+    assert all(c.significance > 3 and c.distance_m > 0.2 for c in moved)
+
+
+def test_ids_stay_when_the_same_drives_are_processed_again(tmp_path: Path) -> None:
+    town = Town(4)
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(town.survey(SPRING), "spring"))
+    before = {one for kind in ("pole", "sign") for one in street.assets(kind)["asset_id"]}
+    for _ in range(3):
+        street.record(found(town.survey(SPRING), "spring"))
+    after = {one for kind in ("pole", "sign") for one in street.assets(kind)["asset_id"]}
+    assert len(before & after) / len(before) >= 0.995
+    assert len(after) == len(before)
+
+
+def test_lines_and_areas_are_known_again_though_their_ends_differ(tmp_path: Path) -> None:
+    def kerbs(shift: float, end: float) -> list[dict[str, Any]]:
+        return [
+            asset("kerb", *[(40.0 * n + x, 3.5 + shift, 100.0) for x in (0.0, 10.0, end)], step_m=0.12)
+            for n in range(5)
+        ] + [asset("sidewalk", *[(40.0 * n + x, y + shift, 100.1) for x, y in ((0, 4), (end, 4), (end, 6), (0, 6))])
+             for n in range(5)]  # fmt: skip
+
+    street = inventory(tmp_path, Everywhere(), kinds=("kerb", "sidewalk"))
+    street.record(found(kerbs(0.0, 30.0), "spring", ()))
+    before = {kind: list(street.assets(kind)["asset_id"]) for kind in ("kerb", "sidewalk")}
+    street.record(found(kerbs(0.03, 26.0), "spring", ()))
+    assert {kind: list(street.assets(kind)["asset_id"]) for kind in before} == before
+
+
+def test_a_sign_hangs_on_its_pole_and_a_pole_stands_on_its_sidewalk(tmp_path: Path) -> None:
+    street = inventory(tmp_path)
+    walk = asset("sidewalk", (0, 3, 100), (200, 3, 100), (200, 6, 100), (0, 6, 100))
+    street.record(found([*poles(3), walk, asset("sign", (20.1, 4.05, 102.5)), asset("sign", (70.0, 4.0, 102.5))]))
+    pole = street.assets("pole").sort_values("station_m")
+    (walk_id,) = street.assets("sidewalk")["asset_id"]
+    assert set(pole["parent"]) == {walk_id}
+    parents = list(street.assets("sign").sort_values("station_m")["parent"])
+    assert parents[0] == pole["asset_id"].iloc[1] and pd.isna(parents[1])
+
+
+def test_what_is_not_seen_says_how_many_passes_should_have(tmp_path: Path) -> None:
+    column, row = int((EAST + 40.0) // 5.0), int((NORTH + 4.0) // 5.0)
+    cells = pa.table({"column": [column, column - 4], "row": [row, row], "passes": [3, 0]})
+    street = inventory(tmp_path, VisibilityGrid(cells, 5.0))
+    street.record(found(poles(), "spring"))
+    ids = list(street.assets("pole").sort_values("station_m")["asset_id"])
+    street.record(found(poles(1, when=AUTUMN), "autumn"))
+    shown = street.assets("pole").set_index("asset_id")
+    assert (shown.loc[ids[2], "status"], shown.loc[ids[2], "passes_expected"]) == ("missing", 3)
+    assert (shown.loc[ids[1], "status"], shown.loc[ids[4], "status"]) == ("found", "found")
+    told = [(e.what, e.why) for e in street.history(ids[2])]
+    assert told == [("found", "epoch spring"), ("not seen", "epoch autumn; 3 passes should have")]
+
+
+def test_a_bad_run_is_undone_and_each_day_is_as_it_was(tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(poles(), "spring"))
+    good = street.assets("pole")
+    street.record(found([asset("pole", (7.0 * n, -3.0, 100.0)) for n in range(40)], "spring"))
+    assert len(street.assets("pole")) == 46
+    street.undo(2, why="wrong parameters")
+    assert street.assets("pole").equals(good)
+    assert len(street.assets("pole", as_of=2)) == 46
+    assert street.assets("pole", as_of=1).equals(good)
+    day = street.truth.commits[0].at[:10]
+    assert len(street.assets("pole", as_of=day)) == len(good)
+    assert len(street.assets("pole", as_of="2001-01-01")) == 0
+    assert Counter(d.change for d in street.diff(2)) == {"removed": 40, "changed": 6}  # six were said to be missing
+    with pytest.raises(ConfigError, match="commit 2 is undone already"):
+        street.undo(2)
+    street.undo(3)
+    assert len(street.assets("pole")) == 46
+    with pytest.raises(ConfigError, match="is no date"):
+        street.state("yesterday")
+
+
+def test_a_table_without_a_column_is_named_before_anything_is_written(tmp_path: Path) -> None:
+    street = inventory(tmp_path)
+    whole = found(poles())
+    tables = {**whole.tables, "pole": whole.tables["pole"].drop_columns(["sigma_height_m"])}
+    with pytest.raises(SchemaError, match="'poles' has no column 'sigma_height_m'"):
+        street.record(Found(tables, "key", "street"))
+    assert street.truth.commits == ()
+
+
+def test_ids_do_not_repeat() -> None:
+    made = new_ids("pole", ["a", "a", "b"], set())
+    assert len(set(made)) == 3
+    assert made == new_ids("pole", ["a", "a", "b"], set())
+    assert not set(new_ids("pole", ["a"], set(made))) & set(made)

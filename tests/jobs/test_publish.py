@@ -26,7 +26,7 @@ from roadscan.cli import app
 from roadscan.jobs.engine.compute import Inline
 from roadscan.jobs.publish import web_part
 from roadscan.jobs.publish.document import json_bytes
-from roadscan.jobs.publish.material import Material, Wishes, box_from_text
+from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.jobs.publish.parts import vectors
 from roadscan.jobs.publish.single import write_single
 from roadscan.jobs.publish.site import KEYS, Published, publish
@@ -37,6 +37,7 @@ from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
+from roadscan.products.site_rasters import Place, Raster, coarser_picture
 from roadscan.simulate import simulate, truth
 from tests.jobs.conftest import Lines, Simulated, small_scene
 
@@ -150,22 +151,57 @@ def test_heights_read_back_are_those_of_the_cells(survey_file: Path, published: 
     assert compared > 60
 
 
-def test_coarser_pictures_are_means(published: Published) -> None:
+def heights_of(published: Published, level: int) -> dict[tuple[int, int], int]:
+    """Numbers that stand for heights, by column and row of the pixel on the map."""
     entry = read(published, "survey.json")
-    levels = entry["raster_grid"]["levels"]
     height = next(r for r in entry["rasters"] if r["name"] == "height")
-    means = []
-    for level in (levels[0], levels[-1]):
-        rows = read(published, level["tiles"])["rows"]
-        places = [(c, row) for row, runs in rows for a, b in runs for c in range(a, b + 1)]
-        values = []
-        for column, row in places:
-            path = height["url"].format(level=level["level"], column=column, row=row)
+    edge, found = entry["raster_grid"]["tile_px"], {}
+    for row, runs in read(published, entry["raster_grid"]["levels"][level]["tiles"])["rows"]:
+        for column in (c for a, b in runs for c in range(a, b + 1)):
+            path = height["url"].format(level=level, column=column, row=row)
             picture = np.asarray(Image.open(published.folder / path)).astype(np.int64)
             number = 65536 * picture[..., 0] + 256 * picture[..., 1] + picture[..., 2]
-            values.append(height["offset"] + height["step"] * number[picture[..., 3] > 0])
-        means.append(np.concatenate(values).mean())
-    assert means[0] == pytest.approx(means[1], abs=0.02)
+            for y, x in np.argwhere(picture[..., 3] > 0).tolist():
+                found[column * edge + x, (row + 1) * edge - 1 - y] = int(number[y, x])
+    return found
+
+
+def test_pixels_of_the_next_level_are_means_of_the_finest(published: Published) -> None:
+    levels = read(published, "survey.json")["raster_grid"]["levels"]
+    factor = round(levels[1]["pixel_m"] / levels[0]["pixel_m"])
+    own: dict[tuple[int, int], list[int]] = {}
+    for (column, row), number in heights_of(published, 0).items():
+        own.setdefault((column // factor, row // factor), []).append(number)
+    coarse = heights_of(published, 1)
+    assert coarse.keys() == own.keys() and len(coarse) > 100
+    assert max(abs(number - np.mean(own[place])) for place, number in coarse.items()) <= 1.01
+
+
+@pytest.mark.parametrize("raster", ["height", "intensity"])
+def test_a_coarser_picture_is_the_mean_of_four_by_four_known_pixels(raster: Raster, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    edge, place = 8, Place(3, -2, 5)
+    bands = 4 if raster == "height" else 2
+    held: dict[Place, Path] = {}
+    whole = np.zeros((4 * edge, 4 * edge, bands), np.uint8)
+    for right, up in ((0, 0), (3, 1), (2, 3)):
+        picture = rng.integers(0, 256, (edge, edge, bands)).astype(np.uint8)
+        picture[..., -1] = np.where(rng.random((edge, edge)) < 0.6, 255, 0)
+        finer = Place(2, 4 * place.column + right, 4 * place.row + up)
+        held[finer] = tmp_path / f"{right}{up}.png"
+        Image.fromarray(picture).save(held[finer])
+        top = (3 - up) * edge
+        whole[top : top + edge, right * edge : (right + 1) * edge] = picture
+    coarser_picture(tmp_path / "out.png", raster, held.get, place, edge)
+    out = np.asarray(Image.open(tmp_path / "out.png")).astype(int)
+    for y in range(edge):
+        for x in range(edge):
+            block = whole[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].reshape(-1, bands).astype(int)
+            known = block[block[:, -1] > 0]
+            assert out[y, x, -1] == (255 if len(known) else 0)
+            if len(known):
+                weights = [65536, 256, 1] if bands == 4 else [1]
+                assert out[y, x, :-1] @ weights == round(float(np.mean(known[:, :-1] @ weights)))
 
 
 def test_a_cloud_holds_every_point_of_the_survey_once(survey_file: Path, published: Published) -> None:
@@ -294,6 +330,15 @@ def test_part_of_a_survey(survey_file: Path, published: Published, tmp_path: Pat
     assert entry["extent_m"][2] < east and entry["extent_m"][0] == west
     assert entry["raster_grid"]["levels"][0]["pixel_m"] >= 0.15 or len(entry["raster_grid"]["levels"]) == 1
     assert not (part.folder / "clouds").exists()
+
+
+def test_a_road_is_its_line_and_what_lies_beside_it(survey_file: Path, published: Published) -> None:
+    material = Material(opened(survey_file))
+    layer = next(one for one in read(published, "survey.json")["layers"] if one["name"] == "reference_lines")
+    grown = [v + d for v, d in zip(layer["parts"][0]["bounds_m"], (-20, -20, 20, 20), strict=True)]
+    assert box_of_road(material, "road1") == pytest.approx(grown, abs=1e-4)
+    with pytest.raises(ConfigError, match="there is no road 'road2'"):
+        box_of_road(material, "road2")
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "1,2,a,4", "5,0,1,2", "0,0,nan,1", ""])

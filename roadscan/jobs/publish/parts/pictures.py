@@ -72,8 +72,7 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
     near = material.wishes.near
     if near is not None:
         held = held.near(Bounds(*near))
-    there = [number for number in range(len(held)) if held.path(number).is_file()]
-    return held if len(held) and len(there) == len(held) else None
+    return held if any(held.path(number).is_file() for number in range(len(held))) else None
 
 
 def _bounds(held: PlacedPictures, numbers: list[int]) -> list[float]:

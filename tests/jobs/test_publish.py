@@ -28,6 +28,7 @@ from roadscan.jobs.publish import web_part
 from roadscan.jobs.publish.document import json_bytes
 from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.jobs.publish.parts import vectors
+from roadscan.jobs.publish.parts.strips import Strips
 from roadscan.jobs.publish.single import write_single
 from roadscan.jobs.publish.site import KEYS, Published, publish
 from roadscan.jobs.run import run_stages
@@ -330,6 +331,26 @@ def test_part_of_a_survey(survey_file: Path, published: Published, tmp_path: Pat
     assert entry["extent_m"][2] < east and entry["extent_m"][0] == west
     assert entry["raster_grid"]["levels"][0]["pixel_m"] >= 0.15 or len(entry["raster_grid"]["levels"]) == 1
     assert not (part.folder / "clouds").exists()
+
+
+def test_strips_of_another_survey_stand_beside_those_of_this_one(
+    survey_file: Path, published: Published, tmp_path: Path
+) -> None:
+    copy = Simulated(survey_file).copy_with_store_to(tmp_path / "survey")
+    text = copy.survey_file.read_text()
+    copy.survey_file.write_text(text.replace('id = "demo"', 'id = "later"', 1))
+    (copy.survey_file.parent / "store" / "survey=demo").rename(copy.survey_file.parent / "store" / "survey=later")
+    later = Session.open(copy.survey_file)
+    both = {d.path: d for d in Strips().documents(Material(opened(survey_file), over=(later,)))}
+    both["strips/index.json"].write(tmp_path / "index.json", Path)
+    lanes = json.loads((tmp_path / "index.json").read_bytes())["lanes"]
+    assert [(lane["survey"], lane["lane_id"]) for lane in lanes] == [
+        ("demo", 0), ("demo", 1), ("later", 2), ("later", 3),
+    ]  # fmt: skip
+    both["strips/2.json"].write(tmp_path / "2.json", Path)
+    assert json.loads((tmp_path / "2.json").read_bytes())["series"] == read(published, "strips/0.json")["series"]
+    with pytest.raises(ConfigError, match="twice"):
+        _ = Material(later, over=(later,)).others
 
 
 def test_a_road_is_its_line_and_what_lies_beside_it(survey_file: Path, published: Published) -> None:

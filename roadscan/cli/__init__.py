@@ -25,6 +25,7 @@ from roadscan.cli import (
     simulations,
     state,
 )
+from roadscan.cli import cameras, estimates, exports, logs, pages, profiles, queries, reports, runs, simulations, state
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
@@ -66,6 +67,8 @@ app.command("status")(state.status)
 app.command("verify")(state.verify)
 app.command("report")(reports.report)
 app.command("compare")(reports.compare)
+app.command("view")(pages.view)
+app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("where")(queries.where)
 app.command("export")(exports.export)

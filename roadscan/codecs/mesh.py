@@ -126,6 +126,16 @@ def check_glb(path: Path) -> None:
         raise StoreError("the glTF is damaged", change="make it again", file=path)
 
 
+def stated_in_glb(content: bytes) -> dict[str, Any]:
+    """What a glTF file states of its mesh (`asset.extras`)."""
+    try:
+        described = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+        stated: dict[str, Any] = described["asset"]["extras"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError("the glTF is cut short", change="make it again") from error
+    return stated
+
+
 def write_ply(path: Path, mesh: Mesh, about: Mapping[str, Any]) -> None:
     """Write binary little-endian PLY 1.0 (Turk 1994): x east, y north, z up, red, green, blue as screens show them.
 

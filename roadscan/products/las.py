@@ -189,11 +189,14 @@ def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
     record["point_source_id"] = points.pass_id
     record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
     record.array["bit_fields"] = ONE_OF_ONE
-    _copy_recorded(record, points)
+    copy_recorded(record, points)
+    for column in _further(points):
+        record[_RENAMED.get(column, column)] = points.extra[column]
     return record
 
 
-def _copy_recorded(record: Any, points: TilePoints) -> None:
+def copy_recorded(record: Any, points: TilePoints) -> None:
+    """Fill the dimensions of LAS that hold what a vendor's program recorded."""
     extra = points.extra
     for name in _AS_RECORDED:
         if name in extra:
@@ -204,8 +207,6 @@ def _copy_recorded(record: Any, points: TilePoints) -> None:
     if "flags" in extra:
         for name, bit in _FLAG_BITS.items():
             record[name] = (extra["flags"] & bit) != 0
-    for column in _further(points):
-        record[_RENAMED.get(column, column)] = extra[column]
 
 
 def adjusted_gps_s(epoch_gps_ns: Int64) -> Float64:

@@ -1,0 +1,175 @@
+"""A layer of vectors: what it is, and which there are: modules of `jobs/publish/layers/`, and entry points."""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.jobs.publish.material import Material
+from roadscan.plugins import found_kinds
+from roadscan.tables.schema import table_schema
+
+ENTRY_POINT_GROUP: Final = "roadscan.site_layers"
+
+Group = Literal["survey", "control", "condition", "distress", "assets"]
+Geometry = Literal["point", "line", "polygon"]
+
+BLUE, ORANGE, GREEN, RED, SKY, YELLOW, PURPLE, GREY = (
+    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#f0e442", "#cc79a7", "#9e9e9e",
+)  # fmt: skip
+"""Colours that all eyes tell apart (Okabe and Ito 2008), and a grey for what is not known."""
+
+GOOD_TO_POOR: Final = ("#4575b4", "#91bfdb", "#fee090", "#fc8d59", "#d73027")
+"""Five steps that all eyes tell apart (ColorBrewer 2, RdYlBu)."""
+
+
+@dataclass(frozen=True)
+class SiteColumn:
+    """A column of a layer's rows."""
+
+    name: str
+    unit: str
+    meaning: str
+    title: str = ""
+    sigma: str = ""
+    """Column that holds its 1 σ."""
+
+    def stated(self) -> dict[str, Any]:
+        """As the page reads it."""
+        title = self.title or self.name.replace("_", " ")
+        told = {"name": self.name, "title": title, "unit": self.unit, "meaning": self.meaning}
+        return told | ({"sigma": self.sigma} if self.sigma else {})
+
+
+@dataclass(frozen=True)
+class Style:
+    """How features are coloured: all alike, by classes of a number, or by values of a column."""
+
+    title: str
+    width_px: float
+    colour: str = BLUE
+    by: str = ""
+    limits: tuple[float, ...] = ()
+    """Limits between the classes, ascending; the colours are those of :data:`GOOD_TO_POOR`."""
+    values: Mapping[str, str] = field(default_factory=dict)
+    """Colour by value."""
+
+    def stated(self) -> dict[str, Any]:
+        """As the page reads it."""
+        told: dict[str, Any] = {"title": self.title, "by": self.by or None, "width_px": self.width_px}
+        if not self.by:
+            return told | {"colour": self.colour}
+        told["none"] = {"colour": GREY, "label": "not known"}
+        if self.values:
+            return told | {"values": [{"value": v, "colour": c, "label": v} for v, c in self.values.items()]}
+        return told | {"classes": list(_classes(self.limits))}
+
+
+def _classes(limits: Sequence[float]) -> Iterator[dict[str, Any]]:
+    ends: list[float | None] = [None, *limits, None]
+    places = np.linspace(0, len(GOOD_TO_POOR) - 1, len(limits) + 1).round().astype(int).tolist()
+    for low, high, place in zip(ends[:-1], ends[1:], places, strict=True):
+        label = f"below {high:g}" if low is None else f"{low:g} and above" if high is None else f"{low:g} to {high:g}"
+        yield {"from": low, "to": high, "colour": GOOD_TO_POOR[place], "label": label}
+
+
+@dataclass(frozen=True)
+class SiteLayer:
+    """A layer with its features."""
+
+    name: str
+    """Letters, digits and ``_``: it becomes a folder."""
+    title: str
+    group: Group
+    geometry: Geometry
+    order: int
+    """Layers are drawn in ascending order."""
+    shapes_m: npt.NDArray[Any]
+    """(n,) shapely geometries on the map."""
+    rows: Sequence[Mapping[str, Any]]
+    """(n,) values by column."""
+    columns: Sequence[SiteColumn]
+    styles: Sequence[Style]
+    """The first is shown at first."""
+    key: str = ""
+    """Column that tells features apart."""
+    label: str = ""
+    """Column whose text stands beside a feature."""
+    visible: bool = True
+    arrows: Mapping[str, Any] | None = None
+    """Columns of differences to be drawn as arrows: east, north, up (m), and how much longer they are drawn."""
+    evidence: Sequence[Sequence[Mapping[str, Any]]] = ()
+    """(n,) what shows each feature; none where this is empty."""
+
+
+class LayerKind(ABC):
+    """Layers of one kind; it reads small tables and records, never readings."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def layers(self, material: Material) -> Iterator[SiteLayer]:
+        """The layers that the survey has of this kind."""
+
+
+@functools.cache
+def layer_kinds() -> tuple[LayerKind, ...]:
+    """All kinds of layers, by name."""
+    known = found_kinds("roadscan.jobs.publish.layers", LayerKind, ENTRY_POINT_GROUP)
+    return tuple(kind() for kind in known.values())
+
+
+def schema_columns(table: str, names: Sequence[str]) -> list[SiteColumn]:
+    """Columns of a table of the store, those that a feature's row can hold; further names stand for themselves."""
+    known = {c.name: c for c in table_schema(table).columns}
+    return [
+        SiteColumn(n, known[n].unit, known[n].meaning, sigma=_sigma_of(n, names)) if n in known else SiteColumn(n, "", "")
+        for n in names
+    ]  # fmt: skip
+
+
+def _sigma_of(name: str, names: Sequence[str]) -> str:
+    place = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}
+    wanted = place.get(name, f"sigma_{name}")
+    return wanted if wanted in names and wanted != name else ""
+
+
+def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[SiteLayer]:
+    """A layer of all rows of a table with shapes, as `about` describes it; nothing where the survey has none."""
+    held = material.table(table)
+    if held is None or held.shapes_m is None or not held.rows.num_rows:
+        return
+    names = [f.name for f in held.rows.schema if not _is_list(f)]
+    rows = held.rows.select(names).to_pylist()
+    yield SiteLayer(
+        about.name, about.title, about.group, about.geometry, about.order, held.shapes_m, rows,
+        schema_columns(table, names), about.styles, about.key, about.label, about.visible, about.arrows,
+        [_tiles_shown(row) for row in rows] if "tiles" in names else (),
+    )  # fmt: skip
+
+
+def described(
+    name: str, title: str, group: Group, geometry: Geometry, order: int, styles: Sequence[Style], **further: Any
+) -> SiteLayer:
+    """A layer without features yet."""
+    return SiteLayer(name, title, group, geometry, order, np.empty(0, object), (), (), styles, **further)
+
+
+def line_of(places_m: npt.NDArray[np.float64]) -> Any:
+    """A line through places (n, 2 or 3), which may be a single one."""
+    return shapely.LineString(places_m if len(places_m) > 1 else np.repeat(places_m, 2, axis=0))
+
+
+def _is_list(column: Any) -> bool:
+    return str(column.type).startswith(("list", "fixed_size_list"))
+
+
+def _tiles_shown(row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [{"title": f"tile {one}", "kind": "tile", "tile": one} for one in str(row["tiles"] or "").split()]

@@ -1,0 +1,1 @@
+"""Kinds of layers of the site, a file a kind."""

@@ -1,0 +1,49 @@
+"""Layer of control and check points with their residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from roadscan.jobs.publish.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_columns
+from roadscan.jobs.publish.material import Material
+from roadscan.jobs.readings import read_groups
+
+_STYLE = Style("Role", 9, by="role", values={"gcp": BLUE, "check": RED})
+_ARROWS = {
+    "east": "easting_after_m", "north": "northing_after_m", "up": "height_after_m", "exaggeration": 1000,
+}  # fmt: skip
+
+
+class Control(LayerKind):
+    """A point a run that saw it, with what is left of surveyed minus measured; before an adjustment the points alone."""
+
+    name = "control"
+
+    def layers(self, material: Material) -> Iterator[SiteLayer]:
+        """One layer; none without surveyed points."""
+        held = material.table("control_residuals")
+        if held is not None and held.rows.num_rows:
+            yield _layer("control_residuals", held.rows, _ARROWS)
+            return
+        points = [
+            read_groups(material.store, file.path, range(len(file.group_rows)))
+            for record in material.plan.records
+            for file in record.tables.get("control_points", ())
+        ]
+        if points and sum(rows.num_rows for rows in points):
+            yield _layer("control_points", pa.concat_tables(points), None)
+
+
+def _layer(table: str, rows: pa.Table, arrows: dict[str, Any] | None) -> SiteLayer:
+    east, north = (rows.column(name).to_numpy() for name in ("easting_m", "northing_m"))
+    columns = schema_columns(table, rows.column_names)
+    shapes = np.asarray(shapely.points(east, north))
+    return SiteLayer(
+        "control", "Control and check points", "control", "point", 500, shapes, rows.to_pylist(), columns, [_STYLE],
+        key="name", label="name", arrows=arrows,
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""What the parts of a site are made of; what several of them ask for is found once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.plan.plan import SurveyPlan
+from roadscan.jobs.products import StoredTiles, product_context
+from roadscan.jobs.session import Session
+from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE
+from roadscan.jobs.tiles.tiles import summary_of
+from roadscan.model.ids import TileId
+from roadscan.products.base import ProductContext, TileSummary
+from roadscan.products.geo_table import read_geo_table
+from roadscan.tables.manifest import OutputRecord, read_recorded
+from roadscan.tables.schema import table_schema
+from roadscan.tables.store import Store
+
+SHEET_M: Final = 1000.0
+"""Edge of a kilometre sheet."""
+
+Box = tuple[float, float, float, float]
+"""Least easting and northing, greatest easting and northing (m)."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a site is to hold."""
+
+    clouds: bool = True
+    """Point clouds."""
+    pictures: bool = True
+    """Pictures of cameras."""
+    finest_pixel_m: float = 0.0
+    """Rasters with finer pixels are left out."""
+    near: Box | None = None
+    """Only what lies in this box of the map; all where it is None."""
+
+
+@dataclass(frozen=True)
+class SiteTable:
+    """Rows of a table with their shapes."""
+
+    rows: pa.Table
+    shapes_m: npt.NDArray[Any] | None
+    """(n,) shapely geometries on the map; None for a table without."""
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A survey as the parts of its site ask for it."""
+
+    session: Session
+    wishes: Wishes = field(default_factory=Wishes)
+
+    @property
+    def store(self) -> Store:
+        """Where the survey lies."""
+        return self.session.store
+
+    @cached_property
+    def plan(self) -> SurveyPlan:
+        """What places the readings."""
+        return self.session.plan
+
+    @cached_property
+    def context(self) -> ProductContext:
+        """What products know of the survey."""
+        return product_context(self.plan)
+
+    @cached_property
+    def tiles(self) -> dict[TileId, OutputRecord]:
+        """Records of all tiles that hold cells, by row and column."""
+        found = {TileId.parse(r.unit): r for r in self.session.manifest.of(TILE).values() if r.path}
+        return {t: found[t] for t in sorted(found, key=lambda t: (t.row, t.column)) if self._is_near(t)}
+
+    @cached_property
+    def summaries(self) -> dict[TileId, TileSummary]:
+        """Figures of those tiles."""
+        return {tile: one for tile, record in self.tiles.items() if (one := summary_of(record)) is not None}
+
+    @cached_property
+    def sheets(self) -> dict[str, tuple[TileId, ...]]:
+        """Tiles of each kilometre sheet by its name; a tile lies in the sheet of its south-west corner."""
+        found: dict[str, list[TileId]] = {}
+        for tile in self.tiles:
+            box = self.context.grid.bounds(tile)
+            found.setdefault(sheet_name(box.easting_min_m, box.northing_min_m), []).append(tile)
+        return {name: tuple(found[name]) for name in sorted(found)}
+
+    @cached_property
+    def extent_m(self) -> Box | None:
+        """Box of all tiles; None without any."""
+        if not self.tiles:
+            return None
+        boxes = [self.context.grid.bounds(tile) for tile in self.tiles]
+        return (
+            min(b.easting_min_m for b in boxes), min(b.northing_min_m for b in boxes),
+            max(b.easting_max_m for b in boxes), max(b.northing_max_m for b in boxes),
+        )  # fmt: skip
+
+    def cells(self, tiles: Sequence[TileId] | None = None) -> StoredTiles:
+        """Cells and overviews of tiles, all of them unless some are named."""
+        chosen = self.tiles if tiles is None else {t: self.tiles[t] for t in tiles if t in self.tiles}
+        overviews = self.session.manifest.of(OVERVIEWS)
+        own = [overviews[r.unit] for r in chosen.values() if r.unit in overviews and overviews[r.unit].key == r.key]
+        return StoredTiles(self.store, list(chosen.values()), [r for r in own if r.path], self.context)
+
+    def records(self, table: str) -> list[OutputRecord]:
+        """Records of the Parquet files of a table, by path."""
+        location = table_schema(table).location
+        found = (r for r in self.session.manifest.all() if r.path.endswith(".parquet"))
+        return sorted((r for r in found if r.path.startswith(f"{location}/")), key=lambda r: r.path)
+
+    def table(self, name: str) -> SiteTable | None:
+        """All rows of a table of the store; None where it has no file."""
+        return self.rows_of(self.records(name))
+
+    def rows_of(self, records: Sequence[OutputRecord]) -> SiteTable | None:
+        """Rows of some files of one table."""
+        parts, shapes = [], []
+        for record in records:
+            content = read_recorded(self.store, record)
+            rows = self.store.parse_table(content, record.path)
+            if b"geo" in (rows.schema.metadata or {}):
+                rows, own = read_geo_table(content, self.context)
+                shapes.append(self._in_metres(own))
+            parts.append(rows.replace_schema_metadata(None))
+        if not parts:
+            return None
+        joined = pa.concat_tables(parts, promote_options="permissive")
+        return SiteTable(joined, np.concatenate(shapes) if shapes else None)
+
+    def key(self, records: Sequence[OutputRecord], *parts: Any) -> str:
+        """Hash of the content of files, and of what else shapes a document."""
+        return key_of([(r.unit, r.digest) for r in records], *parts)
+
+    def _in_metres(self, shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Shapes whose heights, too, are in metres; :func:`read_geo_table` turns easting and northing alone."""
+        unit_m = self.context.map.vertical_unit_m
+        if unit_m == 1.0 or not shapely.has_z(shapes).any():
+            return shapes
+        turned: npt.NDArray[Any] = shapely.transform(shapes, lambda p: p * [1.0, 1.0, unit_m], include_z=True)
+        return turned
+
+    def _is_near(self, tile: TileId) -> bool:
+        near, box = self.wishes.near, self.context.grid.bounds(tile)
+        return near is None or (
+            box.easting_min_m < near[2] and near[0] < box.easting_max_m
+            and box.northing_min_m < near[3] and near[1] < box.northing_max_m
+        )  # fmt: skip
+
+
+def sheet_name(easting_m: float, northing_m: float) -> str:
+    """Name of the kilometre sheet that holds a place: whole kilometres of easting and northing."""
+    return f"{int(easting_m // SHEET_M)}_{int(northing_m // SHEET_M)}"
+
+
+def box_of(shapes: npt.NDArray[Any]) -> list[float]:
+    """Box of shapes (m), to the hundredth of a millimetre."""
+    return [round(float(v), 5) for v in shapely.total_bounds(shapes)]

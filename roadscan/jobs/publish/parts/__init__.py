@@ -1,0 +1,1 @@
+"""Parts of the site, a file a part."""

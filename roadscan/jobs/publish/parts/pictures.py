@@ -1,0 +1,141 @@
+"""Pictures of cameras with their poses."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from roadscan.code_reach import code_digest
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.publish.document import Ask, Document, json_document
+from roadscan.jobs.publish.material import Material, sheet_name
+from roadscan.jobs.publish.part import SitePart
+from roadscan.jobs.surfaces.pictures import Pictures as PlacedPictures
+from roadscan.jobs.surfaces.pictures import plan_pictures
+from roadscan.model.errors import DamagedError, RoadscanError
+from roadscan.points.picture_axes import camera_from_map
+from roadscan.points.views import HEIGHT, WIDTH, PictureRule
+from roadscan.tiles.grid import Bounds
+
+_RULE: Final = PictureRule((), 30.0, 0.0, 1)
+"""All cameras with an interior orientation."""
+_SHOWN_AS_THEY_ARE: Final = {".jpg": ".jpg", ".jpeg": ".jpg", ".png": ".png", ".webp": ".webp"}
+_LENS: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+_CODE: Final = "roadscan.jobs.publish.parts.pictures"
+
+
+class Pictures(SitePart):
+    """Pictures that have a pose, by kilometre sheet of the camera."""
+
+    name = "pictures"
+    position = 600
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Where the index lies."""
+        held = placed_pictures(material)
+        return {"pictures": {"url": "pictures/index.json", "pictures": len(held)} if held is not None else None}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """The index, poses by sheet, and the pictures."""
+        held = placed_pictures(material)
+        if held is None:
+            return
+        sheets: dict[str, list[int]] = {}
+        for number, (east, north) in enumerate(held.place_m.tolist()):
+            sheets.setdefault(sheet_name(east, north), []).append(number)
+        parts = [
+            {"url": f"pictures/{name}.json", "bounds_m": _bounds(held, numbers), "pictures": len(numbers)}
+            for name, numbers in sorted(sheets.items())
+        ]
+        yield json_document("pictures/index.json", {"cameras": _cameras(held), "parts": parts})
+        for name, numbers in sorted(sheets.items()):
+            yield json_document(f"pictures/{name}.json", _poses(held, numbers))
+        for number in range(len(held)):
+            yield Document(_url(held, number), _key(held, number), _copied(held, number))
+
+
+@functools.lru_cache(maxsize=2)
+def placed_pictures(material: Material) -> PlacedPictures | None:
+    """Pictures with poses; None where the survey has none, or none is wished for."""
+    if not material.wishes.pictures:
+        return None
+    try:
+        held = plan_pictures(material.plan, _RULE)
+    except RoadscanError:
+        return None  # no camera, no interior orientation, no picture with a pose: the page goes without
+    near = material.wishes.near
+    if near is not None:
+        held = held.near(Bounds(*near))
+    there = [number for number in range(len(held)) if held.path(number).is_file()]
+    return held if len(held) and len(there) == len(held) else None
+
+
+def _bounds(held: PlacedPictures, numbers: list[int]) -> list[float]:
+    own = held.place_m[numbers]
+    return [round(float(v), 3) for v in (*own.min(axis=0), *own.max(axis=0))]
+
+
+def _cameras(held: PlacedPictures) -> list[dict[str, Any]]:
+    found = []
+    for number, log in enumerate(held.logs):
+        own = np.flatnonzero(held.log == number)
+        if not own.size:
+            continue
+        lens = held.views.lenses[int(held.views.lens[own[0]])]
+        values = dict(zip(_LENS, lens.parameters.tolist(), strict=False))
+        found.append(
+            {
+                "camera": number, "run": log.run, "title": log.sensor, "model": "perspective",
+                "width_px": round(float(lens.parameters[WIDTH])), "height_px": round(float(lens.parameters[HEIGHT])),
+                "focal_px": [values["fx"], values["fy"]], "principal_px": [values["cx"], values["cy"]],
+                "distortion": [values[n] for n in _LENS[4:]],
+            }
+        )  # fmt: skip
+    return found
+
+
+def _poses(held: PlacedPictures, numbers: list[int]) -> dict[str, Any]:
+    views = held.views.picked(np.array(numbers, np.int64))
+    place, turn = np.empty((len(numbers), 3)), np.empty((len(numbers), 3, 3))
+    for world, name in enumerate(held.worlds):
+        own = views.world == world
+        if own.any():
+            place[own], turn[own] = camera_from_map(
+                held.map, name, views.eye_world_m[own], views.opencv_from_world[own]
+            )
+    return {
+        "pictures": len(numbers), "id": numbers, "camera": [int(held.log[k]) for k in numbers],
+        "url": [_url(held, k) for k in numbers], "name": [held.name(k) for k in numbers],
+        "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
+        "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9), "sigma_m": [None] * len(numbers),
+    }  # fmt: skip
+
+
+def _url(held: PlacedPictures, number: int) -> str:
+    suffix = _SHOWN_AS_THEY_ARE.get(held.path(number).suffix.lower(), ".jpg")
+    return f"pictures/{int(held.log[number])}/{number:06d}{suffix}"
+
+
+def _key(held: PlacedPictures, number: int) -> str:
+    return key_of(code_digest(_CODE), held.logs[int(held.log[number])].key, held.files[number])
+
+
+def _copied(held: PlacedPictures, number: int) -> Any:
+    def write(path: Path, _ask: Ask) -> None:
+        source = held.path(number)
+        try:
+            if source.suffix.lower() in _SHOWN_AS_THEY_ARE:
+                path.write_bytes(source.read_bytes())
+                return
+            from PIL import Image
+
+            with Image.open(source) as image:
+                image.convert("RGB").save(path, format="JPEG", quality=90)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise DamagedError(f"the picture {held.name(number)} cannot be read: {error}", file=source) from error
+
+    return write

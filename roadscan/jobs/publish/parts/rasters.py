@@ -1,0 +1,185 @@
+"""Rasters: height, hillshade and intensity in levels, as square pictures in the survey's own map."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from roadscan.code_reach import code_digest
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.publish.document import Ask, Document, json_document
+from roadscan.jobs.publish.material import Material
+from roadscan.jobs.publish.part import SitePart
+from roadscan.products.site_rasters import (
+    COARSER,
+    HEIGHT_STEP_M,
+    RASTERS,
+    Place,
+    Pyramid,
+    Raster,
+    Scales,
+    TileWindows,
+    coarser_picture,
+    write_picture,
+)
+
+_CODE: Final = ("roadscan.products.site_rasters", "roadscan.jobs.products:StoredTiles")
+_PATH: Final = re.compile(r"rasters/(height|hillshade|intensity)/(\d+)/(-?\d+)_(-?\d+)\.png")
+_ABOUT: Final[dict[Raster, dict[str, Any]]] = {
+    "height": {"title": "Height", "unit": "m", "encoding": "rgb24", "colours": "viridis", "order": 10, "visible": False},
+    "hillshade": {"title": "Hillshade", "unit": "", "encoding": "grey8", "colours": "grey", "order": 20, "visible": True},
+    "intensity": {
+        "title": "Intensity", "unit": "counts", "encoding": "grey8", "colours": "grey", "order": 30, "visible": False,
+    },
+}  # fmt: skip
+
+
+class Rasters(SitePart):
+    """All rasters have the same levels and pictures."""
+
+    name = "rasters"
+    position = 300
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Levels, and what the numbers of each raster stand for."""
+        images = images_of(material)
+        if not material.tiles or not images.levels:
+            return {"raster_grid": None, "rasters": []}
+        return {
+            "raster_grid": {"tile_px": images.pyramid.tile_px, "levels": [images.about(k) for k in images.levels]},
+            "rasters": [images.told(raster) for raster in RASTERS],
+        }
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """Which pictures there are, level by level, and then all pictures, those of one place together."""
+        images = images_of(material)
+        for number, level in enumerate(images.levels if material.tiles else ()):
+            yield json_document(f"rasters/tiles_{number}.json", {"level": number, "rows": images.runs(level)})
+        for level in images.levels if material.tiles else ():
+            for column, row in images.pyramid.places(level).tolist():
+                for raster in RASTERS:
+                    yield images.document(raster, Place(level, column, row))
+
+    def find(self, material: Material, path: str) -> Document | None:
+        """A picture by its path."""
+        found, images = _PATH.fullmatch(path), images_of(material)
+        if found is None or not material.tiles or int(found[2]) >= len(images.levels):
+            return None
+        place = Place(images.levels[int(found[2])], int(found[3]), int(found[4]))
+        named = next(raster for raster in RASTERS if raster == found[1])
+        return images.document(named, place) if images.is_there(place) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Pictures of a survey's rasters."""
+
+    material: Material
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """Levels over the survey's tiles."""
+        return Pyramid(self.material.context.grid, tuple(self.material.tiles))
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        """Levels of the pyramid that the site has; they are numbered from 0 there."""
+        finest = self.material.wishes.finest_pixel_m
+        known = range(len(self.pyramid.factors)) if self.material.tiles else range(0)
+        always = self.pyramid.stored_levels - 1 if self.material.tiles else 0  # coarser ones are made from it
+        return tuple(k for k in known if k >= always or self.pyramid.pixel_m(k) >= finest - 1e-12)
+
+    @cached_property
+    def scales(self) -> Scales:
+        """What numbers stand for."""
+        return Scales.of(self.material.summaries.values())
+
+    @cached_property
+    def _windows(self) -> TileWindows:
+        return TileWindows(self.pyramid, self.material.cells())
+
+    def is_there(self, place: Place) -> bool:
+        """True for a picture that a tile lies in."""
+        return (place.column, place.row) in self._there(place.level)
+
+    def about(self, level: int) -> dict[str, Any]:
+        """A level as the page reads it."""
+        places = self.pyramid.places(level)
+        low, high = places.min(axis=0).tolist(), places.max(axis=0).tolist()
+        pixel_m, number = self.pyramid.pixel_m(level), self.levels.index(level)
+        return {
+            "level": number, "pixel_m": pixel_m, "tile_m": pixel_m * self.pyramid.tile_px,
+            "columns": [low[0], high[0]], "rows": [low[1], high[1]], "count": len(places),
+            "tiles": f"rasters/tiles_{number}.json",
+        }  # fmt: skip
+
+    def told(self, raster: Raster) -> dict[str, Any]:
+        """A raster as the page reads it."""
+        heights = [(s.height_min_m, s.height_max_m) for s in self.material.summaries.values()]
+        scale = {
+            "height": (self.scales.height_offset_m, HEIGHT_STEP_M, min(h[0] for h in heights), max(h[1] for h in heights)),
+            "hillshade": (0, 1, 1, 255),
+            "intensity": (0.0, self.scales.intensity_step, 0.0, 255 * self.scales.intensity_step),
+        }[raster]
+        named = dict(zip(("offset", "step", "from", "to"), scale, strict=True))
+        return {"name": raster, **_ABOUT[raster], **named, "url": f"rasters/{raster}/{{level}}/{{column}}_{{row}}.png"}
+
+    def runs(self, level: int) -> list[list[Any]]:
+        """Rows, and first and last column of their pictures' runs."""
+        rows: dict[int, list[list[int]]] = {}
+        for row, column in sorted((r, c) for c, r in self._there(level)):
+            runs = rows.setdefault(row, [])
+            if runs and runs[-1][1] == column - 1:
+                runs[-1][1] = column
+            else:
+                runs.append([column, column])
+        return [[row, runs] for row, runs in rows.items()]
+
+    def document(self, raster: Raster, place: Place) -> Document:
+        """A picture."""
+        number = self.levels.index(place.level)
+        path = f"rasters/{raster}/{number}/{place.column}_{place.row}.png"
+        return Document(path, self._key(raster, place), lambda file, ask: self._write(file, ask, raster, place))
+
+    def _write(self, path: Path, ask: Ask, raster: Raster, place: Place) -> None:
+        if place.level < self.pyramid.stored_levels:
+            window = self._windows.window(place)
+            write_picture(path, raster, window, self.pyramid.pixel_m(place.level), self.scales)
+            return
+
+        def below(finer: Place) -> Path | None:
+            return ask(self.document(raster, finer).path) if self.is_there(finer) else None
+
+        coarser_picture(path, raster, below, place, self.pyramid.tile_px)
+
+    @functools.lru_cache(maxsize=64)  # noqa: B019  it lives as long as the process that publishes
+    def _there(self, level: int) -> frozenset[tuple[int, int]]:
+        return frozenset((c, r) for c, r in self.pyramid.places(level).tolist())
+
+    def _key(self, raster: Raster, place: Place) -> str:
+        """Hash of the tiles that a picture shows, and of how."""
+        tiles = self.material.tiles
+        if place.level < self.pyramid.stored_levels:
+            parts: Any = [tiles[t].digest for t in self.pyramid.tiles_in(place.level, place)]
+        else:
+            steps = range(COARSER)
+            below = [
+                Place(place.level - 1, COARSER * place.column + c, COARSER * place.row + r) for r in steps for c in steps
+            ]
+            parts = [self._held_key(raster, one) for one in below if self.is_there(one)]
+        return key_of(code_digest(*_CODE), raster, place, parts, self.scales, self.pyramid.pixel_m(place.level))
+
+    @functools.lru_cache(maxsize=200_000)  # noqa: B019  as above
+    def _held_key(self, raster: Raster, place: Place) -> str:
+        return self._key(raster, place)
+
+
+@functools.lru_cache(maxsize=2)
+def images_of(material: Material) -> Images:
+    """Pictures of a survey; the same object for the same material."""
+    return Images(material)

@@ -1,0 +1,182 @@
+"""Strips: values along each lane by station, and its cross-sections."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from roadscan.code_reach import code_digest
+from roadscan.condition.index import condition_indices
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.publish.document import Ask, Document, json_bytes, json_document
+from roadscan.jobs.publish.material import Material
+from roadscan.jobs.publish.part import SitePart
+from roadscan.tables.manifest import OutputRecord
+
+_SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")
+_TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
+_CODE: Final = "roadscan.jobs.publish.parts.strips"
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """A lane with the files of its values."""
+
+    number: int
+    row: Mapping[str, Any]
+    """Of the table `lanes`."""
+    station_m: Float64
+    """(n,) of the middle's vertices."""
+    middle_m: Float64
+    """(n, 2) easting and northing."""
+    values: tuple[OutputRecord, ...]
+    cross_sections: tuple[OutputRecord, ...]
+
+    @property
+    def url(self) -> str:
+        """Where its strip lies."""
+        return f"strips/{self.number}.json"
+
+    def direction_deg(self, station_m: float) -> float:
+        """Direction of travel at a station, clockwise from map north (degrees)."""
+        at = int(np.clip(np.searchsorted(self.station_m, station_m, side="right") - 1, 0, self.station_m.size - 2))
+        east, north = (self.middle_m[at + 1] - self.middle_m[at]).tolist()
+        turned = 180.0 if self.row["direction"] == "backward" else 0.0
+        return round((float(np.degrees(np.arctan2(east, north))) + turned) % 360.0, 4)
+
+
+class Strips(SitePart):
+    """All lanes of the survey's roads."""
+
+    name = "strips"
+    position = 200
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Where the index lies."""
+        lanes = lanes_of(material)
+        return {"strips": {"url": "strips/index.json", "lanes": len(lanes)} if lanes else None}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """The index, a file a lane, and its cross-sections by the files of the table."""
+        lanes = lanes_of(material)
+        if not lanes:
+            return
+        told = [_about(material, lane) for lane in lanes]
+        yield json_document("strips/index.json", {"lanes": told, **_quantities()})
+        for lane in lanes:
+            yield _later(lane.url, material.key(lane.values, lane.row), _strip(material, lane))
+            for place, record in enumerate(lane.cross_sections):
+                yield _later(_crossing_url(lane, place), material.key([record], lane.row), _crossings(material, lane, record))
+
+
+def _later(path: str, key: str, make: Any) -> Document:
+    """A document whose tables are read when it is written."""
+
+    def write(file: Path, _ask: Ask) -> None:
+        file.write_bytes(json_bytes(make()))
+
+    return Document(path, key_of(code_digest(_CODE), key), write)
+
+
+@functools.lru_cache(maxsize=2)
+def lanes_of(material: Material) -> tuple[Lane, ...]:
+    """Lanes with any values, in the order of the table; those of a box that is wished for."""
+    held = material.table("lanes")
+    if held is None or held.shapes_m is None:
+        return ()
+    values, crossings = material.records("condition_values"), material.records("cross_sections")
+    near = None if material.wishes.near is None else shapely.box(*material.wishes.near)
+    found: list[Lane] = []
+    names = [f.name for f in held.rows.schema if not pa.types.is_list(f.type)]
+    for row, shape in zip(held.rows.select(names).to_pylist(), held.shapes_m, strict=True):
+        middle = shapely.get_coordinates(shape)
+        if near is not None and not shape.intersects(near):
+            continue
+        stations = np.linspace(row["station_from_m"], row["station_to_m"], len(middle))
+        own = f"{row['road']}/{row['lane']}"
+        of_lane = tuple(r for r in values if r.path.rsplit("/", 1)[0].endswith(f"/{own}"))
+        crossed = tuple(r for r in crossings if r.path.rsplit("/", 1)[0].endswith(f"/{own}"))
+        if len(middle) > 1 and of_lane:
+            found.append(Lane(len(found), row, stations, middle, of_lane, crossed))
+    return tuple(found)
+
+
+def _about(material: Material, lane: Lane) -> dict[str, Any]:
+    spans = []
+    for place, record in enumerate(lane.cross_sections):
+        stations = material.store.read_table(record.path, ["station_m"]).column("station_m").to_numpy()
+        if stations.size:
+            ends = {"from_m": float(stations.min()), "to_m": float(stations.max())}
+            spans.append({**ends, "url": _crossing_url(lane, place)})
+    return {
+        "lane_id": lane.number, "survey": material.context.survey_id, "road": lane.row["road"], "name": None,
+        "lane": lane.row["lane"], "direction": lane.row["direction"],
+        "station_m": [float(lane.station_m[0]), float(lane.station_m[-1])], "url": lane.url, "cross_sections": spans,
+    }  # fmt: skip
+
+
+def _crossing_url(lane: Lane, place: int) -> str:
+    return f"strips/{lane.number}_{place}.json"
+
+
+def _quantities() -> dict[str, Any]:
+    known = condition_indices().values()
+    quantities = [
+        {"name": q.name, "title": q.name.replace("_", " "), "unit": q.unit, "meaning": q.meaning}
+        for index in known
+        for q in index.quantities
+    ]
+    return {"quantities": quantities, "panels": [{"title": i.title, "quantities": i.drawn} for i in known if i.drawn]}
+
+
+def _strip(material: Material, lane: Lane) -> Any:
+    def make() -> dict[str, Any]:
+        held = material.rows_of(lane.values)
+        series = [] if held is None else list(_series(held.rows))
+        east, north = (np.round(lane.middle_m[:, k], 4) for k in (0, 1))
+        line = {"station_m": lane.station_m, "easting_m": east, "northing_m": north}
+        return {
+            "lane_id": lane.number, "survey": material.context.survey_id, "road": lane.row["road"],
+            "lane": lane.row["lane"], "direction": lane.row["direction"], "line": line, "series": series,
+        }  # fmt: skip
+
+    return make
+
+
+def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
+    """Values of each quantity of sections and of cross-sections, by station."""
+    ordered = rows.sort_by([(n, "ascending") for n in ("quantity", "extent", "station_from_m", "station_to_m")])
+    kinds = ordered.select(["quantity", "extent"]).group_by(["quantity", "extent"], use_threads=False).aggregate([])
+    for kind in sorted(kinds.to_pylist(), key=lambda k: (k["quantity"], k["extent"])):
+        both = pc.and_(pc.equal(ordered["quantity"], kind["quantity"]), pc.equal(ordered["extent"], kind["extent"]))
+        own = ordered.filter(both)
+        yield {**kind, **{told: own.column(name).to_pylist() for name, told in zip(_SERIES, _TOLD, strict=True)}}
+
+
+def _crossings(material: Material, lane: Lane, record: OutputRecord) -> Any:
+    def make() -> dict[str, Any]:
+        held = material.rows_of([record])
+        rows: Sequence[Mapping[str, Any]] = [] if held is None else held.rows.to_pylist()
+        stations = [row["station_m"] for row in rows]
+        sections = [_crossing(lane, row) for row in rows]
+        ends = {"from_m": min(stations, default=0.0), "to_m": max(stations, default=0.0)}
+        return {"lane_id": lane.number, **ends, "sections": sections}
+
+    return make
+
+
+def _crossing(lane: Lane, row: Mapping[str, Any]) -> dict[str, Any]:
+    told = {name: row[name] for name in ("station_m", "easting_m", "northing_m", "first_m", "step_m", "height_m")}
+    relative_mm = np.round(1000.0 * np.array(row["relative_height_m"], np.float64), 3)
+    return {**told, "direction_deg": lane.direction_deg(row["station_m"]), "relative_height_mm": relative_mm}

@@ -14,6 +14,8 @@ export interface DecodeTask {
   offset: [number, number, number]
   /** What positions count from (m). */
   origin: [number, number, number]
+  /** Middle of the node's cube (m): it parts the points by the child that lies where they are. */
+  middle: [number, number, number]
 }
 
 export interface Decoded {
@@ -25,6 +27,8 @@ export interface Decoded {
   intensity: Uint16Array<ArrayBuffer>
   classes: Uint8Array<ArrayBuffer>
   pass: Uint16Array<ArrayBuffer>
+  /** Which of the eight children lies there: x, y and z beyond the middle count 1, 2 and 4. */
+  octant: Uint8Array<ArrayBuffer>
   rgb: Uint8Array<ArrayBuffer> | null
 }
 
@@ -44,6 +48,7 @@ async function decode(task: DecodeTask): Promise<Decoded> {
     intensity: new Uint16Array(count),
     classes: new Uint8Array(count),
     pass: new Uint16Array(count),
+    octant: new Uint8Array(count),
     rgb: format === 7 || format === 8 ? new Uint8Array(count * 3) : null,
   }
   try {
@@ -64,13 +69,17 @@ async function decode(task: DecodeTask): Promise<Decoded> {
 }
 
 /** One record of the point formats 6 to 8 (LAS 1.4 R15, table 10). */
-function read(view: DataView, index: number, into: Decoded, { scale, offset, origin }: DecodeTask): void {
+function read(view: DataView, index: number, into: Decoded, { scale, offset, origin, middle }: DecodeTask): void {
   const at = index * 3
+  let octant = 0
   for (let axis = 0; axis < 3; axis++) {
     const number = view.getInt32(axis * 4, true)
     into.raw[at + axis] = number
-    into.position[at + axis] = number * scale[axis]! + (offset[axis]! - origin[axis]!)
+    const position = number * scale[axis]! + (offset[axis]! - origin[axis]!)
+    into.position[at + axis] = position
+    if (position >= middle[axis]! - origin[axis]!) octant |= 1 << axis
   }
+  into.octant[index] = octant
   into.intensity[index] = view.getUint16(12, true)
   into.classes[index] = view.getUint8(16)
   into.pass[index] = view.getUint16(20, true)
@@ -80,7 +89,7 @@ function read(view: DataView, index: number, into: Decoded, { scale, offset, ori
 self.onmessage = async ({ data }: MessageEvent<DecodeTask>) => {
   try {
     const decoded = await decode(data)
-    const buffers = [decoded.raw, decoded.position, decoded.intensity, decoded.classes, decoded.pass, decoded.rgb]
+    const buffers = [decoded.raw, decoded.position, decoded.intensity, decoded.classes, decoded.pass, decoded.octant, decoded.rgb]
     self.postMessage(
       { id: data.id, decoded },
       { transfer: buffers.filter((one) => one !== null).map((one) => one.buffer) },

@@ -7,8 +7,8 @@ import type { Box, CloudNode, CloudStore } from './store'
 const ENOUGH_PX = 1.3
 
 export interface Chosen {
-  /** Nodes to draw with the distance of points that is reached there (m). */
-  nodes: Map<CloudNode, number>
+  /** Nodes to draw; for each of the eight parts of a node, the distance of points that is reached there (m). */
+  nodes: Map<CloudNode, Float32Array>
   points: number
 }
 
@@ -33,7 +33,7 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
     if (root) add(root)
     else if (!sheet.copc) void store.open(sheet)
   }
-  const nodes = new Map<CloudNode, number>()
+  const nodes = new Map<CloudNode, Float32Array>()
   let points = 0
   while (waiting.length) {
     let best = 0
@@ -44,7 +44,7 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
     if (points + node.count > budget) break
     points += node.count
     node.used = store.turn
-    if (node.points) nodes.set(node, node.spacing_m)
+    if (node.points) nodes.set(node, new Float32Array(8).fill(node.spacing_m))
     else if (node.count) void store.load(node)
     if (node.count && !node.points) continue
     const distance = Math.max(0.5, local(node.box).distanceToPoint(eye))
@@ -54,11 +54,17 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
   return { nodes, points }
 }
 
-/** A node whose children are drawn as well is as dense as they are. */
-function reached(store: CloudStore, nodes: Map<CloudNode, number>): void {
+/** Where a child is drawn, its parent's points are as dense as the densest of it: what is coarser there, the child draws. */
+function reached(store: CloudStore, nodes: Map<CloudNode, Float32Array>): void {
   for (const node of [...nodes.keys()].sort((a, b) => b.depth - a.depth)) {
-    const below = store.children(node).map((child) => nodes.get(child))
-    const drawn = below.filter((one) => one !== undefined)
-    if (drawn.length && drawn.length >= below.length / 2) nodes.set(node, Math.max(...drawn))
+    for (const child of store.children(node)) {
+      const below = nodes.get(child)
+      if (below) nodes.get(node)![octantOf(child)] = Math.min(...below)
+    }
   }
+}
+
+function octantOf(child: CloudNode): number {
+  const [, x, y, z] = child.key.split('-').map(Number) as [number, number, number, number]
+  return (x & 1) | ((y & 1) << 1) | ((z & 1) << 2)
 }

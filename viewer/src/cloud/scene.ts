@@ -32,11 +32,12 @@ const POINT_VERTEX = /* glsl */ `
 in float intensity;
 in float class_code;
 in float pass;
+in float octant;
 in vec3 rgb;
 uniform int mode;
 uniform vec2 range;
 uniform float node_height;
-uniform float size_m;
+uniform float sizes_m[8];
 uniform float focal;
 uniform vec2 size_px;
 uniform sampler2D ramp;
@@ -45,10 +46,15 @@ out vec3 colour;
 void main() {
   vec4 seen = modelViewMatrix * vec4(position, 1.0);
   gl_Position = projectionMatrix * seen;
-  gl_PointSize = clamp(size_m * focal / max(0.01, -seen.z), size_px.x, size_px.y);
+  gl_PointSize = clamp(sizes_m[int(octant)] * focal / max(0.01, -seen.z), size_px.x, size_px.y);
   if (mode == 4) { colour = rgb; return; }
-  if (mode == 2) { colour = texture(codes, vec2((class_code + 0.5) / 256.0, 0.25)).rgb; if (texture(codes, vec2((class_code + 0.5) / 256.0, 0.25)).a < 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }
-  if (mode == 3) { vec4 found = texture(codes, vec2((mod(pass, 256.0) + 0.5) / 256.0, 0.75)); colour = found.rgb; if (found.a < 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }
+  if (mode == 2 || mode == 3) {
+    float code = mode == 2 ? class_code : mod(pass, 256.0);
+    vec4 found = texture(codes, vec2((code + 0.5) / 256.0, mode == 2 ? 0.25 : 0.75));
+    colour = found.rgb;
+    if (found.a < 0.5) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+    return;
+  }
   float value = mode == 0 ? node_height + position.z : intensity;
   float at = clamp((value - range.x) / (range.y - range.x), 0.0, 1.0);
   colour = texture(ramp, vec2((at * 255.0 + 0.5) / 256.0, 0.5)).rgb;
@@ -180,11 +186,11 @@ export class CloudScene {
   }
 
   /** Show these nodes, each with points as large as its spacing, and no others. */
-  show(nodes: Map<CloudNode, number>, size: number): void {
+  show(nodes: Map<CloudNode, Float32Array>, size: number): void {
     for (const [node, drawn] of this.#points) drawn.visible = nodes.has(node)
-    for (const [node, spacing_m] of nodes) {
+    for (const [node, spacings_m] of nodes) {
       const drawn = this.#points.get(node) ?? this.#add(node)
-      drawn.material.uniforms['size_m']!.value = spacing_m * 1.25 * size
+      drawn.material.uniforms['sizes_m']!.value = spacings_m.map((one) => one * 1.3 * size)
     }
   }
 
@@ -195,12 +201,13 @@ export class CloudScene {
     geometry.setAttribute('intensity', new BufferAttribute(points.intensity, 1))
     geometry.setAttribute('class_code', new BufferAttribute(points.classes, 1))
     geometry.setAttribute('pass', new BufferAttribute(points.pass, 1))
+    geometry.setAttribute('octant', new BufferAttribute(points.octant, 1))
     if (points.rgb) geometry.setAttribute('rgb', new BufferAttribute(points.rgb, 3, true))
     const material = new ShaderMaterial({
       glslVersion: GLSL3,
       vertexShader: POINT_VERTEX,
       fragmentShader: POINT_FRAGMENT,
-      uniforms: { ...this.#shared, size_m: { value: 0.01 }, node_height: { value: node.origin[2] - this.origin[2] } },
+      uniforms: { ...this.#shared, sizes_m: { value: new Float32Array(8) }, node_height: { value: node.origin[2] - this.origin[2] } },
     })
     const drawn = new Points(geometry, material)
     drawn.position.set(node.origin[0] - this.origin[0], node.origin[1] - this.origin[1], node.origin[2] - this.origin[2])

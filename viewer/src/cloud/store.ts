@@ -24,6 +24,8 @@ export interface CloudNode {
   readonly spacing_m: number
   readonly count: number
   readonly origin: [number, number, number]
+  /** Middle of its cube, which the box is a part of. */
+  readonly middle: [number, number, number]
   points: Decoded | null
   loading: Promise<void> | null
   failed: boolean
@@ -57,7 +59,7 @@ export class CloudStore {
   arrived: () => void = () => {}
   turn = 0
   readonly #decoders = new Decoders()
-  readonly #queue: { node: CloudNode; start: () => void }[] = []
+  readonly #queue: { node: CloudNode; needed: boolean; start: () => void }[] = []
   #running = 0
   #kept = 0
 
@@ -122,6 +124,7 @@ export class CloudStore {
     const edges = [0, 1, 2].map((axis) => ((cube[axis + 3]! - cube[axis]!) / 2 ** depth) * units[axis]!)
     const min = [x, y, z].map((step, axis) => cube[axis]! * units[axis]! + step * edges[axis]!) as [number, number, number]
     const max = min.map((one, axis) => one + edges[axis]!) as [number, number, number]
+    const middle = centre({ min, max })
     // An octree's cube is as high as it is wide: the sheet's own bounds are closer.
     for (let axis = 0; axis < 3; axis++) {
       min[axis] = Math.max(min[axis]!, sheet.bounds.min[axis]! - 0.01)
@@ -129,7 +132,7 @@ export class CloudStore {
     }
     const box = { min, max }
     const spacing_m = (spacing * horizontal_unit.m) / 2 ** depth
-    return { key, sheet, depth, box, spacing_m, count, origin: centre(box), points: null, loading: null, failed: false, used: 0 }
+    return { key, sheet, depth, box, spacing_m, count, origin: centre(box), middle, points: null, loading: null, failed: false, used: 0 }
   }
 
   /** The nodes below a node that are known; a page of the hierarchy that names them is asked for. */
@@ -152,12 +155,14 @@ export class CloudStore {
     return sheet.asked.get(key)
   }
 
-  /** Fetch and decode a node's points; those that are asked for last come first. */
-  load(node: CloudNode): Promise<void> {
+  /** Fetch and decode a node's points; those that are asked for last come first. One that is `needed` is not given up. */
+  load(node: CloudNode, needed = false): Promise<void> {
     node.used = this.turn
     if (node.points || node.failed || !node.count) return Promise.resolve()
+    const waiting = needed && this.#queue.find((one) => one.node === node)
+    if (waiting) waiting.needed = true
     node.loading ??= new Promise<void>((resolve) => {
-      this.#queue.push({ node, start: () => void this.#fetch(node).finally(resolve) })
+      this.#queue.push({ node, needed, start: () => void this.#fetch(node).finally(resolve) })
       this.#pump()
     })
     return node.loading
@@ -166,8 +171,8 @@ export class CloudStore {
   /** Forget the nodes that wait and are not wanted any more. */
   cancelBefore(turn: number): void {
     for (let index = this.#queue.length - 1; index >= 0; index--) {
-      const { node } = this.#queue[index]!
-      if (node.used >= turn) continue
+      const { node, needed } = this.#queue[index]!
+      if (needed || node.used >= turn) continue
       node.loading = null
       this.#queue.splice(index, 1)
     }
@@ -199,6 +204,7 @@ export class CloudStore {
         scale: sheet.scale,
         offset: sheet.offset,
         origin: node.origin,
+        middle: node.middle,
       })
       this.#kept += node.count
       this.#forget()
@@ -262,7 +268,7 @@ export class CloudStore {
       }
       level = below
     }
-    await Promise.all(found.map((node) => this.load(node)))
+    await Promise.all(found.map((node) => this.load(node, true)))
     return { nodes: found.filter((node) => node.points), whole: whole && !found.some((node) => node.failed) }
   }
 

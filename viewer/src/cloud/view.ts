@@ -48,7 +48,7 @@ export class CloudView {
   readonly #hiddenPasses = new Set<number>()
   #look: Look
   #size = { width: 1, height: 1 }
-  #nodes: Map<CloudNode, number> = new Map()
+  #nodes: Map<CloudNode, Float32Array> = new Map()
   #budget = FIRST_BUDGET
   #stale = true
   #asked = false

@@ -29,6 +29,7 @@ export function value(raw: unknown): string {
   if (raw === null || raw === undefined) return '–'
   if (typeof raw === 'number') return Number.isInteger(raw) ? fixed(raw, 0) : number(raw)
   if (typeof raw === 'boolean') return raw ? 'yes' : 'no'
+  if (raw === '') return '–'
   return typeof raw === 'string' ? raw : JSON.stringify(raw)
 }
 
@@ -52,4 +53,10 @@ export function gpsTime(epoch: unknown): string {
   const ns = BigInt(epoch)
   const milliseconds = Number(ns / 1_000_000n + GPS_UNIX_S * 1000n)
   return `${new Date(milliseconds).toISOString().replace('T', ' ').replace('Z', '')} GPS`
+}
+
+/** A column's title for people: its first letter is large, and the unit that stands beside the value is not repeated. */
+export function titled(title: string, unit: string | null): string {
+  const bare = unit ? title.replace(/ (m per km|kg m3|m m2|gps ns|mm|m2|m3|m|px|deg|percent|ns|ms)$/, '') : title
+  return bare.slice(0, 1).toUpperCase() + bare.slice(1)
 }

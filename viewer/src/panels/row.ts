@@ -102,7 +102,7 @@ export class RowPanel {
         return h(
           'div',
           { title: column.meaning ?? undefined },
-          h('dt', {}, column.title),
+          h('dt', {}, format.titled(column.title, column.unit)),
           h(
             'dd',
             { class: typeof raw === 'number' ? 'number' : '' },

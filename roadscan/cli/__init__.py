@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from roadscan import __version__
-from roadscan.cli import cameras, estimates, exports, logs, profiles, queries, reports, runs, simulations, state
+from roadscan.cli import cameras, estimates, exports, logs, pages, profiles, queries, reports, runs, simulations, state
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
@@ -53,6 +53,8 @@ app.command("reprocess")(runs.reprocess)
 app.command("status")(state.status)
 app.command("verify")(state.verify)
 app.command("report")(reports.report)
+app.command("view")(pages.view)
+app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("export")(exports.export)
 app.command("classes")(exports.classes)

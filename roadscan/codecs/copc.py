@@ -1,7 +1,7 @@
 """COPC 1.0 (*Cloud Optimized Point Cloud Specification*, 2021): LAZ 1.4 whose chunks are the nodes of an octree.
 
-LAZ is compressed by lazrs, headers are laid out by laspy; what is written here are the record that describes the octree,
-the chunks by node, and the pages of the hierarchy.
+lazrs compresses, laspy lays out the header; written here are the record that describes the octree, the chunks by node,
+and the pages of the hierarchy.
 """
 
 from __future__ import annotations

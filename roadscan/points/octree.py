@@ -86,7 +86,8 @@ class Cube:
 
     def parts(self, axis: int, values: npt.NDArray[Any]) -> Int32:
         """Stored coordinates (n,) as parts of the edge, 2^30 of them: bits tell the node on each level."""
-        return parts_of_edge(np.ascontiguousarray(values, np.int32), self.corner[axis], self.edge)
+        parts: Int32 = parts_of_edge(np.ascontiguousarray(values, np.int32), self.corner[axis], self.edge)
+        return parts
 
     def first_step(self, axis: int, cell: int) -> int:
         """Least stored coordinate that can lie in a cell."""

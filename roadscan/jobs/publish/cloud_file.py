@@ -20,7 +20,7 @@ from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import TilePoints
 from roadscan.points.octree import CELL_M, Cube, NodeCutter
-from roadscan.products.cloud_records import SCALE_M, Lattice, layout_of, records_of, without_colours
+from roadscan.products.cloud_records import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
 
 _SQUARE_M: Final = 16.0
 """Larger tiles are kept in squares of about this edge."""
@@ -93,7 +93,7 @@ class PointSpool:
         order = np.argsort(number, kind="stable")
         starts = np.flatnonzero(np.diff(number[order], prepend=-1))
         for first, end in zip(starts.tolist(), [*starts[1:].tolist(), number.size], strict=True):
-            yield int(number[order[first]]), records[order[first:end]]
+            yield int(number[order[first]]), picked(records, order[first:end])
 
     def columns(self, cube: Cube) -> Iterator[Records]:
         """Points of each column of the octree's cells, column by column from the west, each from the south."""
@@ -125,7 +125,7 @@ class PointSpool:
                 inside &= records[name] >= first
             if square.high[axis] >= end and place[axis] + 1 < 1 << cube.top:
                 inside &= records[name] < end
-        return records if inside.all() else records[inside]
+        return records if inside.all() else picked(records, np.flatnonzero(inside))
 
 
 def write_cloud(path: Path, spool: PointSpool, lattice: Lattice, facts: dict[str, Any]) -> None:
@@ -142,7 +142,7 @@ def write_cloud(path: Path, spool: PointSpool, lattice: Lattice, facts: dict[str
         for column in spool.columns(cube):
             records = column if spool.coloured else without_colours(column, layout.records)
             for node in cutter.nodes(records["X"], records["Y"], records["Z"]):
-                own = records[node.points]
+                own = picked(records, node.points)
                 if node.key.level < cube.top:
                     above.setdefault(node.key, []).append(own)
                 else:

@@ -130,9 +130,9 @@ def schema_columns(table: str, names: Sequence[str]) -> list[SiteColumn]:
     """Columns of a table of the store, those that a feature's row can hold; further names stand for themselves."""
     known = {c.name: c for c in table_schema(table).columns}
     return [
-        SiteColumn(n, known[n].unit, known[n].meaning, sigma=_sigma_of(n, names)) if n in known else SiteColumn(n, "", "")
+        SiteColumn(n, *((known[n].unit, known[n].meaning) if n in known else ("", "")), sigma=_sigma_of(n, names))
         for n in names
-    ]  # fmt: skip
+    ]
 
 
 def _sigma_of(name: str, names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,7 @@ from roadscan.jobs.products import StoredTiles, product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE
 from roadscan.jobs.tiles.tiles import summary_of
+from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, TileSummary
 from roadscan.products.geo_table import read_geo_table
@@ -168,3 +170,20 @@ def sheet_name(easting_m: float, northing_m: float) -> str:
 def box_of(shapes: npt.NDArray[Any]) -> list[float]:
     """Box of shapes (m), to the hundredth of a millimetre."""
     return [round(float(v), 5) for v in shapely.total_bounds(shapes)]
+
+
+def box_from_text(text: str) -> Box:
+    """A box of the map from ``WEST,SOUTH,EAST,NORTH`` (m).
+
+    Raises
+    ------
+    ConfigError
+        where it is none.
+    """
+    try:
+        west, south, east, north = (float(one) for one in text.split(","))
+    except ValueError:
+        west = south = east = north = math.nan
+    if not (west < east and south < north and math.isfinite(west + south + east + north)):
+        raise ConfigError(f"the box '{text}'", expected="WEST,SOUTH,EAST,NORTH in metres, west before east")
+    return west, south, east, north

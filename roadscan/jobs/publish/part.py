@@ -30,6 +30,10 @@ class SitePart(ABC):
     def documents(self, material: Material) -> Iterator[Document]:
         """All documents; what one takes long to make is made when it is written."""
 
+    def listed(self, material: Material) -> Iterator[Document]:
+        """Documents that a server lists from the beginning; :meth:`find` knows the others."""
+        return self.documents(material)
+
     def find(self, material: Material, path: str) -> Document | None:
         """One document by its path below `name`; for a part whose documents are too many to list them all."""
         return None

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from roadscan.codecs import SOFTWARE
-from roadscan.jobs.publish.document import Document, json_document
+from roadscan.jobs.publish.document import Ask, Document, json_document
 from roadscan.jobs.publish.material import SHEET_M, Box, Material
 from roadscan.jobs.publish.part import site_parts
 from roadscan.jobs.publish.parts.catalog import to_longitude_latitude
@@ -61,9 +61,11 @@ def first_documents(material: Material) -> Iterator[Document]:
     yield entry(material)
     record = _report(material)
     if record is not None:
-        yield Document(
-            REPORT_PAGE, record.digest, lambda path, _: path.write_bytes(read_recorded(material.store, record)) and None
-        )
+
+        def write(path: Path, _ask: Ask) -> None:
+            path.write_bytes(read_recorded(material.store, record))
+
+        yield Document(REPORT_PAGE, record.digest, write)
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,7 @@ class Published:
     """Documents that could not be made, and why."""
 
 
-def publish(
-    material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None
-) -> Published:
+def publish(material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None) -> Published:
     """Publish the site as a folder, which appears as a whole: beside it under another name, then renamed.
 
     What a folder that was published before holds unchanged is taken over.
@@ -191,7 +191,9 @@ def _crs(frame: MapFrame) -> dict[str, Any]:
         "name": (frame.local_name or "local") if crs is None else crs.name,
         "authority": None if authority is None else ":".join(authority), "is_local": frame.is_local,
         "wkt2": frame.wkt(), "proj4": None if crs is None else _proj4(crs),
-        "horizontal_unit": {"name": "metre" if crs is None else crs.axis_info[0].unit_name, "m": frame.horizontal_unit_m},
+        "horizontal_unit": {
+            "name": "metre" if crs is None else crs.axis_info[0].unit_name, "m": frame.horizontal_unit_m,
+        },
         "vertical_unit": {"name": vertical, "m": frame.vertical_unit_m}, "height": frame.height,
         "geoid": None if frame.geoid is None else str(getattr(frame.geoid, "name", frame.geoid)),
     }  # fmt: skip
@@ -210,7 +212,8 @@ def _origin(material: Material) -> list[float]:
     extent_m, heights = material.extent_m, _heights(material)
     if extent_m is None:
         return [0.0, 0.0, 0.0]
-    return [float(extent_m[0] // 10 * 10), float(extent_m[1] // 10 * 10), 0.0 if heights is None else float(heights[0] // 10 * 10)]
+    low = (extent_m[0], extent_m[1], 0.0 if heights is None else heights[0])
+    return [float(v // 10 * 10) for v in low]
 
 
 def _heights(material: Material) -> list[float] | None:

@@ -45,14 +45,12 @@ class Assets(LayerKind):
             names = [n for n in held.rows.column_names if n in known]
             sigmas = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}
             wanted = {n: sigmas.get(n, f"sigma_{n}") for n in names}
+            told = {n: wanted[n] if wanted[n] in names else "" for n in names}
             geometry = _GEOMETRY[schema.geometry]
             yield SiteLayer(
                 f"asset_{schema.table}", schema.title, "assets", geometry, 600 + place, held.shapes_m,
                 held.rows.select(names).to_pylist(),
-                [
-                    SiteColumn(n, known[n].unit, known[n].meaning, known[n].title, wanted[n] if wanted[n] in names else "")
-                    for n in names
-                ],
+                [SiteColumn(n, known[n].unit, known[n].meaning, known[n].title, told[n]) for n in names],
                 [Style("one colour", _WIDTH_PX[geometry], colour)], key="object",
             )  # fmt: skip
 

@@ -20,7 +20,7 @@ _ARROWS = {
 
 
 class Control(LayerKind):
-    """A point a run that saw it, with what is left of surveyed minus measured; before an adjustment the points alone."""
+    """A point a run that saw it, with surveyed minus measured; before an adjustment the points alone."""
 
     name = "control"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +45,8 @@ class Passes(LayerKind):
             add_grid_folder(plan.ground.grids)
         sources = dict.fromkeys(s.trajectory for s, _ in plan.sources if s.trajectory is not None)
         paths = {one.run: _path(material, one) for one in sources}
-        shapes, rows = [], []
+        shapes: list[Any] = []
+        rows: list[dict[str, Any]] = []
         for one in plan.passes:
             if one.run not in paths:
                 continue

@@ -108,9 +108,8 @@ def _times(material: Material, tiles: Sequence[TileId]) -> tuple[str, str]:
 
 def _item(material: Material, name: str, tiles: Sequence[TileId]) -> dict[str, Any]:
     box, frame = _sheet_box(material, tiles), material.context.map
-    border = shapely.transform(
-        shapely.segmentize(shapely.box(*box), max(box[2] - box[0], box[3] - box[1]) / _DENSE), to_longitude_latitude(frame)
-    )
+    dense = shapely.segmentize(shapely.box(*box), max(box[2] - box[0], box[3] - box[1]) / _DENSE)
+    border = shapely.transform(dense, to_longitude_latitude(frame))
     ring = np.round(shapely.get_coordinates(border), 8).tolist()
     first, last = _times(material, tiles)
     unit_m = frame.horizontal_unit_m

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -121,12 +121,13 @@ def _writer(material: Material, name: str, tiles: Sequence[TileId]) -> Any:
                 spool.fill(points)
             if not spool.count:
                 raise StoreError(f"sheet {name} holds no point", change="run the survey again", file=path)
-            write_cloud(path, spool, lattice, {"survey": context.survey_id, "sheet": name, "height": context.map.height})
+            facts = {"survey": context.survey_id, "sheet": name, "height": context.map.height}
+            write_cloud(path, spool, lattice, facts)
 
     return write
 
 
-def _points(material: Material, tiles: Sequence[TileId]) -> Iterator[TilePoints]:
+def _points(material: Material, tiles: Sequence[TileId]) -> Generator[TilePoints, None, None]:
     """Points of tiles, block by block."""
     session, config = material.session, material.session.survey.config.tiles
     planned = TilePlan(session.plan, session.footprints, session.tiles, (), material.context)

@@ -31,8 +31,12 @@ from roadscan.products.site_rasters import (
 _CODE: Final = ("roadscan.products.site_rasters", "roadscan.jobs.products:StoredTiles")
 _PATH: Final = re.compile(r"rasters/(height|hillshade|intensity)/(\d+)/(-?\d+)_(-?\d+)\.png")
 _ABOUT: Final[dict[Raster, dict[str, Any]]] = {
-    "height": {"title": "Height", "unit": "m", "encoding": "rgb24", "colours": "viridis", "order": 10, "visible": False},
-    "hillshade": {"title": "Hillshade", "unit": "", "encoding": "grey8", "colours": "grey", "order": 20, "visible": True},
+    "height": {
+        "title": "Height", "unit": "m", "encoding": "rgb24", "colours": "viridis", "order": 10, "visible": False,
+    },
+    "hillshade": {
+        "title": "Hillshade", "unit": "", "encoding": "grey8", "colours": "grey", "order": 20, "visible": True,
+    },
     "intensity": {
         "title": "Intensity", "unit": "counts", "encoding": "grey8", "colours": "grey", "order": 30, "visible": False,
     },
@@ -48,7 +52,7 @@ class Rasters(SitePart):
     def members(self, material: Material) -> Mapping[str, Any]:
         """Levels, and what the numbers of each raster stand for."""
         images = images_of(material)
-        if not material.tiles or not images.levels:
+        if not images.levels:
             return {"raster_grid": None, "rasters": []}
         return {
             "raster_grid": {"tile_px": images.pyramid.tile_px, "levels": [images.about(k) for k in images.levels]},
@@ -57,18 +61,23 @@ class Rasters(SitePart):
 
     def documents(self, material: Material) -> Iterator[Document]:
         """Which pictures there are, level by level, and then all pictures, those of one place together."""
+        yield from self.listed(material)
         images = images_of(material)
-        for number, level in enumerate(images.levels if material.tiles else ()):
-            yield json_document(f"rasters/tiles_{number}.json", {"level": number, "rows": images.runs(level)})
-        for level in images.levels if material.tiles else ():
+        for level in images.levels:
             for column, row in images.pyramid.places(level).tolist():
                 for raster in RASTERS:
                     yield images.document(raster, Place(level, column, row))
 
+    def listed(self, material: Material) -> Iterator[Document]:
+        """Which pictures there are, level by level."""
+        images = images_of(material)
+        for number, level in enumerate(images.levels):
+            yield json_document(f"rasters/tiles_{number}.json", {"level": number, "rows": images.runs(level)})
+
     def find(self, material: Material, path: str) -> Document | None:
         """A picture by its path."""
         found, images = _PATH.fullmatch(path), images_of(material)
-        if found is None or not material.tiles or int(found[2]) >= len(images.levels):
+        if found is None or int(found[2]) >= len(images.levels):
             return None
         place = Place(images.levels[int(found[2])], int(found[3]), int(found[4]))
         named = next(raster for raster in RASTERS if raster == found[1])
@@ -120,9 +129,10 @@ class Images:
 
     def told(self, raster: Raster) -> dict[str, Any]:
         """A raster as the page reads it."""
-        heights = [(s.height_min_m, s.height_max_m) for s in self.material.summaries.values()]
+        held = self.material.summaries.values()
+        ends = min(s.height_min_m for s in held), max(s.height_max_m for s in held)
         scale = {
-            "height": (self.scales.height_offset_m, HEIGHT_STEP_M, min(h[0] for h in heights), max(h[1] for h in heights)),
+            "height": (self.scales.height_offset_m, HEIGHT_STEP_M, *ends),
             "hillshade": (0, 1, 1, 255),
             "intensity": (0.0, self.scales.intensity_step, 0.0, 255 * self.scales.intensity_step),
         }[raster]
@@ -168,9 +178,8 @@ class Images:
             parts: Any = [tiles[t].digest for t in self.pyramid.tiles_in(place.level, place)]
         else:
             steps = range(COARSER)
-            below = [
-                Place(place.level - 1, COARSER * place.column + c, COARSER * place.row + r) for r in steps for c in steps
-            ]
+            west, south = COARSER * place.column, COARSER * place.row
+            below = [Place(place.level - 1, west + c, south + r) for r in steps for c in steps]
             parts = [self._held_key(raster, one) for one in below if self.is_there(one)]
         return key_of(code_digest(*_CODE), raster, place, parts, self.scales, self.pyramid.pixel_m(place.level))
 

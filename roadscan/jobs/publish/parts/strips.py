@@ -77,7 +77,8 @@ class Strips(SitePart):
         for lane in lanes:
             yield _later(lane.url, material.key(lane.values, lane.row), _strip(material, lane))
             for place, record in enumerate(lane.cross_sections):
-                yield _later(_crossing_url(lane, place), material.key([record], lane.row), _crossings(material, lane, record))
+                key = material.key([record], lane.row)
+                yield _later(_crossing_url(lane, place), key, _crossings(material, lane, record))
 
 
 def _later(path: str, key: str, make: Any) -> Document:

@@ -1,0 +1,79 @@
+"""The commands that show a survey in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadscan.cli.arguments import SurveyFile
+
+
+def publish(
+    survey_file: SurveyFile,
+    out: Annotated[Path | None, typer.Option(help="Folder of the site; one that was published is renewed.")] = None,
+    single: Annotated[Path | None, typer.Option(help="Write one HTML file with all in it, and no folder.")] = None,
+    box: Annotated[
+        str | None, typer.Option(help="Only this part: WEST,SOUTH,EAST,NORTH in metres of the survey's map.")
+    ] = None,
+    finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0,
+    clouds: Annotated[bool, typer.Option(help="With the points.")] = True,
+    pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True,
+    largest: Annotated[float, typer.Option(help="--single: largest file (MB).")] = 200.0,
+) -> None:
+    """The survey as a page to look at: a folder for any web server with range requests, or one file."""
+    from roadscan.cli.terminal import new_reporter
+    from roadscan.jobs.publish.material import Material, Wishes, box_from_text
+    from roadscan.jobs.publish.single import write_single
+    from roadscan.jobs.publish.site import publish as published
+    from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
+    from roadscan.jobs.session import Session
+    from roadscan.model.counted import counted
+    from roadscan.model.errors import ConfigError
+
+    if (out is None) == (single is None):
+        raise ConfigError("publish takes a folder or a single file", expected="--out FOLDER or --single FILE.html")
+    session = Session.open(survey_file)
+    session.hear_of_damage()
+    wishes = Wishes(clouds, pictures, finest, None if box is None else box_from_text(box))
+    reporter = new_reporter()
+    if single is not None:
+        page = write_single(Material(session, wishes), single, largest, lambda d, t: reporter.progress("publish", d, t))
+        reporter.close()
+        for one in page.left_out:
+            typer.echo(f"left out: {one}")
+        typer.echo(f"page: {single} ({page.bytes / 1e6:,.1f} MB)")
+        return
+    if out is not None:
+        made = published(Material(session, wishes), out, lambda d, t: reporter.progress("publish", d, t))
+        reporter.close()
+        for path, reason in made.failures:
+            typer.echo(f"failed: {path}: {reason}")
+        if web_folder() is None:
+            typer.echo(f"note: the folder holds the data without the page: {HOW_TO_BUILD}")
+        typer.echo(f"site: {out} ({counted(made.files, 'file')}, {made.made:,} new, {made.bytes / 1e6:,.1f} MB)")
+        if made.failures:
+            raise typer.Exit(1)
+
+
+def view(
+    survey_file: SurveyFile,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of 127.0.0.1; 0: one that is free.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+) -> None:
+    """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
+    import webbrowser
+
+    from roadscan.jobs.publish.live import LiveSite, open_survey
+    from roadscan.jobs.publish.server import SiteServer
+    from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
+
+    site = LiveSite(open_survey(survey_file))
+    with SiteServer(site, port) as server:
+        if web_folder() is None:
+            typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")
+        typer.echo(f"page: {server.address} (Ctrl-C ends it)")
+        if browser and web_folder() is not None:
+            webbrowser.open(server.address)
+        server.serve_forever()

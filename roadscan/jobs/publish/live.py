@@ -1,0 +1,108 @@
+"""A site whose documents are made when they are asked for, and kept by their keys for the next time."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import uuid
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from roadscan.jobs.publish.document import Document
+from roadscan.jobs.publish.material import Material
+from roadscan.jobs.publish.part import site_parts
+from roadscan.jobs.publish.site import ENTRY, first_documents
+from roadscan.jobs.session import Session
+from roadscan.tables.store import Store
+
+FOLDER: Final = "site"
+"""Below the survey's root: documents that were made for `roadscan view`."""
+_OUTPUTS: Final = "manifest/outputs"
+
+
+class Served(NamedTuple):
+    """A document that is ready."""
+
+    file: Path
+    key: str
+
+
+class LiveSite:
+    """Documents of a survey's site by path. Several threads may ask; documents of one part are made one by one."""
+
+    def __init__(self, open_material: Callable[[], Material]) -> None:
+        self._open = open_material
+        self._listing = threading.Lock()
+        self._making: dict[str, threading.RLock] = defaultdict(threading.RLock)
+        self._seen: list[str] = []
+        self._listed: dict[str, Document] = {}
+        self.material = self._renewed()
+        self._cache = _cache_folder(self.material.store)
+
+    def document(self, path: str) -> Served | None:
+        """A document, made where it is not there yet; None for a path that the site does not have.
+
+        Where the survey has changed since, a page that begins anew (it asks for the entry) gets what holds now.
+        """
+        if path == ENTRY:
+            with self._listing:
+                if self.material.store.files(_OUTPUTS) != self._seen:
+                    self.material = self._renewed()
+        found = self._listed.get(path) or self._unlisted(path)
+        if found is None:
+            return None
+        file = self._cache / found.key[:2] / f"{found.key}{Path(path).suffix}"
+        with self._making[path.partition("/")[0]]:
+            if not file.is_file():
+                self._make(found, file)
+        return Served(file, found.key)
+
+    def _unlisted(self, path: str) -> Document | None:
+        part = next((one for one in site_parts() if one.name == path.partition("/")[0]), None)
+        return None if part is None else part.find(self.material, path)
+
+    def _make(self, document: Document, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        scratch = file.with_name(f".{uuid.uuid4().hex}{file.suffix}")
+        try:
+            document.write(scratch, self._ask)
+            scratch.rename(file)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+    def _ask(self, path: str) -> Path:
+        found = self.document(path)
+        if found is None:
+            raise FileNotFoundError(path)
+        return found.file
+
+    def _renewed(self) -> Material:
+        material = self._open()
+        self._seen = material.store.files(_OUTPUTS)
+        listed = {one.path: one for one in first_documents(material)}
+        for part in site_parts():
+            listed |= {one.path: one for one in part.listed(material)}
+        self._listed = listed
+        return material
+
+
+def open_survey(survey_file: str | Path) -> Callable[[], Material]:
+    """Function that looks at a survey anew; damaged records are no hindrance, what is sound is shown."""
+
+    def opened() -> Material:
+        session = Session.open(survey_file)
+        session.hear_of_damage()
+        return Material(session)
+
+    return opened
+
+
+def _cache_folder(store: Store) -> Path:
+    """Where documents are kept: in the store, or in a folder for this process where the store is no folder."""
+    if store.is_folder:
+        folder = Path(store.path(FOLDER))
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    return Path(tempfile.mkdtemp(prefix="roadscan-site-"))

@@ -73,8 +73,8 @@ export class App {
       this.#left,
       h('div', { class: 'side-head' }, h('h2', {}, 'Layers'), iconButton('close', 'Close the list of layers', () => this.#open(null), { class: 'icon-button sheet-close' })),
       layersPanel(this.map, (layer) => {
+        this.#table.open(layer).catch((error) => this.desk.complain(error))
         this.#openDock('table')
-        void this.#table.open(layer)
       }),
       h('footer', { class: 'about' }, h('span', {}, survey.software), survey.report && h('a', { href: survey.report }, 'Report')),
     )
@@ -165,6 +165,7 @@ export class App {
         this.desk.views.value = new Set(first)
         this.parts.startPictures()
         void this.#followHash()
+        window.setTimeout(() => void this.parts.fetchCode(), 1500)
       })
       this.map.map.render()
     })

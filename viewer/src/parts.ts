@@ -171,6 +171,13 @@ export class ModelParts {
     }
   }
 
+  /** Fetch the code of all parts, so that they work when the host is gone. */
+  async fetchCode(): Promise<void> {
+    const { survey } = this.desk
+    const code = [...(survey.clouds ? [import('./cloud/store'), import('./cloud/view'), import('./cloud/slice')] : []), ...(survey.pictures ? [import('./pictures/list'), import('./pictures/view')] : [])]
+    await Promise.allSettled(code)
+  }
+
   setActive(views: ReadonlySet<ViewName>): void {
     this.#active = views
     if (this.#view) this.#view.active = views.has('cloud')

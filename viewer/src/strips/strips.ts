@@ -273,7 +273,10 @@ export class Strips {
 function curve(series: StripSeries): uPlot.AlignedData {
   const [x, y]: [number[], (number | null)[]] = [[], []]
   const add = (station: number, value: number | null): void => {
-    if (x.length && station <= x.at(-1)!) y[y.length - 1] = value
+    if (x.length && station <= x.at(-1)! && value === null && y.at(-1) !== null) {
+      x.push(x.at(-1)! + 1e-6)
+      y.push(null)
+    } else if (x.length && station <= x.at(-1)!) y[y.length - 1] = value
     else {
       x.push(station)
       y.push(value)

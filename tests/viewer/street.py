@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.codecs.copc import CopcWriter
+from roadscan.codecs.mesh import Mesh, write_glb
 from roadscan.model.crs import MapFrame
 from roadscan.points.octree import Cube, NodeCutter
 from roadscan.products.cloud_records import layout_of
@@ -72,7 +73,7 @@ def write_site(folder: Path) -> None:
         "raster_grid": _write_rasters(folder),
         "rasters": [_HEIGHT],
         "clouds": {"url": "clouds/index.json", "points": _write_cloud(folder)},
-        "meshes": None,
+        "meshes": {"url": "meshes/index.json", "meshes": 1},
         "strips": {"url": "strips/index.json", "lanes": 1},
         "pictures": {"url": "pictures/index.json", "pictures": 2},
         "catalog": None,
@@ -80,6 +81,7 @@ def write_site(folder: Path) -> None:
         "left_out": [],
         "edits": {"layers": ["asset_poles"], "post": None},
     }
+    _write_mesh(folder)
     _write_strips(folder)
     _write_pictures(folder)
     _json(folder / "survey.json", survey)
@@ -272,6 +274,19 @@ def _pole() -> Float64:
     up = np.arange(0.0, 4.25, 0.01)
     turn = up * 40.0
     return np.column_stack([CURB[0] + 0.06 * np.cos(turn), CURB[1] + 0.06 * np.sin(turn), 40.0 + up])
+
+
+def _write_mesh(folder: Path) -> None:
+    """A red square of 4 m, 2 cm above the street's middle."""
+    corners = np.array([[-2, -2, 0.02], [2, -2, 0.02], [2, 2, 0.02], [-2, 2, 0.02]], np.float32)
+    red = np.tile(np.array([[230, 10, 10]], np.uint8), (4, 1))
+    (folder / "meshes").mkdir()
+    square = Mesh(corners, red, np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
+    write_glb(folder / "meshes/55302_602000.glb", square, {}, "roadscan test")
+    middle = [EAST_M + 20, NORTH_M, 40.02]
+    bounds = [middle[0] - 2, middle[1] - 2, middle[0] + 2, middle[1] + 2]
+    one = {"tile": "55302_602000", "url": "meshes/55302_602000.glb", "origin_m": middle, "bounds_m": bounds, "bytes": 0}
+    _json(folder / "meshes/index.json", {"meshes": [one]})
 
 
 # ---- strips ----

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -41,7 +42,7 @@ def _click_cloud(page: Any, place: tuple[float, float, float]) -> None:
 
 
 def _look(page: Any, place: tuple[float, float, float], across_m: float) -> None:
-    page.evaluate(f"location.hash = 'at={place[0]},{place[1]}&zoom={across_m}&t=' + Math.random()")
+    page.evaluate(f"location.hash = 'at={place[0]},{place[1]},{place[2]}&zoom={across_m}&t=' + Math.random()")
     page.wait_for_timeout(700)
     page.wait_for_selector('.cloud-view[data-loading="0"]')
 
@@ -61,11 +62,7 @@ def test_the_page_opens_with_all_its_views(watched: Any, address: str) -> None:
 
 def test_a_click_on_a_target_reads_its_coordinates(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
-    # Straight down, the rod's top stands over its foot.
     _look(page, TARGET, across_m=3)
-    page.locator(".cloud-canvas").focus()
-    page.keyboard.press("t")
-    page.wait_for_timeout(500)
     _middle(page)
     assert np.abs(_read(page) - TARGET).max() <= 0.005
 
@@ -133,15 +130,13 @@ def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) 
 def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, TARGET, across_m=3)
-    page.locator(".cloud-canvas").focus()
-    page.keyboard.press("t")
-    page.wait_for_timeout(500)
     _middle(page)
     read = _read(page)
     page.locator('.place button:has-text("Pictures of it")').click()
     page.locator(".picture-frame[data-mark]:not([data-mark=''])").wait_for()
     page.locator(".picture-list button").first.wait_for()
     assert page.locator(".picture-list button").count() == 2
+    page.wait_for_timeout(800)
     mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
     assert np.hypot(*(mark - perspective_pixel(read))) <= 0.05
     # Back from the pixel: the frame shows the whole picture, as large as it fits.
@@ -168,6 +163,21 @@ def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
         (np.arcsin(down / np.linalg.norm(by)) / np.pi + 0.5) * 512 - 0.5,
     )
     assert np.abs(mark - expected).max() <= 0.02
+
+
+def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=6)
+    before = page.locator(".cloud-canvas").screenshot()
+    page.locator(".cloud-settings label", has_text="Mesh of the surface").click()
+    page.wait_for_function("() => performance.getEntriesByType('resource').some((one) => one.name.endsWith('.glb'))")
+    page.wait_for_timeout(1500)
+    shown = cv2.imdecode(np.frombuffer(page.locator(".cloud-canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    points = cv2.imdecode(np.frombuffer(before, np.uint8), cv2.IMREAD_COLOR)
+    # The mesh is red, and no colour of the points' scale is.
+    red = [int(((one[..., 2] > 90) & (one[..., 0] < 60) & (one[..., 1] < 60)).sum()) for one in (points, shown)]
+    assert red[1] > red[0] + 5_000
+    page.locator(".cloud-settings label", has_text="Mesh of the surface").click()
 
 
 def test_edits_become_a_document(watched: Any, address: str) -> None:
@@ -227,6 +237,7 @@ def _serious(page: Any) -> list[tuple[str, str]]:
 def test_axe_finds_nothing_serious(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#row=asset_poles/1&views=map,cloud,strips")
     page.locator(".details h2").wait_for()
+    page.locator('[role="tab"]:has-text("Strips")').click()
     page.locator(".strips .panel").first.wait_for()
     assert _serious(page) == []
     page.locator('[aria-label="Light or dark"]').click()

@@ -76,7 +76,7 @@ export class App {
         this.#table.open(layer).catch((error) => this.desk.complain(error))
         this.#openDock('table')
       }),
-      h('footer', { class: 'about' }, h('span', {}, survey.software), survey.report && h('a', { href: survey.report }, 'Report')),
+      this.#about(),
     )
     fill(
       this.#right,
@@ -86,6 +86,20 @@ export class App {
       this.#editing?.element ?? null,
     )
     fill(this.element, this.#header(), this.#left, this.#stage, this.#right, this.#dock, this.#footer(), this.#toast, this.#help)
+  }
+
+  /** What is left out, and files for other programs. */
+  #about(): HTMLElement {
+    const { survey, source } = this.desk
+    const files = source.single ? [] : [...(survey.cogs ?? []), ...(survey.catalog ? [survey.catalog.collection, survey.catalog.items, survey.catalog.points] : [])].filter((one) => one !== null)
+    const left = survey.left_out ?? []
+    return h(
+      'footer',
+      { class: 'about' },
+      left.length > 0 && h('details', {}, h('summary', {}, `${left.length} left out`), h('ul', {}, ...left.map((one) => h('li', {}, one)))),
+      files.length > 0 && h('details', {}, h('summary', {}, 'Files for other programs'), h('ul', {}, ...files.map((one) => h('li', {}, h('a', { href: one, download: '' }, one.split('/').at(-1)!))))),
+      h('div', { class: 'row' }, h('span', { class: 'grow' }, survey.software), survey.report && h('a', { href: survey.report }, 'Report')),
+    )
   }
 
   #header(): HTMLElement {
@@ -278,7 +292,7 @@ export class App {
     if (views.length) this.desk.views.value = new Set(views)
     const at = (asked.get('at') ?? '').split(',').map(Number)
     const across_m = Number(asked.get('zoom')) || 30
-    if (at.length >= 2 && at.every(Number.isFinite)) this.desk.goTo({ easting_m: at[0]!, northing_m: at[1]!, across_m })
+    if (at.length >= 2 && at.every(Number.isFinite)) this.desk.goTo({ easting_m: at[0]!, northing_m: at[1]!, height_m: at[2] ?? null, across_m })
     const [layer, id] = (asked.get('row') ?? '').split('/')
     if (layer && id) await this.#goToRow(layer, Number(id))
     const station = asked.get('station')

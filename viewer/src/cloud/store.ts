@@ -58,6 +58,8 @@ export class CloudStore {
   /** Called whenever something arrived. */
   arrived: () => void = () => {}
   turn = 0
+  /** True where the points have colours, as far as it is known yet. */
+  coloured = false
   readonly #decoders = new Decoders()
   readonly #queue: { node: CloudNode; needed: boolean; start: () => void }[] = []
   #running = 0
@@ -69,6 +71,7 @@ export class CloudStore {
     readonly source: Source,
     private readonly complain: (error: unknown) => void,
   ) {
+    this.coloured = index.has_colours === true
     this.sheets = index.sheets.map(({ name, url, bounds_m, points }) => ({
       name,
       url,
@@ -102,6 +105,7 @@ export class CloudStore {
       sheet.scale[axis] = copc.header.scale[axis]! * units[axis]!
       sheet.offset[axis] = copc.header.offset[axis]! * units[axis]!
     }
+    this.coloured ||= copc.header.pointDataRecordFormat > 6
     sheet.copc = copc
     await this.#page(sheet, copc.info.rootHierarchyPage)
     this.arrived()

@@ -6,9 +6,11 @@ import { fill, h, iconButton } from '../core/dom'
 import * as format from '../core/format'
 import { css, ramp, SCALE_NAMES } from '../core/scales'
 import { Signal } from '../core/signal'
+import type { MeshIndex } from '../core/site'
 import { Eye } from './camera'
 import { Controls } from './controls'
 import { chooseNodes } from './levels'
+import type { SurfaceMeshes } from './meshes'
 import { drawOverlay, type Drawing } from './overlay'
 import { type Picked, pick } from './pick'
 import { CloudScene, type Colouring, type Look } from './scene'
@@ -55,6 +57,8 @@ export class CloudView {
   #active = false
   #draft: [number, number, number][] = []
   #far = 60
+  #meshes: Promise<SurfaceMeshes> | null = null
+  #coloured = false
   #hover = 0
 
   constructor(
@@ -86,7 +90,7 @@ export class CloudView {
       this.#settings,
       this.#status,
     )
-    store.arrived = () => this.#redraw(true)
+    store.arrived = () => this.#arrived()
     store.dropped = (node) => this.#scene.drop(node)
     this.#listen()
     this.#applyCodes()
@@ -162,6 +166,7 @@ export class CloudView {
 
   #moved(): void {
     this.#budget = BUDGET
+    if (this.#meshes) void this.#meshes.then((meshes) => this.#lookForMeshes(meshes))
     this.#redraw(true)
   }
 
@@ -224,6 +229,32 @@ export class CloudView {
     }
     if (this.#draft.length) drawings.push({ kind: 'line', points: this.#draft, dots: true })
     drawOverlay(this.#overlay, this.#size, this.eye.camera, this.#origin, drawings, this.desk.dark.value)
+  }
+
+  #arrived(): void {
+    if (!this.#coloured && this.store.coloured) {
+      this.#coloured = true
+      this.#drawSettings()
+    }
+    this.#redraw(true)
+  }
+
+  /** Show the meshes of the detailed surface, or the points alone. */
+  async showMeshes(shown: boolean): Promise<void> {
+    const { survey, source } = this.desk
+    this.#meshes ??= (async () => {
+      const [{ SurfaceMeshes }, index] = await Promise.all([import('./meshes'), source.json<MeshIndex>(survey.meshes!.url)])
+      return new SurfaceMeshes(index, source, this.#scene.meshes, this.#origin, () => this.#redraw(), (error) => this.desk.complain(error))
+    })()
+    const meshes = await this.#meshes
+    meshes.shown = shown
+    this.#lookForMeshes(meshes)
+    this.#redraw()
+  }
+
+  #lookForMeshes(meshes: SurfaceMeshes): void {
+    const at = this.eye.place.clone().addScaledVector(this.eye.direction(), Math.min(this.#far, 200))
+    meshes.look(at.x + this.#origin[0], at.y + this.#origin[1])
   }
 
   // ---- where things are ----
@@ -407,21 +438,31 @@ export class CloudView {
   }
 
   #drawSettings(): void {
-    const { colours, has_colours } = this.store.index
+    const { colours } = this.store.index
     const titles: Record<string, string> = { height: 'Height', intensity: 'Intensity', class: 'Class', pass: 'Pass', rgb: 'Pictures' }
-    const offered = [...new Set([...colours, ...(has_colours ? ['rgb'] : [])])].filter((one) => one in titles)
+    const offered = [...new Set([...colours, ...(this.store.coloured ? ['rgb'] : [])])].filter((one) => one in titles)
     const select = h(
       'select',
       { 'aria-label': 'Colour by', onchange: (event: Event) => this.setColouring((event.target as HTMLSelectElement).value as Colouring) },
       ...offered.map((one) => h('option', { value: one, selected: one === this.#look.colouring }, titles[one])),
     )
-    fill(this.#settings, h('div', { class: 'row' }, select, this.#lightingBox()), this.#legend(), this.#sizeSlider())
+    fill(this.#settings, h('div', { class: 'row' }, select, this.#lightingBox()), this.#legend(), this.#sizeSlider(), this.desk.survey.meshes ? this.#meshBox() : null)
   }
 
   #lightingBox(): HTMLElement {
     const box = h('input', { type: 'checkbox', checked: this.#look.lighting, onchange: () => this.#change({ lighting: box.checked }) })
     return h('label', { class: 'check', title: 'Eye-dome lighting: edges stand out by their depth' }, box, 'Shading')
   }
+
+  #meshBox(): HTMLElement {
+    const box = h('input', { type: 'checkbox', checked: this.#meshShown, onchange: () => {
+      this.#meshShown = box.checked
+      this.showMeshes(box.checked).catch((error) => this.desk.complain(error))
+    } })
+    return h('label', { class: 'check' }, box, 'Mesh of the surface')
+  }
+
+  #meshShown = false
 
   #sizeSlider(): HTMLElement {
     const slider = h('input', { type: 'range', min: 0.4, max: 3, step: 0.1, value: this.#look.size, 'aria-label': 'Size of points', oninput: () => this.#change({ size: Number(slider.value) }) })

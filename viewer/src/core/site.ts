@@ -36,6 +36,9 @@ export interface Survey {
   strips: { url: string; lanes: number } | null
   pictures: { url: string; pictures: number } | null
   report: string | null
+  left_out?: string[]
+  cogs?: string[]
+  catalog?: { collection: string; items: string; points: string | null } | null
   edits?: { layers: string[]; post: string | null } | null
 }
 
@@ -141,10 +144,10 @@ export interface Raster {
 
 export interface CloudIndex {
   points: number
-  bytes: number
-  sheets: { name: string; url: string; bounds_m: [number, number, number, number, number, number]; points: number; bytes: number }[]
+  bytes: number | null
+  sheets: { name: string; url: string; bounds_m: [number, number, number, number, number, number]; points: number; bytes: number | null }[]
   colours: string[]
-  has_colours: boolean
+  has_colours: boolean | null
   intensity: [number, number] | null
   classes: { class: number; title: string; colour: string }[]
   passes: { pass: number; title: string; colour: string }[]
@@ -236,6 +239,7 @@ export interface PictureColumns {
   height_m: number[]
   camera_from_map: number[][]
   sigma_m: (number | null)[]
+  name?: (string | null)[]
 }
 
 /** True where two rectangles meet. */

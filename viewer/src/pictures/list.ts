@@ -12,6 +12,7 @@ export interface Picture extends Pose {
   url: string
   epoch_gps_ns: string
   sigma_m: number | null
+  name: string
 }
 
 export interface View {
@@ -57,6 +58,7 @@ export class PictureList {
         height_m: columns.height_m[index]!,
         camera_from_map: columns.camera_from_map[index]!,
         sigma_m: columns.sigma_m?.[index] ?? null,
+        name: columns.name?.[index] ?? '',
       }
     })
   }

@@ -199,7 +199,7 @@ export class PictureView {
     this.#fit()
     this.#lookAtPlace()
     const sigma = picture.sigma_m === null ? '' : `  σ ${format.length(picture.sigma_m)}`
-    this.#caption.textContent = `${picture.camera.run} · ${picture.camera.title} · ${format.gpsTime(picture.epoch_gps_ns)}${sigma}`
+    this.#caption.textContent = [picture.camera.run, picture.camera.title, picture.name, format.gpsTime(picture.epoch_gps_ns)].filter(Boolean).join(' · ') + sigma
     this.desk.picture.value = picture.id
   }
 

@@ -59,6 +59,8 @@ export class CloudView {
   #far = 60
   #meshes: Promise<SurfaceMeshes> | null = null
   #coloured = false
+  /** True once people have moved the eye. */
+  #touched = false
   #hover = 0
 
   constructor(
@@ -161,10 +163,12 @@ export class CloudView {
     const ratio = Math.min(2, window.devicePixelRatio || 1)
     ;[this.#overlay.width, this.#overlay.height] = [width * ratio, height * ratio]
     this.#applyLook()
+    if (!this.#touched) this.fit()
     this.#redraw(true)
   }
 
   #moved(): void {
+    this.#touched = true
     this.#budget = BUDGET
     if (this.#meshes) void this.#meshes.then((meshes) => this.#lookForMeshes(meshes))
     this.#redraw(true)
@@ -308,7 +312,8 @@ export class CloudView {
     const size = Math.hypot(max[0]! - min[0]!, max[1]! - min[1]!)
     this.eye.heading = 0
     this.eye.tilt = 0.75
-    this.#far = Math.max(5, size * 0.8)
+    const narrowest = Math.min(1, this.#size.width / this.#size.height || 1)
+    this.#far = Math.max(5, (size * 0.8) / Math.max(0.3, narrowest))
     this.eye.lookAt(middle, this.#far)
     this.#redraw(true)
   }

@@ -17,6 +17,7 @@ def publish(
     box: Annotated[
         str | None, typer.Option(help="Only this part: WEST,SOUTH,EAST,NORTH in metres of the survey's map.")
     ] = None,
+    road: Annotated[str | None, typer.Option(help="Only the surroundings of this road of `reference_lines`.")] = None,
     finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0,
     clouds: Annotated[bool, typer.Option(help="With the points.")] = True,
     pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True,
@@ -24,7 +25,7 @@ def publish(
 ) -> None:
     """The survey as a page to look at: a folder for any web server with range requests, or one file."""
     from roadscan.cli.terminal import new_reporter
-    from roadscan.jobs.publish.material import Material, Wishes, box_from_text
+    from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
     from roadscan.jobs.publish.single import write_single
     from roadscan.jobs.publish.site import publish as published
     from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
@@ -36,7 +37,11 @@ def publish(
         raise ConfigError("publish takes a folder or a single file", expected="--out FOLDER or --single FILE.html")
     session = Session.open(survey_file)
     session.hear_of_damage()
-    wishes = Wishes(clouds, pictures, finest, None if box is None else box_from_text(box))
+    if box is not None and road is not None:
+        raise ConfigError("--box and --road are both given", expected="one of them")
+    near = box_from_text(box) if box is not None else None
+    near = near if road is None else box_of_road(Material(session), road)
+    wishes = Wishes(clouds, pictures, finest, near)
     reporter = new_reporter()
     if single is not None:
         page = write_single(Material(session, wishes), single, largest, lambda d, t: reporter.progress("publish", d, t))

@@ -65,5 +65,5 @@ def demo(
     run_survey(survey_file, stages(), Where(workers))
     compared = summarise(survey_file)
     sum_up(survey_file, as_json, {"height_error_m": compared.height_error()})
-    for line in () if as_json else compared.lines():
+    for line in () if as_json else (*compared.lines(), f"look at it    roadscan view {survey_file}"):
         typer.echo(line)

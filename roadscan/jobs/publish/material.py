@@ -19,7 +19,7 @@ from roadscan.jobs.products import StoredTiles, product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE
 from roadscan.jobs.tiles.tiles import summary_of
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, TileSummary
 from roadscan.products.geo_table import read_geo_table
@@ -29,6 +29,9 @@ from roadscan.tables.store import Store
 
 SHEET_M: Final = 1000.0
 """Edge of a kilometre sheet."""
+
+BESIDE_ROAD_M: Final = 20.0
+"""What is shown beside a road that is asked for alone."""
 
 Box = tuple[float, float, float, float]
 """Least easting and northing, greatest easting and northing (m)."""
@@ -170,6 +173,26 @@ def sheet_name(easting_m: float, northing_m: float) -> str:
 def box_of(shapes: npt.NDArray[Any]) -> list[float]:
     """Box of shapes (m), to the hundredth of a millimetre."""
     return [round(float(v), 5) for v in shapely.total_bounds(shapes)]
+
+
+def box_of_road(material: Material, road: str) -> Box:
+    """Box of a road of the table `reference_lines`, with what lies beside it (m).
+
+    Raises
+    ------
+    ConfigError
+        where the survey has no such road.
+    """
+    held = material.table("reference_lines")
+    known = [] if held is None else [str(name) for name in held.rows.column("road").to_pylist()]
+    if held is None or held.shapes_m is None or road not in known:
+        raise ConfigError(
+            f"there is no road '{road}'{nearest(road, known)}",
+            expected=", ".join(known) or "a survey with the stage condition, which finds the roads",
+            change="name a --box instead",
+        )
+    west, south, east, north = (float(v) for v in held.shapes_m[known.index(road)].bounds)
+    return west - BESIDE_ROAD_M, south - BESIDE_ROAD_M, east + BESIDE_ROAD_M, north + BESIDE_ROAD_M
 
 
 def box_from_text(text: str) -> Box:

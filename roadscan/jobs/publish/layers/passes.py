@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from roadscan.jobs.publish.layer import (
     BLUE,
@@ -30,6 +31,8 @@ from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.products.lane_direction import STEP_M
 
 RUN_COLOURS = (BLUE, RED, GREEN, PURPLE, SKY, ORANGE)
+_FAITHFUL_M = 0.02
+"""A line strays no farther from the driven path than this: a network of them is still a small file."""
 _POSE = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m"]
 
 
@@ -54,7 +57,7 @@ class Passes(LayerKind):
             own = places_m[(epochs >= one.start_gps_ns) & (epochs <= one.end_gps_ns)]
             if not len(own):
                 continue
-            shapes.append(line_of(own))
+            shapes.append(shapely.simplify(line_of(own), _FAITHFUL_M))
             times = [utc_from_gps_ns(t).isoformat(timespec="seconds") for t in (one.start_gps_ns, one.end_gps_ns)]
             rows.append(
                 {

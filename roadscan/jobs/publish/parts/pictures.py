@@ -16,6 +16,7 @@ from roadscan.jobs.publish.material import Material, sheet_name
 from roadscan.jobs.publish.part import SitePart
 from roadscan.jobs.surfaces.pictures import Pictures as PlacedPictures
 from roadscan.jobs.surfaces.pictures import plan_pictures
+from roadscan.jobs.surfaces.taken_pictures import taken_pictures
 from roadscan.model.errors import DamagedError, RoadscanError
 from roadscan.points.picture_axes import camera_from_map
 from roadscan.points.views import HEIGHT, WIDTH, PictureRule
@@ -51,9 +52,10 @@ class Pictures(SitePart):
             {"url": f"pictures/{name}.json", "bounds_m": _bounds(held, numbers), "pictures": len(numbers)}
             for name, numbers in sorted(sheets.items())
         ]
+        epochs = _epochs(material, held)
         yield json_document("pictures/index.json", {"cameras": _cameras(held), "parts": parts})
         for name, numbers in sorted(sheets.items()):
-            yield json_document(f"pictures/{name}.json", _poses(held, numbers))
+            yield json_document(f"pictures/{name}.json", _poses(held, numbers, epochs))
         for number in range(len(held)):
             yield Document(_url(held, number), _key(held, number), _copied(held, number))
 
@@ -70,8 +72,7 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
     near = material.wishes.near
     if near is not None:
         held = held.near(Bounds(*near))
-    there = [number for number in range(len(held)) if held.path(number).is_file()]
-    return held if len(held) and len(there) == len(held) else None
+    return held if any(held.path(number).is_file() for number in range(len(held))) else None
 
 
 def _bounds(held: PlacedPictures, numbers: list[int]) -> list[float]:
@@ -98,7 +99,7 @@ def _cameras(held: PlacedPictures) -> list[dict[str, Any]]:
     return found
 
 
-def _poses(held: PlacedPictures, numbers: list[int]) -> dict[str, Any]:
+def _poses(held: PlacedPictures, numbers: list[int], epochs: list[str]) -> dict[str, Any]:
     views = held.views.picked(np.array(numbers, np.int64))
     place, turn = np.empty((len(numbers), 3)), np.empty((len(numbers), 3, 3))
     for world, name in enumerate(held.worlds):
@@ -110,9 +111,19 @@ def _poses(held: PlacedPictures, numbers: list[int]) -> dict[str, Any]:
     return {
         "pictures": len(numbers), "id": numbers, "camera": [int(held.log[k]) for k in numbers],
         "url": [_url(held, k) for k in numbers], "name": [held.name(k) for k in numbers],
+        "epoch_gps_ns": [epochs[k] for k in numbers],
         "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
         "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9), "sigma_m": [None] * len(numbers),
     }  # fmt: skip
+
+
+def _epochs(material: Material, held: PlacedPictures) -> list[str]:
+    """GPS time of each picture (ns), as its camera's clock was found."""
+    known: dict[tuple[str, str], int] = {}
+    for log in held.logs:
+        for taken in taken_pictures(material.store, material.plan.records, log.sensor):
+            known |= {(taken.record.key, f): e for f, e in zip(taken.files, taken.epochs_gps_ns.tolist(), strict=True)}
+    return [str(known[held.logs[log].key, file]) for log, file in zip(held.log.tolist(), held.files, strict=True)]
 
 
 def _url(held: PlacedPictures, number: int) -> str:

@@ -1,0 +1,517 @@
+"""A published site: documents as docs/viewer.md says, places as the survey's, the same bytes for the same store."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import random
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pyproj
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from roadscan.cli import app
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.publish import web_part
+from roadscan.jobs.publish.document import json_bytes
+from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
+from roadscan.jobs.publish.parts import vectors
+from roadscan.jobs.publish.single import write_single
+from roadscan.jobs.publish.site import KEYS, Published, publish
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stages
+from roadscan.jobs.tiles.cell_files import read_cells
+from roadscan.jobs.tiles.tile_plan import TILE
+from roadscan.model.errors import ConfigError
+from roadscan.model.survey import Survey
+from roadscan.products.site_rasters import Place, Raster, coarser_picture
+from roadscan.simulate import simulate, truth
+from tests.jobs.conftest import Lines, Simulated, small_scene
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewer.md"
+SINGLE = "<!doctype html><html><head><title>s</title></head><body><!--roadscan-data--><p id=a></p></body></html>"
+SAFE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_./-]*")
+
+
+def opened(survey_file: Path) -> Session:
+    """A session on a survey."""
+    return Session(Survey.load(survey_file), Simulated(survey_file).store(), Inline(), None, Lines())
+
+
+@pytest.fixture(scope="module")
+def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """14 m of a road with a camera and the condition of its lanes, run once."""
+    scene = small_scene(
+        noise={"position_m": 0.0, "attitude_deg": 0.0},
+        camera={"on": True, "every_m": 5.0, "width_px": 64, "height_px": 64, "mount": {"pitch_deg": -28.0}},
+    )
+    file = simulate(scene, tmp_path_factory.mktemp("site") / "survey").survey_file
+    with file.open("a") as survey:
+        survey.write("\n[condition]\nsection_m = 10\n")
+    run_stages(opened(file), stages())
+    return file
+
+
+@pytest.fixture(scope="module")
+def published(survey_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Published:
+    """Its site."""
+    return publish(Material(opened(survey_file)), tmp_path_factory.mktemp("out") / "site")
+
+
+def read(published: Published, path: str) -> Any:
+    """A document of the site."""
+    return json.loads((published.folder / path).read_bytes())
+
+
+def members(value: Any) -> Iterator[str]:
+    """All names of members of a document."""
+    if isinstance(value, dict):
+        for name, one in value.items():
+            yield name
+            yield from members(one)
+    elif isinstance(value, list):
+        for one in value:
+            yield from members(one)
+
+
+def urls(value: Any) -> Iterator[str]:
+    """All paths that a document names."""
+    if isinstance(value, dict):
+        for name, one in value.items():
+            if name in ("url", "tiles", "collection", "items", "points") and isinstance(one, str):
+                yield one
+            yield from urls(one)
+    elif isinstance(value, list):
+        for one in value:
+            yield from urls(one)
+
+
+def test_every_document_that_is_named_is_there_and_every_member_is_told(published: Published) -> None:
+    assert not published.failures
+    entry = read(published, "survey.json")
+    assert entry["left_out"] == []
+    names = {"survey.json"} | {part["url"] for layer in entry["layers"] for part in layer["parts"]}
+    names |= {entry[part]["url"] for part in ("clouds", "strips", "pictures")}
+    names |= {level["tiles"] for level in entry["raster_grid"]["levels"]} | set(entry["catalog"].values())
+    page = PAGE.read_text()
+    for name in sorted(n for n in names if n.endswith(".json") and not n.startswith("catalog/")):
+        document = read(published, name)
+        for url in urls(document) if not name.startswith("layers/") and name != "survey.json" else ():
+            names.add(url)
+        told = {m for m in members(document) if not name.startswith("layers/")}
+        missing = {m for m in told - {"type"} if not re.search(rf"`{m}`|\b{m}\b", page)}
+        assert not missing, (name, missing)
+    files = {f.relative_to(published.folder).as_posix() for f in published.folder.rglob("*") if f.is_file()}
+    assert {name for name in names if name not in files} == set()
+    assert all(SAFE.fullmatch(name) for name in files)
+    for level in entry["raster_grid"]["levels"]:
+        rows = read(published, level["tiles"])["rows"]
+        there = {f"{c}_{row}.png" for row, runs in rows for a, b in runs for c in range(a, b + 1)}
+        assert len(there) == level["count"]
+        for raster in entry["rasters"]:
+            folder = published.folder / "rasters" / raster["name"] / str(level["level"])
+            assert {f.name for f in folder.iterdir()} == there
+
+
+def test_heights_read_back_are_those_of_the_cells(survey_file: Path, published: Published) -> None:
+    session, entry = opened(survey_file), read(published, "survey.json")
+    grid, level = session.plan.ground.grid, entry["raster_grid"]["levels"][0]
+    height = next(r for r in entry["rasters"] if r["name"] == "height")
+    assert level["pixel_m"] == grid.cell_m
+    compared = 0
+    for record in [r for r in session.manifest.of(TILE).values() if r.path][:3]:
+        cells = read_cells(session.store, record, grid.cells_per_edge)
+        box = grid.bounds(cells.tile)
+        for k in range(0, len(cells), max(1, len(cells) // 40)):
+            easting = box.easting_min_m + (cells.column[k] + 0.5) * grid.cell_m
+            northing = box.northing_min_m + (cells.row[k] + 0.5) * grid.cell_m
+            column, row = int(easting // level["tile_m"]), int(northing // level["tile_m"])
+            path = height["url"].format(level=0, column=column, row=row)
+            picture = np.asarray(Image.open(published.folder / path))
+            x = int((easting - column * level["tile_m"]) / level["pixel_m"])
+            y = int(((row + 1) * level["tile_m"] - northing) / level["pixel_m"])
+            red, green, blue, opacity = picture[y, x].tolist()
+            assert opacity == 255
+            value_m = height["offset"] + height["step"] * (65536 * red + 256 * green + blue)
+            assert value_m == pytest.approx(cells.height_robust_m[k], abs=0.51 * height["step"])
+            compared += 1
+    assert compared > 60
+
+
+def heights_of(published: Published, level: int) -> dict[tuple[int, int], int]:
+    """Numbers that stand for heights, by column and row of the pixel on the map."""
+    entry = read(published, "survey.json")
+    height = next(r for r in entry["rasters"] if r["name"] == "height")
+    edge, found = entry["raster_grid"]["tile_px"], {}
+    for row, runs in read(published, entry["raster_grid"]["levels"][level]["tiles"])["rows"]:
+        for column in (c for a, b in runs for c in range(a, b + 1)):
+            path = height["url"].format(level=level, column=column, row=row)
+            picture = np.asarray(Image.open(published.folder / path)).astype(np.int64)
+            number = 65536 * picture[..., 0] + 256 * picture[..., 1] + picture[..., 2]
+            for y, x in np.argwhere(picture[..., 3] > 0).tolist():
+                found[column * edge + x, (row + 1) * edge - 1 - y] = int(number[y, x])
+    return found
+
+
+def test_pixels_of_the_next_level_are_means_of_the_finest(published: Published) -> None:
+    levels = read(published, "survey.json")["raster_grid"]["levels"]
+    factor = round(levels[1]["pixel_m"] / levels[0]["pixel_m"])
+    own: dict[tuple[int, int], list[int]] = {}
+    for (column, row), number in heights_of(published, 0).items():
+        own.setdefault((column // factor, row // factor), []).append(number)
+    coarse = heights_of(published, 1)
+    assert coarse.keys() == own.keys() and len(coarse) > 100
+    assert max(abs(number - np.mean(own[place])) for place, number in coarse.items()) <= 1.01
+
+
+@pytest.mark.parametrize("raster", ["height", "intensity"])
+def test_a_coarser_picture_is_the_mean_of_four_by_four_known_pixels(raster: Raster, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    edge, place = 8, Place(3, -2, 5)
+    bands = 4 if raster == "height" else 2
+    held: dict[Place, Path] = {}
+    whole = np.zeros((4 * edge, 4 * edge, bands), np.uint8)
+    for right, up in ((0, 0), (3, 1), (2, 3)):
+        picture = rng.integers(0, 256, (edge, edge, bands)).astype(np.uint8)
+        picture[..., -1] = np.where(rng.random((edge, edge)) < 0.6, 255, 0)
+        finer = Place(2, 4 * place.column + right, 4 * place.row + up)
+        held[finer] = tmp_path / f"{right}{up}.png"
+        Image.fromarray(picture).save(held[finer])
+        top = (3 - up) * edge
+        whole[top : top + edge, right * edge : (right + 1) * edge] = picture
+    coarser_picture(tmp_path / "out.png", raster, held.get, place, edge)
+    out = np.asarray(Image.open(tmp_path / "out.png")).astype(int)
+    for y in range(edge):
+        for x in range(edge):
+            block = whole[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].reshape(-1, bands).astype(int)
+            known = block[block[:, -1] > 0]
+            assert out[y, x, -1] == (255 if len(known) else 0)
+            if len(known):
+                weights = [65536, 256, 1] if bands == 4 else [1]
+                assert out[y, x, :-1] @ weights == round(float(np.mean(known[:, :-1] @ weights)))
+
+
+def test_a_cloud_holds_every_point_of_the_survey_once(survey_file: Path, published: Published) -> None:
+    session, index = opened(survey_file), read(published, "clouds/index.json")
+    places, passes = [], []
+    for sheet in index["sheets"]:
+        with laspy.CopcReader.open(published.folder / sheet["url"]) as reader:
+            points = reader.query()
+        assert len(points) == sheet["points"]
+        west, south, low, east, north, high = sheet["bounds_m"]
+        xyz = np.stack([points.x, points.y, points.z], axis=-1)
+        assert (xyz >= [west, south, low - 1e-4]).all() and (xyz <= [east, north, high + 1e-4]).all()
+        places.append(xyz)
+        passes.append(points.point_source_id)
+    held = sum(r.figures()["points"] for r in session.manifest.of(TILE).values() if r.path)
+    assert index["points"] == held == sum(map(len, places))
+    assert set(np.concatenate(passes).tolist()) == {one["pass"] for one in index["passes"]}
+    path = next(r.path for r in session.manifest.of("las").values() if r.path)
+    las = laspy.read(io.BytesIO(session.store.read_bytes(path)))
+    wanted = {tuple(one) for one in np.round(np.stack([las.x, las.y, las.z, las.gps_time], axis=-1), 4).tolist()}
+    assert len(wanted) > 100
+    whole = np.round(np.concatenate(places), 4)
+    assert {one[:3] for one in wanted} <= set(map(tuple, whole.tolist()))
+
+
+def test_strips_hold_the_values_of_the_tables(survey_file: Path, published: Published) -> None:
+    session, index = opened(survey_file), read(published, "strips/index.json")
+    assert {lane["lane"] for lane in index["lanes"]} == {"1", "2"}
+    for lane in index["lanes"]:
+        strip = read(published, lane["url"])
+        assert strip["line"]["station_m"] == sorted(strip["line"]["station_m"])
+        records = [r for r in session.manifest.all() if f"/rut_wire/{lane['road']}/{lane['lane']}/" in r.path]
+        rows = [row for r in records for row in session.store.read_table(r.path).to_pylist()]
+        series = {(s["quantity"], s["extent"]): s for s in strip["series"]}
+        own = series["rut_depth_left_mm", "cross_section"]
+        expected = sorted(
+            (r["station_from_m"], r["value"]) for r in rows
+            if (r["quantity"], r["extent"]) == ("rut_depth_left_mm", "cross_section")
+        )  # fmt: skip
+        assert expected and [one for one, _ in expected] == own["from_m"]
+        known = [(a, b) for (_, a), b in zip(expected, own["value"], strict=True) if b is not None]
+        assert all(a == b for a, b in known) and known
+        for part in lane["cross_sections"]:
+            for section in read(published, part["url"])["sections"]:
+                assert part["from_m"] <= section["station_m"] <= part["to_m"]
+                assert 0.0 <= section["direction_deg"] < 360.0
+    crossing = next(r for r in session.manifest.all() if r.product == "cross_sections" and r.path)
+    row = session.store.read_table(crossing.path).to_pylist()[0]
+    told = [s for lane in index["lanes"] for p in lane["cross_sections"] for s in read(published, p["url"])["sections"]]
+    same = next(s for s in told if s["easting_m"] == row["easting_m"] and s["northing_m"] == row["northing_m"])
+    heights = [None if v is None else same["height_m"] + v / 1000 for v in same["relative_height_mm"]]
+    for height, true in zip(heights, row["relative_height_m"], strict=True):
+        assert (height is None) == np.isnan(true)
+        assert height is None or height == pytest.approx(row["height_m"] + true, abs=1e-5)
+
+
+def test_the_direction_of_travel_is_that_of_the_drive(published: Published) -> None:
+    """The truth drives lane 2 forward and lane 1 backward; the passes say so."""
+    index = read(published, "strips/index.json")
+    turned = {}
+    for lane in index["lanes"]:
+        line = read(published, lane["url"])["line"]
+        east, north = (line[a][-1] - line[a][0] for a in ("easting_m", "northing_m"))
+        along = np.degrees(np.arctan2(east, north)) % 360.0
+        section = read(published, lane["cross_sections"][0]["url"])["sections"][0]
+        turned[lane["direction"]] = (section["direction_deg"] - along + 180.0) % 360.0 - 180.0
+    assert abs(turned["forward"]) < 5.0
+    assert abs(abs(turned["backward"]) - 180.0) < 5.0
+
+
+def test_points_stand_in_pictures_where_the_true_camera_sees_them(survey_file: Path, published: Published) -> None:
+    known = truth.load(survey_file.parent)
+    to_world = pyproj.Transformer.from_crs(pyproj.CRS("EPSG:32632").to_3d(), "EPSG:4978", always_xy=True)
+    index = read(published, "pictures/index.json")
+    assert {c["run"] for c in index["cameras"]} == {"run-1", "run-2"}
+    worst, seen = 0.0, 0
+    for part in index["parts"]:
+        poses = read(published, part["url"])
+        for k in range(poses["pictures"]):
+            camera = index["cameras"][poses["camera"][k]]
+            name = poses["name"][k].rsplit("/", 1)[-1]
+            true = next(r for r in pq.read_table(known.camera_file(camera["run"])).to_pylist() if r["file"] == name)
+            assert abs(int(poses["epoch_gps_ns"][k]) - true["epoch_gps_ns"]) < 1000
+            raw = survey_file.parent / "raw" / camera["run"] / "camera" / name
+            assert (published.folder / poses["url"][k]).read_bytes() == raw.read_bytes()
+            eye_m = np.array([poses[n][k] for n in ("easting_m", "northing_m", "height_m")])
+            turn = Rotation.from_quat([true[q] for q in ("qx", "qy", "qz", "qw")]).as_matrix()
+            ahead_m = eye_m + np.array([[6.0, 4.0, -2.0], [-6.0, -4.0, -2.0], [5.0, 5.0, -2.5], [-5.0, -3.0, -2.5]])
+            world = np.stack(to_world.transform(*ahead_m.T), axis=-1)
+            body = (world - [true[f"{a}_world_m"] for a in "xyz"]) @ turn  # x ahead, y right, z down
+            matrix = np.array(poses["camera_from_map"][k]).reshape(3, 3)
+            for one, own in zip(body, (ahead_m - eye_m) @ matrix.T, strict=True):
+                if one[0] > 0.5:
+                    wanted, found = one[1:] / one[0], own[:2] / own[2]
+                    worst = max(worst, float(np.abs(wanted - found).max()) * camera["focal_px"][0])
+                    seen += 1
+    assert seen > 5
+    assert worst < 0.5  # pixels
+
+
+def test_the_same_survey_gives_the_same_bytes_and_nothing_is_made_twice(
+    survey_file: Path, published: Published, tmp_path: Path
+) -> None:
+    other = publish(Material(opened(survey_file)), tmp_path / "site")
+    files = {f.relative_to(published.folder): f.read_bytes() for f in published.folder.rglob("*") if f.is_file()}
+    assert {f.relative_to(other.folder): f.read_bytes() for f in other.folder.rglob("*") if f.is_file()} == files
+    again = publish(Material(opened(survey_file)), tmp_path / "site")
+    assert (again.made, again.files, again.bytes) == (0, other.files, other.bytes)
+    assert [f.name for f in tmp_path.iterdir()] == ["site"]
+
+
+def test_a_folder_of_something_else_is_left_alone(survey_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "letters.txt").write_text("dear")
+    done = CliRunner().invoke(app, ["publish", str(survey_file), "--out", str(tmp_path)])
+    assert done.exit_code != 0 and isinstance(done.exception, ConfigError)
+    assert "holds no site" in str(done.exception)
+    assert [f.name for f in tmp_path.iterdir()] == ["letters.txt"]
+
+
+def test_part_of_a_survey(survey_file: Path, published: Published, tmp_path: Path) -> None:
+    west, south, east, north = read(published, "survey.json")["extent_m"]
+    wishes = Wishes(clouds=False, pictures=False, finest_pixel_m=0.15, near=(west, south, west + 5.0, north))
+    part = publish(Material(opened(survey_file), wishes), tmp_path / "site")
+    entry = read(part, "survey.json")
+    assert entry["clouds"] is None and entry["pictures"] is None and entry["cogs"] == []
+    assert entry["extent_m"][2] < east and entry["extent_m"][0] == west
+    assert entry["raster_grid"]["levels"][0]["pixel_m"] >= 0.15 or len(entry["raster_grid"]["levels"]) == 1
+    assert not (part.folder / "clouds").exists()
+
+
+def test_a_road_is_its_line_and_what_lies_beside_it(survey_file: Path, published: Published) -> None:
+    material = Material(opened(survey_file))
+    layer = next(one for one in read(published, "survey.json")["layers"] if one["name"] == "reference_lines")
+    grown = [v + d for v, d in zip(layer["parts"][0]["bounds_m"], (-20, -20, 20, 20), strict=True)]
+    assert box_of_road(material, "road1") == pytest.approx(grown, abs=1e-4)
+    with pytest.raises(ConfigError, match="there is no road 'road2'"):
+        box_of_road(material, "road2")
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "1,2,a,4", "5,0,1,2", "0,0,nan,1", ""])
+def test_a_box_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="the box"):
+        box_from_text(text)
+
+
+def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
+    pystac = pytest.importorskip("pystac", reason="pystac is not installed")
+    collection = pystac.Collection.from_file(str(published.folder / "catalog" / "collection.json"))
+    items = list(collection.get_items())
+    assert collection.id == "demo" and len(items) == len(read(published, "clouds/index.json")["sheets"])
+    for item in items:
+        for asset in item.assets.values():
+            assert Path(asset.get_absolute_href()).is_file()
+        assert item.get_collection() is collection
+    table = geopandas.read_parquet(published.folder / "catalog" / "items.parquet")
+    assert sorted(table["id"]) == sorted(item.id for item in items)
+    assert table.crs.to_epsg() in (4326, None) or table.crs.to_string() == "OGC:CRS84"
+    west, south, east, north = read(published, "survey.json")["extent_m"]
+    placed = table.to_crs("EPSG:32632").total_bounds
+    assert placed == pytest.approx([west, south, east, north], abs=0.01)
+
+
+def test_the_virtual_point_cloud_names_the_sheets(published: Published) -> None:
+    virtual, index = read(published, "catalog/points.vpc"), read(published, "clouds/index.json")
+    assert sum(f["properties"]["pc:count"] for f in virtual["features"]) == index["points"]
+    for feature in virtual["features"]:
+        file = published.folder / "catalog" / feature["assets"]["data"]["href"]
+        with laspy.open(file) as reader:
+            box = feature["properties"]["proj:bbox"]
+            assert (reader.header.mins >= np.array(box[:3]) - 1e-4).all()
+            assert (reader.header.maxs <= np.array(box[3:]) + 1e-4).all()
+        assert pyproj.CRS.from_wkt(feature["properties"]["proj:wkt2"]).to_epsg() == 32632
+
+
+class Scripts(HTMLParser):
+    """What stands in a page's scripts, by path, and how many elements of each kind there are."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=False)
+        self.held: dict[str, str] = {}
+        self.kinds: list[str] = []
+        self._path: str | None = None
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.kinds.append(tag)
+        self._path = dict(attrs).get("data-path") if tag == "script" else None
+
+    def handle_data(self, data: str) -> None:
+        if self._path is not None:
+            self.held[self._path] = self.held.get(self._path, "") + data
+
+    def handle_endtag(self, tag: str) -> None:
+        self._path = None
+
+
+@pytest.fixture
+def with_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A web part of a few bytes."""
+    folder = tmp_path / "dist"
+    (folder / "app").mkdir(parents=True)
+    (folder / "index.html").write_text("<!doctype html>")
+    (folder / "app" / "app.js").write_text("1;")
+    (folder / "single.html").write_text(SINGLE)
+    monkeypatch.setattr(web_part, "web_folder", lambda: folder)
+    return folder
+
+
+def test_a_single_file_holds_all(survey_file: Path, published: Published, with_page: Path, tmp_path: Path) -> None:
+    made = write_single(Material(opened(survey_file)), tmp_path / "street.html")
+    page = Scripts((tmp_path / "street.html").read_text())
+    assert made.left_out == () and made.bytes == (tmp_path / "street.html").stat().st_size
+    assert {kind for kind in page.kinds if kind != "script"} == {"html", "head", "title", "body", "p"}
+    for path, text in page.held.items():
+        file = published.folder / path
+        if path.endswith(".json"):
+            content, true = json.loads(text), json.loads(file.read_bytes())
+            assert content == ({**true, "report": None} if path == "survey.json" else true)
+        else:
+            assert base64.b64decode(text, validate=True) == file.read_bytes()
+    assert set(read(published, KEYS)["keys"]) - set(page.held) <= {
+        f.relative_to(published.folder).as_posix()
+        for f in published.folder.rglob("*")
+        if f.suffix in (".parquet", ".vpc", ".tif", ".vrt", ".html")
+    }
+
+
+def test_a_single_file_has_a_limit(survey_file: Path, with_page: Path, tmp_path: Path) -> None:
+    whole = write_single(Material(opened(survey_file)), tmp_path / "whole.html").bytes
+    limit_mb = 0.6 * whole / 1e6
+    small = write_single(Material(opened(survey_file)), tmp_path / "street.html", limit_mb)
+    assert small.bytes <= 1e6 * limit_mb and small.left_out[0] == "pictures of cameras"
+    with pytest.raises(ConfigError, match="even without"):
+        write_single(Material(opened(survey_file)), tmp_path / "none.html", 1e-3)
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_without_the_page_the_data_are_published_and_it_is_said(
+    survey_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(web_part, "web_folder", lambda: None)
+    done = CliRunner().invoke(app, ["publish", str(survey_file), "--out", str(tmp_path / "site"), "--no-clouds"])
+    assert done.exit_code == 0, done.output
+    assert "make viewer" in done.output and (tmp_path / "site" / "survey.json").is_file()
+    done = CliRunner().invoke(app, ["publish", str(survey_file), "--single", str(tmp_path / "one.html")])
+    assert isinstance(done.exception, ConfigError) and "make viewer" in str(done.exception)
+
+
+def test_hostile_names_are_data(survey_file: Path, with_page: Path, tmp_path: Path) -> None:
+    nasty = "</script><script>alert(1)</script><!--<img src=x onerror=alert(2)>\u2028'\"&"
+    copy = Simulated(survey_file).copy_with_store_to(tmp_path / "survey")
+    text = copy.survey_file.read_text().splitlines()
+    text = [f"title = {json.dumps(nasty)}" if line.startswith("title") else line for line in text]
+    copy.survey_file.write_text("\n".join(text))
+    wishes = Wishes(clouds=False, pictures=False)
+    write_single(Material(opened(copy.survey_file), wishes), tmp_path / "street.html")
+    page = Scripts((tmp_path / "street.html").read_text())
+    assert {kind for kind in page.kinds if kind != "script"} == {"html", "head", "title", "body", "p"}
+    assert page.kinds.count("script") == len(page.held)
+    assert json.loads(page.held["survey.json"])["title"] == nasty
+
+
+def test_ten_thousand_texts_come_back_and_end_no_element() -> None:
+    rng = random.Random(7)
+    pieces = [
+        "<script>",
+        "</script>",
+        "<!--",
+        "-->",
+        "]]>",
+        "\\",
+        '"',
+        "'",
+        "&lt;",
+        "\u2028",
+        "\x00",
+        "😀",
+        "</",
+    ]
+
+    def text() -> str:
+        count = rng.randrange(30)
+        return "".join(
+            rng.choice(pieces) if rng.random() < 0.4 else chr(rng.randrange(1, 0xD800)) for _ in range(count)
+        )
+
+    texts = [text() for _ in range(10_000)]
+    content = json_bytes(texts)
+    assert not set(content) & set(b"<>&")
+    assert content.isascii()
+    assert json.loads(content) == texts
+    page = Scripts(f'<p></p><script type="application/json" data-path="x">{content.decode()}</script><p></p>')
+    assert page.kinds == ["p", "script", "p"] and json.loads(page.held["x"]) == texts
+
+
+def test_what_json_has_no_word_for_is_null_and_long_numbers_are_text() -> None:
+    told = json.loads(
+        json_bytes({"a": np.float64("nan"), "b": [np.inf, 1.5], "c": 2**60, "d": np.arange(2), "e": None})
+    )
+    assert told == {"a": None, "b": [None, 1.5], "c": str(2**60), "d": [0, 1], "e": None}
+
+
+def test_a_large_layer_is_cut_into_sheets(
+    survey_file: Path, monkeypatch: pytest.MonkeyPatch, published: Published
+) -> None:
+    monkeypatch.setattr(vectors, "_MOST_VERTICES", 10)
+    material = Material(opened(survey_file))
+    documents = {d.path: d for d in vectors.Vectors().documents(material) if d.path.startswith("layers/tiles/")}
+    layer = next(one for one in vectors.Vectors().members(material)["layers"] if one["name"] == "tiles")
+    assert {part["url"] for part in layer["parts"]} == set(documents)
+    assert "whole" not in "".join(documents)
+    assert sum(part["features"] for part in layer["parts"]) == layer["features"]

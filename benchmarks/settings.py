@@ -38,6 +38,8 @@ class Settings:
     """Length of the road whose passes are adjusted."""
     adjustment_seeds: int = 10
     """Draws of the reference site's observations."""
+    site: str = ""
+    """Folder of a published site that the page opens in Chromium; without one, only its code is weighed."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check lint types contracts docs docs-check pytest nightly test-library fuzz bench format venv install install-dev constraints clean
+.PHONY: help demo test check lint types contracts docs docs-check pytest nightly test-library fuzz bench viewer format venv install install-dev constraints clean
 
 help:  ## Show the targets.
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -62,6 +62,16 @@ fuzz: $(VENV)/.installed-dev  ## Every reader on 10,000 damaged files (an hour o
 bench: $(VENV)/.installed-dev  ## Benchmarks.
 	$(BIN)/python -m benchmarks
 
+viewer: viewer/dist/index.html  ## Build the page of `roadscan view` and `publish` (needs Node 20 or newer with npm).
+
+viewer/dist/index.html: viewer/node_modules/.installed viewer/build.mjs viewer/tsconfig.json $(shell find viewer/src viewer/licences -type f)
+	cd viewer && npm run --silent check && npm run --silent build
+
+viewer/node_modules/.installed: viewer/package.json viewer/package-lock.json
+	@command -v npm >/dev/null || { echo "npm was not found; on Debian or Ubuntu: apt-get install nodejs npm" >&2; exit 1; }
+	cd viewer && npm ci --no-audit --no-fund
+	@touch $@
+
 format: $(VENV)/.installed-dev  ## Format the code and mend what the linter can mend.
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -104,5 +114,5 @@ constraints: $(VENV)/.created  ## Write constraints.txt anew from the newest ver
 	mv build/constraints.txt constraints.txt && rm -rf build/constraints
 
 clean:  ## Remove everything that was made here.
-	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist demo viewer/dist viewer/node_modules .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

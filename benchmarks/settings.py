@@ -44,6 +44,8 @@ class Settings:
     """Runs over it."""
     seam_m: float = 120.0
     """Length of the roads whose seams are judged."""
+    site: str = ""
+    """Folder of a published site that the page opens in Chromium; without one, only its code is weighed."""
 
     @classmethod
     def current(cls) -> Settings:

@@ -18,6 +18,7 @@ from roadscan.cli import (
     exports,
     inventory,
     logs,
+    pages,
     profiles,
     queries,
     reports,
@@ -25,7 +26,6 @@ from roadscan.cli import (
     simulations,
     state,
 )
-from roadscan.cli import cameras, estimates, exports, logs, pages, profiles, queries, reports, runs, simulations, state
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 

@@ -1,0 +1,268 @@
+"""The page in Debian's Chromium, against the coordinates of a street that is known."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.viewer.street import CURB, EAST_M, HOSTILE, NORTH_M, TARGET, height_m, perspective_pixel
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+AXE = REPOSITORY / "viewer/node_modules/axe-core/axe.min.js"
+NUMBERS = re.compile(r"-?\d+(?:\.\d+)?")
+
+
+def _number(text: str) -> float:
+    """A number as the page writes it."""
+    found = NUMBERS.search(text.replace("\u202f", "").replace("\u2212", "-"))
+    assert found, text
+    return float(found.group())
+
+
+def _read(page: Any) -> np.ndarray[Any, Any]:
+    """The place that the page states."""
+    names = ("easting", "northing", "height")
+    return np.array([_number(page.locator(f'[data-read="{name}"]').inner_text()) for name in names])
+
+
+def _figure(page: Any, name: str) -> float:
+    return _number(page.locator(".figure").first.locator(f'dt:text-is("{name}") + dd').inner_text())
+
+
+def _click_cloud(page: Any, place: tuple[float, float, float]) -> None:
+    """Click where the cloud shows a place: the eye looks at it, so that is the middle."""
+    _look(page, place, across_m=4)
+    _middle(page)
+
+
+def _look(page: Any, place: tuple[float, float, float], across_m: float) -> None:
+    page.evaluate(f"location.hash = 'at={place[0]},{place[1]},{place[2]}&zoom={across_m}&t=' + Math.random()")
+    page.wait_for_timeout(700)
+    page.wait_for_selector('.cloud-view[data-loading="0"]')
+
+
+def _middle(page: Any, dx: float = 0, dy: float = 0) -> None:
+    box = page.locator(".cloud-canvas").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2 + dx, box["y"] + box["height"] / 2 + dy)
+
+
+def test_the_page_opens_with_all_its_views(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    assert page.title().endswith("roadscan")
+    assert page.locator("nav.views button").all_inner_texts() == ["Map", "3D", "Pictures", "Strips"]
+    assert _number(page.locator(".cloud-status").inner_text()) > 0
+    page.locator(".strips .panel canvas").first.wait_for()
+
+
+def test_a_click_on_a_target_reads_its_coordinates(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    _look(page, TARGET, across_m=3)
+    _middle(page)
+    assert np.abs(_read(page) - TARGET).max() <= 0.005
+
+
+def test_a_click_on_the_map_reads_place_and_height(watched: Any, address: str) -> None:
+    page = watched.open(address)
+    page.locator("#search").fill(f"{EAST_M + 10.5} {NORTH_M + 2.5}")
+    page.locator("#search").press("Enter")
+    page.wait_for_timeout(600)
+    box = page.locator(".map-target").bounding_box()
+    for _ in range(8):
+        page.locator(".map-view .view-buttons button").first.click()
+        page.wait_for_timeout(200)
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.locator('.place:has-text("from the map")').wait_for()
+    east, north, height = _read(page)
+    assert abs(east - EAST_M - 10.5) <= 0.005
+    assert abs(north - NORTH_M - 2.5) <= 0.005
+    # Pixels of 5 cm on a slope of 2 %.
+    assert abs(height - height_m(east, north)) <= 0.001
+
+
+def test_distances_in_the_cloud_are_those_of_its_points(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    page.locator('.cloud-view ~ .toolbar [aria-label="Height difference"]').click()
+    _look(page, (EAST_M + 10, NORTH_M + 2.0, 40.0), across_m=8)
+    _middle(page, dx=-40)
+    _middle(page, dx=60, dy=20)
+    page.locator(".figure").first.wait_for()
+    text = page.evaluate("() => [...document.querySelectorAll('.figure dd')].map((one) => one.textContent)")
+    rise, distance, level = (_number(one) for one in text[:3])
+    assert distance == pytest.approx(np.hypot(rise, level), abs=2e-4)
+    assert 0.1 < level < 8.0
+    # Both clicks lie on the street, which climbs by no more than its slopes and ruts.
+    assert abs(rise) <= 0.022 * level + 0.02
+
+
+def test_the_cross_section_of_the_cloud_agrees_with_the_table(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    page.evaluate("location.hash = 'lane=0&station=20.02'")
+    page.locator(".strips-head button").click()
+    page.locator(".section-panel[data-rms]:not([data-rms=''])").wait_for()
+    assert float(page.locator(".section-panel").get_attribute("data-rms")) <= 1.0
+
+
+def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) -> None:
+    page = watched.open_cloud(f"{address}#row=asset_poles/1")
+    details = page.locator(".details")
+    details.locator("h2").wait_for()
+    assert details.locator("h2").inner_text() == HOSTILE
+    height = details.locator('dt:text-is("Height") + dd').inner_text().replace("\u202f", " ")
+    assert height == "4.25 m ± 0.012"
+    assert details.locator(".evidence").inner_text() == HOSTILE
+    page.locator('[aria-label="Rows of Poles"]').click()
+    page.locator("td", has_text="<script>").wait_for()
+    page.locator('nav.views button:has-text("Pictures")').click()
+    page.locator(".picture-caption", has_text="<img").wait_for()
+    for kind in ("class", "pass"):
+        page.locator('.cloud-settings select[aria-label="Colour by"]').select_option(kind)
+        page.locator(".codes li", has_text="<script>").wait_for()
+    assert page.evaluate("window.hit") is None
+    assert page.locator("img").count() == 0
+
+
+def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    _look(page, TARGET, across_m=3)
+    _middle(page)
+    read = _read(page)
+    page.locator('.place button:has-text("Pictures of it")').click()
+    page.locator(".picture-frame[data-mark]:not([data-mark=''])").wait_for()
+    page.locator(".picture-list button").first.wait_for()
+    assert page.locator(".picture-list button").count() == 2
+    page.wait_for_timeout(800)
+    mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
+    assert np.hypot(*(mark - perspective_pixel(read))) <= 0.05
+    # Back from the pixel: the frame shows the whole picture, as large as it fits.
+    box = page.locator(".picture-frame").bounding_box()
+    zoom = min(box["width"] / 640, box["height"] / 480)
+    left, top = (box["width"] - 640 * zoom) / 2, (box["height"] - 480 * zoom) / 2
+    page.mouse.click(box["x"] + left + (mark[0] + 0.5) * zoom, box["y"] + top + (mark[1] + 0.5) * zoom)
+    page.locator('.place:has-text("from the picture")').wait_for()
+    assert np.abs(_read(page) - TARGET).max() <= 0.005
+
+
+def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    page.locator("#search").fill(f"{TARGET[0]} {TARGET[1]} {TARGET[2]}")
+    page.locator("#search").press("Enter")
+    page.locator('.place button:has-text("Pictures of it")').click()
+    page.locator(".picture-list button", has_text="ball").click()
+    page.locator(".picture-caption", has_text="ball ·").wait_for()
+    mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
+    by = np.array(TARGET) - (553_008.0, 6_020_000.5, 42.0)
+    right, down, ahead = -by[1], -by[2], by[0]
+    expected = (
+        (np.arctan2(right, ahead) / (2 * np.pi) + 0.5) * 1024 - 0.5,
+        (np.arcsin(down / np.linalg.norm(by)) / np.pi + 0.5) * 512 - 0.5,
+    )
+    assert np.abs(mark - expected).max() <= 0.02
+
+
+def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=6)
+    before = page.locator(".cloud-canvas").screenshot()
+    page.locator(".cloud-settings label", has_text="Mesh of the surface").click()
+    page.wait_for_function("() => performance.getEntriesByType('resource').some((one) => one.name.endsWith('.glb'))")
+    page.wait_for_timeout(1500)
+    shown = cv2.imdecode(np.frombuffer(page.locator(".cloud-canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    points = cv2.imdecode(np.frombuffer(before, np.uint8), cv2.IMREAD_COLOR)
+    # The mesh is red, and no colour of the points' scale is.
+    red = [int(((one[..., 2] > 90) & (one[..., 0] < 60) & (one[..., 1] < 60)).sum()) for one in (points, shown)]
+    assert red[1] > red[0] + 5_000
+    page.locator(".cloud-settings label", has_text="Mesh of the surface").click()
+
+
+def test_edits_become_a_document(watched: Any, address: str) -> None:
+    page = watched.open(f"{address}#row=asset_poles/1&views=map")
+    page.locator(".edit button", has_text="Correct").click()
+    page.locator('.edit-form [aria-label="height m"]').fill("4.5")
+    page.locator('.edit-form [aria-label="Comment"]').fill(HOSTILE)
+    page.locator('.edit-form button:has-text("Keep")').click()
+    with page.expect_download() as download:
+        page.locator("button", has_text="Save the edits").click()
+    document = json.loads(Path(download.value.path()).read_text())
+    (edit,) = document["features"]
+    assert document["survey"] == "street"
+    assert document["crs"] == "EPSG:25832"
+    assert edit["geometry"] is None
+    assert edit["properties"]["attributes"] == {"height_m": 4.5}
+    assert (
+        edit["properties"] | {"layer": "asset_poles", "action": "change", "id": 1, "comment": HOSTILE}
+        == edit["properties"]
+    )
+
+
+def test_the_page_goes_on_without_the_host(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=4)
+    page.wait_for_timeout(2000)
+    page.context.set_offline(True)
+    _middle(page)
+    read = _read(page)
+    assert abs(read[2] - height_m(read[0], read[1])) <= 0.001
+    page.evaluate("location.hash = 'row=asset_poles/1'")
+    page.locator(".details h2", has_text="<script>").wait_for()
+    # Tiles and points that were not fetched before are missing now; all else goes on.
+    watched.wrong[:] = [one for one in watched.wrong if "ERR_INTERNET_DISCONNECTED" not in one]
+
+
+def test_one_file_opens_by_itself(open_page: Any, single: Path) -> None:
+    with open_page(single.as_uri(), offline=True) as watched:
+        page = watched.open_cloud(single.as_uri())
+        assert _number(page.locator(".cloud-status").inner_text()) > 0
+        _click_cloud(page, (EAST_M + 20, NORTH_M, 40.0))
+        read = _read(page)
+        assert abs(read[2] - height_m(read[0], read[1])) <= 0.001
+        page.locator('nav.views button:has-text("Pictures")').click()
+        page.locator(".picture-caption", has_text="run_a").wait_for()
+
+
+def _serious(page: Any) -> list[tuple[str, str]]:
+    """What axe-core finds that keeps people out."""
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed: make viewer")
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("axe.run().then((answer) => answer.violations)")
+    return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
+
+
+def test_axe_finds_nothing_serious(watched: Any, address: str) -> None:
+    page = watched.open(f"{address}#row=asset_poles/1&views=map,cloud,strips")
+    page.locator(".details h2").wait_for()
+    page.locator('[role="tab"]:has-text("Strips")').click()
+    page.locator(".strips .panel").first.wait_for()
+    assert _serious(page) == []
+    page.locator('[aria-label="Light or dark"]').click()
+    assert _serious(page) == []
+
+
+def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
+    with open_page(viewport={"width": 390, "height": 800}) as watched:
+        page = watched.open(address)
+        page.locator('nav.views button[title^="3D"]').click()
+        page.wait_for_selector('.cloud-view[data-loading="0"]')
+        assert page.locator(".view:not([hidden])").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        page.locator('[aria-label="Layers (L)"]').click()
+        assert page.locator(".side.left").is_visible()
+        assert _serious(page) == []
+
+
+def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
+    page = watched.open(f"{address}#at={CURB[0]},{CURB[1]}&zoom=2&views=map")
+    page.wait_for_timeout(700)
+    page.locator(".map-target").focus()
+    page.keyboard.press("Enter")
+    page.locator(".details h2", has_text="<script>").wait_for()
+    page.keyboard.press("Escape")
+    page.locator(".details .hint").first.wait_for()
+    page.keyboard.press("?")
+    assert page.locator("dialog.help").is_visible()

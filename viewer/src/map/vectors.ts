@@ -1,0 +1,146 @@
+/** Layers of features: parts are loaded where the map looks; from far away, where too many would come, only their outlines. */
+
+import Feature from 'ol/Feature'
+import type { Extent } from 'ol/extent'
+import LineString from 'ol/geom/LineString'
+import MultiLineString from 'ol/geom/MultiLineString'
+import MultiPoint from 'ol/geom/MultiPoint'
+import MultiPolygon from 'ol/geom/MultiPolygon'
+import Point from 'ol/geom/Point'
+import Polygon, { fromExtent } from 'ol/geom/Polygon'
+import VectorLayer from 'ol/layer/Vector'
+import VectorSource from 'ol/source/Vector'
+import OlFill from 'ol/style/Fill'
+import OlStroke from 'ol/style/Stroke'
+import OlStyle from 'ol/style/Style'
+import { Signal } from '../core/signal'
+import { type Bounds, type FeatureCollection, type FeatureDocument, type Layer, meets, type Part, type Style } from '../core/site'
+import type { Source } from '../core/source'
+import { colourOf, styleOf } from './styles'
+
+const MOST_FEATURES = 30_000
+
+/** The geometry of a document; null where there is none or its kind is unknown. */
+export function geometryOf(document: FeatureDocument['geometry']) {
+  if (!document) return null
+  const { type, coordinates } = document
+  switch (type) {
+    case 'Point':
+      return new Point(coordinates)
+    case 'MultiPoint':
+      return new MultiPoint(coordinates)
+    case 'LineString':
+      return new LineString(coordinates)
+    case 'MultiLineString':
+      return new MultiLineString(coordinates)
+    case 'Polygon':
+      return new Polygon(coordinates)
+    case 'MultiPolygon':
+      return new MultiPolygon(coordinates)
+    default:
+      return null
+  }
+}
+
+export class FeatureLayer {
+  readonly source = new VectorSource()
+  readonly layer: VectorLayer<VectorSource>
+  readonly style: Signal<Style>
+  /** Entries of the legend that are switched off. */
+  readonly hidden = new Signal<ReadonlySet<number>>(new Set())
+  /** Features that are loaded, and whether that is all that the map shows of the layer. */
+  readonly loaded = new Signal<{ count: number; whole: boolean }>({ count: 0, whole: false })
+  readonly #parts = new Map<Part, Promise<void>>()
+  readonly #outlines = new Map<Part, Feature>()
+
+  constructor(
+    readonly document: Layer,
+    private readonly files: Source,
+    private readonly dark: Signal<boolean>,
+    private readonly complain: (error: unknown) => void,
+  ) {
+    this.style = new Signal(document.style)
+    this.layer = new VectorLayer({
+      source: this.source,
+      visible: document.visible,
+      zIndex: 1000 + document.order,
+      declutter: Boolean(document.label),
+      updateWhileInteracting: document.features < 2000,
+    })
+    for (const signal of [this.style, this.hidden, this.dark]) (signal as Signal<unknown>).on(() => this.#restyle())
+    this.#restyle()
+  }
+
+  #restyle(): void {
+    const features = styleOf(this.document, this.style.value, this.hidden.value, this.dark.value)
+    const colour = colourOf(this.style.value, {})
+    const outline = new OlStyle({
+      stroke: new OlStroke({ color: colour, width: 1, lineDash: [4, 3] }),
+      fill: new OlFill({ color: 'rgba(128, 128, 128, 0.08)' }),
+    })
+    this.layer.setStyle((feature, resolution) => (feature.get('part') ? outline : features(feature, resolution)))
+  }
+
+  /** Load what the map shows; called after each move. */
+  look(extent: Extent): void {
+    if (!this.layer.getVisible()) return
+    const wanted = this.document.parts.filter((part) => meets(part.bounds_m, extent as Bounds))
+    const features = wanted.reduce((sum, part) => sum + part.features, 0)
+    if (features > MOST_FEATURES) {
+      for (const part of wanted) if (!this.#parts.has(part)) this.#outline(part)
+    } else {
+      for (const part of wanted) void this.load(part)
+    }
+    this.loaded.value = { count: this.source.getFeatures().length - this.#outlines.size, whole: features <= MOST_FEATURES }
+  }
+
+  #outline(part: Part): void {
+    if (this.#outlines.has(part)) return
+    const feature = new Feature({ geometry: fromExtent(part.bounds_m), part: true })
+    this.#outlines.set(part, feature)
+    this.source.addFeature(feature)
+  }
+
+  /** Load a part, once. */
+  load(part: Part): Promise<void> {
+    let loading = this.#parts.get(part)
+    if (!loading) {
+      loading = this.#load(part).catch((error) => {
+        this.#parts.delete(part)
+        this.complain(error)
+      })
+      this.#parts.set(part, loading)
+    }
+    return loading
+  }
+
+  async #load(part: Part): Promise<void> {
+    const { features } = await this.files.json<FeatureCollection>(part.url)
+    const outline = this.#outlines.get(part)
+    if (outline) {
+      this.source.removeFeature(outline)
+      this.#outlines.delete(part)
+    }
+    this.source.addFeatures(features.map((one) => this.#feature(one)).filter((one) => one !== null))
+    this.loaded.value = { count: this.source.getFeatures().length - this.#outlines.size, whole: this.loaded.value.whole }
+  }
+
+  #feature(document: FeatureDocument): Feature | null {
+    const geometry = geometryOf(document.geometry)
+    if (!geometry) return null
+    const feature = new Feature({ geometry, row: document.properties, document, layer: this.document })
+    feature.setId(document.id)
+    return feature
+  }
+
+  /** Load all parts: for the table of rows, and to find a row by its id. */
+  async loadAll(): Promise<FeatureDocument[]> {
+    await Promise.all(this.document.parts.map((part) => this.load(part)))
+    const found = this.source.getFeatures().map((feature) => feature.get('document') as FeatureDocument | undefined)
+    return found.filter((one) => one !== undefined).sort((a, b) => a.id - b.id)
+  }
+
+  setVisible(visible: boolean): void {
+    this.layer.setVisible(visible)
+  }
+}

@@ -1,0 +1,164 @@
+/** The row of what was clicked: values with their σ, units and meaning, and the evidence for it. */
+
+import type { Desk, Place, Selected } from '../core/desk'
+import { fill, h, icon } from '../core/dom'
+import * as format from '../core/format'
+import type { Evidence } from '../core/site'
+import type { Hit } from '../map/map'
+import { geometryOf } from '../map/vectors'
+
+export interface RowActions {
+  openPicture(url: string): void
+  openPictures(place: Place): void
+  openTile(tile: string): void
+  edit: ((selected: Selected) => HTMLElement) | null
+}
+
+export class RowPanel {
+  readonly element = h('div', { class: 'row-panel' })
+  readonly #place = h('section', { class: 'place', hidden: true, 'aria-live': 'polite' })
+  readonly #row = h('section', { class: 'details', 'aria-live': 'polite' })
+  #hits: Hit[] = []
+
+  constructor(
+    readonly desk: Desk,
+    readonly actions: RowActions,
+  ) {
+    this.element.append(this.#place, this.#row)
+    desk.selected.on((selected) => this.#draw(selected), true)
+    desk.place.on((place) => this.#drawPlace(place))
+  }
+
+  /** What lay below the last click; the first is selected. */
+  offer(hits: Hit[]): void {
+    this.#hits = hits
+    this.desk.selected.value = hits[0] ?? null
+  }
+
+  #draw(selected: Selected | null): void {
+    if (!selected) {
+      fill(this.#row, h('p', { class: 'hint' }, 'Click anything on the map to see its row, its σ and its evidence.'))
+      return
+    }
+    const { layer, feature } = selected
+    fill(
+      this.#row,
+      h('header', {}, h('p', { class: 'over' }, layer.title), h('h2', {}, this.#name(selected))),
+      this.#others(selected),
+      h('div', { class: 'actions' }, this.#action('target', 'Look there', () => this.#goTo(selected)), this.#action('copy', 'Copy the row', () => this.#copy(selected))),
+      this.actions.edit?.(selected) ?? null,
+      h('dl', { class: 'values' }, ...this.#values(selected)),
+      ...this.#evidence(feature.evidence ?? []),
+    )
+  }
+
+  #name({ layer, feature }: Selected): string {
+    const key = layer.label ?? layer.key
+    const named = key ? feature.properties[key] : null
+    const title = layer.columns.find((one) => one.name === key)?.title
+    if (named === null || named === undefined || named === '') return `${feature.id}`
+    return typeof named === 'number' ? `${title ?? key} ${format.value(named)}` : String(named)
+  }
+
+  #others(selected: Selected): HTMLElement | null {
+    if (this.#hits.length < 2 || !this.#hits.some((one) => one.feature === selected.feature)) return null
+    const select = h(
+      'select',
+      { 'aria-label': 'What lies here', onchange: () => (this.desk.selected.value = this.#hits[Number(select.value)]!) },
+      ...this.#hits.map((hit, index) => h('option', { value: index, selected: hit.feature === selected.feature }, `${hit.layer.title}: ${this.#name(hit)}`)),
+    )
+    return h('label', { class: 'others' }, `${this.#hits.length} lie here`, select)
+  }
+
+  #action(name: Parameters<typeof icon>[0], label: string, onclick: () => void): HTMLElement {
+    return h('button', { type: 'button', onclick }, icon(name), label)
+  }
+
+  #goTo({ feature }: Selected): void {
+    const extent = geometryOf(feature.geometry)?.getExtent()
+    if (!extent) return
+    const size = Math.max(extent[2]! - extent[0]!, extent[3]! - extent[1]!)
+    this.desk.goTo({ easting_m: (extent[0]! + extent[2]!) / 2, northing_m: (extent[1]! + extent[3]!) / 2, across_m: Math.max(8, size * 1.6) })
+  }
+
+  #copy({ layer, feature }: Selected): void {
+    const text = JSON.stringify({ layer: layer.name, id: feature.id, ...feature.properties }, null, 1)
+    copyText(text).then(
+      () => this.desk.say('The row is in the clipboard.'),
+      (error) => this.desk.complain(error),
+    )
+  }
+
+  #values({ layer, feature }: Selected): HTMLElement[] {
+    const row = feature.properties
+    const sigmas = new Set(layer.columns.map((one) => one.sigma).filter(Boolean))
+    return layer.columns
+      .filter((column) => !sigmas.has(column.name))
+      .map((column) => {
+        const raw = row[column.name]
+        const sigma = column.sigma ? row[column.sigma] : null
+        const unit = column.unit && !['text', 'number', '1'].includes(column.unit) ? `\u202f${column.unit}` : ''
+        const text = /_gps_ns$/.test(column.name) ? format.gpsTime(raw) : format.value(raw)
+        return h(
+          'div',
+          { title: column.meaning ?? undefined },
+          h('dt', {}, format.titled(column.title, column.unit)),
+          h(
+            'dd',
+            { class: typeof raw === 'number' ? 'number' : '' },
+            raw === null || raw === undefined || /_gps_ns$/.test(column.name) ? text : text + unit,
+            typeof sigma === 'number' && h('span', { class: 'sigma', title: '1 σ' }, ` ± ${format.value(sigma)}`),
+          ),
+        )
+      })
+  }
+
+  #evidence(list: Evidence[]): HTMLElement[] {
+    if (!list.length) return []
+    const entry = (one: Evidence): HTMLElement => {
+      if (one.kind === 'picture' && one.url) return h('button', { type: 'button', class: 'link', onclick: () => this.actions.openPicture(one.url!) }, icon('picture'), one.title)
+      if (one.kind === 'tile' && one.tile) return h('button', { type: 'button', class: 'link', onclick: () => this.actions.openTile(one.tile!) }, icon('fit'), one.title)
+      return h('span', {}, one.title)
+    }
+    return [h('h3', {}, 'Evidence'), h('ul', { class: 'evidence' }, ...list.map((one) => h('li', {}, entry(one))))]
+  }
+
+  #drawPlace(place: Place | null): void {
+    this.#place.hidden = !place
+    if (!place) return
+    const { crs } = this.desk.survey
+    const line = (name: string, text: string, id = ''): HTMLElement => h('div', {}, h('dt', {}, name), h('dd', { class: 'number', 'data-read': id || null }, text))
+    fill(
+      this.#place,
+      h('header', {}, h('p', { class: 'over' }, `Place, from the ${place.from}`)),
+      h(
+        'dl',
+        { class: 'values' },
+        line('Easting', format.metres(place.easting_m, 4), 'easting'),
+        line('Northing', format.metres(place.northing_m, 4), 'northing'),
+        line(`Height${crs.height ? `, ${crs.height}` : ''}`, format.metres(place.height_m, 4), 'height'),
+        ...(place.notes ?? []).map(([name, text]) => line(name, text)),
+      ),
+      h(
+        'div',
+        { class: 'actions' },
+        this.#action('copy', 'Copy', () => {
+          const text = [place.easting_m, place.northing_m, place.height_m].filter((one) => one !== null).map((one) => one!.toFixed(4)).join(' ')
+          copyText(text).then(() => this.desk.say('The coordinates are in the clipboard.'), (error) => this.desk.complain(error))
+        }),
+        this.desk.survey.pictures ? this.#action('picture', 'Pictures of it', () => this.actions.openPictures(place)) : null,
+      ),
+    )
+  }
+}
+
+/** The clipboard needs a secure page; a file or a host without TLS gets the older way. */
+export async function copyText(text: string): Promise<void> {
+  if (navigator.clipboard && window.isSecureContext) return navigator.clipboard.writeText(text)
+  const area = h('textarea', { 'aria-hidden': 'true' })
+  area.value = text
+  document.body.append(area)
+  area.select()
+  document.execCommand('copy')
+  area.remove()
+}

@@ -1,0 +1,396 @@
+/** Pictures: one large, with the place marked; below it those that see the place, best first. */
+
+import type { Desk, Place } from '../core/desk'
+import { fill, h, iconButton } from '../core/dom'
+import * as format from '../core/format'
+import { meet, rayNear } from '../cloud/pick'
+import type { CloudStore } from '../cloud/store'
+import { pixelOf, rayOf } from './geometry'
+import type { Picture, PictureList, View } from './list'
+import { Panorama } from './panorama'
+
+const OFFERED = 24
+const CHECKED = 8
+const RAY_POINTS = 2_000_000
+/** Half the angle (radian) within which points count as met by a ray: about two pixels of a common camera. */
+const CONE = 1.5e-3
+
+export class PictureView {
+  readonly element: HTMLElement
+  readonly #frame = h('div', { class: 'picture-frame', tabindex: 0, role: 'application', 'aria-label': 'Picture. Arrow keys move it, plus and minus zoom, a click on a pixel gives its place.' })
+  readonly #flat = h('canvas', { class: 'picture-canvas' })
+  readonly #ball = h('canvas', { class: 'picture-canvas', hidden: true })
+  readonly #marks = h('canvas', { class: 'picture-marks', 'aria-hidden': 'true' })
+  readonly #caption = h('p', { class: 'picture-caption', 'aria-live': 'polite' })
+  readonly #list = h('div', { class: 'picture-list', role: 'list', 'aria-label': 'Pictures that see the place' })
+  #panorama: Panorama | null = null
+  #picture: Picture | null = null
+  #bitmap: ImageBitmap | null = null
+  #view = { x: 0, y: 0, zoom: 1 }
+  #views: View[] = []
+  #place: Place | null = null
+  #drag: { x: number; y: number; moved: boolean } | null = null
+  readonly #urls = new Map<string, Promise<ImageBitmap>>()
+
+  constructor(
+    readonly desk: Desk,
+    readonly pictures: PictureList,
+    readonly cloud: () => Promise<CloudStore | null>,
+  ) {
+    this.#frame.append(this.#flat, this.#ball, this.#marks)
+    this.element = h(
+      'div',
+      { class: 'picture-view' },
+      this.#frame,
+      h(
+        'div',
+        { class: 'view-buttons' },
+        iconButton('plus', 'Zoom in (+)', () => this.#zoom(1.5)),
+        iconButton('minus', 'Zoom out (-)', () => this.#zoom(1 / 1.5)),
+        iconButton('fit', 'All of the picture (0)', () => this.#fit()),
+        iconButton('left', 'Picture before', () => void this.#step(-1)),
+        iconButton('right', 'Next picture', () => void this.#step(1)),
+      ),
+      this.#caption,
+      this.#list,
+    )
+    this.#listen()
+  }
+
+  get current(): Picture | null {
+    return this.#picture
+  }
+
+  #listen(): void {
+    const frame = this.#frame
+    frame.addEventListener('pointerdown', (event) => {
+      this.#drag = { x: event.clientX, y: event.clientY, moved: false }
+      frame.setPointerCapture(event.pointerId)
+    })
+    frame.addEventListener('pointermove', (event) => this.#dragTo(event))
+    frame.addEventListener('pointerup', (event) => {
+      const drag = this.#drag
+      this.#drag = null
+      if (drag && !drag.moved) void this.#click(event.clientX, event.clientY)
+    })
+    frame.addEventListener('wheel', (event) => {
+      event.preventDefault()
+      const box = frame.getBoundingClientRect()
+      this.#zoom(Math.exp(-event.deltaY * 0.0015), event.clientX - box.left, event.clientY - box.top)
+    }, { passive: false })
+    frame.addEventListener('keydown', (event) => this.#key(event))
+    new ResizeObserver(() => this.#fit()).observe(frame)
+  }
+
+  #key(event: KeyboardEvent): void {
+    const steps: Record<string, [number, number]> = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] }
+    if (event.key in steps) this.#shift(...steps[event.key]!)
+    else if (event.key === '+' || event.key === '=') this.#zoom(1.3)
+    else if (event.key === '-') this.#zoom(1 / 1.3)
+    else if (event.key === '0') this.#fit()
+    else if (event.key === 'PageDown') void this.#step(1)
+    else if (event.key === 'PageUp') void this.#step(-1)
+    else if (event.key === 'Enter') {
+      const box = this.#frame.getBoundingClientRect()
+      void this.#click(box.left + box.width / 2, box.top + box.height / 2)
+    } else return
+    event.preventDefault()
+  }
+
+  #dragTo(event: PointerEvent): void {
+    const drag = this.#drag
+    if (!drag) return
+    const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y]
+    if (!drag.moved && Math.hypot(dx, dy) < 4) return
+    this.#drag = { x: event.clientX, y: event.clientY, moved: true }
+    this.#shift(dx, dy)
+  }
+
+  #shift(dx: number, dy: number): void {
+    if (this.#around && this.#panorama) {
+      const scale = this.#panorama.angle / this.#frame.clientHeight
+      this.#panorama.yaw -= dx * scale
+      this.#panorama.pitch = Math.max(-1.5, Math.min(1.5, this.#panorama.pitch - dy * scale))
+    } else {
+      this.#view.x += dx
+      this.#view.y += dy
+    }
+    this.#draw()
+  }
+
+  get #around(): boolean {
+    return this.#picture?.camera.model === 'equirectangular'
+  }
+
+  // ---- which pictures ----
+
+  /** The pictures that see a place; the best is opened. */
+  async showPlace(place: Place): Promise<void> {
+    this.#place = place
+    const at = [place.easting_m, place.northing_m, place.height_m ?? this.desk.survey.height_extent_m?.[0] ?? 0] as const
+    this.#views = (await this.pictures.seeing(at)).slice(0, OFFERED)
+    this.#drawList()
+    if (!this.#views.length) {
+      this.#caption.textContent = 'No picture sees this place.'
+      return
+    }
+    await this.open(this.#views[0]!.picture)
+    await this.#findHidden(at)
+  }
+
+  /** Ask the cloud whether something stands before the place; a picture in which it is hidden comes last. */
+  async #findHidden(at: readonly [number, number, number]): Promise<void> {
+    const store = await this.cloud()
+    if (!store) return
+    const views = this.#views
+    for (const view of views.slice(0, CHECKED)) {
+      const { picture } = view
+      const from = [picture.easting_m, picture.northing_m, picture.height_m] as const
+      const by = [0, 1, 2].map((axis) => at[axis]! - from[axis]!) as [number, number, number]
+      const size = Math.hypot(...by)
+      const ray = { from, direction: by.map((one) => one / size) as [number, number, number] }
+      const nodes = store.ready().filter((node) => rayNear(node.box, ray, CONE * 4, size))
+      const met = meet(store, nodes, ray, CONE * 4, 1, size - Math.max(0.4, size * 0.04))
+      view.hidden = met !== null
+    }
+    if (views !== this.#views) return
+    const first = views.find((one) => !one.hidden)
+    this.#views = [...views.filter((one) => !one.hidden), ...views.filter((one) => one.hidden)]
+    this.#drawList()
+    if (first && first.picture !== this.#picture && views.find((one) => one.picture === this.#picture)?.hidden) await this.open(first.picture)
+  }
+
+  async openUrl(url: string): Promise<void> {
+    const picture = await this.pictures.byUrl(url)
+    if (picture) await this.open(picture)
+    else this.desk.complain(`the picture ${url} is not in the list of pictures`)
+  }
+
+  async openFirst(): Promise<void> {
+    if (this.#picture) return
+    if (this.desk.place.value) return this.showPlace(this.desk.place.value)
+    const { extent_m } = this.desk.survey
+    const [e, n] = [(extent_m[0] + extent_m[2]) / 2, (extent_m[1] + extent_m[3]) / 2]
+    const near = await this.pictures.near(e, n, Infinity)
+    const apart = (one: Picture): number => Math.hypot(one.easting_m - e, one.northing_m - n)
+    const first = near.reduce<Picture | null>((best, one) => (!best || apart(one) < apart(best) ? one : best), null)
+    if (first) await this.open(first)
+  }
+
+  async #step(by: number): Promise<void> {
+    const now = this.#picture
+    if (!now) return
+    const beside = (await this.pictures.near(now.easting_m, now.northing_m)).filter((one) => one.camera === now.camera).sort((a, b) => a.id - b.id)
+    const next = beside[beside.indexOf(now) + by]
+    if (next) await this.open(next)
+    else this.desk.say('There is no further picture of this camera.')
+  }
+
+  async open(picture: Picture): Promise<void> {
+    this.#picture = picture
+    this.#caption.textContent = `Loading ${picture.camera.title} …`
+    this.#drawList()
+    const bitmap = await this.#load(picture.url)
+    if (this.#picture !== picture) return
+    this.#bitmap = bitmap
+    this.#flat.hidden = this.#around
+    this.#ball.hidden = !this.#around
+    if (this.#around) this.#openBall(bitmap)
+    this.#fit()
+    this.#lookAtPlace()
+    const sigma = picture.sigma_m === null ? '' : `  σ ${format.length(picture.sigma_m)}`
+    this.#caption.textContent = [picture.camera.run, picture.camera.title, picture.name, format.gpsTime(picture.epoch_gps_ns)].filter(Boolean).join(' · ') + sigma
+    this.desk.picture.value = picture.id
+  }
+
+  #openBall(bitmap: ImageBitmap): void {
+    this.#panorama ??= new Panorama(this.#ball)
+    this.#panorama.load(bitmap)
+  }
+
+  #load(url: string): Promise<ImageBitmap> {
+    let loading = this.#urls.get(url)
+    if (!loading) {
+      const type = url.endsWith('.png') ? 'image/png' : 'image/jpeg'
+      loading = this.desk.source.blob(url, type).then((blob) => createImageBitmap(blob))
+      loading.catch(() => this.#urls.delete(url))
+      this.#urls.set(url, loading)
+      if (this.#urls.size > 12) this.#urls.delete(this.#urls.keys().next().value!)
+    }
+    return loading
+  }
+
+  #drawList(): void {
+    fill(
+      this.#list,
+      ...this.#views.map((view) =>
+        h(
+          'button',
+          {
+            type: 'button',
+            role: 'listitem',
+            'aria-current': view.picture === this.#picture ? 'true' : null,
+            class: view.hidden ? 'dim' : '',
+            onclick: () => this.open(view.picture).catch((error) => this.desk.complain(error)),
+          },
+          h('span', {}, view.picture.camera.title),
+          h('span', { class: 'number' }, `${format.fixed(view.distance_m, 1)} m`),
+          h('span', { class: 'number' }, `${format.fixed(view.pixel_m * 1000, 1)} mm/px`),
+          view.hidden ? h('span', {}, 'behind something') : null,
+        ),
+      ),
+    )
+  }
+
+  // ---- the picture ----
+
+  #fit(): void {
+    const [width, height] = [this.#frame.clientWidth, this.#frame.clientHeight]
+    const ratio = Math.min(2, window.devicePixelRatio || 1)
+    for (const canvas of [this.#flat, this.#ball, this.#marks]) [canvas.width, canvas.height] = [Math.max(1, width * ratio), Math.max(1, height * ratio)]
+    if (this.#bitmap) {
+      const zoom = Math.min(width / this.#bitmap.width, height / this.#bitmap.height)
+      this.#view = { x: (width - this.#bitmap.width * zoom) / 2, y: (height - this.#bitmap.height * zoom) / 2, zoom }
+    }
+    if (this.#panorama) this.#panorama.angle = 1.2
+    this.#draw()
+  }
+
+  /** Turn or move the picture so that the marked place is in sight. */
+  #lookAtPlace(): void {
+    const pixel = this.#markedPixel()
+    if (!pixel || !this.#picture || !this.#around || !this.#panorama) return
+    const { width_px, height_px } = this.#picture.camera
+    this.#panorama.yaw = ((pixel[0] + 0.5) / width_px - 0.5) * 2 * Math.PI
+    this.#panorama.pitch = ((pixel[1] + 0.5) / height_px - 0.5) * Math.PI
+    this.#draw()
+  }
+
+  #zoom(factor: number, x = this.#frame.clientWidth / 2, y = this.#frame.clientHeight / 2): void {
+    if (this.#around && this.#panorama) this.#panorama.angle = Math.max(0.05, Math.min(2.4, this.#panorama.angle / factor))
+    else {
+      const zoom = Math.max(0.02, Math.min(40, this.#view.zoom * factor))
+      const by = zoom / this.#view.zoom
+      this.#view = { zoom, x: x - (x - this.#view.x) * by, y: y - (y - this.#view.y) * by }
+    }
+    this.#draw()
+  }
+
+  /** The pixel of the picked place in this picture. */
+  #markedPixel(): [number, number] | null {
+    const place = this.#place ?? this.desk.place.value
+    if (!place || !this.#picture || place.height_m === null) return null
+    const pixel = pixelOf(this.#picture.camera, this.#picture, [place.easting_m, place.northing_m, place.height_m])
+    return pixel && [pixel.u, pixel.v]
+  }
+
+  /** A picture may be published smaller than it was taken. */
+  get #shrunk(): number {
+    return this.#bitmap!.width / this.#picture!.camera.width_px
+  }
+
+  /** Point of the frame (CSS pixels) of a pixel of the camera. */
+  #screenOf(u: number, v: number): [number, number] | null {
+    const { camera } = this.#picture!
+    if (this.#around && this.#panorama) {
+      const at = this.#panorama.pointOf(((u + 0.5) / camera.width_px - 0.5) * 2 * Math.PI, ((v + 0.5) / camera.height_px - 0.5) * Math.PI)
+      return at && [at[0] * this.#frame.clientWidth, at[1] * this.#frame.clientHeight]
+    }
+    const scale = this.#view.zoom * this.#shrunk
+    return [this.#view.x + (u + 0.5) * scale, this.#view.y + (v + 0.5) * scale]
+  }
+
+  #pixelAt(x: number, y: number): [number, number] {
+    const { camera } = this.#picture!
+    if (this.#around && this.#panorama) {
+      const [longitude, latitude] = this.#panorama.directionAt(x / this.#frame.clientWidth, y / this.#frame.clientHeight)
+      return [(longitude / (2 * Math.PI) + 0.5) * camera.width_px - 0.5, (latitude / Math.PI + 0.5) * camera.height_px - 0.5]
+    }
+    const scale = this.#view.zoom * this.#shrunk
+    return [(x - this.#view.x) / scale - 0.5, (y - this.#view.y) / scale - 0.5]
+  }
+
+  #draw(): void {
+    if (!this.#bitmap || !this.#picture) return
+    const ratio = this.#flat.width / Math.max(1, this.#frame.clientWidth)
+    if (this.#around) this.#panorama?.draw()
+    else {
+      const context = this.#flat.getContext('2d')!
+      context.setTransform(1, 0, 0, 1, 0, 0)
+      context.clearRect(0, 0, this.#flat.width, this.#flat.height)
+      context.imageSmoothingEnabled = this.#view.zoom < 3
+      context.setTransform(ratio * this.#view.zoom, 0, 0, ratio * this.#view.zoom, ratio * this.#view.x, ratio * this.#view.y)
+      context.drawImage(this.#bitmap, 0, 0)
+    }
+    this.#drawMark(ratio)
+  }
+
+  #drawMark(ratio: number): void {
+    const context = this.#marks.getContext('2d')!
+    context.setTransform(ratio, 0, 0, ratio, 0, 0)
+    context.clearRect(0, 0, this.#marks.width, this.#marks.height)
+    const pixel = this.#markedPixel()
+    const at = pixel && this.#screenOf(...pixel)
+    this.#frame.dataset['mark'] = pixel ? pixel.map((one) => one.toFixed(2)).join(' ') : ''
+    if (!at) return
+    for (const [width, colour] of [[4.5, '#000'], [2, '#ffd43b']] as const) {
+      context.beginPath()
+      context.arc(at[0], at[1], 11, 0, 2 * Math.PI)
+      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]] as const) {
+        context.moveTo(at[0] + dx * 5, at[1] + dy * 5)
+        context.lineTo(at[0] + dx * 18, at[1] + dy * 18)
+      }
+      ;[context.lineWidth, context.strokeStyle] = [width, colour]
+      context.stroke()
+    }
+  }
+
+  // ---- from a pixel to the place ----
+
+  async #click(clientX: number, clientY: number): Promise<void> {
+    const picture = this.#picture
+    if (!picture || !this.#bitmap) return
+    const box = this.#frame.getBoundingClientRect()
+    const [u, v] = this.#pixelAt(clientX - box.left, clientY - box.top)
+    await this.placeOf(picture, u, v)
+  }
+
+  /** The place that a pixel shows: where its ray meets the cloud first. */
+  async placeOf(picture: Picture, u: number, v: number): Promise<void> {
+    const store = await this.cloud()
+    if (!store) {
+      this.desk.say('This site holds no point cloud, so a pixel has no place.')
+      return
+    }
+    this.desk.say('Looking for the point …')
+    const ray = { from: [picture.easting_m, picture.northing_m, picture.height_m] as const, direction: rayOf(picture.camera, picture, u, v) }
+    const { nodes } = await store.within((one) => rayNear(one, ray, CONE * 2, 80), RAY_POINTS)
+    const met = meet(store, nodes, ray, CONE, 0.8, 80) ?? meet(store, nodes, ray, CONE * 4, 0.8, 80)
+    if (!met) {
+      this.desk.say('The ray of this pixel meets no point within 80 m.')
+      return
+    }
+    const { coordinate } = met
+    this.desk.message.value = null
+    this.#place = {
+      easting_m: coordinate[0],
+      northing_m: coordinate[1],
+      height_m: coordinate[2],
+      from: 'picture',
+      notes: [
+        ['Distance', format.metres(met.distance_m, 2)],
+        ['Point beside the ray', format.length(met.apart_m)],
+      ],
+    }
+    this.desk.place.value = this.#place
+    this.#views = (await this.pictures.seeing(coordinate)).slice(0, OFFERED)
+    this.#drawList()
+    this.#draw()
+  }
+
+  /** Show another place's mark in the picture that is open. */
+  mark(place: Place | null): void {
+    this.#place = place
+    this.#draw()
+  }
+}

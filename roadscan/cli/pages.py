@@ -17,6 +17,9 @@ def publish(
     box: Annotated[
         str | None, typer.Option(help="Only this part: WEST,SOUTH,EAST,NORTH in metres of the survey's map.")
     ] = None,
+    over: Annotated[
+        list[Path] | None, typer.Option(help="Survey file of another survey of the roads, for strips over one another.")
+    ] = None,
     road: Annotated[str | None, typer.Option(help="Only the surroundings of this road of `reference_lines`.")] = None,
     finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0,
     clouds: Annotated[bool, typer.Option(help="With the points.")] = True,
@@ -35,23 +38,25 @@ def publish(
 
     if (out is None) == (single is None):
         raise ConfigError("publish takes a folder or a single file", expected="--out FOLDER or --single FILE.html")
-    session = Session.open(survey_file)
-    session.hear_of_damage()
+    session, *others = (Session.open(file) for file in (survey_file, *(over or ())))
+    for one in (session, *others):
+        one.hear_of_damage()
     if box is not None and road is not None:
         raise ConfigError("--box and --road are both given", expected="one of them")
     near = box_from_text(box) if box is not None else None
     near = near if road is None else box_of_road(Material(session), road)
     wishes = Wishes(clouds, pictures, finest, near)
+    material = Material(session, wishes, tuple(others))
     reporter = new_reporter()
     if single is not None:
-        page = write_single(Material(session, wishes), single, largest, lambda d, t: reporter.progress("publish", d, t))
+        page = write_single(material, single, largest, lambda d, t: reporter.progress("publish", d, t))
         reporter.close()
         for one in page.left_out:
             typer.echo(f"left out: {one}")
         typer.echo(f"page: {single} ({page.bytes / 1e6:,.1f} MB)")
         return
     if out is not None:
-        made = published(Material(session, wishes), out, lambda d, t: reporter.progress("publish", d, t))
+        made = published(material, out, lambda d, t: reporter.progress("publish", d, t))
         reporter.close()
         for path, reason in made.failures:
             typer.echo(f"failed: {path}: {reason}")
@@ -65,6 +70,9 @@ def publish(
 def view(
     survey_file: SurveyFile,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of 127.0.0.1; 0: one that is free.")] = 0,
+    over: Annotated[
+        list[Path] | None, typer.Option(help="Survey file of another survey of the roads, for strips over one another.")
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
 ) -> None:
     """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
@@ -74,7 +82,7 @@ def view(
     from roadscan.jobs.publish.server import SiteServer
     from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
 
-    site = LiveSite(open_survey(survey_file))
+    site = LiveSite(open_survey(survey_file, over or ()))
     with SiteServer(site, port) as server:
         if web_folder() is None:
             typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")

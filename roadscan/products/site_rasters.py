@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -84,6 +84,29 @@ class Pyramid:
         ordered: npt.NDArray[np.int64] = found[order]
         return ordered
 
+    def holds(self, place: Place) -> bool:
+        """True for a picture that a tile lies in."""
+        if place.level >= self.stored_levels:
+            return (place.column, place.row) in self._coarse(place.level)
+        edge_px = self.grid.cells_per_edge // self.factors[place.level]
+        ends = [(first * self.tile_px, (first + 1) * self.tile_px - 1) for first in (place.column, place.row)]
+        columns, rows = (range(low // edge_px, high // edge_px + 1) for low, high in ends)
+        return any(TileId(c, r) in self._known for r in rows for c in columns)
+
+    def runs(self, level: int) -> list[list[Any]]:
+        """Rows of pictures, each with first and last column of its runs."""
+        found = self._lattice(self.factors[level])
+        found = found[np.lexsort((found[:, 0], found[:, 1]))]
+        column, row = found[:, 0], found[:, 1]
+        starts = np.flatnonzero((np.diff(row, prepend=row[0] - 1) != 0) | (np.diff(column, prepend=column[0] - 2) != 1))
+        ends = np.append(starts[1:], len(found)) - 1
+        told: list[list[Any]] = []
+        for y, first, last in zip(row[starts].tolist(), column[starts].tolist(), column[ends].tolist(), strict=True):
+            if not told or told[-1][0] != y:
+                told.append([y, []])
+            told[-1][1].append([first, last])
+        return told
+
     def tiles_in(self, level: int, place: Place) -> list[TileId]:
         """Tiles that a picture and the ring of pixels around it may touch."""
         edge_px = self.grid.cells_per_edge // self.factors[level]
@@ -95,6 +118,16 @@ class Pyramid:
     @cached_property
     def _known(self) -> frozenset[TileId]:
         return frozenset(self.tiles)
+
+    def _coarse(self, level: int) -> frozenset[tuple[int, int]]:
+        """Pictures of a level above those of the tiles: few."""
+        if level not in self._coarse_places:
+            self._coarse_places[level] = frozenset((c, r) for c, r in self._lattice(self.factors[level]).tolist())
+        return self._coarse_places[level]
+
+    @cached_property
+    def _coarse_places(self) -> dict[int, frozenset[tuple[int, int]]]:
+        return {}
 
     def _lattice(self, factor: int) -> npt.NDArray[np.int64]:
         """(n, 2) pictures of a pixel of so many cells, without order."""

@@ -6,7 +6,7 @@ import tempfile
 import threading
 import uuid
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -88,13 +88,16 @@ class LiveSite:
         return material
 
 
-def open_survey(survey_file: str | Path) -> Callable[[], Material]:
-    """Function that looks at a survey anew; damaged records are no hindrance, what is sound is shown."""
+def open_survey(survey_file: str | Path, over: Sequence[str | Path] = ()) -> Callable[[], Material]:
+    """Function that looks at a survey anew, and at others over it; damaged records are no hindrance, what is sound is
+    shown.
+    """
 
     def opened() -> Material:
-        session = Session.open(survey_file)
-        session.hear_of_damage()
-        return Material(session)
+        sessions = [Session.open(file) for file in (survey_file, *over)]
+        for session in sessions:
+            session.hear_of_damage()
+        return Material(sessions[0], over=tuple(sessions[1:]))
 
     return opened
 

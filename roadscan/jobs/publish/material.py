@@ -66,6 +66,30 @@ class Material:
 
     session: Session
     wishes: Wishes = field(default_factory=Wishes)
+    over: tuple[Session, ...] = ()
+    """Surveys of the same roads whose strips are shown over those of this one."""
+
+    @cached_property
+    def others(self) -> tuple[Material, ...]:
+        """Those surveys.
+
+        Raises
+        ------
+        ConfigError
+            where one has another map, or the name of this one.
+        """
+        found = tuple(Material(session, self.wishes) for session in self.over)
+        known = {self.context.survey_id}
+        for one in found:
+            name = one.context.survey_id
+            if one.context.map.wkt() != self.context.map.wkt() or one.context.map.height != self.context.map.height:
+                raise ConfigError(
+                    f"the survey '{name}' has another map", expected=f"that of '{self.context.survey_id}'"
+                )
+            if name in known:
+                raise ConfigError(f"the survey '{name}' is there twice", expected="surveys with ids of their own")
+            known.add(name)
+        return found
 
     @property
     def store(self) -> Store:

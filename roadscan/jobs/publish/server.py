@@ -8,6 +8,7 @@ reads the survey by a name that resolves to this machine.
 from __future__ import annotations
 
 import re
+import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -66,6 +67,11 @@ class SiteServer(ThreadingHTTPServer):
         """Listen; port 0 takes one that is free."""
         self.documents = documents
         super().__init__((LOOPBACK, port), _Handler)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Pass over a browser that went away before its answer was there; tell of all else."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
     @property
     def address(self) -> str:

@@ -75,18 +75,17 @@ def write_single(
 def _ever_less(material: Material) -> Iterator[tuple[Material, str]]:
     """The material with ever fewer wishes, and what each goes without."""
     wishes = material.wishes
-    material = Material(material.session, wishes)
     yield material, ""
     if wishes.pictures:
         wishes = replace(wishes, pictures=False)
-        yield Material(material.session, wishes), "pictures of cameras"
+        yield replace(material, wishes=wishes), "pictures of cameras"
     pixel_m = max(material.context.grid.cell_m, wishes.finest_pixel_m)
     for _ in range(3):
         pixel_m *= 4
         wishes = replace(wishes, finest_pixel_m=pixel_m)
-        yield Material(material.session, wishes), f"rasters with pixels finer than {pixel_m:g} m"
+        yield replace(material, wishes=wishes), f"rasters with pixels finer than {pixel_m:g} m"
     if wishes.clouds:
-        yield Material(material.session, replace(wishes, clouds=False)), "points"
+        yield replace(material, wishes=replace(wishes, clouds=False)), "points"
 
 
 def _inside(folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from roadscan.code_reach import code_digest
 from roadscan.jobs.engine.fingerprint import key_of
-from roadscan.jobs.publish.document import Ask, Document, json_document
+from roadscan.jobs.publish.document import Ask, Document, json_bytes
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.publish.part import SitePart
 from roadscan.products.site_rasters import (
@@ -72,7 +72,7 @@ class Rasters(SitePart):
         """Which pictures there are, level by level."""
         images = images_of(material)
         for number, level in enumerate(images.levels):
-            yield json_document(f"rasters/tiles_{number}.json", {"level": number, "rows": images.runs(level)})
+            yield images.list_of(number, level)
 
     def find(self, material: Material, path: str) -> Document | None:
         """A picture by its path."""
@@ -81,7 +81,7 @@ class Rasters(SitePart):
             return None
         place = Place(images.levels[int(found[2])], int(found[3]), int(found[4]))
         named = next(raster for raster in RASTERS if raster == found[1])
-        return images.document(named, place) if images.is_there(place) else None
+        return images.document(named, place) if images.pyramid.holds(place) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +112,6 @@ class Images:
     def _windows(self) -> TileWindows:
         return TileWindows(self.pyramid, self.material.cells())
 
-    def is_there(self, place: Place) -> bool:
-        """True for a picture that a tile lies in."""
-        return (place.column, place.row) in self._there(place.level)
-
     def about(self, level: int) -> dict[str, Any]:
         """A level as the page reads it."""
         places = self.pyramid.places(level)
@@ -139,16 +135,20 @@ class Images:
         named = dict(zip(("offset", "step", "from", "to"), scale, strict=True))
         return {"name": raster, **_ABOUT[raster], **named, "url": f"rasters/{raster}/{{level}}/{{column}}_{{row}}.png"}
 
-    def runs(self, level: int) -> list[list[Any]]:
-        """Rows, and first and last column of their pictures' runs."""
-        rows: dict[int, list[list[int]]] = {}
-        for row, column in sorted((r, c) for c, r in self._there(level)):
-            runs = rows.setdefault(row, [])
-            if runs and runs[-1][1] == column - 1:
-                runs[-1][1] = column
-            else:
-                runs.append([column, column])
-        return [[row, runs] for row, runs in rows.items()]
+    def list_of(self, number: int, level: int) -> Document:
+        """Which pictures a level has."""
+
+        def write(path: Path, _ask: Ask) -> None:
+            path.write_bytes(json_bytes({"level": number, "rows": self.pyramid.runs(level)}))
+
+        shape = [self.pyramid.tile_px, self.pyramid.factors[level], self.pyramid.grid.size_m, self.pyramid.grid.cell_m]
+        return Document(
+            f"rasters/tiles_{number}.json", key_of(code_digest(*_CODE), number, shape, self._tiles_key), write
+        )
+
+    @cached_property
+    def _tiles_key(self) -> str:
+        return key_of(self.pyramid.tiles)
 
     def document(self, raster: Raster, place: Place) -> Document:
         """A picture."""
@@ -163,13 +163,9 @@ class Images:
             return
 
         def below(finer: Place) -> Path | None:
-            return ask(self.document(raster, finer).path) if self.is_there(finer) else None
+            return ask(self.document(raster, finer).path) if self.pyramid.holds(finer) else None
 
         coarser_picture(path, raster, below, place, self.pyramid.tile_px)
-
-    @functools.lru_cache(maxsize=64)  # noqa: B019  it lives as long as the process that publishes
-    def _there(self, level: int) -> frozenset[tuple[int, int]]:
-        return frozenset((c, r) for c, r in self.pyramid.places(level).tolist())
 
     def _key(self, raster: Raster, place: Place) -> str:
         """Hash of the tiles that a picture shows, and of how."""
@@ -180,7 +176,7 @@ class Images:
             steps = range(COARSER)
             west, south = COARSER * place.column, COARSER * place.row
             below = [Place(place.level - 1, west + c, south + r) for r in steps for c in steps]
-            parts = [self._held_key(raster, one) for one in below if self.is_there(one)]
+            parts = [self._held_key(raster, one) for one in below if self.pyramid.holds(one)]
         return key_of(code_digest(*_CODE), raster, place, parts, self.scales, self.pyramid.pixel_m(place.level))
 
     @functools.lru_cache(maxsize=200_000)  # noqa: B019  as above

@@ -34,6 +34,8 @@ class Lane:
     """A lane with the files of its values."""
 
     number: int
+    material: Material
+    """Its survey."""
     row: Mapping[str, Any]
     """Of the table `lanes`."""
     station_m: Float64
@@ -47,6 +49,15 @@ class Lane:
     def url(self) -> str:
         """Where its strip lies."""
         return f"strips/{self.number}.json"
+
+    @property
+    def survey(self) -> str:
+        """Id of its survey."""
+        return self.material.context.survey_id
+
+    def key(self, records: Sequence[OutputRecord]) -> str:
+        """Hash of some of its files, and of the lane."""
+        return self.material.key(records, self.survey, self.number, self.row, self.middle_m.tolist())
 
     def direction_deg(self, station_m: float) -> float:
         """Direction of travel at a station, clockwise from map north (degrees)."""
@@ -72,13 +83,12 @@ class Strips(SitePart):
         lanes = lanes_of(material)
         if not lanes:
             return
-        told = [_about(material, lane) for lane in lanes]
+        told = [_about(lane) for lane in lanes]
         yield json_document("strips/index.json", {"lanes": told, **_quantities()})
         for lane in lanes:
-            yield _later(lane.url, material.key(lane.values, lane.row), _strip(material, lane))
+            yield _later(lane.url, lane.key(lane.values), _strip(lane))
             for place, record in enumerate(lane.cross_sections):
-                key = material.key([record], lane.row)
-                yield _later(_crossing_url(lane, place), key, _crossings(material, lane, record))
+                yield _later(_crossing_url(lane, place), lane.key([record]), _crossings(lane, record))
 
 
 def _later(path: str, key: str, make: Any) -> Document:
@@ -92,10 +102,18 @@ def _later(path: str, key: str, make: Any) -> Document:
 
 @functools.lru_cache(maxsize=2)
 def lanes_of(material: Material) -> tuple[Lane, ...]:
-    """Lanes with any values, in the order of the table; those of a box that is wished for."""
+    """Lanes with any values, in the order of the table; those of a box that is wished for, and of surveys over it."""
+    found: list[Lane] = []
+    for one in (material, *material.others):
+        found += _lanes(one, len(found))
+    return tuple(found)
+
+
+def _lanes(material: Material, first: int) -> list[Lane]:
+    """Lanes of one survey, numbered from `first`."""
     held = material.table("lanes")
     if held is None or held.shapes_m is None:
-        return ()
+        return []
     values, crossings = material.records("condition_values"), material.records("cross_sections")
     near = None if material.wishes.near is None else shapely.box(*material.wishes.near)
     found: list[Lane] = []
@@ -109,19 +127,19 @@ def lanes_of(material: Material) -> tuple[Lane, ...]:
         of_lane = tuple(r for r in values if r.path.rsplit("/", 1)[0].endswith(f"/{own}"))
         crossed = tuple(r for r in crossings if r.path.rsplit("/", 1)[0].endswith(f"/{own}"))
         if len(middle) > 1 and of_lane:
-            found.append(Lane(len(found), row, stations, middle, of_lane, crossed))
-    return tuple(found)
+            found.append(Lane(first + len(found), material, row, stations, middle, of_lane, crossed))
+    return found
 
 
-def _about(material: Material, lane: Lane) -> dict[str, Any]:
+def _about(lane: Lane) -> dict[str, Any]:
     spans = []
     for place, record in enumerate(lane.cross_sections):
-        stations = material.store.read_table(record.path, ["station_m"]).column("station_m").to_numpy()
+        stations = lane.material.store.read_table(record.path, ["station_m"]).column("station_m").to_numpy()
         if stations.size:
             ends = {"from_m": float(stations.min()), "to_m": float(stations.max())}
             spans.append({**ends, "url": _crossing_url(lane, place)})
     return {
-        "lane_id": lane.number, "survey": material.context.survey_id, "road": lane.row["road"], "name": None,
+        "lane_id": lane.number, "survey": lane.survey, "road": lane.row["road"], "name": None,
         "lane": lane.row["lane"], "direction": lane.row["direction"],
         "station_m": [float(lane.station_m[0]), float(lane.station_m[-1])], "url": lane.url, "cross_sections": spans,
     }  # fmt: skip
@@ -141,14 +159,14 @@ def _quantities() -> dict[str, Any]:
     return {"quantities": quantities, "panels": [{"title": i.title, "quantities": i.drawn} for i in known if i.drawn]}
 
 
-def _strip(material: Material, lane: Lane) -> Any:
+def _strip(lane: Lane) -> Any:
     def make() -> dict[str, Any]:
-        held = material.rows_of(lane.values)
+        held = lane.material.rows_of(lane.values)
         series = [] if held is None else list(_series(held.rows))
         east, north = (np.round(lane.middle_m[:, k], 4) for k in (0, 1))
         line = {"station_m": lane.station_m, "easting_m": east, "northing_m": north}
         return {
-            "lane_id": lane.number, "survey": material.context.survey_id, "road": lane.row["road"],
+            "lane_id": lane.number, "survey": lane.survey, "road": lane.row["road"],
             "lane": lane.row["lane"], "direction": lane.row["direction"], "line": line, "series": series,
         }  # fmt: skip
 
@@ -165,9 +183,9 @@ def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
         yield {**kind, **{told: own.column(name).to_pylist() for name, told in zip(_SERIES, _TOLD, strict=True)}}
 
 
-def _crossings(material: Material, lane: Lane, record: OutputRecord) -> Any:
+def _crossings(lane: Lane, record: OutputRecord) -> Any:
     def make() -> dict[str, Any]:
-        held = material.rows_of([record])
+        held = lane.material.rows_of([record])
         rows: Sequence[Mapping[str, Any]] = [] if held is None else held.rows.to_pylist()
         stations = [row["station_m"] for row in rows]
         sections = [_crossing(lane, row) for row in rows]

@@ -39,8 +39,8 @@ def publish(
     if (out is None) == (single is None):
         raise ConfigError("publish takes a folder or a single file", expected="--out FOLDER or --single FILE.html")
     session, *others = (Session.open(file) for file in (survey_file, *(over or ())))
-    for one in (session, *others):
-        one.hear_of_damage()
+    for opened in (session, *others):
+        opened.hear_of_damage()
     if box is not None and road is not None:
         raise ConfigError("--box and --road are both given", expected="one of them")
     near = box_from_text(box) if box is not None else None

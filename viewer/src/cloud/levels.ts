@@ -44,7 +44,7 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
     if (points + node.count > budget) break
     points += node.count
     node.used = store.turn
-    if (node.points) nodes.set(node, new Float32Array(8).fill(spacingOf(store, node)))
+    if (node.points) nodes.set(node, new Float32Array(8).fill(node.spacing_m))
     else if (node.count) void store.load(node)
     if (node.count && !node.points) continue
     const distance = Math.max(0.5, local(node.box).distanceToPoint(eye))
@@ -52,23 +52,6 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
   }
   reached(store, nodes)
   return { nodes, points }
-}
-
-/** A last node holds all points that are left, so they may lie closer than the file's spacing of its level. */
-function spacingOf(store: CloudStore, node: CloudNode): number {
-  if (store.children(node).length) return node.spacing_m
-  const { position, count } = node.points!
-  if (node.apart_m === 0) {
-    const [low, high] = [[Infinity, Infinity], [-Infinity, -Infinity]]
-    for (let at = 0; at < count * 3; at += 3) {
-      for (let axis = 0; axis < 2; axis++) {
-        low[axis] = Math.min(low[axis]!, position[at + axis]!)
-        high[axis] = Math.max(high[axis]!, position[at + axis]!)
-      }
-    }
-    node.apart_m = 1.5 * Math.sqrt(((high[0]! - low[0]!) * (high[1]! - low[1]!)) / count) || node.spacing_m
-  }
-  return Math.min(node.spacing_m, node.apart_m)
 }
 
 /** Where a child is drawn, its parent's points are as dense as the densest of it: what is coarser there, the child draws. */

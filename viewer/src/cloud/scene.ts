@@ -190,7 +190,7 @@ export class CloudScene {
     for (const [node, drawn] of this.#points) drawn.visible = nodes.has(node)
     for (const [node, spacings_m] of nodes) {
       const drawn = this.#points.get(node) ?? this.#add(node)
-      drawn.material.uniforms['sizes_m']!.value = spacings_m.map((one) => one * 1.3 * size)
+      drawn.material.uniforms['sizes_m']!.value = spacings_m.map((one) => one * 1.7 * size)
     }
   }
 

@@ -23,8 +23,6 @@ export interface CloudNode {
   /** Distance of its points (m), as the file states it. */
   readonly spacing_m: number
   readonly count: number
-  /** Distance of its points as they lie on the ground (m); 0 until it is asked for. */
-  apart_m: number
   readonly origin: [number, number, number]
   /** Middle of its cube, which the box is a part of. */
   readonly middle: [number, number, number]
@@ -138,7 +136,7 @@ export class CloudStore {
     }
     const box = { min, max }
     const spacing_m = (spacing * horizontal_unit.m) / 2 ** depth
-    return { key, sheet, depth, box, spacing_m, count, apart_m: 0, origin: centre(box), middle, points: null, loading: null, failed: false, used: 0 }
+    return { key, sheet, depth, box, spacing_m, count, origin: centre(box), middle, points: null, loading: null, failed: false, used: 0 }
   }
 
   /** The nodes below a node that are known; a page of the hierarchy that names them is asked for. */

@@ -124,7 +124,8 @@ export class CloudView {
     desk.target.on((goal) => {
       if (!goal) return
       const height = goal.height_m ?? this.groundAt(goal.easting_m, goal.northing_m)
-      this.eye.lookAt(this.#local([goal.easting_m, goal.northing_m, height]), Math.max(3, goal.across_m ?? 15))
+      this.#far = Math.max(2, goal.across_m ?? 15)
+      this.eye.lookAt(this.#local([goal.easting_m, goal.northing_m, height]), this.#far)
       this.#moved()
     })
     desk.place.on(() => this.#redraw())
@@ -285,7 +286,11 @@ export class CloudView {
     const { width, height } = this.#size
     const picked = this.pickAt(x, y, 14)
     const ray = this.eye.ray(x, y, width, height)
-    if (picked) this.#far = this.#local(picked.coordinate).distanceTo(this.eye.place)
+    if (picked) {
+      // The near plane follows, so other nodes may come into sight.
+      this.#far = this.#local(picked.coordinate).distanceTo(this.eye.place)
+      this.#redraw(true)
+    }
     return picked ? this.#local(picked.coordinate) : this.eye.place.clone().addScaledVector(ray, this.#far)
   }
 

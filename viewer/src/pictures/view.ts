@@ -5,14 +5,14 @@ import { fill, h, iconButton } from '../core/dom'
 import * as format from '../core/format'
 import { meet, rayNear } from '../cloud/pick'
 import type { CloudStore } from '../cloud/store'
-import { pixelOf, rayOf } from './geometry'
+import { pixelOf, pixelSize, rayOf } from './geometry'
 import type { Picture, PictureList, View } from './list'
 import { Panorama } from './panorama'
 
 const OFFERED = 24
 const CHECKED = 8
 const RAY_POINTS = 2_000_000
-/** Half the angle (radian) within which points count as met by a ray: about two pixels of a common camera. */
+/** Least half angle (radian) within which points count as met by a ray: about two pixels of a common camera. */
 const CONE = 1.5e-3
 
 export class PictureView {
@@ -352,11 +352,17 @@ export class PictureView {
     if (!picture || !this.#bitmap) return
     const box = this.#frame.getBoundingClientRect()
     const [u, v] = this.#pixelAt(clientX - box.left, clientY - box.top)
-    await this.placeOf(picture, u, v)
+    await this.placeOf(picture, u, v, Math.max(CONE, this.#pixelAngle()))
+  }
+
+  /** The angle (radian) of a pixel of the picture, or of the screen where that is larger: nobody points closer. */
+  #pixelAngle(): number {
+    if (this.#around && this.#panorama) return this.#panorama.angle / Math.max(1, this.#frame.clientHeight)
+    return pixelSize(this.#picture!.camera, 1) / Math.min(1, this.#view.zoom * this.#shrunk)
   }
 
   /** The place that a pixel shows: where its ray meets the cloud first. */
-  async placeOf(picture: Picture, u: number, v: number): Promise<void> {
+  async placeOf(picture: Picture, u: number, v: number, cone: number): Promise<void> {
     const store = await this.cloud()
     if (!store) {
       this.desk.say('This site holds no point cloud, so a pixel has no place.')
@@ -364,8 +370,8 @@ export class PictureView {
     }
     this.desk.say('Looking for the point …')
     const ray = { from: [picture.easting_m, picture.northing_m, picture.height_m] as const, direction: rayOf(picture.camera, picture, u, v) }
-    const { nodes } = await store.within((one) => rayNear(one, ray, CONE * 2, 80), RAY_POINTS)
-    const met = meet(store, nodes, ray, CONE, 0.8, 80) ?? meet(store, nodes, ray, CONE * 4, 0.8, 80)
+    const { nodes } = await store.within((one) => rayNear(one, ray, cone * 2, 80), RAY_POINTS)
+    const met = meet(store, nodes, ray, cone, 0.8, 80) ?? meet(store, nodes, ray, cone * 3, 0.8, 80)
     if (!met) {
       this.desk.say('The ray of this pixel meets no point within 80 m.')
       return

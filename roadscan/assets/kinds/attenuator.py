@@ -34,7 +34,8 @@ class Attenuator(AssetKind):
     ) -> Iterable[AssetObject]:
         """Boxes at the end of something that they shield."""
         lines = [o.geometry for kind in self.after for o in others.get(kind, ())]
-        ends = shapely.multipoints([p for g in lines for p in (g.coords[0][:2], g.coords[-1][:2]) if g.length > 4.0])
+        places = [p for g in lines for p in (g.coords[0][:2], g.coords[-1][:2]) if g.length > 4.0]
+        ends = shapely.multipoints(np.array(places, np.float64).reshape(-1, 2))
         for row in pieces.to_pylist():
             box = shapely.Polygon([(*p, row["ground_m"]) for p in row["ring"]])
             away = float(shapely.distance(shapely.force_2d(box), ends)) if lines else np.nan

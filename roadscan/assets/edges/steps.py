@@ -57,6 +57,7 @@ class Places(NamedTuple):
 DEFAULT: Final = StepSettings()
 _CLIPPED: Final = 4.0
 _STILL: Final = 0.5
+_PRIOR: Final = 0.06
 _MEAN_SIZE: Final = math.sqrt(2.0 / math.pi)
 """Mean of the absolute value of a normal variable."""
 
@@ -127,7 +128,7 @@ def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSetti
     wide = round(settings.around_m / cell_m)
     size = np.where(still, _STILL, np.minimum(np.abs(evidence), _CLIPPED))
     share = scipy.ndimage.uniform_filter((still | (evidence != 0.0)).astype(np.float64), wide, mode="constant")
-    mean = scipy.ndimage.uniform_filter(size, wide, mode="constant") / np.maximum(share, 1e-6)
+    mean = (scipy.ndimage.uniform_filter(size, wide, mode="constant") + _PRIOR * _STILL) / (share + _PRIOR)
     return np.maximum(mean / _MEAN_SIZE, 1.0)
 
 

@@ -186,6 +186,7 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
         log_gain[mine] += by_laser[returns.laser[mine]]
         log_gain[mine] += np.interp(range_m[mine], *of("range"))
         log_gain[mine] += np.where(on_ground[mine], np.interp(incidence[mine], *of("incidence")), 0.0)
+    log_gain[np.isnan(log_gain)] = 0.0  # it is not known where the sensor stood
     intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
     return replace(returns, intensity=intensity, calibrated=True)
 
@@ -250,7 +251,9 @@ def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
         first += int(place.max(initial=-1)) + 1
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 7
     unit = min((s.unit for s in ordered), default=1.0)
-    return IntensitySample((0.0, 0.0), names, *joined, unit=unit if np.isfinite(unit) else 1.0)
+    place, sensor, laser, range_m, incidence, intensity, returns = joined
+    digit = unit if np.isfinite(unit) else 1.0
+    return IntensitySample((0.0, 0.0), names, place, sensor, laser, range_m, incidence, intensity, returns, digit)
 
 
 def _values(sample: IntensitySample) -> tuple[npt.NDArray[np.generic], ...]:

@@ -25,7 +25,7 @@ ACROSS_DEG: Final = 55.0
 _STOP_BAR_M: Final = (0.15, 1.0)
 """Narrowest band across the road that is a bar, and shortest."""
 _LEAST_AREA_M2: Final = 0.03
-_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, -2.0
+_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, 0.0
 _OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0
 _SPREAD: Final = 0.25
 """1 σ of the contrast of fresh paint from place to place, as a share of its mean."""

@@ -22,6 +22,7 @@ Int64 = npt.NDArray[np.int64]
 
 ACROSS_DEG: Final = 55.0
 """Bands at this angle to the road or more lie across it."""
+WIDEST_LINE_M: Final = 0.42
 _STOP_BAR_M: Final = (0.15, 1.0)
 """Narrowest band across the road that is a bar, and shortest."""
 _LEAST_AREA_M2: Final = 0.03
@@ -85,7 +86,7 @@ def _paint_of(scene: Scene) -> Paint:
     lines, patches = [], []
     for stripe, crossed in zip(bands, in_crosswalk[: len(bands)], strict=True):
         direction = road.at(*stripe.middle_m)
-        if crossed or _lies_across(stripe, direction):
+        if crossed or stripe.width_m > WIDEST_LINE_M or _lies_across(stripe, direction):
             patches.append(_of_stripe(stripe, bool(crossed), direction))
         else:
             lines.append(stripe)

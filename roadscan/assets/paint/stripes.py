@@ -17,8 +17,8 @@ Int64 = npt.NDArray[np.int64]
 CHUNK_M: Final = 5.0
 """Long components are cut at multiples of this in the map, so that each piece is straight."""
 _LONGEST_WHOLE_M: Final = 7.0
-WIDEST_M: Final = 0.42
-"""Widest band that counts as a line."""
+WIDEST_M: Final = 0.7
+"""Widest band: lines, and bars of crossings and stops."""
 _SLIMMEST: Final = 2.0
 """Length over width of a band."""
 _SHORTEST_M: Final = 0.35

@@ -27,10 +27,12 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.model.strict import meanings
 from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
-from roadscan.tables.schema import TableSchema, schema_names, table_schema
+from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
+from roadscan.tables.schema import TableSchema, schema_folder, schema_names, table_schema
 
 DOCS: Final = Path(__file__).resolve().parent
 TEMPLATES: Final = DOCS / "pages"
@@ -240,6 +242,44 @@ def _range_words(lowest: float | None, highest: float | None) -> Iterable[str]:
         yield f" {highest:g} or less."
 
 
+def asset_columns(_: str) -> str:
+    """Columns that the tables of all kinds of assets have."""
+    return _asset_table(asset_schema(asset_kind_names()[0]).common)
+
+
+def asset_list(_: str) -> str:
+    """A section for each kind of assets: its table, its own columns, how it is found, its settings."""
+    known = _own(asset_kinds(), "roadscan.asset_kinds")
+    names = [name for name in asset_kind_names() if (schema_folder() / "assets" / f"{name}.toml").is_file()]
+    return "\n\n".join(part for name in names for part in _asset_section(name, known.get(name)))
+
+
+def _asset_section(name: str, kind: AssetKind | None) -> Iterable[str]:
+    schema = asset_schema(name)
+    shapes = {"PointZ": "points", "LineStringZ": "lines", "PolygonZ": "polygons"}
+    yield f"### `{name}`\n\n{schema.meaning} Table `{schema.table}`, {shapes[schema.geometry]}."
+    if kind is not None:
+        yield from manual(type(kind))
+    yield _asset_table(schema.own)
+    if kind is not None and kind.options.model_fields:
+        yield f"Settings (`[assets.options.{name}]`):"
+        yield fields_table(kind.options)
+
+
+def _asset_table(columns: Iterable[AssetColumn]) -> str:
+    rows = [
+        (
+            f"`{c.name}`",
+            c.type + (", may be null" if c.nullable else ""),
+            c.unit,
+            c.title,
+            c.meaning + (" One of " + ", ".join(f"`{v}`" for v in c.values) + "." if c.values else ""),
+        )
+        for c in columns
+    ]
+    return markdown_table(("column", "type", "unit", "called", "meaning"), rows)
+
+
 # --- formats and products -----------------------------------------------------------------------
 
 
@@ -398,6 +438,8 @@ DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "formats": formats,
     "products": product_list,
     "include": include,
+    "asset_columns": asset_columns,
+    "asset_list": asset_list,
 }
 
 if __name__ == "__main__":

@@ -215,6 +215,18 @@ class OpenSurvey:
             self._check_values(name, {"run": run, "sensor": sensor})
         return _frame(rows, self.crs)
 
+    def assets(self, kind: str) -> pd.DataFrame:
+        """Assets of a kind, such as `pole` or `kerb`, as a GeoDataFrame in the map's CRS; geometries have heights.
+
+        Raises
+        ------
+        RoadscanError
+            where there is no such kind, or its table is not made (yet).
+        """
+        from roadscan.tables.asset_schema import asset_schema
+
+        return self.table(asset_schema(kind).table)
+
     def trajectory(self, run: str, *, start: Instant | None = None, end: Instant | None = None) -> pd.DataFrame:
         """Poses of a run on the map, as readings are placed by them: clocks, corrections and smoothing applied.
 

@@ -7,6 +7,7 @@ import re
 import runpy
 import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ import rasterio
 from typer.testing import CliRunner
 
 from docs import generate
+from roadscan.assets.kind import asset_kinds
+from roadscan.assets.object_table import table_of_objects
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box, GroundModel, Scene
 from roadscan.cli import app
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stages
@@ -30,6 +35,7 @@ from roadscan.model.ids import TileId
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
 from roadscan.sensors.base import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.tables.asset_schema import _files, asset_schema, asset_tables
 from roadscan.tables.schema import _schema_files, table_schema
 from roadscan.tables.sql import query
 from roadscan.tiles.cells import TileCells
@@ -203,7 +209,9 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
-GROUPS = {"sensors": "roadscan.formats", "jobs/stages": "roadscan.stages"}
+GROUPS = {
+    "sensors": "roadscan.formats", "jobs/stages": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds"
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +222,9 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     entries: dict[str, list[str]] = {}
     for group, module, code in blocks:
         (folder / f"contributed_{module}.py").write_text(code)
-        name = re.findall(r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|Stage)\)", code, flags=re.MULTILINE)[0]
+        name = re.findall(
+            r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|AssetKind|Stage)\)", code, flags=re.MULTILINE
+        )[0]
         entry = f"{module} = contributed_{module}:{name}"
         entries.setdefault(GROUPS.get(group, f"roadscan.{group}"), []).append(entry)
     schemas = folder / "contributed_schemas"
@@ -222,6 +232,11 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (schemas / "__init__.py").touch()
     for name, text in re.findall(r"```toml\n# schemas/(\w+)\.toml\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL):
         (schemas / f"{name}.toml").write_text(text)
+    (schemas / "assets").mkdir()
+    for name, text in re.findall(
+        r"```toml\n# schemas/assets/(\w+)\.toml\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL
+    ):
+        (schemas / "assets" / f"{name}.toml").write_text(text)
     entries["roadscan.schemas"] = ["contributed = contributed_schemas"]
     info = folder / "contributed-1.0.dist-info"
     info.mkdir()
@@ -236,7 +251,17 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def _look_again() -> None:
     """Let what is installed be found anew."""
-    for found in (log_formats, products, stages, _schema_files, table_schema):
+    for found in (
+        log_formats,
+        products,
+        stages,
+        asset_kinds,
+        asset_tables,
+        asset_schema,
+        _files,
+        _schema_files,
+        table_schema,
+    ):
         found.cache_clear()
 
 
@@ -331,6 +356,28 @@ def test_the_contributed_index(plugin: Path, tmp_path: Path) -> None:
         product.check(file)
 
 
+def test_the_contributed_kind_of_assets(plugin: Path) -> None:
+    kind, schema = asset_kinds()["overhang"], asset_schema("overhang")
+    assert asset_tables()["overhangs"] == "overhang"
+    height = np.array([0.0, 4.4, 3.1, 1.5, 2.8])
+    ones = np.ones(5, np.uint8)
+    returns = Returns(
+        (700_000.0, 5_300_000.0), np.array([5.0, 5.0, 5.5, 5.0, 9.0]), np.full(5, 5.0), height,
+        np.zeros(5, np.float32), np.arange(5) + 10**18, np.ones(5, np.uint16), 0 * ones, np.zeros(5, np.uint16), ones,
+        ones, np.zeros(5), np.zeros(5), np.full(5, 2.0), ("roof",),
+    )  # fmt: skip
+    ground = GroundModel(0.0, 0.0, 1.0, np.zeros((10, 10), np.float32), np.ones((10, 10), bool))
+    box, drive = Box(0.0, 0.0, 10.0, 10.0), np.array([[5.0, 0.0, 2.0, 1.0], [5.0, 5.0, 2.0, 1.0]])
+    scene = Scene(returns, box, box, ground, height.astype(np.float32), ones, drive)
+    pieces = kind.evidence(scene, kind.options()).pieces
+    (found,) = kind.objects(pieces, kind.options(), {})
+    rows = table_of_objects("overhang", [found], schema.arrow())
+    assert rows["clearance_m"].to_pylist() == pytest.approx([3.1])  # the lower ones are ground, or beside the way
+    assert rows["easting_m"].to_pylist() == [700_005.5]
+    assert kind.evidence(replace(scene, drive_xyh_m=drive[:0]), kind.options()).pieces.num_rows == 0
+    assert "overhang" not in generate.asset_list("")
+
+
 def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
     assert "boxlog" in log_formats()
     assert "boxlog" not in generate.formats("")
@@ -339,7 +386,7 @@ def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
 
 def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:  # noqa: F811
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
-    assert [s.name for s in stages()][-4:] == ["levels", "surfaces", "products", "condition"]
+    assert [s.name for s in stages()][-5:] == ["levels", "surfaces", "products", "condition", "assets"]
 
     def due() -> int:
         return survey_status(Session.open(survey)).of("levels").stale

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.cubes import cubes_of
 from roadscan.assets.ground.bare_earth import bare_earth
+from roadscan.assets.ground.road import road_cells
+from roadscan.assets.ground.surface import Place
+from roadscan.assets.moving import road_users
 from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.surroundings import surroundings
+from roadscan.kernels.assets.columns import marked
 from roadscan.model.asset_ground import GroundSettings
+
+_ABOVE_M: Final = 0.1
+"""Returns are looked at that do not lie on the ground and stand higher above it."""
 
 
 def make_scene(
@@ -28,8 +39,26 @@ def make_scene(
     drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass, in the order of time.
     settings : of bare earth; its defaults where left out.
     """
-    ground = bare_earth(returns, window, settings if settings is not None else GroundSettings())
+    drive = np.asarray(drive_xyh_m, np.float64).reshape(-1, 4)
+    ground = bare_earth(Place(returns, window, drive, settings if settings is not None else GroundSettings()))
     found = np.full(len(returns), classes.UNCLASSIFIED, np.uint8)
     found[ground.on_ground] = classes.GROUND
     found[ground.below] = classes.LOW_NOISE
-    return Scene(returns, tile, window, ground.model, ground.above_m, found, np.asarray(drive_xyh_m, np.float64))
+    above = ~ground.on_ground & (ground.above_m > _ABOVE_M)
+    cubes = cubes_of(returns, ground.above_m, above, window)
+    users = road_users(returns, ground.above_m, ground.on_ground, cubes, window)
+    found[users.vehicle] = classes.VEHICLE
+    found[users.person] = classes.PERSON
+    found = surroundings(returns, ground.above_m, found, cubes, window)
+    found[ground.on_ground & on_road(returns, ground.model, drive)] = classes.ROAD
+    return Scene(returns, tile, window, ground.model, ground.above_m, found, drive)
+
+
+def on_road(returns: Returns, model: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Returns (n,) above cells that are known to be road."""
+    cells = road_cells(model, drive_xyh_m).astype(np.int32)
+    at = np.empty(len(returns), np.int32)
+    corner, always = np.array([model.x_min_m, model.y_min_m]), np.array([-np.inf, -np.inf])
+    flat = np.zeros(len(returns), np.float32)
+    marked(returns.x_m, returns.y_m, flat, corner, 1.0 / model.cell_m, cells, always, -always, at)
+    return np.asarray(at > 0)

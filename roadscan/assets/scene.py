@@ -39,6 +39,9 @@ class GroundModel:
     """(rows, columns) height at the middle of each cell; NaN where nothing is known near."""
     seen: npt.NDArray[np.bool_]
     """(rows, columns) True where ground was seen; elsewhere the height is interpolated between seen cells."""
+    sigma_m: Float32 | None = None
+    """(rows, columns) 1 σ of the heights (m): the noise of returns where ground was seen, more with the distance from
+    there elsewhere; NaN where the height is."""
 
     def height_at(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Float64:
         """Height (as the points) of bare earth, bilinear between cells; NaN where it is not known."""

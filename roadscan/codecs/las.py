@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from blake3 import blake3
 from laspy.header import GpsTimeType
-from laspy.vlrs.known import WktCoordinateSystemVlr
+from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
 from lazrs import LazrsError
 from pyproj.exceptions import CRSError
 
@@ -46,6 +46,8 @@ class Layout:
     map: MapFrame
     product: str
     """Named in errors."""
+    class_names: tuple[tuple[int, str], ...] = ()
+    """Names of classes that the file states (LAS 1.4 R15, Classification Lookup); left out without any."""
 
     @property
     def header(self) -> laspy.LasHeader:
@@ -69,6 +71,10 @@ def _header(layout: Layout) -> laspy.LasHeader:
     header.global_encoding.gps_time_type = GpsTimeType.STANDARD
     header.global_encoding.wkt = True
     header.vlrs.append(WktCoordinateSystemVlr(_wkt1(layout.map, layout.product)))
+    if layout.class_names:
+        lookup = ClassificationLookupVlr()
+        lookup.lookups = dict.fromkeys(range(256), "") | dict(layout.class_names)
+        header.vlrs.append(lookup)
     for name, kind, about in layout.further:
         header.add_extra_dim(laspy.ExtraBytesParams(name, np.dtype(kind), about))
     return header

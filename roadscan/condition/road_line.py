@@ -19,6 +19,8 @@ Float64 = npt.NDArray[np.float64]
 
 NODE_M: Final = 1.0
 """Distance between the nodes of a line, and between those of a lane's middle (m)."""
+_ROUNDS: Final = 4
+"""Steps of Newton's method to the station beside a place."""
 _AROUND: Final = 4
 """Nodes beyond a stretch that its places depend on."""
 
@@ -61,6 +63,16 @@ class RoadLine:
         s, o = np.ascontiguousarray(station.ravel()), np.ascontiguousarray(offset.ravel())
         place(self.nodes_m, self.first_m, s, o, out)
         return out
+
+    def along(self, places_m: Float64, guess_m: npt.ArrayLike) -> tuple[Float64, Float64]:
+        """Stations and offsets (n,) of places (n, 2), from a station near each of them."""
+        station = np.array(np.broadcast_to(np.asarray(guess_m, np.float64), len(places_m)))
+        at = self.places(station, 0.0)
+        for _ in range(_ROUNDS):
+            station = station + np.sum((places_m - at[:, :2]) * at[:, 2:], axis=1)
+            at = self.places(station, 0.0)
+        beside = places_m - at[:, :2]
+        return station, beside[:, 0] * at[:, 3] - beside[:, 1] * at[:, 2]
 
     def curvature_per_m(self, station_m: Float64, half_m: float = 10.0) -> Float64:
         """(n,) curvature of the line (1/m), positive where it turns right: change of direction over 2 · `half_m`."""

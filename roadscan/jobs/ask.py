@@ -12,6 +12,7 @@ from roadscan.model.errors import RoadscanError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.products.base import SurveyProduct, products
 from roadscan.sensors.base import log_formats
+from roadscan.tables.asset_schema import asset_tables
 from roadscan.tables.schema import schema_names
 from roadscan.tables.sql import missing_table, query
 from roadscan.tables.store import Store
@@ -36,6 +37,7 @@ _MADE_BY: Final = {
         "`roadscan adjust` makes it, where passes overlap or come by ground control",
     ),
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
+    "intensity_gains": "`roadscan assets` makes it, where the survey file has a section [assets]",
     "innovations": "`roadscan navigate` makes it, for runs with GNSS and IMU",
     "navigation_states": "`roadscan navigate` makes it, for runs with GNSS and IMU",
     "regions": 'a run makes it with regions = "found" in [surface]',
@@ -77,6 +79,10 @@ def not_made(name: str, survey: Survey) -> RoadscanError | None:
 
 def _way_to(table: str, survey: Survey) -> str | None:
     """What makes a table; None where no such table is known."""
+    if table in asset_tables():
+        return (
+            f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"
+        )
     if table not in schema_names() and table not in _MADE_BY:
         return None
     made = next((p for p in products().values() if isinstance(p, SurveyProduct) and p.table == table), None)

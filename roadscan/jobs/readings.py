@@ -28,6 +28,7 @@ from roadscan.points.place import (
     EVERYWHERE,
     CloudFrame,
     HeightLimits,
+    Located,
     Placed,
     Placement,
     Window,
@@ -192,6 +193,14 @@ class Placer:
             rows = read_rows(self._store, one.source, one.file, groups).combine_chunks()
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
+
+    def located(self, one: RawSlice, window: Window, columns: list[str]) -> Iterator[tuple[pa.RecordBatch, Located]]:
+        """Some columns of a slice of scans or returns, chunk by chunk, and where its readings lie within a window."""
+        placement, geometry = self._placements[one.source.key], geometry_of(one.source)
+        for groups in _chunks(one):
+            rows = read_rows(self._store, one.source, one.file, groups, columns).combine_chunks()
+            for batch in rows.to_batches():
+                yield batch, placement.located(batch, geometry, window)
 
     def placement(self, source: ReadingSource) -> Placement:
         """How the readings of a source, which is no cloud, become points."""

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.adjust import AdjustConfig
+from roadscan.model.assets import AssetsConfig
 from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.model.condition import ConditionConfig
@@ -408,6 +409,8 @@ class SurveyConfig(Strict):
     """Reconstruction of the road's surface; left out, there is none."""
     condition: ConditionConfig | None = None
     """The road's condition along its lanes; left out, none is computed."""
+    assets: AssetsConfig | None = None
+    """Assets on, beside and over the road; left out, none are sought."""
     products: ProductConfig = ProductConfig()
     """Products."""
 

@@ -121,6 +121,19 @@ class ProfilePoints:
 
 
 @dataclass(frozen=True)
+class Located:
+    """Readings of a batch that no filter leaves out, by their rows in it; arrays (n, …)."""
+
+    row: Int32
+    reading: Int32
+    """Number of the reading in its profile; not set for returns."""
+    tiles: Int32
+    """(n, 2) column and row."""
+    quanta: Int32
+    """(n, 3) x and y from the tile's south-west corner, height; 10 µm."""
+
+
+@dataclass(frozen=True)
 class Placement:
     """How the readings of one sensor in one run become points."""
 
@@ -182,6 +195,11 @@ class Placement:
         return Placed(
             work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
         )
+
+    def located(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window) -> Located:
+        """Places of the readings of a batch within a window, with their rows; `geometry` for scans."""
+        work = self._work(batch, geometry, window, marked=False)
+        return Located(work.rows, work.readings, work.tiles, work.quanta)
 
     def by_profile(self, batch: pa.RecordBatch, geometry: ScanGeometry) -> ProfilePoints:
         """Where the readings of rows of the table ``scans`` lie, profile by profile."""

@@ -11,6 +11,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.products.base import ProductContext
+from roadscan.products.geo_table import in_crs_unit
 
 _WRITTEN: Final = "2000-01-01T00:00:00.000Z"
 """A GeoPackage states when a layer changed; equal tables have to give equal bytes."""
@@ -20,8 +21,7 @@ def write_layer(path: Path, table: pa.Table, shapes_m: npt.NDArray[Any], context
     """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's own unit."""
     import pyogrio  # slow to import
 
-    unit_m = context.map.horizontal_unit_m
-    shapes = shapes_m if unit_m == 1.0 else shapely.transform(shapes_m, lambda xy: xy / unit_m)
+    shapes = in_crs_unit(shapes_m, context)
     frame = table.to_pandas()
     pyogrio.raw.write(
         path,

@@ -37,8 +37,7 @@ def write_geo_table(
     shapes_m : (n,) shapely geometries on the map (m); kinds : their types, such as ``["Polygon"]``.
     counterclockwise : whether the outer rings of all polygons run that way, which the file then states.
     """
-    unit_m = context.map.horizontal_unit_m
-    shapes = shapes_m if unit_m == 1.0 else shapely.transform(shapes_m, lambda xy: xy / unit_m)
+    shapes = in_crs_unit(shapes_m, context)
     field = pa.field(geometry, pa.binary(), nullable=False)
     table = columns.append_column(field, pa.array(shapely.to_wkb(shapes), pa.binary()))
     column = {"encoding": "WKB", "geometry_types": kinds, "crs": _crs(context), "edges": "planar"}
@@ -58,10 +57,22 @@ def read_geo_table(content: bytes, context: ProductContext) -> tuple[pa.Table, n
     table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # by this thread: see Store.read_table
     name = json.loads(table.schema.metadata[b"geo"])["primary_column"]
     shapes = shapely.from_wkb(table[name].to_numpy())
-    unit_m = context.map.horizontal_unit_m
-    if unit_m != 1.0:
-        shapes = shapely.transform(shapes, lambda xy: xy * unit_m)
-    return table.drop_columns([name]), shapes
+    return table.drop_columns([name]), _changed(shapes, context, np.multiply)
+
+
+def in_crs_unit(shapes_m: npt.NDArray[Any], context: ProductContext) -> npt.NDArray[Any]:
+    """Geometries (n,) on the map (m), in the CRS's own unit; heights, where they have any, in that of its heights."""
+    return _changed(shapes_m, context, np.divide)
+
+
+def _changed(shapes: npt.NDArray[Any], context: ProductContext, how: np.ufunc) -> npt.NDArray[Any]:
+    units = [context.map.horizontal_unit_m] * 2
+    with_heights = bool(shapely.has_z(shapes).any())
+    units += [context.map.vertical_unit_m] if with_heights else []
+    if units == [1.0] * len(units):
+        return shapes
+    changed: npt.NDArray[Any] = shapely.transform(shapes, lambda xyz: how(xyz, units), include_z=with_heights)
+    return changed
 
 
 def check_geo_table(path: Path, columns: pa.Schema) -> None:

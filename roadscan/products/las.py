@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Final, cast
@@ -99,6 +100,30 @@ class Las(TileProduct):
     def check(self, path: Path) -> None:
         """Decode every point and compare number, box and digest with what the header states."""
         check_points(path)
+
+
+def write_las(
+    path: Path,
+    points: TilePoints,
+    options: LasOptions,
+    context: ProductContext,
+    facts: Mapping[str, Any],
+    class_names: Mapping[int, str],
+) -> None:
+    """Write points (one or more) of a tile of the context's grid, as :class:`Las` does.
+
+    Parameters
+    ----------
+    facts : what the record of the user ``roadscan`` states beside the rounding errors.
+    class_names : names of classes that the file holds in its Classification Lookup, up to 15 letters each.
+    """
+    axes = _axes(points, options.scale_m, context)
+    layout = replace(_layout(points, axes, context), class_names=tuple(sorted(class_names.items())))
+    records = _record(points, axes, layout.header).array
+    stated = {
+        **facts, "rounding_error_max_m": rounding_errors(axes), "gps_time_step_ns": _gps_time_step_ns(points)
+    }  # fmt: skip
+    write_points(path, layout, [one.offset for one in axes], records, stated, context.date, options.compress)
 
 
 def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:

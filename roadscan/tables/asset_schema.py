@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
 import pyarrow as pa
 
 from roadscan.model.errors import SchemaError, nearest
-from roadscan.tables.schema import schema_folder
+from roadscan.tables.schema import schema_folders
 
 GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ"]
 
@@ -22,6 +23,8 @@ _TYPES: Final = {
     "string": pa.string(),
 }
 _COMMON: Final = "common"
+ASSET_FOLDER: Final = "products/assets"
+"""Folder of the tables, relative to the survey's root: a file a table."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,20 @@ class AssetSchema:
 
 def asset_kind_names() -> list[str]:
     """Names of all kinds of assets."""
-    return sorted(p.stem for p in (schema_folder() / "assets").glob("*.toml") if p.stem != _COMMON)
+    return sorted(set(_files()) - {_COMMON})
+
+
+@functools.cache
+def _files() -> dict[str, Path]:
+    """Schema files by name of their kind: roadscan's own, and those of packages that add kinds."""
+    folders = [folder / "assets" for folder in reversed(schema_folders())]
+    return {file.stem: file for folder in folders for file in sorted(folder.glob("*.toml"))}
+
+
+@functools.cache
+def asset_tables() -> dict[str, str]:
+    """Kind of assets by the name of its table, in the order of these."""
+    return dict(sorted((asset_schema(kind).table, kind) for kind in asset_kind_names()))
 
 
 @functools.cache
@@ -97,7 +113,7 @@ def asset_schema(kind: str) -> AssetSchema:
 
 
 def _read(name: str) -> dict[str, Any]:
-    with (schema_folder() / "assets" / f"{name}.toml").open("rb") as stream:
+    with _files()[name].open("rb") as stream:
         return tomllib.load(stream)
 
 

@@ -178,6 +178,11 @@ def schema_folder() -> Path:
     return installed if installed.is_dir() else installed.parent.parent / "schemas"
 
 
+def schema_folders() -> list[Path]:
+    """The same, and the folders of packages that add tables."""
+    return [schema_folder(), *(Path(str(resources.files(e.value))) for e in entry_points(group=ENTRY_POINT_GROUP))]
+
+
 def schema_names() -> list[str]:
     """Names of all tables."""
     return sorted(_schema_files())
@@ -186,10 +191,8 @@ def schema_names() -> list[str]:
 @functools.cache
 def _schema_files() -> dict[str, Path]:
     """Schema files by name of their table: roadscan's own, and those of packages that add tables."""
-    added = (Path(str(resources.files(entry.value))) for entry in entry_points(group=ENTRY_POINT_GROUP))
-    folders = [schema_folder(), *added]
     found: dict[str, Path] = {}
-    for file in (file for folder in folders for file in sorted(folder.glob("*.toml"))):
+    for file in (file for folder in schema_folders() for file in sorted(folder.glob("*.toml"))):
         if file.stem in found:
             raise SchemaError(f"table '{file.stem}' is there twice: {found[file.stem]} and {file}")
         found[file.stem] = file

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from roadscan.model.errors import RoadscanError, StoreError
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, leap_second_steps
+from roadscan.tables.asset_schema import ASSET_FOLDER, asset_tables
 from roadscan.tables.logs import DataFile, read_log_records
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.schema import schema_names, table_schema
@@ -71,7 +72,7 @@ def connect(
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
     ``tiles``, ``cells``, ``overviews``, ``cracks``, ``potholes``, ``regions``, ``footprints``, ``outputs`` are there
-    once a run has made them,
+    once a run has made them, as are the tables of assets (``poles`` …),
     ``clocks``, ``mountings`` and ``corrections`` once they were estimated. `logs` are the keys of the logs to
     show, all in the store where left out. What is damaged is an error, or joins `damaged` and is not shown.
     The macro ``utc(epoch_gps_ns)`` gives the UTC instant of a GPS epoch.
@@ -130,8 +131,10 @@ def _with_views(
     if made.num_rows:
         connection.register("outputs", made)
     places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
-    for name, folder in places.items():
-        found = store.files(folder, ".parquet")
+    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
+    assets = store.files(ASSET_FOLDER, ".parquet")
+    made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
+    for name, found in made_of.items():
         urls = [url(store, f) for f in found]
         if found and (fault := _view(connection, own_files, name, urls, damaged, filename=name in _PER_TILE)):
             shut[name] = fault

@@ -28,7 +28,9 @@ def test_kernels_pass_their_tests_without_the_compiler() -> None:
         "tests/kernels/test_cell_figures.py",
         "tests/kernels/test_profile_kernels.py",
         "tests/kernels/test_adjust_kernels.py",
+        "tests/kernels/test_asset_kernels.py",
         "tests/kernels/test_natural_neighbour.py",
+        "tests/kernels/test_upright_kernels.py",
     ]
     places += ["-k", "not profiles_lie"]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

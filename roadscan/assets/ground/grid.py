@@ -32,9 +32,9 @@ class Grid(NamedTuple):
 
     @property
     def middles_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """x (columns,) and y (rows,) of the middles of cells (m)."""
-        x = self.x_min_m + (np.arange(self.columns) + 0.5) * self.cell_m
-        return x, self.y_min_m + (np.arange(self.rows) + 0.5) * self.cell_m
+        """Middles of the columns (x) and of the rows (y) (m)."""
+        x = self.x_min_m + (np.arange(self.columns, dtype=np.float64) + 0.5) * self.cell_m
+        return x, self.y_min_m + (np.arange(self.rows, dtype=np.float64) + 0.5) * self.cell_m
 
 
 def grid_over(window: Box, cell_m: float) -> Grid:

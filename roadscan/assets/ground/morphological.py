@@ -1,7 +1,7 @@
 """Bare earth by opening the surface of lowest returns with growing windows.
 
-After Pingel, Clarke, McBride (2013), "An improved simple morphological filter for the terrain classification of airborne
-LIDAR data", ISPRS Journal 77: 21–30.
+After Pingel, Clarke, McBride (2013), "An improved simple morphological filter for the terrain classification of
+airborne LIDAR data", ISPRS Journal 77: 21–30.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Bools = npt.NDArray[np.bool_]
 
 _GROWTH: Final = 1.15
 """Each window is wider than the one before by this factor, and by a cell at the least."""
-_PIT_M, _PIT_SLOPE = 1.0, 1.0
-"""A lowest return is noise where it lies below all ground within 3 m by this, and this slope (m, m/m)."""
+_PIT_M: Final = 8.0
+"""A lowest return is noise where it lies below the surface around by more: crowns with a gap are no deeper."""
 
 
 def disk(radius: int) -> npt.NDArray[np.uint8]:
@@ -62,8 +62,7 @@ def bare_cells(lowest_m: Float32, cell_m: float, steepest: float, largest_m: flo
     """
     known = np.isfinite(lowest_m)
     surface = filled(lowest_m, known)
-    reach = max(round(3.0 / cell_m), 1)
-    pits = -surface - opened(-surface, reach) > _PIT_M + _PIT_SLOPE * cell_m
+    pits = -surface - opened(-surface, 1) > _PIT_M
     if (pits & known).any():
         known &= ~pits
         surface = filled(lowest_m, known)

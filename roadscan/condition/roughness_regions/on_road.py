@@ -20,7 +20,6 @@ Float64 = npt.NDArray[np.float64]
 
 _FINER: Final = 4.0
 """Survey cells are joined to blocks of at most this part of a raster cell: closer points tell no more."""
-_ROUNDS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +70,7 @@ def section_regions(points: Sequence[RoadPoints], piece: Stretch, settings: Roug
     joined = RoadPoints.of(*(np.concatenate([getattr(p, n) for p in points] or [np.empty(0)]) for n in _COLUMNS))
     reach = np.hypot(piece.to_m - piece.from_m, settings.width_m)
     joined = joined.take(np.hypot(joined.x_m - origin[0], joined.y_m - origin[1]) <= reach)
-    station, offset = _along(piece.line, np.column_stack([joined.x_m, joined.y_m]), 0.5 * (piece.from_m + piece.to_m))
+    station, offset = piece.line.along(np.column_stack([joined.x_m, joined.y_m]), 0.5 * (piece.from_m + piece.to_m))
     own = (station >= piece.from_m) & (station < piece.to_m) & (np.abs(offset) <= settings.width_m / 2)
     from_lane = np.full(station.size, np.inf)
     on_lane = np.zeros(station.size, bool)
@@ -92,18 +91,7 @@ def section_regions(points: Sequence[RoadPoints], piece: Stretch, settings: Roug
 _COLUMNS: Final = ("x_m", "y_m", "height_m", "intensity", "readings")
 
 
-def _along(line: RoadLine, places_m: Float64, guess_m: float) -> tuple[Float64, Float64]:
-    """Stations and offsets (n,) of places (n, 2), from a station near all of them."""
-    station = np.full(len(places_m), guess_m)
-    at = line.places(station, 0.0)
-    for _ in range(_ROUNDS):
-        station = station + np.sum((places_m - at[:, :2]) * at[:, 2:], axis=1)
-        at = line.places(station, 0.0)
-    beside = places_m - at[:, :2]
-    return station, beside[:, 0] * at[:, 3] - beside[:, 1] * at[:, 2]
-
-
 def station_and_offset(line: RoadLine, place_m: tuple[float, float], guess_m: float) -> tuple[float, float]:
     """Station and offset of a place near a station."""
-    station, offset = _along(line, np.array([place_m]), guess_m)
+    station, offset = line.along(np.array([place_m]), guess_m)
     return float(station[0]), float(offset[0])

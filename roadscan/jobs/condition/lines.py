@@ -84,17 +84,37 @@ def _layer_file(plan: SurveyPlan, config: ConditionConfig) -> Path | None:
     return None if config.layer is None else plan.survey.resolve(config.layer)
 
 
-def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[OutputRecord]:
-    """Find the lines and lanes and write their tables."""
+def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
+    """Find the lines and lanes: from the drives, or those of the layer that were driven."""
     if plan.ground.grids is not None:
         add_grid_folder(plan.ground.grids)
     drives = [Drive(one.pass_id, _path_m(plan, one, source), one.lane) for one, source in _driven(plan)]
     lines, lanes = find_roads(drives, stated_lines(plan, config), config)
-    lanes = _with_roll(plan, lanes)
-    context = product_context(plan)
+    return Roads({line.road: line for line in lines}, tuple(_with_roll(plan, lanes)))
+
+
+def roads_key(plan: SurveyPlan) -> str:
+    """Key of the lines and lanes of :func:`survey_roads`."""
+    return lines_key(plan, plan.survey.config.condition or ConditionConfig())
+
+
+def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
+    """Lines and lanes of a survey, and their key: as the stage `condition` stored them, or found now.
+
+    A survey without a section `[condition]` has those of its drives.
+    """
+    config, key = plan.survey.config.condition or ConditionConfig(), roads_key(plan)
+    if current_lines(manifest, key):
+        return load_roads(plan.store, manifest, product_context(plan)), key
+    return find_lines(plan, config), key
+
+
+def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[OutputRecord]:
+    """Find the lines and lanes and write their tables."""
+    roads, context = find_lines(plan, config), product_context(plan)
     return [
-        _write_lines(plan.store, lines, config.reference, key, context),
-        _write_lanes(plan.store, {line.road: line for line in lines}, lanes, key, context),
+        _write_lines(plan.store, list(roads.lines.values()), config.reference, key, context),
+        _write_lanes(plan.store, roads.lines, roads.lanes, key, context),
     ]
 
 

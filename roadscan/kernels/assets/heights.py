@@ -1,10 +1,6 @@
-"""Returns against a raster of ground: their height above it, and robust heights of its cells."""
+"""Returns against a raster of ground: their height above it."""
 
 from __future__ import annotations
-
-import math
-
-import numpy as np
 
 from roadscan.kernels.options import inlined, kernel
 
@@ -37,25 +33,3 @@ def heights_above(x, y, z, origin, per_m, ground, out):
     for k in range(x.size):
         u, v = (x[k] - origin[0]) * per_m - 0.5, (y[k] - origin[1]) * per_m - 0.5
         out[k] = z[k] - bilinear(ground, u, v)
-
-
-@kernel
-def heights_by_cell(x, y, above, origin, per_m, least, most, sums):
-    """Number, mean and scatter of the heights above a surface in each cell, of returns between `least` and `most`.
-
-    Parameters
-    ----------
-    x, y : (n,) float64 (m); above : (n,) float32 (m).
-    origin : (2,) float64; per_m : cells a metre.
-    least, most : (rows, columns) float32, what counts in each cell (m).
-    sums : (3, rows, columns) float64, added to: number, sum, sum of squares.
-    """
-    rows, columns = least.shape
-    for k in range(x.size):
-        i, j = math.floor((y[k] - origin[1]) * per_m), math.floor((x[k] - origin[0]) * per_m)
-        if 0 <= i < rows and 0 <= j < columns:
-            h = np.float64(above[k])
-            if least[i, j] <= h <= most[i, j]:
-                sums[0, i, j] += 1.0
-                sums[1, i, j] += h
-                sums[2, i, j] += h * h

@@ -1,0 +1,150 @@
+"""Edges of the carriageway on both sides of a drive: at kerbs, barriers, and where the paved surface bends or ends."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+import scipy.spatial
+
+from roadscan.assets.edges.across import edge_along
+from roadscan.assets.edges.beside import Beside, beside_of
+from roadscan.assets.edges.find import edges_of
+from roadscan.assets.edges.line_pieces import NODE_COLUMNS, CutEdge, columns_of, cut_at, dense
+from roadscan.assets.edges.profiles import smooth_line
+from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.scene import Scene
+
+Float64 = npt.NDArray[np.float64]
+
+STATION_M: Final = 0.5
+NEAREST_M: Final = 0.8
+FARTHEST_M: Final = 14.0
+"""Edges are sought this far beside the drive."""
+SAME_ROAD_M: Final = 8.0
+"""A drive this near to an earlier one is on the same road: its edges are found from the earlier."""
+KERB_EVIDENCE: Final = 6.0
+BARRIER_EVIDENCE: Final = 3.0
+LEAST_EVIDENCE: Final = 0.6
+EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
+_EDGES: Final[weakref.WeakKeyDictionary[Scene, list[CutEdge]]] = weakref.WeakKeyDictionary()
+
+
+class Track(NamedTuple):
+    """Stations of a drive: places (n, 2) and unit vectors (n, 2) along it."""
+
+    places: Float64
+    heading: Float64
+
+
+def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
+    """Stations each half metre of each pass, where no earlier pass drove beside it."""
+    earlier = np.zeros((0, 2))
+    for number in np.unique(drive_xyh_m[:, 3]):
+        driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
+        step = np.hypot(*np.diff(driven, axis=0).T) if len(driven) > 1 else np.zeros(0)
+        driven = driven[np.append(True, step > 0.02)]
+        if len(driven) < 2 or float(np.hypot(*np.diff(driven, axis=0).T).sum()) < 2.0 * STATION_M:
+            continue
+        # A jump is a way that was driven outside the window.
+        jumps = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1
+        for part in np.split(driven, jumps):
+            if len(part) >= 2:
+                yield from _stations(part, earlier)
+        earlier = np.concatenate([earlier, driven])
+
+
+def _stations(part: Float64, earlier: Float64) -> Iterator[Track]:
+    places = np.column_stack(dense(part, STATION_M))
+    smooth = scipy.ndimage.gaussian_filter1d(places, 4.0, axis=0, mode="nearest")
+    heading = np.gradient(smooth, axis=0)
+    heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
+    free = np.ones(len(places), np.bool_)
+    if len(earlier):
+        free = scipy.spatial.cKDTree(earlier).query(places)[0] > SAME_ROAD_M
+    number, count = scipy.ndimage.label(free)
+    for k in range(1, count + 1):
+        rows = number == k
+        if rows.sum() >= 4:
+            yield Track(places[rows], heading[rows])
+
+
+def road_edges(scene: Scene) -> list[CutEdge]:
+    """Edges beside the drives within the scene's tile: nodes (n, `EDGE_COLUMNS`) in the direction of the drive."""
+    if scene not in _EDGES:
+        _EDGES[scene] = _found(scene)
+    return _EDGES[scene]
+
+
+def _found(scene: Scene) -> list[CutEdge]:
+    raster = raster_of(scene)
+    if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
+        return []
+    kerbs = [columns_of(edge) for edge in edges_of(scene)]
+    beside = beside_of(scene, raster, kerbs)
+    parts: list[CutEdge] = []
+    for track in tracks_of(scene.drive_xyh_m):
+        for right in (False, True):
+            for nodes in _one_side(track, right, raster, beside, kerbs):
+                parts += cut_at(nodes, scene.tile)
+    return parts
+
+
+def _one_side(
+    track: Track, right: bool, raster: HeightRaster, beside: Beside, kerbs: list[Float64]
+) -> Iterator[Float64]:
+    """Runs of nodes of one side's edge."""
+    out = np.column_stack([track.heading[:, 1], -track.heading[:, 0]]) * (1.0 if right else -1.0)
+    offset = np.arange(NEAREST_M, FARTHEST_M, raster.cell_m)
+    x = track.places[:, :1] + offset * out[:, :1]
+    y = track.places[:, 1:] + offset * out[:, 1:]
+    row, column = raster.cells_of(x, y)
+    height = beside.height_m[row, column]
+    inside = (x >= raster.x_min_m) & (y >= raster.y_min_m)
+    inside &= x < raster.x_min_m + raster.count.shape[1] * raster.cell_m
+    inside &= y < raster.y_min_m + raster.count.shape[0] * raster.cell_m
+    height = np.where(inside, height, np.nan)
+    up = beside.edge_x[row, column] * out[:, :1] + beside.edge_y[row, column] * out[:, 1:] > 0.5
+    stands = beside.blocked[row, column] & inside
+    behind = np.cumsum(stands, axis=1) > 3
+    known = np.where(up & inside, KERB_EVIDENCE, np.where(stands & ~behind, BARRIER_EVIDENCE, 0.0))
+    height = np.where(behind, np.nan, height)
+    sigma = np.full(height.shape, 0.008)
+    found = edge_along(height, sigma, (STATION_M, raster.cell_m), known)
+    at = np.arange(len(offset))[None, :] == found.cell[:, None]
+    near = scipy.ndimage.binary_dilation(at, np.ones((1, 5)))
+    by_kerb = scipy.ndimage.median_filter((near & up).any(axis=1).astype(np.float64), 5)
+    by_barrier = scipy.ndimage.median_filter((near & stands).any(axis=1).astype(np.float64), 5)
+    lines = np.column_stack([np.take_along_axis(a, found.cell[:, None], axis=1)[:, 0] for a in (x, y)])
+    good = (found.evidence >= LEAST_EVIDENCE) & np.take_along_axis(inside, found.cell[:, None], axis=1)[:, 0]
+    number, count = scipy.ndimage.label(good)
+    for k in range(1, count + 1):
+        rows = np.flatnonzero(number == k)
+        if len(rows) < 5:
+            continue
+        line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
+        r, c = raster.cells_of(line[:, 0], line[:, 1])
+        level = beside.height_m[r, c]
+        level = np.where(np.isfinite(level), level, np.nanmedian(beside.height_m))
+        nodes = np.zeros((len(rows), len(EDGE_COLUMNS)))
+        nodes[:, 3:5] = np.nan
+        nodes[:, :3] = np.column_stack([line, level])
+        nodes[:, EDGE_COLUMNS.index("sigma_m")] = np.where(by_kerb[rows] > 0.5, 0.02, 0.15)
+        nodes[:, EDGE_COLUMNS.index("seen")] = 1.0
+        nodes[:, -4:] = np.column_stack(
+            [by_kerb[rows], by_barrier[rows], np.full(len(rows), float(right)), found.evidence[rows]]
+        )
+        yield nodes
+
+
+def _snapped(line: Float64, at_kerb: npt.NDArray[np.bool_], kerbs: list[Float64]) -> Float64:
+    """Points (n, 2) of a line, those at a kerb moved onto it."""
+    if not kerbs or not at_kerb.any():
+        return line
+    points = np.concatenate([np.column_stack(dense(k[:, :2], 0.05)) for k in kerbs])
+    distance, at = scipy.spatial.cKDTree(points).query(line)
+    return np.where((at_kerb & (distance < 0.4))[:, None], points[at], line)

@@ -1,0 +1,112 @@
+"""What lies on the higher side of an edge: how wide the surface is there, how it slopes, and what ends it."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import scipy.ndimage
+
+from roadscan.assets import classes
+from roadscan.assets.edges.find import edges_of
+from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
+from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.scene import Scene
+from roadscan.kernels.assets import transects as kernel
+
+Float64 = npt.NDArray[np.float64]
+
+FIRST_M: Final = 0.3
+"""The walk begins this far behind the middle of the edge's face."""
+REACH_M: Final = 7.0
+"""A surface is followed this far from its edge; tiles need a halo of a metre more."""
+HOLE_M: Final = 0.8
+SLOPE: Final = 0.15
+ROUGH_M: Final = 0.03
+OBSTACLE_M: Final = (0.35, 2.2)
+"""What stands between these heights above the ground ends a surface."""
+TRANSECT_COLUMNS: Final = ("width_m", "ends_down", "ends_known", "outer_height_m", "slope", "middle_height_m")
+BESIDE_PIECES: Final = line_schema((*NODE_COLUMNS, *TRANSECT_COLUMNS))
+"""Columns of a line's piece, and at each node the surface behind it: width, whether an edge down ends it and whether its
+end is known (0 or 1), height at its end and in its middle, and slope outward."""
+_OPEN: Final = (classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE)
+
+
+class Beside(NamedTuple):
+    """Rasters (rows, columns) that walks go over."""
+
+    height_m: Float64
+    rough_m: Float64
+    blocked: npt.NDArray[np.bool_]
+    edge_x: Float64
+    edge_y: Float64
+
+
+_PIECES: Final[weakref.WeakKeyDictionary[Scene, pa.Table]] = weakref.WeakKeyDictionary()
+
+
+def pieces_beside(scene: Scene) -> pa.Table:
+    """Rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
+    if scene not in _PIECES:
+        raster, edges = raster_of(scene), edges_of(scene)
+        parts = []
+        if edges:
+            beside = beside_of(scene, raster, [columns_of(e) for e in edges])
+            parts = [
+                part for edge in edges for part in cut_at(_with_transects(columns_of(edge), beside, raster), scene.tile)
+            ]
+        _PIECES[scene] = pieces_table(parts, scene, raster, BESIDE_PIECES)
+    return _PIECES[scene]
+
+
+def beside_of(scene: Scene, raster: HeightRaster, edges: list[Float64]) -> Beside:
+    """Rasters of a scene for walks that end at its edges (n, columns as `NODE_COLUMNS`)."""
+    known = raster.count > 0
+    height = smooth(np.where(known, raster.height_m, 0.0), known, 1.5)
+    rest = np.where(known, np.square(np.where(known, raster.height_m, 0.0) - np.nan_to_num(height)), 0.0)
+    rough = np.sqrt(np.nan_to_num(smooth(rest, known, 3.0)))
+    edge_x, edge_y = np.zeros(known.shape), np.zeros(known.shape)
+    for nodes in edges:
+        x, y = dense(nodes[:, :2], raster.cell_m / 2)
+        ux, uy = np.gradient(x), np.gradient(y)
+        length = np.maximum(np.hypot(ux, uy), 1e-9)
+        row, column = raster.cells_of(x, y)
+        edge_x[row, column], edge_y[row, column] = uy / length, -ux / length
+    return Beside(height, rough, _blocked(scene, raster), edge_x, edge_y)
+
+
+def smooth(values: Float64, known: npt.NDArray[np.bool_], sigma_cells: float) -> Float64:
+    """Mean (rows, columns) of known values around each cell; NaN where none is near."""
+    weight = scipy.ndimage.gaussian_filter(known.astype(np.float64), sigma_cells, truncate=2.5)
+    total = scipy.ndimage.gaussian_filter(values, sigma_cells, truncate=2.5)
+    return np.where(weight > 0.02, total / np.maximum(weight, 0.02), np.nan)
+
+
+def _blocked(scene: Scene, raster: HeightRaster) -> npt.NDArray[np.bool_]:
+    """Cells where two returns or more stand above the ground."""
+    above, returns = np.nan_to_num(scene.above_ground_m), scene.returns
+    stands = (above > OBSTACLE_M[0]) & (above < OBSTACLE_M[1]) & ~np.isin(scene.classes, _OPEN)
+    stands &= scene.window.holds(returns.x_m, returns.y_m)
+    row, column = raster.cells_of(returns.x_m[stands], returns.y_m[stands])
+    columns = raster.count.shape[1]
+    number = np.bincount(row * columns + column, minlength=raster.count.size)
+    return np.asarray(number.reshape(raster.count.shape) >= 2)
+
+
+def _with_transects(nodes: Float64, beside: Beside, raster: HeightRaster) -> Float64:
+    """Nodes (n, columns) with the columns of what lies behind them."""
+    ux, uy = np.gradient(nodes[:, 0]), np.gradient(nodes[:, 1])
+    length = np.maximum(np.hypot(ux, uy), 1e-9)
+    start = np.column_stack([nodes[:, :2], uy / length, -ux / length])
+    out = np.empty((len(nodes), kernel.RESULTS))
+    grid: Any = (raster.x_min_m, raster.y_min_m, raster.cell_m)
+    kernel.walk(start, *beside, grid, (FIRST_M, REACH_M, HOLE_M, SLOPE, ROUGH_M), out)
+    end = out[:, kernel.END]
+    known = np.isin(end, (kernel.OBSTACLE, kernel.STEP_DOWN, kernel.STEP_UP, kernel.BENT))
+    return np.column_stack([
+        nodes, out[:, kernel.WIDTH], end == kernel.STEP_DOWN, known, out[:, kernel.OUTER_HEIGHT],
+        out[:, kernel.SLOPE], out[:, kernel.MIDDLE_HEIGHT],
+    ])  # fmt: skip

@@ -1,0 +1,272 @@
+"""Lines cut at the border of a tile with exact end points, as rows of a table, and joined again across tiles."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import scipy.spatial
+
+from roadscan.assets.edges.find import Edge
+from roadscan.assets.edges.profiles import Nodes
+from roadscan.assets.edges.raster import HeightRaster
+from roadscan.assets.scene import Box, Scene
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+NODE_COLUMNS: Final = (
+    "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low_m",
+    "seen_high_m", "seen",
+)  # fmt: skip
+
+
+def line_schema(columns: Sequence[str]) -> pa.Schema:
+    """Columns of a piece of a line: a value a node of each of `columns`, and what saw it."""
+    return pa.schema(
+        [pa.field(name, pa.list_(pa.float64()), nullable=False) for name in columns]
+        + [
+            pa.field("returns", pa.int64(), nullable=False),
+            pa.field("passes", pa.list_(pa.int32()), nullable=False),
+            pa.field("first_epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field("last_epoch_gps_ns", pa.int64(), nullable=False),
+            pa.field("cut_first", pa.bool_(), nullable=False),
+            pa.field("cut_last", pa.bool_(), nullable=False),
+        ]
+    )
+
+
+LINE_PIECES: Final = line_schema(NODE_COLUMNS)
+"""Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
+its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured."""
+JOIN_M: Final = 0.5
+"""Farthest apart that the ends of two tiles may lie on their border."""
+NEAR_M: Final = 0.25
+"""Returns this near to a line count as those that show it."""
+
+
+class Seen(NamedTuple):
+    """What saw something."""
+
+    returns: int
+    passes: tuple[int, ...]
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+
+    def with_other(self, other: Seen) -> Seen:
+        """What saw one or the other."""
+        if self.returns == 0 or other.returns == 0:
+            return self if other.returns == 0 else other
+        return Seen(
+            self.returns + other.returns, tuple(sorted({*self.passes, *other.passes})),
+            min(self.first_epoch_gps_ns, other.first_epoch_gps_ns),
+            max(self.last_epoch_gps_ns, other.last_epoch_gps_ns),
+        )  # fmt: skip
+
+
+class Line(NamedTuple):
+    """A line of nodes (n, columns) in the map, and what saw it."""
+
+    nodes: Float64
+    seen_by: Seen
+    names: tuple[str, ...] = NODE_COLUMNS
+    """Names of the columns."""
+
+    def column(self, name: str) -> Float64:
+        """A column (n,) of its nodes."""
+        return np.asarray(self.nodes[:, self.names.index(name)])
+
+    @property
+    def length_m(self) -> float:
+        """Length in the map."""
+        return float(np.hypot(*np.diff(self.nodes[:, :2], axis=0).T).sum())
+
+
+class CutEdge(NamedTuple):
+    """A part of an edge within a tile (n, columns as `NODE_COLUMNS`), coordinates as the scene's returns."""
+
+    nodes: Float64
+    cut_first: bool
+    cut_last: bool
+
+
+def columns_of(edge: Edge) -> Float64:
+    """Nodes (n, columns as `NODE_COLUMNS`) of an edge, coordinates as the scene's returns."""
+    n: Nodes = edge.nodes
+    return np.column_stack([
+        n.x_m, n.y_m, n.top_m, n.step_m, n.sigma_step_m, n.face_m, n.scatter_m, n.sigma_m, n.seen_low_m, n.seen_high_m,
+        edge.seen.astype(np.float64),
+    ])  # fmt: skip
+
+
+def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
+    """Parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes."""
+    parts: list[list[Float64]] = []
+    cuts: list[list[bool]] = []
+    for a, b in itertools.pairwise(nodes):
+        inner = _inside(a[:2], b[:2], tile)
+        if inner is None:
+            continue
+        t0, t1 = inner
+        if t0 > 0.0 or not parts or cuts[-1][1]:
+            parts.append([_between(a, b, t0)])
+            cuts.append([t0 > 0.0, False])
+        parts[-1].append(_between(a, b, t1))
+        cuts[-1][1] = t1 < 1.0
+    return [CutEdge(np.array(p), *c) for p, c in zip(parts, cuts, strict=True)]
+
+
+def _inside(a: Float64, b: Float64, tile: Box) -> tuple[float, float] | None:
+    """Beginning and end, as shares, of what of a segment lies in a tile (Liang and Barsky 1984)."""
+    t0, t1 = 0.0, 1.0
+    for axis, low, high in ((0, tile.x_min_m, tile.x_max_m), (1, tile.y_min_m, tile.y_max_m)):
+        step = float(b[axis] - a[axis])
+        if step == 0.0:
+            if not low <= a[axis] < high:
+                return None
+            continue
+        ends = sorted(((low - float(a[axis])) / step, (high - float(a[axis])) / step))
+        t0, t1 = max(t0, ends[0]), min(t1, ends[1])
+    return (t0, t1) if t0 < t1 else None
+
+
+def _between(a: Float64, b: Float64, share: float) -> Float64:
+    """Node at a share of the way; what only one of both knows is taken from it."""
+    if share in {0.0, 1.0}:
+        return a if share == 0.0 else b
+    mixed = a + share * (b - a)
+    return np.where(np.isnan(a), b, np.where(np.isnan(b), a, mixed))
+
+
+def pieces_table(
+    parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster, schema: pa.Schema = LINE_PIECES
+) -> pa.Table:
+    """Rows of a schema of :func:`line_schema`: parts of lines in the map, with what saw them."""
+    corner = scene.returns.corner_m
+    seen = seen_by([p.nodes[:, :2] for p in parts], scene, raster)
+    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
+    for part, one in zip(parts, seen, strict=True):
+        nodes = part.nodes.copy()
+        nodes[:, 0] += corner[0]
+        nodes[:, 1] += corner[1]
+        for name, column in zip(node_names(schema), nodes.T, strict=True):
+            columns[name].append(column)
+        columns["returns"].append(one.returns)
+        columns["passes"].append(list(one.passes))
+        columns["first_epoch_gps_ns"].append(one.first_epoch_gps_ns)
+        columns["last_epoch_gps_ns"].append(one.last_epoch_gps_ns)
+        columns["cut_first"].append(part.cut_first)
+        columns["cut_last"].append(part.cut_last)
+    return pa.table(columns, schema=schema)
+
+
+def node_names(schema: pa.Schema) -> tuple[str, ...]:
+    """Names of the columns that hold a value a node."""
+    return tuple(f.name for f in schema if f.type == pa.list_(pa.float64()))
+
+
+def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> list[Seen]:
+    """What saw each of some lines (k, 2): returns of the ground within a quarter of a metre of it, each once."""
+    label = np.full(raster.count.shape, -1, np.int64)
+    reach = np.arange(-round(NEAR_M / raster.cell_m), round(NEAR_M / raster.cell_m) + 1)
+    for number, line in enumerate(lines):
+        x, y = dense(line, raster.cell_m / 2)
+        row, column = raster.cells_of(
+            x[:, None, None] + reach * raster.cell_m, y[:, None, None] + reach[:, None] * raster.cell_m
+        )
+        free = label[row, column] < 0
+        label[row[free], column[free]] = number
+    rows = np.flatnonzero(raster.used)
+    at = label[raster.cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows])]
+    rows, at = rows[at >= 0], at[at >= 0]
+    return gathered(at, len(lines), scene.returns.pass_id[rows], scene.returns.epoch_gps_ns[rows])
+
+
+def gathered(owner: Int64, number: int, pass_id: npt.NDArray[np.uint16], epoch_gps_ns: Int64) -> list[Seen]:
+    """What saw each of `number` things: returns (n,) with their owner (n,)."""
+    count = np.bincount(owner, minlength=number)
+    first, last = np.full(number, np.iinfo(np.int64).max), np.full(number, np.iinfo(np.int64).min)
+    np.minimum.at(first, owner, epoch_gps_ns)
+    np.maximum.at(last, owner, epoch_gps_ns)
+    pairs = np.unique(np.column_stack([owner, pass_id.astype(np.int64)]), axis=0)
+    found = []
+    for i in range(number):
+        passes = tuple(int(p) for p in pairs[pairs[:, 0] == i, 1])
+        found.append(Seen(int(count[i]), passes, int(first[i]), int(last[i])) if count[i] else Seen(0, (), 0, 0))
+    return found
+
+
+def dense(line: Float64, every_m: float) -> tuple[Float64, Float64]:
+    """Coordinates x and y (k,) of points at even distances along a line (n, 2), with both ends."""
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    at = np.linspace(0.0, length[-1], max(int(np.ceil(length[-1] / every_m)), 1) + 1)
+    return np.interp(at, length, line[:, 0]), np.interp(at, length, line[:, 1])
+
+
+def joined_lines(pieces: pa.Table) -> list[Line]:
+    """Lines of the pieces of all tiles: ends on a border meet the nearest end from the other side that goes on."""
+    names = node_names(pieces.schema)
+    lines = [_line(row, names) for row in pieces.to_pylist()]
+    cut_first, cut_last = pieces["cut_first"].to_pylist(), pieces["cut_last"].to_pylist()
+    after = _partners(lines, [i for i, c in enumerate(cut_last) if c], [i for i, c in enumerate(cut_first) if c])
+    begun = set(after.values())
+    found: list[Line] = []
+    done: set[int] = set()
+    for start in [*(i for i in range(len(lines)) if i not in begun), *range(len(lines))]:
+        if start in done:
+            continue
+        line, at = lines[start], start
+        done.add(at)
+        while at in after and after[at] not in done:
+            at = after[at]
+            done.add(at)
+            line = _end_to_end(line, lines[at])
+        found.append(line)
+    return found
+
+
+def _line(row: dict[str, Any], names: tuple[str, ...]) -> Line:
+    nodes = np.column_stack([np.array([np.nan if v is None else v for v in row[name]]) for name in names])
+    seen = Seen(row["returns"], tuple(row["passes"]), row["first_epoch_gps_ns"], row["last_epoch_gps_ns"])
+    return Line(nodes, seen, names)
+
+
+def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]) -> dict[int, int]:
+    """For each line that ends on a border, the one that goes on there, nearest first."""
+    if not lasts or not firsts:
+        return {}
+    ends = np.array([lines[i].nodes[-1, :2] for i in lasts])
+    begins = np.array([lines[i].nodes[0, :2] for i in firsts])
+    tree = scipy.spatial.cKDTree(begins)
+    ranked = sorted(
+        (float(np.hypot(*(ends[i] - begins[j]))), lasts[i], firsts[j])
+        for i, near in enumerate(tree.query_ball_point(ends, JOIN_M))
+        for j in near
+        if lasts[i] != firsts[j] and _direction(lines[lasts[i]], -1) @ _direction(lines[firsts[j]], 0) > 0.7
+    )
+    after: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in ranked:
+        if i not in after and j not in taken:
+            after[i] = j
+            taken.add(j)
+    return after
+
+
+def _direction(line: Line, end: int) -> Float64:
+    part = line.nodes[-4:, :2] if end else line.nodes[:4, :2]
+    step = part[-1] - part[0]
+    return np.asarray(step / max(float(np.hypot(*step)), 1e-9))
+
+
+def _end_to_end(a: Line, b: Line) -> Line:
+    """Both lines as one; their ends on the border become one node in the middle."""
+    both = np.stack([a.nodes[-1], b.nodes[0]])
+    known = np.isfinite(both)
+    middle = np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    middle = np.where(known.any(axis=0), middle, np.nan)
+    return Line(np.concatenate([a.nodes[:-1], middle[None], b.nodes[1:]]), a.seen_by.with_other(b.seen_by), a.names)

@@ -1,0 +1,206 @@
+"""Chains of places made exact: at even nodes along them, the step's place, height and face from all heights near."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+import scipy.ndimage
+
+from roadscan.assets.edges.paths import Chain
+from roadscan.assets.edges.raster import HeightRaster
+from roadscan.kernels.assets import step_profiles as kernel
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+NODE_M: Final = 0.5
+"""Distance of nodes along an edge."""
+ALONG_M: Final = 0.5
+"""Half the length of a node's window: neighbours share half of their heights."""
+SEARCH: Final = (0.2, 0.02, 0.24, 0.35)
+"""Farthest offset from the chain, least and greatest face, depth of a side (m)."""
+PRIOR: Final = (0.05, 0.015)
+"""Standard deviation of a side's slope about the ground's (m/m), and of a height (m)."""
+ROUNDS: Final = 2
+STIFFNESS: Final = 4.0
+"""Weight of a bend against that of a place."""
+BEND_M: Final = 0.04
+"""A bend of this (second difference of nodes) counts half."""
+AWAY_M: Final = 0.04
+"""A node this far off its line counts half."""
+PLACE_BLUR_M: Final = 0.02
+"""Standard deviation of the place of a return, across an edge: it makes a face look wider."""
+_BIN_M: Final = 0.5
+
+
+class Heights(NamedTuple):
+    """Heights of the ground, sorted by place for the kernel."""
+
+    x_m: Float64
+    y_m: Float64
+    height_m: Float64
+    order: Int64
+    starts: Int64
+    bins: tuple[float, float, float, float, float]
+
+
+class Nodes(NamedTuple):
+    """Nodes of an edge, in its direction; the higher side lies to the right."""
+
+    x_m: Float64
+    """Of the middle of the step's face."""
+    y_m: Float64
+    top_m: Float64
+    """Height of the upper edge."""
+    heading_x: Float64
+    heading_y: Float64
+    step_m: Float64
+    sigma_step_m: Float64
+    """NaN where no step could be told."""
+    face_m: Float64
+    """Width of the face, seen from above."""
+    scatter_m: Float64
+    """Of both sides about their lines, strip by strip."""
+    returns: Float64
+    seen_low_m: Float64
+    """Width that was seen of the lower side, of at most 1.2 m."""
+    seen_high_m: Float64
+    sigma_m: Float64
+    """Of the place, across the edge."""
+    covered: Float64
+    """Share of the window along the edge that was seen on both sides."""
+
+    def at(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice) -> Nodes:
+        """The nodes at `rows`."""
+        return Nodes(*(column[rows] for column in self))
+
+
+def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
+    """Heights (n,) at places (n,), sorted by bins of half a metre; the order of equal bins is that given."""
+    if x_m.size == 0:
+        return Heights(x_m, y_m, height_m, np.zeros(0, np.int64), np.zeros(2, np.int64), (0.0, 0.0, _BIN_M, 1.0, 1.0))
+    x_min, y_min = _BIN_M * np.floor(x_m.min() / _BIN_M), _BIN_M * np.floor(y_m.min() / _BIN_M)
+    column, row = ((x_m - x_min) / _BIN_M).astype(np.int64), ((y_m - y_min) / _BIN_M).astype(np.int64)
+    columns, rows = int(column.max()) + 1, int(row.max()) + 1
+    number = row * columns + column
+    order = np.argsort(number, kind="stable")
+    starts = np.searchsorted(number[order], np.arange(rows * columns + 1))
+    return Heights(x_m, y_m, height_m, order, starts, (float(x_min), float(y_min), _BIN_M, float(rows), float(columns)))
+
+
+def chain_line(chain: Chain) -> Float64:
+    """Points (k, 2) at even distances along a chain of places."""
+    return even_nodes(np.column_stack(chain.places[:2]), NODE_M)
+
+
+def nodes_of(line: Float64, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64]) -> Nodes:
+    """Nodes of a line (k, 2), each with the step that its surroundings show; the higher side is the right one.
+
+    The line is moved to the steps and smoothed twice, since the steps are told best where it runs along the edge.
+    slopes : of the ground at large, see :meth:`HeightRaster.slopes`.
+    """
+    for _ in range(ROUNDS):
+        ux, uy = headings(line[:, 0], line[:, 1])
+        out, level = _fitted(line, (ux, uy), heights, raster, slopes)
+        known = np.isfinite(out[:, kernel.SIGMA_STEP])
+        offset = smooth_offsets(out[:, kernel.OFFSET] - 0.5 * out[:, kernel.FACE], known)
+        moved = np.column_stack([line[:, 0] + offset * uy, line[:, 1] - offset * ux])
+        line = smooth_line(moved, np.where(known, out[:, kernel.COVERED] + 0.05, 0.02))
+    face = np.sqrt(np.maximum(out[:, kernel.FACE] ** 2 - 12.0 * PLACE_BLUR_M**2, 0.0))
+    ux, uy = headings(line[:, 0], line[:, 1])
+    return Nodes(
+        line[:, 0], line[:, 1], level + out[:, kernel.TOP], ux, uy, out[:, kernel.STEP], out[:, kernel.SIGMA_STEP],
+        face, out[:, kernel.SCATTER], out[:, kernel.RETURNS], out[:, kernel.SEEN_LOW], out[:, kernel.SEEN_HIGH],
+        out[:, kernel.SIGMA_OFFSET], out[:, kernel.COVERED],
+    )  # fmt: skip
+
+
+def _fitted(
+    line: Float64,
+    heading: tuple[Float64, Float64],
+    heights: Heights,
+    raster: HeightRaster,
+    slopes: tuple[Float64, Float64],
+) -> tuple[Float64, Float64]:
+    """Steps (n, RESULTS) at the nodes of a line, and the heights (n,) that they count from."""
+    ux, uy = heading
+    row, column = raster.cells_of(line[:, 0], line[:, 1])
+    gx, gy = slopes[0][row, column], slopes[1][row, column]
+    level = _level(raster, row, column)
+    node = np.column_stack([line, ux, uy, level, gx * ux + gy * uy, gx * uy - gy * ux])
+    out = np.empty((len(line), kernel.RESULTS))
+    kernel.fit_nodes(node, *heights, ALONG_M, SEARCH, PRIOR, out)
+    return out, level
+
+
+def smooth_line(points: Float64, weight: Float64) -> Float64:
+    """Points (n, 2) of a smooth line near points (n, 2) with weights (n,).
+
+    The sum of squared distances and of squared second differences is least; points that lie far off, and bends, count
+    less each time that it is solved, so that a wrong node is left aside and a corner stays one.
+    """
+    n = len(points)
+    if n < 4:
+        return points
+    line = points
+    second = np.zeros(n - 2)
+    away = np.zeros(n)
+    for _ in range(4):
+        stiff = STIFFNESS / (1.0 + (second / BEND_M) ** 2)
+        banded = np.zeros((3, n))
+        banded[0] = weight / (1.0 + (away / AWAY_M) ** 2)
+        right = banded[0][:, None] * points
+        for i, (a, b) in enumerate(((0, 1.0), (1, -2.0), (2, 1.0))):
+            banded[0, a : n - 2 + a] += stiff * b * b
+            for j, c in ((1, -2.0), (2, 1.0)):
+                if j > i:
+                    banded[j - i, a : n - 2 + a] += stiff * b * c
+        line = scipy.linalg.solveh_banded(banded, right, lower=True)
+        second = np.hypot(*(line[2:] - 2.0 * line[1:-1] + line[:-2]).T)
+        away = np.hypot(*(line - points).T)
+    return np.asarray(line)
+
+
+def even_nodes(places: Float64, distance_m: float) -> Float64:
+    """Points (k, 2) at even distances along places (n, 2), which are smoothed over 0.6 m first."""
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))
+    fine = np.arange(0.0, length[-1] + 0.05, 0.1)
+    path = np.column_stack([np.interp(fine, length, places[:, i]) for i in range(2)])
+    if len(path) >= 3:
+        path = scipy.ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    pieces = max(round(length[-1] / distance_m), 1)
+    at = np.linspace(0.0, length[-1], pieces + 1)
+    return np.column_stack([np.interp(at, length, path[:, i]) for i in range(2)])
+
+
+def headings(x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:
+    """Unit vectors (n,) along a line of two points or more, at its points."""
+    ex, ey = np.gradient(x_m), np.gradient(y_m)
+    length = np.maximum(np.hypot(ex, ey), 1e-9)
+    return ex / length, ey / length
+
+
+def smooth_offsets(offset_m: Float64, known: npt.NDArray[np.bool_]) -> Float64:
+    """Offsets (n,) of nodes, the median of three known neighbours, and 0 far from known ones."""
+    if not known.any():
+        return np.zeros_like(offset_m)
+    at = np.flatnonzero(known)
+    found = offset_m[at]
+    middle = scipy.ndimage.median_filter(found, 3, mode="nearest")
+    return np.asarray(np.interp(np.arange(len(offset_m)), at, middle))
+
+
+def _level(raster: HeightRaster, row: Int64, column: Int64) -> Float64:
+    """Height (n,) near cells: the mean of those known within 0.3 m, so that the kernel's sums stay small."""
+    rows, columns = raster.count.shape
+    step = np.arange(-3, 4)
+    r = np.clip(row[:, None, None] + step[:, None], 0, rows - 1)
+    c = np.clip(column[:, None, None] + step, 0, columns - 1)
+    near, known = raster.height_m[r, c], raster.count[r, c] > 0
+    number = known.sum(axis=(1, 2))
+    total = np.where(known, near, 0.0).sum(axis=(1, 2))
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nanmedian(raster.height_m)))

@@ -1,0 +1,151 @@
+"""The ground of a scene as a fine raster of robust low heights, what edges are sought in."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+
+from roadscan.assets import classes
+from roadscan.assets.scene import Scene
+from roadscan.kernels.assets.low_heights import low_heights
+
+Float64 = npt.NDArray[np.float64]
+
+CELL_M: Final = 0.1
+DEPTH_M: Final = 0.12
+"""Returns up to this above the lowest one of a cell count as its ground."""
+REACH_M: Final = 0.45
+"""Returns up to this above bare earth may be ground: the top of a kerb that the filter has taken for an object too."""
+BESIDE_VEHICLE_M: Final = 0.15
+UNEVENNESS_M: Final = 0.004
+"""Standard deviation of a cell's true height about a smooth surface; no number of returns takes it away."""
+COARSE_M: Final = 1.5
+"""Standard deviation of the window that the slope of the ground at large is taken from."""
+NOT_GROUND: Final = (
+    classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION, classes.BUILDING, classes.LOW_NOISE, classes.HIGH_NOISE,
+    classes.WIRE, classes.VEHICLE, classes.PERSON, classes.POLE, classes.SIGN, classes.FENCE,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class HeightRaster:
+    """Heights of cells. Row 0 is the southern one, column 0 the western one; coordinates as the scene's returns."""
+
+    x_min_m: float
+    y_min_m: float
+    cell_m: float
+    count: npt.NDArray[np.int32]
+    """(rows, columns) returns of the ground; 0: no height."""
+    height_m: Float64
+    """(rows, columns) mean height; NaN where there is none."""
+    sigma_m: Float64
+    """(rows, columns) standard deviation of the mean; NaN where there is none."""
+    used: npt.NDArray[np.bool_]
+    """(n,) returns of the scene that count as ground; none where the raster was made of cells."""
+
+    @property
+    def weight(self) -> Float64:
+        """(rows, columns) one over the variance of a height (1/m²), 0 where there is none."""
+        return np.where(self.count > 0, 1.0 / np.square(np.where(self.count > 0, self.sigma_m, 1.0)), 0.0)
+
+    def slopes(self, sigma_m: float = COARSE_M) -> tuple[Float64, Float64]:
+        """Slope (rows, columns) of the ground at large along x and y (m/m)."""
+        sigma = sigma_m / self.cell_m
+        known = (self.count > 0).astype(np.float64)
+        level = float(np.nanmedian(self.height_m)) if known.any() else 0.0
+        weight = scipy.ndimage.gaussian_filter(known, sigma, truncate=3.0)
+        total = scipy.ndimage.gaussian_filter(np.where(known > 0, self.height_m - level, 0.0), sigma, truncate=3.0)
+        smooth = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0.0)
+        down, right = np.gradient(smooth, self.cell_m)
+        near = weight > 1e-2
+        return np.where(near, np.clip(right, -0.3, 0.3), 0.0), np.where(near, np.clip(down, -0.3, 0.3), 0.0)
+
+    def cells_of(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Row and column of places (any shape), held inside the raster."""
+        rows, columns = self.count.shape
+        x_m, y_m = np.broadcast_arrays(x_m, y_m)
+        row = np.floor((np.asarray(y_m) - self.y_min_m) / self.cell_m).astype(np.int64)
+        column = np.floor((np.asarray(x_m) - self.x_min_m) / self.cell_m).astype(np.int64)
+        return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+
+
+def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
+    """Returns (n,) of the scene that edges of the ground may be made of."""
+    above = scene.above_ground_m
+    near = np.isnan(above) | (np.abs(above) <= REACH_M)
+    return near & ~np.isin(scene.classes, NOT_GROUND)
+
+
+_RASTERS: Final[weakref.WeakKeyDictionary[Scene, HeightRaster]] = weakref.WeakKeyDictionary()
+
+
+def raster_of(scene: Scene) -> HeightRaster:
+    """The raster of a scene's window; its cells are those of a grid that all tiles share."""
+    if scene not in _RASTERS:
+        _RASTERS[scene] = _made(scene)
+    return _RASTERS[scene]
+
+
+def _made(scene: Scene) -> HeightRaster:
+    window, used = scene.window, may_be_ground(scene)
+    x_min, y_min = (CELL_M * math.floor(v / CELL_M + 1e-6) for v in window[:2])
+    columns = max(math.ceil((window.x_max_m - x_min) / CELL_M - 1e-6), 8)
+    rows = max(math.ceil((window.y_max_m - y_min) / CELL_M - 1e-6), 8)
+    count = np.zeros((rows, columns), np.int32)
+    mean, variance = np.zeros((rows, columns)), np.zeros((rows, columns))
+    returns = scene.returns
+    grid = HeightRaster(x_min, y_min, CELL_M, count, mean, variance, used)
+    used &= ~_beside_vehicles(scene, grid)
+    low_heights(
+        returns.x_m[used], returns.y_m[used], returns.height_m[used], (x_min, y_min, CELL_M), DEPTH_M, count, mean,
+        variance,
+    )  # fmt: skip
+    raster = of_cells(x_min, y_min, CELL_M, count, mean, np.sqrt(variance))
+    row, column = raster.cells_of(returns.x_m[used], returns.y_m[used])
+    used[used] = returns.height_m[used] <= raster.height_m[row, column] + DEPTH_M
+    return replace(raster, used=used)
+
+
+def _beside_vehicles(scene: Scene, grid: HeightRaster) -> npt.NDArray[np.bool_]:
+    """Returns (n,) at vehicles: what is seen of the ground there ends at their outline, and steps go along it."""
+    x, y, rows, columns = scene.returns.x_m, scene.returns.y_m, *grid.count.shape
+    vehicle = scene.classes == classes.VEHICLE
+    row, column = grid.cells_of(x[vehicle], y[vehicle])
+    number = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    cells = math.ceil(BESIDE_VEHICLE_M / grid.cell_m)
+    reach = np.arange(-cells, cells + 1) * grid.cell_m
+    disc = np.hypot(reach, reach[:, None]) <= BESIDE_VEHICLE_M + 1e-9
+    near = scipy.ndimage.binary_dilation(number >= 2, disc)
+    return np.asarray(near[grid.cells_of(x, y)])
+
+
+def of_cells(
+    x_min_m: float,
+    y_min_m: float,
+    cell_m: float,
+    count: npt.NDArray[np.int32],
+    mean_m: Float64,
+    spread_m: Float64,
+) -> HeightRaster:
+    """Raster of cells whose mean height and spread are known.
+
+    Parameters
+    ----------
+    x_min_m, y_min_m, cell_m : the corner of the first cell, and the edge of a cell (m).
+    count : (rows, columns) heights in each cell, 0 where there is none.
+    mean_m, spread_m : (rows, columns) their mean and standard deviation (m).
+    """
+    many = count >= 4
+    noise = float(np.median(spread_m[many])) if many.any() else 0.0
+    known = count > 0
+    sigma = np.sqrt(UNEVENNESS_M**2 + max(noise, 0.001) ** 2 / np.maximum(count, 1))
+    return HeightRaster(
+        x_min_m, y_min_m, cell_m, count, np.where(known, mean_m, np.nan), np.where(known, sigma, np.nan),
+        np.zeros(0, np.bool_),
+    )  # fmt: skip

@@ -1,0 +1,100 @@
+"""Bare earth of dense returns, those of scanners on the road: several in each cell of a quarter of a metre."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.ground.growth import grown_cells
+from roadscan.assets.ground.morphological import bare_cells
+from roadscan.assets.ground.surface import Found, Place, Surface
+from roadscan.kernels.assets.ground_cells import on_ground, scatter
+from roadscan.kernels.assets.lowest import lowest_returns
+
+Float32 = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+
+LOWEST_CELL_M: Final = 0.5
+_CELL_M: Final = 0.25
+_NEAR_M, _CLOSE_M = (-0.25, 0.40), 0.20
+"""Returns between these heights above the provisional ground tell how rough a cell is, and where the ground lies."""
+_ROUGH_M, _EVEN_M, _REACH_M = 0.03, 0.02, 0.03
+"""Beyond the noise of the data: scatter from which a place is rough, up to which a cell is even, and how far a return
+may lie from an even cell's height."""
+_NOISIEST_M: Final = 0.04
+"""More than this is no noise of the data."""
+_AROUND: Final = 5
+"""A place is rough where most cells of so many by so many are."""
+_LEAST: Final = 3
+"""Returns of a cell that tell its scatter."""
+_TOLERANCE_M, _TOLERANCE_SLOPE = 0.15, 0.35
+"""How far returns in places that are not rough may lie from the provisional ground, and more with its slope (m, m)."""
+
+
+class Cells(NamedTuple):
+    """Arrays (rows, columns) of cells near the provisional ground."""
+
+    rough: Bools
+    """Most cells around scatter more than ground does: hedges, planted beds, walls."""
+    even_m: Float32
+    """Height of even cells above the provisional ground; NaN for all others."""
+    noise_m: float
+    """Scatter of the evenest quarter of cells: noise of the data."""
+
+
+def dense_ground(place: Place) -> Found:
+    """Returns on the ground, from cells whose lowest return goes on from the drive (:mod:`.growth`)."""
+    returns, settings = place.returns, place.settings
+    x, y, z = returns.x_m, returns.y_m, returns.height_m
+    grid = grid_over(place.window, LOWEST_CELL_M)
+    lowest = np.full(grid.shape, np.inf, np.float32)
+    lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
+    known = grown_cells(lowest, grid, place.drive_xyh_m, settings.largest_object_m)
+    if known is None:
+        known = bare_cells(lowest, grid.cell_m, settings.steepest, settings.largest_object_m)
+    base = Surface(grid, filled(lowest, known))
+    fine, above = grid_over(place.window, _CELL_M), np.empty(x.size, np.float32)
+    sums = np.zeros((*fine.shape, 5))
+    limits = np.array([*_NEAR_M, _CLOSE_M])
+    per_m = 1.0 / fine.cell_m
+    scatter(x, y, z, grid.origin, 1.0 / grid.cell_m, base.height_m, per_m, limits, above, sums)
+    cells = judged(sums)
+    tolerance = tolerances(base, fine)
+    found = np.empty(x.size, np.bool_)
+    reach = _REACH_M + cells.noise_m
+    on_ground(x, y, above, fine.origin, per_m, cells.rough, tolerance, cells.even_m, reach, found)
+    return Found(base, above, found)
+
+
+def judged(sums: npt.NDArray[np.float64]) -> Cells:
+    """Which cells are rough or even, from their sums (rows, columns, 5) as `scatter` makes them."""
+    count, total, squares, close, close_total = np.moveaxis(sums, -1, 0)
+    several = count >= _LEAST
+    mean = np.divide(total, count, out=np.zeros(count.shape), where=several)
+    variance = np.divide(squares, count, out=np.zeros(count.shape), where=several) - mean * mean
+    scattered = np.sqrt(np.maximum(variance, 0.0))
+    noise = float(np.quantile(scattered[several], 0.25)) if several.any() else 0.0
+    noise = min(noise, _NOISIEST_M)
+    rough = around(several & (scattered > _ROUGH_M + noise)) * 2 > around(several)
+    even = several & ~rough & (scattered <= _EVEN_M + noise) & (close > 0)
+    height = np.full(count.shape, np.nan, np.float32)
+    height[even] = close_total[even] / close[even]
+    return Cells(rough, height, noise)
+
+
+def around(cells: Bools) -> npt.NDArray[np.int64]:
+    """How many of the cells (rows, columns) about each one are True."""
+    side = (_AROUND, _AROUND)
+    counted = cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, side, None, (-1, -1), False, cv2.BORDER_CONSTANT)
+    return np.asarray(counted, np.int64)
+
+
+def tolerances(base: Surface, fine: Grid) -> Float32:
+    """How far returns on the ground may lie from the provisional one, at each cell of the finer grid (m)."""
+    slope = Surface(base.grid, base.slope()).at(fine)
+    return np.asarray(_TOLERANCE_M + _TOLERANCE_SLOPE * slope, np.float32)

@@ -1,0 +1,79 @@
+"""A provisional ground and what lies on it: what every filter hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
+from roadscan.kernels.assets.lowest import counts
+from roadscan.model.asset_ground import GroundSettings
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+DENSE_PER_M2: Final = 4
+"""Median number of returns of the square metres that hold any, from which the data are those of a scanner on the road:
+scanners from the air give about one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What a filter gets: returns of a window, the drives through it, and the settings."""
+
+    returns: Returns
+    window: Box
+    drive_xyh_m: Float64
+    settings: GroundSettings
+
+
+class Surface(NamedTuple):
+    """Whole heights (rows, columns) at the middles of a grid's cells (m)."""
+
+    grid: Grid
+    height_m: Float32
+
+    def at(self, grid: Grid) -> Float32:
+        """Heights at the middles of another grid's cells, bilinear."""
+        return sampled(self.height_m, self.grid, grid)
+
+    def slope(self) -> Float32:
+        """Slope (rows, columns) of the surface (m/m)."""
+        if min(self.height_m.shape) < 2:
+            return np.zeros(self.height_m.shape, np.float32)
+        north, east = np.gradient(self.height_m, self.grid.cell_m)
+        return np.asarray(np.hypot(north, east), np.float32)
+
+
+class Found(NamedTuple):
+    """Which returns lie on the ground."""
+
+    base: Surface
+    """A provisional ground, near to it."""
+    above_m: Float32
+    """(n,) heights of returns above the provisional ground (m)."""
+    on_ground: npt.NDArray[np.bool_]
+    """(n,)."""
+
+
+def sampled(z: Float32, grid: Grid, other: Grid) -> Float32:
+    """Raster z of a grid (rows, columns), bilinear at the middles of another grid's cells."""
+    x_m, y_m = other.middles_m
+    u = np.clip((x_m - grid.x_min_m) / grid.cell_m - 0.5, 0, grid.columns - 1).astype(np.float32)
+    v = np.clip((y_m - grid.y_min_m) / grid.cell_m - 0.5, 0, grid.rows - 1).astype(np.float32)
+    return np.asarray(cv2.remap(z, *np.meshgrid(u, v), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def is_dense(place: Place) -> bool:
+    """Whether the returns of the window lie as dense as those of a scanner on the road."""
+    grid = grid_over(place.window, 1.0)
+    found = np.zeros(grid.shape, np.int32)
+    counts(place.returns.x_m, place.returns.y_m, grid.origin, 1.0, found)
+    held = found[found > 0]
+    return bool(held.size and np.median(held) >= DENSE_PER_M2)

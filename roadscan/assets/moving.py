@@ -1,0 +1,257 @@
+"""Vehicles and people: those that move, and vehicles that are parked."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.cubes import Cubes
+from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
+from roadscan.kernels.assets import columns, voxels
+
+Bools = npt.NDArray[np.bool_]
+Int32 = npt.NDArray[np.int32]
+
+CELL_M: Final = 0.2
+LEVEL_M: Final = 0.2
+SLOT_NS: Final = 200_000_000
+"""Time is told in slots of this length, or of as many of them as leave no more than 64."""
+_SLOTS: Final = 64
+_THING_M: Final = (0.3, 2.5)
+"""Returns at these heights are of things that may move."""
+_GAP: Final = 2
+"""What stands on the ground may have gaps of so many levels, as between a car's body and its roof."""
+_START: Final = 5
+"""It begins below this level."""
+_TALL: Final = 14
+"""What reaches this level is no vehicle that is parked: 2.8 m."""
+_BODY: Final = 0b111100
+"""Levels at which a vehicle has its body: 0.4–1.2 m."""
+_TALLEST: Final = 21
+"""Level that a moving lorry may reach: 4.2 m."""
+_LEAST_CELLS: Final = 6
+_TREE_CELLS: Final = 60
+"""Places that seem to move below a tree's crown count only from this size on (cells): branches swing."""
+_PERSON_M: Final = 1.2
+"""What moves along a narrower track is a person, on foot or on a bicycle (m)."""
+
+
+class Users(NamedTuple):
+    """Which returns (n,) are those of road users."""
+
+    vehicle: Bools
+    person: Bools
+
+
+class Columns(NamedTuple):
+    """Rasters (rows, columns) of what stands in each cell."""
+
+    grid: Grid
+    levels: npt.NDArray[np.uint32]
+    top: Int32
+    """Level that what stands on the ground reaches; -1 of none."""
+    things: npt.NDArray[np.uint64]
+    grounds: npt.NDArray[np.uint64]
+    """Slots of time in which things and ground were seen, as bits."""
+
+
+def road_users(
+    returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box
+) -> Users:
+    """Returns of vehicles and people among those that do not lie on the ground."""
+    held = columns_of(returns, above_m, on_ground, window)
+    moving = moving_cells(held)
+    vehicle, person = tracks(held, moving)
+    parked = parked_cells(held, moving, Bodies(returns, above_m, on_ground, cubes))
+    return Users(
+        returns_of(np.where(parked > 0, parked, vehicle), held, returns, above_m) & ~on_ground,
+        returns_of(person, held, returns, above_m) & ~on_ground,
+    )
+
+
+def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, window: Box) -> Columns:
+    """What stands in each cell of a window, and when it was seen."""
+    grid = grid_over(window, CELL_M)
+    levels = np.zeros(grid.shape, np.uint32)
+    things, grounds = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.uint64)
+    columns.columns(
+        returns.x_m,
+        returns.y_m,
+        above_m,
+        on_ground,
+        time_slots(returns.epoch_gps_ns),
+        grid.origin,
+        1.0 / CELL_M,
+        LEVEL_M,
+        np.array(_THING_M),
+        levels,
+        things,
+        grounds,
+    )
+    top = np.empty(grid.shape, np.int32)
+    columns.tops(levels, 1, _START, _GAP, top)
+    return Columns(grid, levels, top, things, grounds)
+
+
+def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+    """Slot (n,) of each epoch: those in which nothing was seen are left out, so that passes follow one another."""
+    found = np.empty(4096, np.int64)
+    count = columns.distinct(epoch_gps_ns, SLOT_NS, found)
+    if count > found.size:
+        found = np.empty(count, np.int64)
+        columns.distinct(epoch_gps_ns, SLOT_NS, found)
+    steps = np.unique(found[:count])
+    slot = np.empty(epoch_gps_ns.size, np.uint8)
+    columns.slots(epoch_gps_ns, SLOT_NS, steps, max(1, -(-steps.size // _SLOTS)), slot)
+    return slot
+
+
+def moving_cells(held: Columns) -> Bools:
+    """Cells (rows, columns) where things were seen for a while, and the ground for longer when they were not there."""
+    things = np.bitwise_count(held.things).astype(np.int64)
+    free = np.bitwise_count(held.grounds & ~held.things).astype(np.int64)
+    both = np.bitwise_count(held.grounds & held.things).astype(np.int64)
+    apart = (free >= 2) & (2 * free >= 3 * things) & (2 * both <= things)
+    moving = (things > 0) & (apart | ((free >= 3) & (free >= 2 * things)))
+    around = _around(moving)
+    return np.asarray((things > 0) & (2 * around >= _around(things > 0)) & (around >= 3))
+
+
+def _around(cells: Bools) -> Int32:
+    counted = cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, (3, 3), None, (-1, -1), False, cv2.BORDER_CONSTANT)
+    return np.asarray(counted, np.int32)
+
+
+def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
+    """Level that vehicles and people who move reach, in the cells of their tracks (rows, columns); 0 elsewhere."""
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(moving.view(np.uint8), connectivity=8)
+    vehicle, person = np.zeros(label.shape, np.int32), np.zeros(label.shape, np.int32)
+    for k in range(1, count):
+        left, low, width, height, cells = boxes[k]
+        if cells < _LEAST_CELLS:
+            continue
+        part = slice(max(low - 1, 0), low + height + 1), slice(max(left - 1, 0), left + width + 1)
+        inside = label[part] == k
+        top = held.top[part][inside]
+        if cells < _TREE_CELLS and 2 * np.count_nonzero(top >= _TALL) > cells:
+            continue
+        reached = min(int(np.quantile(top, 0.9)) + 1, _TALLEST)
+        target = vehicle if sides_m(inside)[1] >= _PERSON_M else person
+        wider = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        target[part][wider] = np.maximum(target[part][wider], reached)
+    return vehicle, person
+
+
+def sides_m(cells: Bools) -> tuple[float, float]:
+    """Length and width of the smallest rectangle about the middles of cells (rows, columns), a cell added (m)."""
+    row, column = np.nonzero(cells)
+    sides = cv2.minAreaRect(np.column_stack([column, row]).astype(np.float32))[1]
+    return (max(sides) + 1.0) * CELL_M, (min(sides) + 1.0) * CELL_M
+
+
+class Bodies(NamedTuple):
+    """Returns that may be those of parked vehicles."""
+
+    returns: Returns
+    above_m: npt.NDArray[np.float32]
+    on_ground: Bools
+    cubes: Cubes
+
+
+class Shape(NamedTuple):
+    """What is known of a group of cells that stand apart."""
+
+    length_m: float
+    width_m: float
+    top_m: float
+    """Height that nine tenths of its cells do not surpass."""
+    fill: float
+    """Share of its rectangle that its cells cover."""
+    scattering: float
+    """Mean scattering of its returns: 0 on surfaces, above 0.4 in leaves."""
+    ground: float
+    """Share of the cells around it in which ground was seen."""
+
+    @property
+    def is_vehicle(self) -> bool:
+        """Whether a vehicle looks so, or a part of one, or a row of them that stand close together."""
+        if self.scattering > _LEAFY or not _LOWEST_M <= self.top_m <= _HIGHEST_M:
+            return False
+        low = self.top_m <= _CAR_TOP_M
+        one = 0.9 <= self.length_m <= 7.0 and 0.5 <= self.width_m <= 2.8 and self.ground >= 0.2
+        hidden = 1.1 <= self.length_m <= 3.0 and 0.45 <= self.width_m <= 2.2 and self.scattering <= 0.31
+        van = self.length_m >= 3.5 and self.width_m >= 1.4
+        face = 1.4 <= self.length_m <= 2.3 and self.width_m >= 0.4 and self.ground >= 0.4 and self.scattering <= 0.3
+        row = self.length_m > 4.0 and 1.4 <= self.width_m <= 6.5 and self.ground >= 0.5 and self.fill >= 0.25
+        return (one and (low or van)) or ((face or hidden) and low) or row
+
+
+_LEAFY: Final = 0.42
+_LOWEST_M, _CAR_TOP_M, _HIGHEST_M = 1.15, 2.25, 2.85
+
+
+def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
+    """Level that parked vehicles reach, in their cells (rows, columns); 0 elsewhere.
+
+    A vehicle's body stands apart from all that is tall, has the size and the surfaces of one, and ground around it.
+    """
+    low = (held.top >= 1) & (held.top < _TALL) & ~moving
+    body = low & ((held.levels & np.uint32(_BODY)) > 0)
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(body.view(np.uint8), connectivity=8)
+    tall = (held.top >= _TALL) & ~moving
+    touched = np.bincount(label[cv2.dilate(tall.view(np.uint8), np.ones((3, 3), np.uint8)) > 0], minlength=count)
+    scattering = mean_scattering(label.astype(np.int32), held.grid, bodies, count)
+    found = np.zeros(label.shape, np.int32)
+    for k in range(1, count):
+        left, lower, width, height, cells = boxes[k]
+        if cells < _LEAST_CELLS or 20 * touched[k] > cells or not scattering[k] <= _LEAFY:
+            continue
+        part = slice(max(lower - 3, 0), lower + height + 3), slice(max(left - 3, 0), left + width + 3)
+        inside = label[part] == k
+        length_m, width_m = sides_m(inside)
+        top = held.top[part][inside]
+        ground = ground_around(inside, held.grounds[part] > 0)
+        fill = float(cells) * CELL_M**2 / (length_m * width_m)
+        top_m = float(np.quantile(top, 0.9) + 1.0) * LEVEL_M
+        if Shape(length_m, width_m, top_m, fill, float(scattering[k]), ground).is_vehicle:
+            wider = cv2.dilate(inside.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            wider &= (label[part] == 0) | inside
+            reached = int(np.quantile(top, 0.9)) + 1
+            wider &= held.top[part] <= reached + 1  # what is taller stands beside it
+            found[part][wider] = np.maximum(found[part][wider], reached + 1)
+    return found
+
+
+def mean_scattering(label: Int32, grid: Grid, bodies: Bodies, count: int) -> npt.NDArray[np.float64]:
+    """Mean scattering (count,) of the returns above the cells of each label; NaN of none."""
+    at = np.empty(len(bodies.returns), np.int32)
+    lowest, highest = np.full(count, LEVEL_M), np.full(count, _TALL * LEVEL_M)
+    x, y = bodies.returns.x_m, bodies.returns.y_m
+    columns.marked(x, y, bodies.above_m, grid.origin, 1.0 / CELL_M, label, lowest, highest, at)
+    chosen = (at > 0) & ~bodies.on_ground & (bodies.cubes.number >= 0)
+    values = bodies.cubes.features[bodies.cubes.number[chosen], voxels.SCATTERING].astype(np.float64)
+    total = np.bincount(at[chosen], weights=values, minlength=count)
+    number = np.bincount(at[chosen], minlength=count)
+    return np.asarray(np.divide(total, number, out=np.full(count, np.nan), where=number > 0))
+
+
+def ground_around(inside: Bools, ground: Bools) -> float:
+    """Share of the cells in a ring about some cells (rows, columns) in which ground was seen."""
+    near = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8))
+    ring = cv2.dilate(inside.view(np.uint8), np.ones((7, 7), np.uint8)) > near
+    return float(np.count_nonzero(ground & ring)) / float(max(int(np.count_nonzero(ring)), 1))
+
+
+def returns_of(reached: Int32, held: Columns, returns: Returns, above_m: npt.NDArray[np.float32]) -> Bools:
+    """Returns (n,) in cells up to the level that is reached there, and one more."""
+    most = _TALLEST + 2
+    lowest, highest = np.full(most + 1, -0.2), (np.arange(most + 1) + 1.0) * LEVEL_M
+    at = np.empty(len(returns), np.int32)
+    grid = held.grid
+    columns.marked(returns.x_m, returns.y_m, above_m, grid.origin, 1.0 / CELL_M, reached, lowest, highest, at)
+    return np.asarray(at > 0)

@@ -1,0 +1,141 @@
+"""Classes of what stands still beside and over the road: vegetation, buildings, wires, noise."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets import classes
+from roadscan.assets.cubes import EDGE_M, Cubes
+from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
+from roadscan.kernels.assets import voxels
+
+Bools = npt.NDArray[np.bool_]
+Float32 = npt.NDArray[np.float32]
+
+_PLANAR, _UPRIGHT, _THICK = 0.4, 0.25, 0.4
+"""A cube is part of an upright plane whose planarity is no less, whose normal points no more upwards, and that is no
+thicker (cubes)."""
+_WALL_CUBES, _WALL_M, _WALL_LENGTH_M = 2, 1.5, 4.0
+"""A wall has so many of them above one another, half of all that stand there, reaches this height, and is this long."""
+_FOOT_M: Final = 1.8
+"""It is seen below this height: a crown is not."""
+_CUBES_UP: Final = 1 << 20
+"""Higher than any cube."""
+_IN_LEAVES: Final = 0.6
+"""What scatters more is no wall, even in front of one."""
+_LEAFY: Final = 0.2
+"""Mean scattering of the columns around from which things are vegetation."""
+_MEDIUM_M, _HIGH_M = 0.5, 2.0
+"""Heights from which vegetation is medium and high."""
+_ROOF_M, _ROOF_LENGTH_M = 2.5, 6.0
+"""A roof lies above this height, and is this long."""
+_WIRE_LINEAR, _WIRE_LEVEL, _WIRE_M, _WIRE_LENGTH_M = 0.8, 0.4, 4.0, 3.0
+"""A wire is linear, level, above the ground by so much, and so long."""
+_NEAR_M: Final = 15.0
+"""A return alone in nine tenths of a metre is noise, so near to the sensor."""
+_LOW_M: Final = 0.3
+"""Returns within this of the ground that do not lie on it are low vegetation, where the ground is rough."""
+
+
+def surroundings(
+    returns: Returns, above_m: Float32, found: npt.NDArray[np.uint8], cubes: Cubes, window: Box
+) -> npt.NDArray[np.uint8]:
+    """Classes (n,): those of `found`, and in place of `UNCLASSIFIED` what stands there."""
+    grid = grid_over(window, EDGE_M)
+    free = found == classes.UNCLASSIFIED
+    held = free & (cubes.number >= 0)
+    number = np.where(held, cubes.number, 0)
+    out = found.copy()
+    out[free & (np.abs(above_m) < _LOW_M)] = classes.LOW_VEGETATION
+    if not len(cubes.place):
+        return out
+    features = cubes.features
+    at_wall = near_walls(cubes, grid)[number] & (features[number, voxels.SCATTERING] <= _IN_LEAVES)
+    at_wire = wires(cubes, grid)[number]
+    alone = (features[number, voxels.NUMBER] <= 1) & (returns.range_m < _NEAR_M)
+    leafy = leaves(cubes, grid)[number]
+    out[held & leafy] = by_height(above_m[held & leafy])
+    out[held & ~leafy & (out == classes.LOW_VEGETATION)] = classes.UNCLASSIFIED
+    out[held & at_wall] = classes.BUILDING
+    out[held & at_wire] = classes.WIRE
+    out[held & alone] = classes.HIGH_NOISE
+    return out
+
+
+def by_height(above_m: Float32) -> npt.NDArray[np.uint8]:
+    """Class of vegetation at heights above the ground (n,) (m)."""
+    codes = np.array([classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION], np.uint8)
+    return np.asarray(codes[np.searchsorted([_MEDIUM_M, _HIGH_M], above_m, side="right")])
+
+
+def leaves(cubes: Cubes, grid: Grid) -> Bools:
+    """Cubes (cubes,) in columns that scatter in all directions, with those around."""
+    row, column = cubes.place[:, 0], cubes.place[:, 1]
+    number, scattering = np.zeros(grid.shape), np.zeros(grid.shape)
+    np.add.at(number, (row, column), 1.0)
+    np.add.at(scattering, (row, column), cubes.features[:, voxels.SCATTERING].astype(np.float64))
+    sums = [
+        cv2.boxFilter(a, cv2.CV_64F, (3, 3), None, (-1, -1), False, cv2.BORDER_CONSTANT) for a in (number, scattering)
+    ]
+    return np.asarray((sums[1] >= _LEAFY * sums[0])[row, column])
+
+
+def near_walls(cubes: Cubes, grid: Grid) -> Bools:
+    """Cubes (cubes,) at walls, the large upright planes, and roofs: large planes that are not, above a man's height."""
+    place, features = cubes.place, cubes.features
+    row, column = place[:, 0], place[:, 1]
+    planar = (features[:, voxels.PLANARITY] >= _PLANAR) & (features[:, voxels.THICKNESS] <= _THICK)
+    upright = planar & (features[:, voxels.NORMAL_UP] <= _UPRIGHT)
+    many, all_there = np.zeros(grid.shape, np.int64), np.zeros(grid.shape, np.int64)
+    top, low = np.zeros(grid.shape, np.int64), np.full(grid.shape, _CUBES_UP)
+    np.add.at(many, (row[upright], column[upright]), 1)
+    np.add.at(all_there, (row, column), 1)
+    np.maximum.at(top, (row[upright], column[upright]), place[upright, 2] + 1)
+    np.minimum.at(low, (row, column), place[:, 2].astype(np.int64))
+    walls = (many >= _WALL_CUBES) & (top * EDGE_M >= _WALL_M) & (2 * many >= all_there) & (low * EDGE_M < _FOOT_M)
+    walls = long_ones(walls, _WALL_LENGTH_M)
+    roof = planar & ~upright & (place[:, 2] * EDGE_M >= _ROOF_M)
+    roofs = np.zeros(grid.shape, np.bool_)
+    roofs[row[roof], column[roof]] = True
+    roofs = long_ones(
+        cv2.morphologyEx(roofs.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0, _ROOF_LENGTH_M
+    )
+    return np.asarray(walls[row, column] | (roofs[row, column] & roof))
+
+
+def long_ones(cells: Bools, least_m: float) -> Bools:
+    """Groups of cells (rows, columns), a cell wider, that are no shorter than `least_m`."""
+    wider = cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8))
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(wider, connectivity=8)
+    keep = (
+        np.hypot(boxes[:count, cv2.CC_STAT_WIDTH], boxes[:count, cv2.CC_STAT_HEIGHT]) * EDGE_M >= least_m + 2 * EDGE_M
+    )
+    keep[0] = False
+    around = cv2.dilate(keep[label].view(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(around > 0)
+
+
+def wires(cubes: Cubes, grid: Grid) -> Bools:
+    """Cubes (cubes,) of wires: linear and level, high, with nothing else in their columns above a man's height."""
+    place, features = cubes.place, cubes.features
+    row, column = place[:, 0], place[:, 1]
+    linear = (features[:, voxels.LINEARITY] >= _WIRE_LINEAR) & (features[:, voxels.ALONG_UP] <= _WIRE_LEVEL)
+    linear &= place[:, 2] * EDGE_M >= _WIRE_M
+    if not linear.any():
+        return linear
+    high = place[:, 2] * EDGE_M >= _ROOF_M
+    wire, others = np.zeros(grid.shape, np.int64), np.zeros(grid.shape, np.int64)
+    np.add.at(wire, (row[linear], column[linear]), 1)
+    np.add.at(others, (row[high & ~linear], column[high & ~linear]), 1)
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(
+        ((wire > 0) & (wire >= others)).view(np.uint8), connectivity=8
+    )
+    keep = np.hypot(boxes[:count, cv2.CC_STAT_WIDTH], boxes[:count, cv2.CC_STAT_HEIGHT]) * EDGE_M >= _WIRE_LENGTH_M
+    keep[0] = False
+    return np.asarray(linear & keep[label[row, column]])

@@ -1,0 +1,49 @@
+"""Outlines of façades, and the returns that belong to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.lines import Chain
+from roadscan.assets.upright.slices import usable
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_BEFORE_M, _BEHIND_M = 0.4, 1.5
+"""Balconies stand before the plane of a façade, windows and doors behind it, this far at the most."""
+
+
+def outline(chain: Chain) -> Float64:
+    """Ring (n, 3) of a façade: its lower edge, then its upper edge back; stretches without returns as those beside."""
+    low, high = _filled(chain.values["low_m"]), _filled(chain.values["high_m"])
+    xy = np.repeat(chain.xy_m, 2, axis=0)[1:-1]
+    lower, upper = np.column_stack([xy, np.repeat(low, 2)]), np.column_stack([xy, np.repeat(high, 2)])
+    ring = np.concatenate([lower, upper[::-1], lower[:1]])
+    keep = np.append(True, np.abs(np.diff(ring, axis=0)).max(axis=1) > 1e-6)
+    out: Float64 = ring[keep]
+    return out
+
+
+def _filled(values: Float64) -> Float64:
+    known = np.isfinite(values)
+    return np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
+
+
+def beside(scene: Scene, rows: Int64) -> Int64:
+    """Returns of a façade: those of its surface (`rows`), and what stands close before it or behind it."""
+    returns = scene.returns
+    xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
+    middle = xy.mean(axis=0)
+    some = xy[:: max(1, len(xy) // 20_000)] - middle
+    _, _, axes = np.linalg.svd(some, full_matrices=False)
+    along, normal = axes[0], axes[1]
+    seen = np.array([returns.sensor_x_m[rows].mean(), returns.sensor_y_m[rows].mean()]) - middle
+    normal = normal if float(normal @ seen) > 0.0 else -normal
+    x, y = returns.x_m - middle[0], returns.y_m - middle[1]
+    t, away = x * along[0] + y * along[1], x * normal[0] + y * normal[1]
+    begin, end = float((some @ along).min()) - 0.3, float((some @ along).max()) + 0.3
+    inside = usable(scene) & (t >= begin) & (t <= end) & (away >= -_BEHIND_M) & (away <= _BEFORE_M)
+    return np.union1d(rows, np.flatnonzero(inside))

@@ -1,0 +1,283 @@
+"""Pieces of upright surfaces, cut at the borders of tiles, and the chains that they join to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.assets.scene import Box, Scene
+from roadscan.assets.upright.panels import Panel
+from roadscan.assets.upright.pieces import seen_by
+
+Float64 = npt.NDArray[np.float64]
+
+STRETCHES: Final = ("ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "open_top")
+PIECE_SCHEMA: Final = pa.schema(
+    [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
+    + [(name, pa.list_(pa.float64())) for name in STRETCHES]
+    + [
+        ("across_m", pa.float64()), ("vegetation", pa.float64()), ("sensor_x_m", pa.float64()),
+        ("sensor_y_m", pa.float64()), ("seen", pa.int64()), ("passes", pa.list_(pa.int32())),
+        ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
+    ]
+)  # fmt: skip
+"""A row a piece: ends of its stretches in the map, then values of each stretch."""
+
+_JOIN_M: Final = 1.5
+_JOIN_TURN: Final = math.cos(math.radians(25.0))
+_JOIN_BESIDE_M: Final = 0.35
+_JOIN_LEVEL_M: Final = 0.15
+"""Low surfaces join where they begin at one height above the ground: a rail does not go on as a solid end …"""
+_LOW_M: Final = 1.2
+"""… of this height or less."""
+_SHORTEST_M: Final = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Pieces joined along a line, values as those of a piece."""
+
+    xy_m: Float64
+    """(k + 1, 2) in the map."""
+    values: dict[str, Float64]
+    """(k,) of each stretch, names of :data:`STRETCHES`; a gap between pieces is a stretch without returns."""
+    across_m: float
+    vegetation: float
+    sensor_xy_m: tuple[float, float]
+    seen: int
+    passes: int
+    epochs_gps_ns: tuple[int, int]
+
+    @property
+    def length_m(self) -> float:
+        """From end to end, along it."""
+        return float(self.values["length_m"].sum())
+
+    def median(self, name: str) -> float:
+        """Median of a height above the ground, over the stretches that are known; NaN where none is."""
+        above = self.values[name] - self.values["ground_m"]
+        return float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else math.nan
+
+    @property
+    def passing(self) -> float:
+        """Share of the sight lines at it that go through."""
+        passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
+        return passed / max(passed + stopped, 1.0)
+
+    @property
+    def open_top(self) -> float:
+        """Share of its length whose upper edge is higher than scanners saw."""
+        return float(self.values["length_m"] @ self.values["open_top"]) / max(self.length_m, 1e-9)
+
+    @property
+    def covered(self) -> float:
+        """Share of its length that returns show."""
+        shown = np.isfinite(self.values["high_m"])
+        return float(self.values["length_m"] @ shown) / max(self.length_m, 1e-9)
+
+
+def pieces_of_panels(scene: Scene, panels: list[Panel]) -> pa.Table:
+    """Pieces of panels inside the scene's tile; ends at its border lie on it."""
+    rows = [_row(scene, panel, part) for panel in panels for part in _inside(panel, scene.tile)]
+    return pa.Table.from_pylist(rows, schema=PIECE_SCHEMA)
+
+
+def _inside(panel: Panel, tile: Box) -> list[list[tuple[int, float, float]]]:
+    """Runs of stretches inside the tile: number of a stretch, and the shares of it where it enters and leaves."""
+    runs: list[list[tuple[int, float, float]]] = [[]]
+    for k in range(panel.returns.size):
+        enters, leaves = _clip(panel.xy_m[k], panel.xy_m[k + 1], tile)
+        if leaves <= enters:
+            runs.append([])
+            continue
+        if enters > 0.0:
+            runs.append([])
+        runs[-1].append((k, enters, leaves))
+        if leaves < 1.0:
+            runs.append([])
+    return [run for run in runs if run]
+
+
+def _clip(start: Float64, end: Float64, tile: Box) -> tuple[float, float]:
+    """Shares of a segment between which it lies in the tile (Liang and Barsky 1984); 1, 0 where it does not."""
+    enters, leaves = 0.0, 1.0
+    for axis, low, high in ((0, tile.x_min_m, tile.x_max_m), (1, tile.y_min_m, tile.y_max_m)):
+        way = float(end[axis] - start[axis])
+        if way == 0.0:
+            if not low <= float(start[axis]) < high:
+                return 1.0, 0.0
+            continue
+        first, second = sorted(((low - float(start[axis])) / way, (high - float(start[axis])) / way))
+        enters, leaves = max(enters, first), min(leaves, second)
+    return enters, leaves
+
+
+def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dict[str, Any]:
+    east, north = scene.returns.corner_m
+    points = [panel.xy_m[k] + a * (panel.xy_m[k + 1] - panel.xy_m[k]) for k, a, _ in run]
+    last, _, share = run[-1]
+    points.append(panel.xy_m[last] + share * (panel.xy_m[last + 1] - panel.xy_m[last]))
+    xy = np.array(points)
+    numbers, shares = np.array([k for k, _, _ in run]), np.array([b - a for _, a, b in run])
+    rows = panel.rows[np.isin(panel.stretch, numbers)]
+    seen = (
+        seen_by(scene, rows)
+        if rows.size
+        else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
+    )
+    counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed")}
+    heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
+    return {
+        "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),
+        **{name: value.tolist() for name, value in (counts | heights).items()},
+        "open_top": panel.open_top[numbers].astype(float).tolist(),
+        "length_m": np.hypot(*np.diff(xy, axis=0).T).tolist(),
+        "across_m": panel.across_m, "vegetation": panel.vegetation, "sensor_x_m": east + panel.seen_from_m[0],
+        "sensor_y_m": north + panel.seen_from_m[1], "seen": seen.pop("returns"), **seen,
+    }  # fmt: skip
+
+
+def chains_of(pieces: pa.Table) -> list[Chain]:
+    """Chains of pieces whose ends meet, by the place of their first point; pieces without any returns are left out.
+
+    Ends meet that are at most 1.5 m apart, where the one goes on in the other's direction and line. Of several the
+    nearest pair is joined first, so the chains do not depend on the order of the pieces.
+    """
+    parts = [_part(row) for row in pieces.to_pylist() if sum(row["length_m"]) > _SHORTEST_M]
+    parts.sort(key=lambda p: (p.xy_m[0].tolist(), p.xy_m[-1].tolist()))
+    following = _matched(parts)
+    chains, used = [], set[int]()
+    for start in range(len(parts)):
+        if start in used:
+            continue
+        first, reverse = _first_of(start, following)
+        run = _walk(first, reverse, following)
+        used.update(i for i, _ in run)
+        chains.append(_linked([_reversed(parts[i]) if back else parts[i] for i, back in run]))
+    return sorted(chains, key=lambda c: (c.xy_m[0].tolist(), c.xy_m[-1].tolist()))
+
+
+def _part(row: dict[str, Any]) -> Chain:
+    values = {name: np.array(row[name], np.float64) for name in STRETCHES}
+    return Chain(
+        np.column_stack([row["x_m"], row["y_m"]]), values, row["across_m"], row["vegetation"],
+        (row["sensor_x_m"], row["sensor_y_m"]), row["seen"], len(row["passes"]),
+        (row["first_epoch_gps_ns"] or 0, row["last_epoch_gps_ns"] or 0),
+    )  # fmt: skip
+
+
+def _reversed(part: Chain) -> Chain:
+    values = {name: value[::-1] for name, value in part.values.items()}
+    return Chain(
+        part.xy_m[::-1], values, part.across_m, part.vegetation, part.sensor_xy_m, part.seen, part.passes,
+        part.epochs_gps_ns,
+    )  # fmt: skip
+
+
+def _matched(parts: list[Chain]) -> dict[tuple[int, int], tuple[int, int]]:
+    """Which end (0 or 1) of which piece each end is joined to."""
+    ends = np.array([p.xy_m[[0, -1]] for p in parts]).reshape(-1, 2)
+    outwards = np.array([[_way(p.xy_m[::-1]), _way(p.xy_m)] for p in parts]).reshape(-1, 2)
+    levels = [_level(p) for p in parts]
+    cells: dict[tuple[int, int], list[int]] = {}
+    for i, (x, y) in enumerate(ends.tolist()):
+        cells.setdefault((int(x // _JOIN_M), int(y // _JOIN_M)), []).append(i)
+    pairs = []
+    for (cx, cy), here in cells.items():
+        near = [j for a in (-1, 0, 1) for b in (-1, 0, 1) for j in cells.get((cx + a, cy + b), ())]
+        for i in here:
+            for j in near:
+                if i // 2 < j // 2:
+                    gap = ends[j] - ends[i]
+                    apart = float(np.hypot(*gap))
+                    beside = abs(float(outwards[i][0] * gap[1] - outwards[i][1] * gap[0]))
+                    straight = -float(outwards[i] @ outwards[j]) >= _JOIN_TURN
+                    alike = abs(levels[i // 2] - levels[j // 2]) <= _JOIN_LEVEL_M
+                    if (
+                        alike
+                        and apart <= _JOIN_M
+                        and straight
+                        and beside <= _JOIN_BESIDE_M
+                        and float(outwards[i] @ gap) > -0.5
+                    ):
+                        pairs.append((apart, i, j))
+    joined: dict[tuple[int, int], tuple[int, int]] = {}
+    for _, i, j in sorted(pairs):
+        a, b = (i // 2, i % 2), (j // 2, j % 2)
+        if a not in joined and b not in joined:
+            joined[a], joined[b] = b, a
+    return joined
+
+
+def _level(part: Chain) -> float:
+    """Height above the ground that the bulk of a low surface begins at; 0 of high ones, which join in any case."""
+    bulk, top = part.median("bulk_m"), part.median("high_m")
+    return bulk if np.isfinite(bulk) and top <= _LOW_M else 0.0
+
+
+def _way(xy: Float64) -> Float64:
+    """Direction (2,) in which a line ends, over its last 3 m."""
+    past = np.hypot(*(xy[:-1] - xy[-1]).T)
+    back = int(np.argmax(past <= 3.0)) if (past <= 3.0).any() else len(xy) - 2
+    way = xy[-1] - xy[back]
+    out: Float64 = way / max(float(np.hypot(*way)), 1e-9)
+    return out
+
+
+def _first_of(start: int, following: dict[tuple[int, int], tuple[int, int]]) -> tuple[int, bool]:
+    """Where the chain of a piece begins, and whether that piece runs backwards in it."""
+    piece, end = start, 0
+    while (piece, end) in following:
+        piece, other = following[(piece, end)]
+        end = 1 - other
+        if piece == start:
+            break
+    return piece, end == 1
+
+
+def _walk(piece: int, back: bool, following: dict[tuple[int, int], tuple[int, int]]) -> list[tuple[int, bool]]:
+    """Pieces of a chain from its first one on, each with whether it runs backwards."""
+    run = [(piece, back)]
+    while (end := (run[-1][0], 0 if run[-1][1] else 1)) in following:
+        piece, other = following[end]
+        if piece == run[0][0]:
+            break
+        run.append((piece, other == 1))
+    return run
+
+
+def _linked(parts: list[Chain]) -> Chain:
+    """One chain of pieces in their order."""
+    xy, values = [parts[0].xy_m], {name: [value] for name, value in parts[0].values.items()}
+    for part in parts[1:]:
+        gap = float(np.hypot(*(part.xy_m[0] - xy[-1][-1])))
+        if gap > _SHORTEST_M:
+            xy.append(part.xy_m)
+            empty = dict.fromkeys(STRETCHES, 0.0) | {
+                "length_m": gap,
+                "low_m": np.nan,
+                "high_m": np.nan,
+                "bulk_m": np.nan,
+            }
+            empty["ground_m"] = float((values["ground_m"][-1][-1] + part.values["ground_m"][0]) / 2)
+            for name in STRETCHES:
+                values[name].append(np.array([empty[name]]))
+        else:
+            xy.append(part.xy_m[1:])
+        for name in STRETCHES:
+            values[name].append(part.values[name])
+    weights = np.array([max(p.seen, 1) for p in parts], np.float64)
+    weights /= weights.sum()
+    epochs = [p.epochs_gps_ns for p in parts if p.seen]
+    return Chain(
+        np.concatenate(xy), {name: np.concatenate(v) for name, v in values.items()},
+        float(weights @ [p.across_m for p in parts]), float(weights @ [p.vegetation for p in parts]),
+        (float(weights @ [p.sensor_xy_m[0] for p in parts]), float(weights @ [p.sensor_xy_m[1] for p in parts])),
+        sum(p.seen for p in parts), max(p.passes for p in parts),
+        (min((e for e, _ in epochs), default=0), max((e for _, e in epochs), default=0)),
+    )  # fmt: skip

@@ -1,0 +1,155 @@
+"""Upright surfaces in stretches of a metre: where they run, how high they stand, and what passes through them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets import classes
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.memory import once_a_scene
+from roadscan.assets.upright.regions import Region, regions_of
+from roadscan.kernels.assets.upright_voxels import passing_lines
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+STRETCH_M: Final = 1.0
+_MOST_LINES: Final = 200_000
+"""Sight lines that are held against surfaces: every k-th return, so that no more are taken."""
+_BESIDE_M: Final = 0.2
+"""Returns of a region that lie this far beside its line or less make the surface."""
+_OPEN_DEG: Final = 1.2
+_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A surface of k stretches, along its line."""
+
+    xy_m: Float64
+    """(k + 1, 2) ends of the stretches, from the corner of the returns."""
+    ground_m: Float64
+    """(k,) height of the ground in the map frame."""
+    low_m: Float64
+    """(k,) lower edge, that 2 % of the returns lie below; NaN where there is none."""
+    high_m: Float64
+    """(k,) upper edge."""
+    bulk_m: Float64
+    """(k,) height that 15 % of the returns lie below: the posts of a guardrail hold less of them."""
+    returns: Int64
+    """(k,)"""
+    stopped: Int64
+    """(k,) sight lines of the sample that end on it; those that go through: `passed`."""
+    passed: Int64
+    open_top: npt.NDArray[np.bool_]
+    """(k,) True where the highest laser still meets it: its top is not seen."""
+    across_m: float
+    vegetation: float
+    """Share of its returns that are classed as vegetation."""
+    seen_from_m: tuple[float, float]
+    """Mean place of the sensor."""
+    rows: Int64
+    stretch: Int64
+    """Stretch of each row."""
+
+
+@once_a_scene
+def panels_of(scene: Scene) -> list[Panel]:
+    """Panels of all upright surfaces of a scene with its halo."""
+    highest = _highest_elevation_deg(scene)
+    panels = [_panel(scene, region, highest) for region in regions_of(scene)]
+    return _with_sight(scene, [p for p in panels if p is not None])
+
+
+def _highest_elevation_deg(scene: Scene) -> float:
+    """Elevation that hardly any sight line exceeds (degrees)."""
+    returns = scene.returns
+    if len(returns) == 0:
+        return 90.0
+    some = slice(None, None, max(1, len(returns) // _MOST_LINES))
+    flat = np.hypot(returns.x_m[some] - returns.sensor_x_m[some], returns.y_m[some] - returns.sensor_y_m[some])
+    rise = returns.height_m[some] - returns.sensor_height_m[some]
+    return float(np.degrees(np.quantile(np.arctan2(rise, flat), 0.999)))
+
+
+def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
+    returns, rows = scene.returns, region.rows
+    past = np.column_stack([returns.x_m[rows], returns.y_m[rows]]) - region.middle_xy_m
+    beside = np.array([-region.along[1], region.along[0]])
+    t, d = past @ region.along, past @ beside
+    begin, end = np.quantile(t, [0.003, 0.997])
+    count = max(1, round(float(end - begin) / STRETCH_M))
+    edges = np.linspace(begin, end, count + 1)
+    stretch = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
+    middle = _medians(d, stretch, count)
+    near = np.abs(d - np.interp(t, (edges[:-1] + edges[1:]) / 2, middle)) <= _BESIDE_M
+    if near.sum() < 10:
+        return None
+    rows, stretch = rows[near], stretch[near]
+    at_edges = np.interp(edges, (edges[:-1] + edges[1:]) / 2, middle)
+    if count >= 2:
+        at_edges[0], at_edges[-1] = 1.5 * middle[0] - 0.5 * middle[1], 1.5 * middle[-1] - 0.5 * middle[-2]
+    xy = region.middle_xy_m + edges[:, None] * region.along + at_edges[:, None] * beside
+    low, bulk, high = (np.full(count, np.nan) for _ in range(3))
+    open_top = np.zeros(count, np.bool_)
+    for k in range(count):
+        own = rows[stretch == k]
+        if own.size >= 4:
+            heights = returns.height_m[own]
+            low[k], bulk[k], high[k] = np.quantile(heights, [0.02, 0.15, 0.98])
+            top = own[np.argmax(heights)]
+            flat = math.hypot(returns.x_m[top] - returns.sensor_x_m[top], returns.y_m[top] - returns.sensor_y_m[top])
+            rise = float(returns.height_m[top] - returns.sensor_height_m[top])
+            open_top[k] = math.degrees(math.atan2(rise, flat)) > highest_deg - _OPEN_DEG
+    centre = (xy[:-1] + xy[1:]) / 2
+    none = np.zeros(count, np.int64)
+    sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
+    vegetation = float(np.isin(scene.classes[rows], _VEGETATION).mean())
+    return Panel(
+        xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
+        np.bincount(stretch, minlength=count), none, none, open_top, region.across_m, vegetation, sensor, rows, stretch,
+    )  # fmt: skip
+
+
+def _medians(d: Float64, stretch: Int64, count: int) -> Float64:
+    """Median of d in each stretch (count,); where fewer than 5 are known, as beside it."""
+    out = np.full(count, np.nan)
+    for k in range(count):
+        own = d[stretch == k]
+        if own.size >= 5:
+            out[k] = np.median(own)
+    known = np.isfinite(out)
+    if not known.any():
+        return np.full(count, float(np.median(d)))
+    filled: Float64 = np.interp(np.arange(count), np.flatnonzero(known), out[known])
+    return filled
+
+
+def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
+    """The panels with the sight lines that end on them, and those that go through."""
+    returns = scene.returns
+    step = max(1, -(-len(returns) // _MOST_LINES))
+    some = slice(None, None, step)
+    taken = np.zeros(len(returns), np.bool_)
+    taken[some] = True
+    rectangles = np.concatenate(
+        [np.zeros((0, 6))]
+        + [np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08]) for p in panels]
+    )
+    passed = np.zeros(len(rectangles), np.int64)
+    passing_lines(
+        returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
+        returns.sensor_y_m[some], returns.sensor_height_m[some], rectangles, passed,
+    )  # fmt: skip
+    out, first = [], 0
+    for p in panels:
+        count = p.returns.size
+        stopped = np.bincount(p.stretch[taken[p.rows]], minlength=count)
+        out.append(replace(p, stopped=stopped, passed=passed[first : first + count]))
+        first += count
+    return out

@@ -1,0 +1,59 @@
+"""Returns of a scene by their place, seen from above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.memory import once_a_scene
+from roadscan.assets.upright.slices import usable
+from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
+
+Int64 = npt.NDArray[np.int64]
+
+_CELL_M: Final = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Returns that may belong to something upright, sorted by cells of a metre."""
+
+    scene: Scene
+    rows: Int64
+    starts: Int64
+    shape: tuple[int, int]
+
+    def within(self, x_m: float, y_m: float, reach_m: float) -> Int64:
+        """Returns within reach of a place, seen from above, in order of their number."""
+        window = self.scene.window
+        u, v = (x_m - window.x_min_m) / _CELL_M, (y_m - window.y_min_m) / _CELL_M
+        reach = reach_m / _CELL_M
+        first, last = max(int(u - reach), 0), min(int(u + reach), self.shape[1] - 1)
+        parts = [np.zeros(0, np.int64)]
+        for row in range(max(int(v - reach), 0), min(int(v + reach), self.shape[0] - 1) + 1):
+            if last >= first:
+                begin = row * self.shape[1]
+                parts.append(self.rows[self.starts[begin + first] : self.starts[begin + last + 1]])
+        rows = np.concatenate(parts)
+        returns = self.scene.returns
+        near = (returns.x_m[rows] - x_m) ** 2 + (returns.y_m[rows] - y_m) ** 2 <= reach_m**2
+        return np.sort(rows[near])
+
+
+@once_a_scene
+def places_of(scene: Scene) -> Places:
+    """Returns of a scene, those of ground, vehicles, people and noise left out, by cells of a metre."""
+    window, returns = scene.window, scene.returns
+    rows = int(np.ceil((window.y_max_m - window.y_min_m) / _CELL_M - 1e-9))
+    columns = int(np.ceil((window.x_max_m - window.x_min_m) / _CELL_M - 1e-9))
+    corner = np.array([window.x_min_m, window.y_min_m])
+    counted = usable(scene)
+    starts = np.zeros(rows * columns + 1, np.int64)
+    count_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts)
+    order = np.empty(int(starts[-1]), np.int64)
+    fill_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts.copy(), order)
+    return Places(scene, order, starts, (rows, columns))

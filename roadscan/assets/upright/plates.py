@@ -1,0 +1,232 @@
+"""Plates of signs: bright returns on a small upright plane, high enough above the ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from roadscan.assets import classes
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.outlines import Outline, outline_of
+from roadscan.assets.upright.places import places_of
+from roadscan.assets.upright.probability import logistic
+from roadscan.assets.upright.regions import regions_of
+from roadscan.assets.upright.shafts import shafts_of
+from roadscan.assets.upright.slices import usable
+from roadscan.model.strict import Strict
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_VOXEL_M: Final = 0.2
+_THICK_M: Final = 0.06
+_SEARCHED_ABOVE_M: Final = 1.0
+_LEAST_BRIGHT: Final = 8
+_ENOUGH_BRIGHT: Final = 60
+"""So many bright returns tell the outline by themselves."""
+
+
+class SignOptions(Strict):
+    """What counts as a sign."""
+
+    intensity_ratio: float = Field(default=2.0, gt=1.0)
+    """Least intensity of a retroreflecting return, as a multiple of the median of the ground about."""
+    least_height_m: float = Field(default=1.524, ge=0.0)
+    """Least height of the plate's middle above the ground (m): 5 feet."""
+    least_size_m: float = Field(default=0.4, gt=0.05)
+    """Least width and height of a plate (m); plates of 0.85 of it are still looked at."""
+    greatest_size_m: float = Field(default=1.6, gt=0.1)
+    """Greatest width and height of a sign (m)."""
+    greatest_board_m: float = Field(default=12.0, gt=0.1)
+    """Greatest width of a board, which is larger than a sign and has to be plane within 3 cm (m)."""
+    greatest_tilt_deg: float = Field(default=20.0, ge=0.0, le=90.0)
+    """Greatest angle of a plate from upright (degrees)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A plate, measured."""
+
+    rows: Int64
+    middle_m: tuple[float, float, float]
+    """x and y from the corner of the returns, height."""
+    outline: Outline
+    facing_deg: float
+    tilt_deg: float
+    clearance_m: float
+    residual_m: float
+    probability: float
+
+
+def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
+    """Plates in the scene and its halo, by their place."""
+    bright = _bright(scene, options.intensity_ratio)
+    rows = np.flatnonzero(bright & ~_in_large_planes(scene, options.greatest_board_m))
+    found = [_plate(scene, cluster, bright, options) for cluster in _clusters(scene, rows)]
+    return sorted((p for p in found if p is not None and not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
+
+
+def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
+    """Whether a plate is not wider than the trunk or mast that it would hang on: then it is its bark or paint."""
+    for shaft in shafts_of(scene):
+        x, y = shaft.axis.at(plate.middle_m[2])
+        away = math.hypot(float(x) - plate.middle_m[0], float(y) - plate.middle_m[1])
+        if away < shaft.axis.radius_m + 0.15 and plate.outline.width_m < 3.0 * shaft.axis.radius_m:
+            return True
+    return False
+
+
+def _bright(scene: Scene, ratio: float) -> npt.NDArray[np.bool_]:
+    """Returns (n,) more than a metre above the ground, as bright as `ratio` times the median of the ground."""
+    ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
+    if not ground.any():
+        return np.zeros(len(scene.returns), np.bool_)
+    least = ratio * float(np.median(scene.returns.intensity[ground]))
+    return usable(scene) & (scene.above_ground_m > _SEARCHED_ABOVE_M) & (scene.returns.intensity >= least)
+
+
+def _in_large_planes(scene: Scene, longest_m: float) -> npt.NDArray[np.bool_]:
+    """Returns (n,) on upright surfaces that are too long for a plate, or that reach the ground."""
+    out = np.zeros(len(scene.returns), np.bool_)
+    for region in regions_of(scene):
+        if region.length_m > longest_m or (region.length_m > 2.5 and region.low_above_m < 1.0):
+            out[region.rows] = True
+    return out
+
+
+def _clusters(scene: Scene, rows: Int64) -> list[Int64]:
+    """Rows in voxels of 0.2 m that touch, corners too, by their first row."""
+    if rows.size == 0:
+        return []
+    returns, window = scene.returns, scene.window
+    cells = np.column_stack(
+        [
+            np.floor((returns.x_m[rows] - window.x_min_m) / _VOXEL_M),
+            np.floor((returns.y_m[rows] - window.y_min_m) / _VOXEL_M),
+            np.floor(scene.above_ground_m[rows] / _VOXEL_M),
+        ]
+    ).astype(np.int64)
+    span = cells.max(axis=0) + 3
+    flat = (cells[:, 0] + 1) + span[0] * ((cells[:, 1] + 1) + span[1] * (cells[:, 2] + 1))
+    voxels, owner = np.unique(flat, return_inverse=True)
+    steps = [
+        i + span[0] * (j + span[1] * k)
+        for k in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        for i in (-1, 0, 1)
+        if (k, j, i) > (0, 0, 0)
+    ]
+    pairs = []
+    for step in steps:
+        at = np.searchsorted(voxels, voxels + step)
+        met = (at < voxels.size) & (voxels[np.minimum(at, voxels.size - 1)] == voxels + step)
+        pairs.append(np.column_stack([np.flatnonzero(met), at[met]]))
+    edges = np.concatenate(pairs)
+    graph = sparse.coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(voxels.size,) * 2)
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label[owner], kind="stable")
+    parts = np.split(rows[order], np.flatnonzero(np.diff(label[owner][order])) + 1)
+    return [np.sort(p) for p in parts if p.size >= _LEAST_BRIGHT]
+
+
+def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
+    """Middle, unit normal and root mean square residual of points (n, 3), those far off left out twice."""
+    kept = np.ones(len(xyh), np.bool_)
+    for _ in range(3):
+        middle = xyh[kept].mean(axis=0)
+        _, _, axes = np.linalg.svd(xyh[kept] - middle, full_matrices=False)
+        away = np.abs((xyh - middle) @ axes[2])
+        limit = max(3.0 * 1.4826 * float(np.median(away[kept])), 0.02)
+        kept = away <= limit
+        if kept.sum() < 5:
+            kept[:] = True
+    return middle, axes[2], float(np.sqrt(np.mean(away[kept] ** 2)))
+
+
+def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options: SignOptions) -> Plate | None:
+    """The plate of a cluster of bright returns; None where it is none."""
+    returns = scene.returns
+    xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
+    spread = np.ptp(xyh, axis=0)
+    if math.hypot(spread[0], spread[1]) > options.greatest_board_m or spread[2] > options.greatest_board_m:
+        return None
+    middle, normal, residual = _plane(xyh)
+    tilt = math.degrees(math.asin(min(abs(float(normal[2])), 1.0)))
+    if tilt > options.greatest_tilt_deg:
+        return None
+    seen = np.array([np.median(returns.sensor_x_m[cluster]), np.median(returns.sensor_y_m[cluster])])
+    normal = normal if float(normal[:2] @ (seen - middle[:2])) > 0.0 else -normal
+    near = places_of(scene).within(float(middle[0]), float(middle[1]), 0.5 * math.hypot(spread[0], spread[1]) + 0.7)
+    inside, about = _on_plane(scene, near, middle, normal, xyh)
+    rows = np.union1d(cluster, inside)
+    edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)
+    right, up = _axes(normal)
+    placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
+    outline = outline_of(np.column_stack([placed @ right, placed @ up]))
+    place = middle + outline.middle[0] * right + outline.middle[1] * up
+    ground = float(scene.ground.height_at(place[0], place[1]))
+    above = float(place[2]) - ground
+    if not _has_size(outline, options) or not above >= options.least_height_m:
+        return None
+    large = outline.width_m > options.greatest_size_m or outline.height_m > options.greatest_size_m
+    share = float(bright[rows].mean())
+    probability = logistic(
+        -1.5,
+        [(0.05, min(cluster.size, 80)), (3.0, share), (-60.0, max(residual - 0.025, 0.0)), (-6.0, about),
+         (-60.0 * large, max(residual - 0.02, 0.0)), (-25.0, min(max(outline.misfit_m - 0.04, 0.0), 0.5))],
+    )  # fmt: skip
+    facing = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
+    lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
+    clearance = above - outline.height_m / 2
+    return Plate(rows, tuple(map(float, place)), outline, facing, lean, clearance, residual, probability)  # type: ignore[arg-type]
+
+
+def _axes(normal: Float64) -> tuple[Float64, Float64]:
+    """Right, seen from the front, and up, in a plane of a unit normal."""
+    right = np.array([-normal[1], normal[0], 0.0])
+    right /= np.hypot(right[0], right[1])
+    return right, np.cross(normal, right)
+
+
+def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, cluster: Float64) -> tuple[Int64, float]:
+    """Returns on the plane within the box of the cluster, and the share of those just outside it."""
+    returns = scene.returns
+    past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - middle
+    right, up = _axes(normal)
+    u, v, away = past @ right, past @ up, np.abs(past @ normal)
+    cu, cv = (cluster - middle) @ right, (cluster - middle) @ up
+    box = [(float(np.quantile(c, 0.01)), float(np.quantile(c, 0.99))) for c in (cu, cv)]
+
+    def within(margin: float) -> npt.NDArray[np.bool_]:
+        (a, b), (c, d) = box
+        return (u > a - margin) & (u < b + margin) & (v > c - margin) & (v < d + margin) & (away < _THICK_M)
+
+    inside, outer = within(0.1), within(0.5)
+    n = int(inside.sum())
+    beside = int((outer & ~inside & (np.abs(u) > 0.15)).sum())
+    return near[inside], beside / max(n + beside, 1)
+
+
+def _wide(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> Int64:
+    """Rows at the heights where the plate is wide: its post is not."""
+    returns = scene.returns
+    past = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - middle
+    right, up = _axes(normal)
+    u, level = past @ right, np.floor((past @ up) / 0.1).astype(np.int64)
+    widths = {k: float(np.ptp(u[level == k])) for k in np.unique(level).tolist()}
+    least = 0.4 * max(widths.values())
+    kept: Int64 = rows[np.array([widths[k] >= least for k in level.tolist()])]
+    return kept
+
+
+def _has_size(outline: Outline, options: SignOptions) -> bool:
+    least = 0.85 * options.least_size_m
+    small, large = sorted((outline.width_m, outline.height_m))
+    return least <= small and large <= options.greatest_board_m

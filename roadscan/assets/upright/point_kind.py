@@ -1,0 +1,48 @@
+"""What kinds of shafts have in common: evidence and objects follow from the uprights of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import pyarrow as pa
+
+from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of
+from roadscan.assets.upright.standing import Upright, uprights_of
+
+_APART_M = 0.4
+_GROUND_SIGMA_M = 0.03
+
+
+class ShaftKind(AssetKind):
+    """A kind of shafts."""
+
+    code: ClassVar[int]
+    """Class of its returns."""
+
+    def evidence(self, scene: Scene, options: Any) -> Evidence:
+        """Shafts of this kind whose foot the tile holds."""
+        own = [u for u in uprights_of(scene) if u.kind == self.name]
+        pieces = pieces_of(scene, [_place(u) for u in own], self.piece_schema)
+        return Evidence(pieces, tuple(Marked(rows, code) for u in own for rows, code in self.marks(scene, u)))
+
+    def marks(self, scene: Scene, upright: Upright) -> Iterable[tuple[Any, int]]:
+        """Returns of a shaft and their class."""
+        yield upright.rows, self.code
+
+    def objects(
+        self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
+    ) -> Iterable[AssetObject]:
+        """An object a shaft."""
+        return objects_at_places(pieces, _APART_M)
+
+
+def _place(upright: Upright) -> Place:
+    shaft = upright.shaft
+    x, y = shaft.foot_xy_m
+    return Place(
+        x, y, shaft.ground_m, shaft.axis.sigma_m, _GROUND_SIGMA_M, upright.probability, upright.rows,
+        upright.attributes,
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""Upright surfaces in voxels: elements that continue one another's plane, joined where gaps part them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.memory import once_a_scene
+from roadscan.assets.upright.slices import usable
+from roadscan.kernels.assets.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+SIDE_M: Final = 0.25
+LAYER_M: Final = 0.5
+LOWEST_M: Final = 0.15
+LAYERS: Final = 40
+"""Up to 20 m above the ground."""
+_LIMITS: Final = np.array([6.0, 0.12, 0.06, 0.35])
+"""Of an element: returns, spread along and across its plane (m), ratio of both."""
+_TURN_DEG: Final = 20.0
+_APART_M: Final = 0.12
+"""Elements are neighbours on one plane where each lies this near to the other's."""
+_LEAST_LENGTH_M: Final = 0.7
+_JOIN_TURN_DEG: Final = 8.0
+_JOIN_APART_M: Final = 0.15
+_JOIN_GAP_M: Final = 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """An upright surface: returns of a scene that lie on it."""
+
+    rows: Int64
+    middle_xy_m: Float64
+    along: Float64
+    """(2,) unit vector of its direction seen from above."""
+    span_m: tuple[float, float]
+    """From its middle along it."""
+    across_m: float
+    """Median standard deviation of its elements across their planes."""
+    low_above_m: float
+    """Height above the ground that 2 % of its returns lie below, and …"""
+    top_above_m: float
+    """… above."""
+
+    @property
+    def length_m(self) -> float:
+        """From end to end."""
+        return self.span_m[1] - self.span_m[0]
+
+    def distance_m(self, x_m: float, y_m: float, beyond_m: float) -> float:
+        """How far a place lies beside its line, `beyond_m` past its ends at the most; infinite elsewhere."""
+        dx, dy = x_m - float(self.middle_xy_m[0]), y_m - float(self.middle_xy_m[1])
+        along = dx * float(self.along[0]) + dy * float(self.along[1])
+        if not self.span_m[0] - beyond_m <= along <= self.span_m[1] + beyond_m:
+            return math.inf
+        return abs(dy * float(self.along[0]) - dx * float(self.along[1]))
+
+
+@once_a_scene
+def regions_of(scene: Scene) -> list[Region]:
+    """Upright surfaces at least 0.7 m long, pieces on one plane joined over gaps of 1.6 m."""
+    window, returns = scene.window, scene.returns
+    columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
+    rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
+    index = np.full((LAYERS, rows, columns), -1, np.int32)
+    above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)
+    most = min(int(np.count_nonzero(np.isfinite(above))), int(index.size))
+    moments, voxel = np.empty((max(most, 1), 10)), np.empty(len(returns), np.int32)
+    corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
+    sizes = np.array([SIDE_M, LAYER_M])
+    found = gather_moments(returns.x_m, returns.y_m, above, corner, sizes, index, moments, voxel)
+    elements = np.zeros((max(found, 1), 6))
+    thin_elements(index, moments, SIDE_M, _LIMITS, elements)
+    region = np.zeros(max(found, 1), np.int32)
+    turn = math.cos(math.radians(_TURN_DEG))
+    count = grow_regions(
+        index, elements, turn, _APART_M, np.array([1, 1]), region, np.empty((max(found, 1), 3), np.int32)
+    )
+    members, starts = np.empty(region.size, np.int64), np.empty(count + 2, np.int64)
+    region_ranges(region, members, starts)
+    elements[:, 1:3] += corner[:2]
+    groups = [members[starts[k] : starts[k + 1]] for k in range(1, count + 1)]
+    groups = [g for g in groups if g.size >= 3]
+    held = np.flatnonzero(voxel >= 0)
+    order = held[np.argsort(voxel[held], kind="stable")]
+    first = np.searchsorted(voxel[order], np.arange(found + 1))
+    out = []
+    for group in _joined(elements, groups):
+        near = np.concatenate([order[first[j] : first[j + 1]] for j in group.tolist()])
+        one = _region(scene, elements[group], np.sort(near))
+        if one is not None:
+            out.append(one)
+    return out
+
+
+def _line(elements: Float64) -> tuple[Float64, Float64, float, float]:
+    """Middle (2,), direction (2,) and span of elements (n, 6) seen from above."""
+    middle = elements[:, 1:3].mean(axis=0)
+    past = elements[:, 1:3] - middle
+    if past.shape[0] < 3:
+        along = elements[0, 3:5]
+    else:
+        _, _, axes = np.linalg.svd(past, full_matrices=False)
+        along = axes[0]
+    if along[0] < 0.0 or (along[0] == 0.0 and along[1] < 0.0):
+        along = -along
+    t = past @ along
+    return middle, along, float(t.min()) - SIDE_M, float(t.max()) + SIDE_M
+
+
+def _joined(elements: Float64, groups: list[Int64]) -> list[Int64]:
+    """Groups of elements, those on one plane beside one another made one; in the order of their first element."""
+    lines = [_line(elements[g]) for g in groups]
+    parent = list(range(len(groups)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    ends = np.array([[*(m + a * s), *(m + a * t)] for m, a, s, t in lines]).reshape(-1, 4)
+    for i in range(len(groups)):
+        near = _boxes_near(ends, i)
+        for j in near[near > i].tolist():
+            if _on_one_line(lines[i], lines[j]):
+                parent[max(root(i), root(j))] = min(root(i), root(j))
+    out: dict[int, list[Int64]] = {}
+    for i, group in enumerate(groups):
+        out.setdefault(root(i), []).append(group)
+    return [np.sort(np.concatenate(parts)) for parts in out.values()]
+
+
+def _boxes_near(ends: Float64, i: int) -> Int64:
+    """Lines whose boxes come within the joining gap of line `i`'s."""
+    x0, x1 = np.minimum(ends[:, 0], ends[:, 2]), np.maximum(ends[:, 0], ends[:, 2])
+    y0, y1 = np.minimum(ends[:, 1], ends[:, 3]), np.maximum(ends[:, 1], ends[:, 3])
+    gap = _JOIN_GAP_M
+    return np.flatnonzero((x0 <= x1[i] + gap) & (x1 >= x0[i] - gap) & (y0 <= y1[i] + gap) & (y1 >= y0[i] - gap))
+
+
+def _on_one_line(first: tuple[Float64, Float64, float, float], second: tuple[Float64, Float64, float, float]) -> bool:
+    """Whether two lines continue each other: nearly parallel, the nearer parts within 0.15 m, a short gap or none."""
+    (m1, a1, s1, t1), (m2, a2, s2, t2) = first, second
+    if abs(float(a1 @ a2)) < math.cos(math.radians(_JOIN_TURN_DEG)):
+        return False
+    if t2 - s2 > t1 - s1:
+        (m1, a1, s1, t1), (m2, a2, s2, t2) = second, first
+    ends = np.array([m2 + a2 * s2, m2 + a2 * t2]) - m1
+    along, across = ends @ a1, np.abs(a1[0] * ends[:, 1] - a1[1] * ends[:, 0])
+    gap = max(float(along.min()) - t1, s1 - float(along.max()))
+    nearer = float(across[np.argmin(np.abs(along - 0.5 * (s1 + t1)))])
+    return gap <= _JOIN_GAP_M and nearer <= _JOIN_APART_M
+
+
+def _region(scene: Scene, elements: Float64, rows: Int64) -> Region | None:
+    middle, along, low, high = _line(elements)
+    if high - low < _LEAST_LENGTH_M + 2 * SIDE_M:
+        return None
+    bottom, top = np.quantile(scene.above_ground_m[rows].astype(np.float64), [0.02, 0.98])
+    across = float(np.median(elements[:, 5]))
+    return Region(rows, middle, along, (low, high), across, float(bottom), float(top))

@@ -1,0 +1,99 @@
+"""Compact components of horizontal slices: what a shaft shows in each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets import classes
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.memory import once_a_scene
+from roadscan.kernels.assets.slices import fill_slices, label_slices
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+CELL_M: Final = 0.1
+SLICE_M: Final = 0.2
+LOWEST_M: Final = 0.2
+"""Slices begin here above the ground: below it stand kerbs, grass and the ground's own noise."""
+SLICES: Final = 60
+"""Up to 12.2 m above the ground."""
+WIDEST_M: Final = 0.9
+"""A component this wide or less can be the slice of a shaft."""
+SET_APART: Final = (
+    classes.GROUND, classes.ROAD, classes.SIDEWALK, classes.MARKING, classes.KERB, classes.LOW_NOISE,
+    classes.HIGH_NOISE, classes.VEHICLE, classes.PERSON,
+)  # fmt: skip
+"""Classes that nothing upright is made of."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """Returns of a scene in horizontal slices of 0.2 m, parallel to the ground, on cells of 0.1 m."""
+
+    corner_m: tuple[float, float]
+    """Plan coordinates of cell (0, 0)."""
+    counts: npt.NDArray[np.uint16]
+    """(slices, rows, columns) returns."""
+    level: Int64
+    """(k,) slice of each compact component."""
+    x_m: Float64
+    """(k,) mean of its returns; y likewise."""
+    y_m: Float64
+    owner: npt.NDArray[np.int32]
+    """(n,) compact component of each return of the scene; −1: none."""
+
+    def members(self) -> tuple[Int64, Int64]:
+        """Returns sorted by their component, and where each component begins (k + 1,)."""
+        order = np.argsort(self.owner, kind="stable")
+        starts = np.searchsorted(self.owner[order], np.arange(self.level.size + 1))
+        return order, starts
+
+
+def usable(scene: Scene) -> npt.NDArray[np.bool_]:
+    """Returns (n,) that may belong to something upright: those of ground, vehicles, people and noise are set apart."""
+    lookup = np.ones(256, np.bool_)
+    lookup[list(SET_APART)] = False
+    return lookup[scene.classes] & np.isfinite(scene.above_ground_m)
+
+
+@once_a_scene
+def slices_of(scene: Scene) -> Slices:
+    """Slices of a scene, and their compact components: cells that touch, at most 0.9 m wide."""
+    returns, window = scene.returns, scene.window
+    columns = int(np.ceil((window.x_max_m - window.x_min_m) / CELL_M - 1e-9))
+    rows = int(np.ceil((window.y_max_m - window.y_min_m) / CELL_M - 1e-9))
+    above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)
+    counts = np.zeros((SLICES, rows, columns), np.uint16)
+    cell = np.empty(len(returns), np.int64)
+    corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
+    fill_slices(returns.x_m, returns.y_m, above, corner, CELL_M, SLICE_M, counts, cell)
+    most = int(np.count_nonzero(counts))
+    labels, boxes = np.zeros(counts.shape, np.int32), np.empty((most, 5), np.int32)
+    found = label_slices(counts, labels, boxes, np.empty(max(most, 1), np.int64))
+    boxes = boxes[:found]
+    widest = round(WIDEST_M / CELL_M)
+    compact = (boxes[:, 2] - boxes[:, 1] < widest) & (boxes[:, 4] - boxes[:, 3] < widest)
+    number = np.full(found + 1, -1, np.int32)
+    number[1:][compact] = np.arange(int(compact.sum()), dtype=np.int32)
+    owner = np.full(len(returns), -1, np.int32)
+    inside = cell >= 0
+    owner[inside] = number[labels.ravel()[cell[inside]]]
+    held = owner >= 0
+    n = np.bincount(owner[held], minlength=int(compact.sum()))
+    x = np.bincount(owner[held], returns.x_m[held], minlength=n.size) / n
+    y = np.bincount(owner[held], returns.y_m[held], minlength=n.size) / n
+    return Slices((window.x_min_m, window.y_min_m), counts, boxes[compact, 0].astype(np.int64), x, y, owner)
+
+
+def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArray[Any]:
+    """Counts (slices, r, c) of the cells within `reach_m` of a place, a square of them."""
+    column, row = int((x_m - slices.corner_m[0]) / CELL_M), int((y_m - slices.corner_m[1]) / CELL_M)
+    reach = round(reach_m / CELL_M)
+    return slices.counts[
+        :, max(row - reach, 0) : max(row + reach + 1, 0), max(column - reach, 0) : max(column + reach + 1, 0)
+    ]

@@ -1,0 +1,142 @@
+"""Shafts told apart: poles, lamp posts, signals, trees, delineators, and what is none of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, signal_head
+from roadscan.assets.upright.memory import once_a_scene
+from roadscan.assets.upright.probability import logistic
+from roadscan.assets.upright.regions import Region, regions_of
+from roadscan.assets.upright.shafts import Shaft, shafts_of
+
+Int64 = npt.NDArray[np.int64]
+Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
+
+LEAST: Final = 0.5
+"""What is less probable is left out."""
+_LOW_M: Final = 1.35
+"""Posts up to this height are delineators and bollards."""
+_BOLLARD_M: Final = 0.08
+_SIGNAL_M: Final = 8.0
+_LAMP_M: Final = 3.5
+"""Least height of a lamp post."""
+_IN_PLANE_M: Final = 0.35
+_APART_M: Final = 0.45
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """A shaft with what it is and carries."""
+
+    kind: Standing
+    shaft: Shaft
+    probability: float
+    rows: Int64
+    """Returns of the shaft and of what it carries."""
+    attributes: Mapping[str, float | str | None]
+
+
+@once_a_scene
+def uprights_of(scene: Scene) -> list[Upright]:
+    """Everything thin that stands upright in a scene with its halo, what is probable at 0.5 or more."""
+    planes = [r for r in regions_of(scene) if r.length_m > 2.5 and r.top_above_m > 1.6]
+    judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts_of(scene)]
+    probable = _apart([(s, p) for s, p in judged if p >= LEAST])
+    near = [about(scene, shaft) for shaft, _ in probable]
+    crowns = [tree_probability(shaft, crown_share(a, shaft)) for (shaft, _), a in zip(probable, near, strict=True)]
+    trunks = np.array([[s.axis.x_m, s.axis.y_m] for (s, _), c in zip(probable, crowns, strict=True) if c >= 0.5])
+    return [
+        _told(shaft, probability, a, c, trunks.reshape(-1, 2))
+        for (shaft, probability), a, c in zip(probable, near, crowns, strict=True)
+    ]
+
+
+def in_plane(shaft: Shaft, planes: list[Region]) -> bool:
+    """Whether the shaft lies in an upright surface and is as good as a piece of it."""
+    return any(r.distance_m(shaft.axis.x_m, shaft.axis.y_m, 0.5) < _IN_PLANE_M for r in planes)
+
+
+def probability_of(shaft: Shaft, inside_plane: bool) -> float:
+    """Probability that a shaft stands by itself: a logistic function of its measures.
+
+    Measures: slices that show it, the share of them from its foot up, the share of the returns about it that are its
+    own, the share of slices free around, the height of its hidden foot, its lean, its roughness, its returns where they
+    are few.
+    """
+    lean = shaft.axis.lean_deg
+    if shaft.top_above_m <= _LOW_M:
+        low = [
+            (1.0, min(shaft.slices, 4)), (6.0, shaft.alone), (2.5, shaft.free), (-3.0, shaft.covered),
+            (-25.0, max(shaft.axis.radius_m - 0.13, 0.0)), (-3.0, max(shaft.low_above_m - 0.3, 0.0)), (-0.3, lean),
+            (-0.1, max(25 - shaft.rows.size, 0)), (-6.0, float(inside_plane)),
+        ]  # fmt: skip
+        return logistic(-9.0, low)
+    rough = shaft.axis.residual_m / (0.05 + 0.2 * shaft.axis.radius_m)
+    high = [
+        (0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free),
+        (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)), (-0.35, max(lean - 5.0, 0.0)),
+        (-5.0, float(inside_plane)), (-0.1, max(40 - shaft.rows.size, 0)),
+    ]  # fmt: skip
+    return logistic(-12.5, high)
+
+
+def tree_probability(shaft: Shaft, filled_directions: float) -> float:
+    """Probability that a shaft is a trunk: returns in all directions about its upper part, and its thickness."""
+    return logistic(-5.0, [(11.0, filled_directions), (10.0, min(shaft.axis.radius_m, 0.25) - 0.08)])
+
+
+def _apart(judged: list[tuple[Shaft, float]]) -> list[tuple[Shaft, float]]:
+    """The shafts without those that stand where a more probable one does."""
+    kept: list[tuple[Shaft, float]] = []
+    order = sorted(judged, key=lambda one: (-one[1] * one[0].slices, one[0].foot_xy_m))
+    for shaft, probability in order:
+        x, y = shaft.axis.at(shaft.axis.height_m)
+        reach = _APART_M
+        if all(
+            np.hypot(*np.subtract(other.axis.at(shaft.axis.height_m), (x, y))) > reach + other.axis.radius_m
+            for other, _ in kept
+        ):
+            kept.append((shaft, probability))
+    return kept
+
+
+def _told(shaft: Shaft, probability: float, near: About, tree: float, trunks: npt.NDArray[np.float64]) -> Upright:
+    """What a shaft is, with the values of its kind."""
+    diameter, lean = round(2.0 * shaft.axis.radius_m, 4), round(shaft.axis.lean_deg, 3)
+    values: dict[str, float | str | None] = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter}
+    if tree >= 0.5:
+        return _tree(shaft, probability * tree, near, trunks)
+    if shaft.top_above_m <= _LOW_M:
+        values["type"] = "bollard" if diameter > _BOLLARD_M else "post"
+        return Upright("delineator", shaft, probability, shaft.rows, values)
+    values["lean_deg"] = lean
+    out = arms(near, shaft)
+    if signal_head(near, shaft) is not None and shaft.top_above_m < _SIGNAL_M:
+        values["arm_m"] = out.reach_m if out else None
+        return Upright("signal", shaft, probability, shaft.rows, values)
+    if out is not None and shaft.top_above_m >= _LAMP_M:
+        values |= {
+            "asset_height_m": max(shaft.top_above_m, out.top_above_m), "arm_m": out.reach_m,
+            "type": "double_arm" if out.other_m else "arm", "lamp_height_m": out.lamp_above_m,
+        }  # fmt: skip
+        return Upright("lighting", shaft, probability, shaft.rows, values)
+    return Upright("pole", shaft, probability, shaft.rows, values)
+
+
+def _tree(shaft: Shaft, probability: float, near: About, trunks: npt.NDArray[np.float64]) -> Upright:
+    """A tree with its crown; returns nearer to another trunk belong to that."""
+    here = np.array([shaft.axis.x_m, shaft.axis.y_m])
+    others = trunks[np.hypot(*(trunks - here).T) > 0.2] - here
+    top, wide, rows = crown(near, shaft, others)
+    values: dict[str, float | str | None] = {
+        "asset_height_m": top, "trunk_diameter_m": round(2.0 * shaft.axis.radius_m, 4),
+        "crown_diameter_m": wide if np.isfinite(wide) else None, "lean_deg": round(shaft.axis.lean_deg, 3),
+    }  # fmt: skip
+    return Upright("tree", shaft, probability, np.union1d(shaft.rows, rows), values)

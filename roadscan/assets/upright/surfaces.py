@@ -1,0 +1,103 @@
+"""Upright surfaces told apart: façades, walls, barriers, guardrails and fences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, chains_of, pieces_of_panels
+from roadscan.assets.upright.panels import panels_of
+from roadscan.assets.upright.probability import logistic
+
+Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
+
+_SIMPLE_M: Final = 0.03
+_FENCE_PASSES: Final = 0.12
+"""A surface that lets this share of the sight lines through is a fence."""
+_LEAST_FENCE_M: Final = 2.5
+_MOST_VEGETATION: Final = 0.5
+
+
+def told(chain: Chain) -> Surface | None:
+    """What an upright surface is; None where it is none of these.
+
+    A façade is solid and rises to 3 m or above what scanners saw; a wall ends lower, a barrier at 1.25 m at the most; a
+    guardrail has free space below its rail; a fence lets sight lines through. What begins 2 m above the ground or
+    higher (crowns, boards, roofs), and hedges, are none.
+    """
+    top, low, bulk = chain.median("high_m"), chain.median("low_m"), chain.median("bulk_m")
+    if not np.isfinite(top) or chain.vegetation > _MOST_VEGETATION or low > 2.0 or chain.length_m < 1.5:
+        return None
+    if top > 3.0 or (top > 1.4 and chain.open_top > 0.4):
+        return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
+    if low > 0.6:
+        return None
+    if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5:
+        return "guardrail" if chain.length_m >= 4.0 else None
+    if chain.passing >= _FENCE_PASSES:
+        return "fence" if top >= 0.6 and chain.length_m >= _LEAST_FENCE_M else None
+    if top > 1.25:
+        return "wall" if chain.length_m >= _LEAST_FENCE_M else None
+    return "barrier" if top >= 0.5 and chain.length_m >= 3.0 else None
+
+
+def probability_of(chain: Chain) -> float:
+    """Probability of a surface: a logistic function of its length, its covered share, its returns and its thickness."""
+    return logistic(
+        -1.5,
+        [(0.5, min(chain.length_m, 10.0)), (2.0, chain.covered), (0.02, min(chain.seen, 100)),
+         (-50.0, max(chain.across_m - 0.04, 0.0))],
+    )  # fmt: skip
+
+
+class SurfaceKind(AssetKind):
+    """A kind of upright surfaces: its evidence are the pieces of all of them, told apart once they are joined."""
+
+    code: ClassVar[int]
+    piece_schema = PIECE_SCHEMA
+
+    def evidence(self, scene: Scene, options: Any) -> Evidence:
+        """Pieces of all upright surfaces in the tile; marked are the returns of those that look like this kind."""
+        panels = panels_of(scene)
+        whole = Scene(
+            scene.returns, scene.window, scene.window, scene.ground, scene.above_ground_m, scene.classes,
+            scene.drive_xyh_m,
+        )  # fmt: skip
+        marked = []
+        for panel in panels:
+            chains = chains_of(pieces_of_panels(whole, [panel]))
+            if any(told(c) == self.name for c in chains):
+                marked.append(Marked(self.marks(scene, panel.rows), self.code))
+        return Evidence(pieces_of_panels(scene, panels), tuple(marked))
+
+    def marks(self, scene: Scene, rows: Any) -> Any:
+        """Returns that belong to a surface of these rows."""
+        return rows
+
+    def objects(
+        self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
+    ) -> Iterable[AssetObject]:
+        """An object a chain of this kind."""
+        return [self.made(chain) for chain in chains_of(pieces) if told(chain) == self.name]
+
+    def made(self, chain: Chain) -> AssetObject:
+        """The object of a chain: its line along the ground."""
+        ground = chain.values["ground_m"]
+        height = np.concatenate([ground[:1], (ground[:-1] + ground[1:]) / 2, ground[-1:]])
+        line = shapely.LineString(np.column_stack([chain.xy_m, height])).simplify(_SIMPLE_M)
+        values = {"asset_height_m": chain.median("high_m"), "length_m": chain.length_m}
+        return as_object(chain, line, values)
+
+
+def as_object(chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any]) -> AssetObject:
+    """An object of a chain."""
+    sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
+    return AssetObject(
+        geometry, float(sigma), 0.03, probability_of(chain), chain.seen, chain.passes, *chain.epochs_gps_ns, values
+    )

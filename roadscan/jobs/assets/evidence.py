@@ -1,0 +1,255 @@
+"""Evidence: returns of a square and its halo → its scene → pieces of each kind, classified points, bare earth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.assets.intensity import calibrated_scene
+from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Scene
+from roadscan.code_reach import code_digest
+from roadscan.jobs.assets.load_returns import LoadedSquare, ReturnsTask, load_squares
+from roadscan.jobs.assets.plan import AssetPlan
+from roadscan.jobs.engine.compute import reason_of
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.tiles.tile_files import publish_file
+from roadscan.jobs.tiles.tiles import TaskResult
+from roadscan.model.asset_ground import GroundSettings
+from roadscan.model.errors import SchemaError
+from roadscan.model.ids import TileId
+from roadscan.model.strict import Strict
+from roadscan.products.assets.bare_earth import within, write_bare_earth
+from roadscan.products.assets.classified_points import classified_points, write_classified
+from roadscan.products.base import ProductContext
+from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.tables.store import Store
+from roadscan.tiles.blocks import Block
+
+EVIDENCE: Final = "asset_evidence"
+"""Manifest name of the pieces of a kind in a square."""
+CLASSIFIED: Final = "classified_points"
+BARE_EARTH: Final = "bare_earth"
+OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH)
+
+
+def evidence_unit(kind: str, square: TileId) -> str:
+    """Name of a kind's evidence of a square in the manifest."""
+    return f"{kind}/{square}"
+
+
+@dataclass(frozen=True)
+class SquareWork:
+    """What is due of a square; empty keys stand for what is not."""
+
+    square: TileId
+    kinds: tuple[tuple[str, str], ...]
+    """Names of the kinds whose evidence is due, with its key."""
+    classified_key: str = ""
+    bare_earth_key: str = ""
+
+
+@dataclass(frozen=True)
+class EvidenceTask:
+    """Some neighbouring squares to be searched. Sent to workers: it holds no data."""
+
+    load: ReturnsTask
+    work: tuple[SquareWork, ...]
+    kinds: tuple[tuple[str, Strict], ...]
+    """All kinds of the survey with their settings: the classes of points come from all of them."""
+    ground: GroundSettings
+    gains: OutputRecord | None
+    """Table that intensities are calibrated by; None where they are taken as recorded."""
+    context: ProductContext
+
+    @property
+    def block(self) -> Block:
+        """The squares."""
+        return Block(self.load.squares)
+
+    @property
+    def store(self) -> Store:
+        """Where the survey lies."""
+        return self.load.readings.store
+
+
+def due_squares(
+    plan: AssetPlan, manifest: Manifest, gains: OutputRecord | None, forced: Sequence[TileId] = ()
+) -> list[SquareWork]:
+    """What is missing or stale of each square, and all of those that are forced."""
+    calibrated = "" if gains is None else gains.digest
+    kind_keys = {one.name: key_of(one.evidence_key(), calibrated) for one in plan.kinds}
+    code = code_digest("roadscan.jobs.assets.evidence:find_evidence")
+    anew = set(forced)
+    found: list[SquareWork] = []
+    for square, key in plan.keys.items():
+        unit = str(square)
+        keys = {name: key_of(own, key) for name, own in kind_keys.items()}
+        classified = key_of(code, key, sorted(keys.items()), plan.context.survey_id) if plan.config.classified else ""
+        bare = key_of(code, key, plan.context.survey_id) if plan.config.bare_earth else ""
+        if square not in anew:
+            keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
+            classified = "" if manifest.is_current(CLASSIFIED, unit, classified) else classified
+            bare = "" if manifest.is_current(BARE_EARTH, unit, bare) else bare
+        if keys or classified or bare:
+            found.append(SquareWork(square, tuple(keys.items()), classified, bare))
+    return found
+
+
+def evidence_tasks(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, workers: int = 1
+) -> list[EvidenceTask]:
+    """Tasks over the squares of which anything is due."""
+    return [_task(plan, due, gains, squares) for squares in plan.blocks([one.square for one in due], workers)]
+
+
+def singly(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: Sequence[TileId]
+) -> list[EvidenceTask]:
+    """A task for each square."""
+    return [_task(plan, due, gains, (square,)) for square in squares]
+
+
+def _task(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: tuple[TileId, ...]
+) -> EvidenceTask:
+    chosen = set(squares)
+    return EvidenceTask(
+        plan.load(squares), tuple(one for one in due if one.square in chosen),
+        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, gains, plan.context,
+    )  # fmt: skip
+
+
+def find_evidence(task: EvidenceTask) -> TaskResult:
+    """Search the squares of a task and write what is due of them (runs on a worker)."""
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    due = {one.square: one for one in task.work}
+    store, gains = task.store, None
+    if task.gains is not None:
+        gains = store.parse_table(read_recorded(store, task.gains), task.gains.path)
+    with store.scratch() as folder:
+        for loaded in load_squares(task.load):
+            work = due[loaded.square]
+            try:
+                search = _Search(task, work, loaded, folder, gains)
+                records += search.records()
+                failures += search.failures
+            except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
+                failures.append((str(work.square), reason_of(error)))
+    return TaskResult.of(records, failures)
+
+
+class _Search:
+    """A square on its way from returns to files."""
+
+    def __init__(
+        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path, gains: pa.Table | None
+    ) -> None:
+        self._task, self._work, self._loaded, self._folder, self._gains = task, work, loaded, folder, gains
+        self.failures: list[tuple[str, str]] = []
+
+    def records(self) -> Iterator[OutputRecord]:
+        """Write what is due, kind by kind."""
+        if not len(self._loaded.returns):
+            yield from self._nothing()
+            return
+        grid = self._task.load.grid
+        scene = make_scene(
+            self._loaded.returns, grid.own_box, grid.window_box, self._loaded.drive_xyh_m, self._task.ground
+        )
+        seen = scene if self._gains is None else calibrated_scene(scene, self._gains)
+        keys = dict(self._work.kinds)
+        marked: list[Marked] = []
+        for name, options in self._task.kinds:
+            if name not in keys and not self._work.classified_key:
+                continue
+            try:
+                kind = asset_kinds()[name]
+                found = kind.evidence(seen, options)
+                if name in keys:
+                    yield self._write_pieces(kind, found, keys[name])
+                marked += found.marked
+            except Exception as error:  # noqa: BLE001  one kind's fault must not stop the others
+                self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
+        if self._work.bare_earth_key:
+            yield self._write_bare_earth(scene)
+        if self._work.classified_key and not self.failures:
+            yield self._write_classified(scene, marked)
+
+    def _nothing(self) -> Iterator[OutputRecord]:
+        """Records of a square without returns: finished, and no file."""
+        square, w = self._work.square, self._work
+        for name, key in w.kinds:
+            yield OutputRecord(EVIDENCE, evidence_unit(name, square), key, "", 0, "", _told(0))
+        for product, key in ((BARE_EARTH, w.bare_earth_key), (CLASSIFIED, w.classified_key)):
+            if key:
+                yield OutputRecord(product, str(square), key, "", 0, "", _told(0))
+
+    def _write_pieces(self, kind: AssetKind, found: Evidence, key: str) -> OutputRecord:
+        unit = evidence_unit(kind.name, self._work.square)
+        pieces = conformed(found.pieces, kind)
+        if not pieces.num_rows:
+            return OutputRecord(EVIDENCE, unit, key, "", 0, "", _told(0))
+        path = self._folder / "pieces.parquet"
+        pq.write_table(pieces, path, compression="zstd", write_page_checksum=True, version="2.6")
+        target = f"tables/{EVIDENCE}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, EVIDENCE, unit, key, _told(pieces.num_rows))
+
+    def _write_bare_earth(self, scene: Scene) -> OutputRecord:
+        grid, square, key = self._task.load.grid, self._work.square, self._work.bare_earth_key
+        model = within(scene.ground, grid.own_box)
+        known = 0 if model is None else int(np.count_nonzero(~np.isnan(model.height_m)))
+        if model is None or not known:
+            return OutputRecord(BARE_EARTH, str(square), key, "", 0, "", _told(0))
+        path = self._folder / "bare_earth.tif"
+        write_bare_earth(path, model, grid.corner_m(square), self._task.context)
+        detail = json.dumps({"cells": known, "seen": int(np.count_nonzero(model.seen))})
+        target = f"products/{BARE_EARTH}/{square}.tif"
+        return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
+
+    def _write_classified(self, scene: Scene, marked: Sequence[Marked]) -> OutputRecord:
+        square, key = self._work.square, self._work.classified_key
+        own = np.flatnonzero(scene.tile.holds(scene.returns.x_m, scene.returns.y_m))
+        if not own.size:
+            return OutputRecord(CLASSIFIED, str(square), key, "", 0, "", _told(0))
+        classes = marked_classes(scene, marked)
+        points = classified_points(scene.returns.at(own), classes[own], square)
+        path = self._folder / "points.laz"
+        write_classified(path, points, self._task.load.grid.squares, self._task.context)
+        target = f"products/{CLASSIFIED}/{square}.laz"
+        return publish_file(self._task.store, path, target, CLASSIFIED, str(square), key, _told(len(points)))
+
+
+def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uint8]:
+    """Classes (n,) of the scene's returns, with those that kinds give to the returns of their pieces.
+
+    A return that two kinds mark has the class of the last one.
+    """
+    classes = scene.classes.copy()
+    for one in marked:
+        classes[one.rows] = one.code
+    return classes
+
+
+def conformed(pieces: pa.Table, kind: AssetKind) -> pa.Table:
+    """Pieces as the kind's schema says; SchemaError where they are not."""
+    if pieces.schema.names != kind.piece_schema.names:
+        raise SchemaError(
+            f"pieces of '{kind.name}' have the columns {', '.join(pieces.schema.names)}",
+            expected=", ".join(kind.piece_schema.names),
+        )
+    return pieces.cast(kind.piece_schema)
+
+
+def _told(count: int, **more: Any) -> str:
+    return json.dumps({"count": count, **more})

@@ -1,0 +1,162 @@
+"""What assets are sought in: squares that a sensor with a wide view saw, their keys, and tasks over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from roadscan.assets.tiling import AssetGrid
+from roadscan.jobs.assets.kinds import WantedKind, wanted_kinds
+from roadscan.jobs.assets.load_returns import ReturnsTask
+from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
+from roadscan.jobs.products import product_context
+from roadscan.jobs.readings import ReadingSource, TrajectorySource, geometry_of
+from roadscan.jobs.tiles.footprints import FootprintRanges
+from roadscan.jobs.tiles.tile_plan import TilePlan, plan_tiles
+from roadscan.model.assets import AssetsConfig
+from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.products.base import ProductContext
+from roadscan.tables.store import bytes_digest
+from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.grid import TileGrid
+
+_BLOCK_EDGE_M: Final = 160.0
+"""Edge of the squares that one task searches together, about: a lidar sees as far to both sides."""
+
+
+@dataclass(frozen=True)
+class AssetPlan:
+    """Squares of a survey, and what is sought in them."""
+
+    survey: SurveyPlan
+    config: AssetsConfig
+    grid: AssetGrid
+    tiles: TilePlan
+    """The survey's tiles that the chosen sensors may have seen."""
+    sensors: tuple[str, ...]
+    ways: tuple[tuple[str, TrajectorySource], ...]
+    kinds: tuple[WantedKind, ...]
+    keys: Mapping[TileId, str]
+    """Key of what was seen in each square, by row and column."""
+    readings: Mapping[TileId, int]
+    """About how many returns each square and its halo hold."""
+
+    @property
+    def context(self) -> ProductContext:
+        """What files need to know of the survey."""
+        return self.tiles.context
+
+    def blocks(self, squares: Sequence[TileId], workers: int = 1) -> list[tuple[TileId, ...]]:
+        """Neighbouring squares that fit into memory together; fewer where there are few for that many workers."""
+        edge = max(1, round(_BLOCK_EDGE_M / self.grid.edge_m))
+        while edge > 1 and len(squares) < edge * edge * workers:
+            edge //= 2
+        readings = {square: self.readings[square] for square in squares}
+        return [b.tiles for b in cut_blocks(readings, edge, self.config.max_block_returns)]
+
+    def load(self, squares: tuple[TileId, ...]) -> ReturnsTask:
+        """What loads the returns of some squares."""
+        known = self.tiles.tiles.number
+        under = dict.fromkeys(t for square in squares for t in self.grid.tiles_under(square) if t in known)
+        own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
+        return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, self.ways)
+
+    def near(self, chosen: Sequence[TileId]) -> set[TileId]:
+        """Squares that see one of some of the survey's tiles, in themselves or in their halo."""
+        near = set(chosen)
+        return {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
+
+
+def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
+    """The squares that the sensors which are looked at may have seen.
+
+    Raises
+    ------
+    ConfigError
+        where the survey's settings of assets do not fit it.
+    """
+    config = plan.survey.config.assets
+    if config is None:
+        raise ConfigError("the survey file has no section [assets]")
+    grid = asset_grid(plan.survey, config)
+    chosen = sorted({source.sensor for source, _ in plan.sources if is_looked_at(source, config)})
+    ways = _ways(plan, config)
+    common = key_of(
+        grid, chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
+        plan.centre_lines.key(), [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
+    )  # fmt: skip
+    own = _looked_at(footprints, config)
+    tiles = plan_tiles(own, replace(plan, tile_key=common))
+    held = TilePlan(plan, own, tiles, (), product_context(plan))
+    keys: dict[TileId, str] = {}
+    readings: dict[TileId, int] = {}
+    squares = {grid.of_tile(tile) for tile in tiles.ids}
+    for square in sorted(squares, key=lambda t: (t.row, t.column)):
+        numbers = [tiles.number[t] for t in grid.tiles_under(square) if t in tiles.number]
+        keys[square] = key_of(common, [(str(tiles.ids[n]), tiles.keys[n]) for n in numbers])
+        readings[square] = int(tiles.readings[numbers].sum())
+    return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), keys, readings)
+
+
+def asset_grid(survey: Survey, config: AssetsConfig) -> AssetGrid:
+    """Squares of a survey."""
+    tiles = survey.config.tiles
+    edge_m = config.edge_m(tiles.size_m)
+    return AssetGrid(TileGrid(tiles.size_m, tiles.cell_m), round(edge_m / tiles.size_m), config.halo_m)
+
+
+def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:
+    """Whether assets are sought in a source's readings."""
+    if config.sensors is not None:
+        return source.sensor in config.sensors
+    geometry = geometry_of(source)
+    return geometry is None or geometry.kind == "polar"
+
+
+def check_assets(survey: Survey) -> None:
+    """Raise :class:`ConfigError` where the section [assets] names what there is not; reads nothing."""
+    config = survey.config.assets
+    if config is None:
+        return
+    wanted_kinds(config)
+    named = {log.sensor for run in survey.config.runs for log in run.logs if log.sensor is not None}
+    known = sorted({*survey.rig.sensors, *named, "cloud"})
+    for name in config.sensors or ():
+        if name not in known:
+            raise ConfigError(
+                f"assets.sensors names the unknown sensor '{name}'{nearest(name, known)}",
+                expected="a sensor of the rig: " + ", ".join(known),
+            )
+
+
+def _looked_at(footprints: FootprintRanges, config: AssetsConfig) -> FootprintRanges:
+    """Footprints of the sources that are looked at; nothing of their profiles is left out for not being road."""
+    held = np.array([is_looked_at(one.source, config) for one in footprints.slices], bool)
+    rows = held[footprints.slice_index] if held.size else np.zeros(0, bool)
+    slices = tuple(replace(one, source=replace(one.source, road=None)) for one in footprints.slices)
+    return FootprintRanges(
+        footprints.tile_column[rows], footprints.tile_row[rows], footprints.slice_index[rows],
+        footprints.first_group[rows], footprints.last_group[rows], footprints.readings[rows],
+        footprints.first_epoch_gps_ns[rows], footprints.last_epoch_gps_ns[rows], slices,
+    )  # fmt: skip
+
+
+def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, TrajectorySource], ...]:
+    """Trajectories of the runs of clouds, as far as they have one: they tell where the sensor stood."""
+    runs = sorted({s.run for s, _ in plan.sources if s.table == "cloud" and is_looked_at(s, config)})
+    held = {r.run for r in plan.records if r.tables.get("trajectory")}
+    return tuple((run, trajectory_source(run, plan.records)) for run in runs if run in held)
+
+
+def _corrections(plan: SurveyPlan, run: str) -> str:
+    own = plan.corrections.by_run.get(run)
+    if own is None:
+        return ""
+    arrays = (own.epochs_gps_ns, own.north_east_down_m, own.roll_pitch_heading_rad)
+    return bytes_digest(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))

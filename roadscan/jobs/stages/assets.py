@@ -1,0 +1,137 @@
+"""Stage `assets`: returns into evidence, evidence into objects, objects into tables and files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
+from roadscan.jobs.assets.gains import current_gains, find_samples, sample_tasks, write_gains
+from roadscan.jobs.assets.objects import OBJECTS, Cluster, join_objects, plan_joins
+from roadscan.jobs.assets.plan import AssetPlan, check_assets
+from roadscan.jobs.assets.sections import SECTIONS, plan_sections, write_sections
+from roadscan.jobs.assets.tables import TABLES, plan_files, plan_tables, write_file, write_table
+from roadscan.jobs.assets.work import AssetsWork, due_joins, plan_evidence
+from roadscan.jobs.condition.lines import roads_key, survey_roads
+from roadscan.jobs.condition.tasks import run_units
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.tiles.tiles import run_tasks
+from roadscan.model.errors import RoadscanError
+from roadscan.model.survey import Survey
+from roadscan.tables.asset_schema import ASSET_FOLDER
+
+
+class Assets(Stage):
+    """What stands on, beside and over the road, where the survey file has a section `[assets]`."""
+
+    name = "assets"
+    title = "what stands on, beside and over the road: ground, kerbs, markings, signs, poles, by kind"
+    after = ("condition",)
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or stale."""
+        work = plan_evidence(session)
+        session.manifest.remove(work.gone)
+        if work.plan is None:
+            return
+        if not work.plan.keys:
+            session.note("assets: no lidar, no line scanner with a turning mirror and no cloud saw anything")
+        if work.gains_due:
+            self._calibrate(session, work, work.plan)
+            work = plan_evidence(session)
+        if work.plan is not None:
+            self._search(session, work, work.plan)
+            self._join(session, work.plan)
+            self._write(session, work.plan)
+
+    def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        """Gains of the intensity: samples of some squares, then the table."""
+        manifest, due = session.manifest, work.samples
+        failures = run_tasks(
+            find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
+            manifest, session.compute, session.bar("squares that tell of intensity"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+        if not work.gains.due(manifest):
+            manifest.add([write_gains(work.gains, manifest, plan, work.gains.key(manifest))])
+
+    def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        manifest = session.manifest
+        due, gains = work.squares, current_gains(work.gains, session.manifest)
+        tasks = evidence_tasks(plan, due, gains, session.compute.workers)
+        failures = run_tasks(
+            find_evidence, tasks, len(due), lambda squares: singly(plan, due, gains, squares), manifest,
+            session.compute, session.bar("squares searched for assets"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+
+    def _join(self, session: Session, plan: AssetPlan) -> None:
+        """Join pieces kind after kind, each after those that it looks at."""
+        manifest = session.manifest
+        clusters: dict[str, list[Cluster]] = {}
+        for wanted in plan.kinds:
+            joins = plan_joins(session.store, plan.grid, wanted, manifest, clusters)
+            manifest.remove(joins.gone)
+            due = joins.due(manifest)
+            if due:
+                bar = session.bar(f"objects: {wanted.name}")
+                failed = run_units(join_objects, due, manifest, session.compute, bar)
+                session.failed(self.name, failed)
+
+    def _write(self, session: Session, plan: AssetPlan) -> None:
+        manifest, context = session.manifest, plan.context
+        roads, key = survey_roads(plan.survey, manifest)
+        if plan.kinds and not roads.lines:
+            session.note("assets: no run has a trajectory of 20 m or more, so assets have no road, station and offset")
+        for table in plan_tables(plan.kinds, manifest, key, context):
+            if not manifest.is_current(TABLES, table.unit, table.key):
+                manifest.add([write_table(table, roads, session.store, context)])
+        for file in plan_files(plan.kinds, manifest, plan.config, context):
+            if not manifest.is_current(TABLES, file.unit, file.key):
+                manifest.add([write_file(file, session.store, context)])
+        sections = plan_sections(roads, plan.config.cross_sections, plan.grid, manifest, context)
+        manifest.remove(manifest.beside({SECTIONS}, {unit for one in sections for unit in one.units}))
+        for one in sections:
+            if not all(manifest.is_current(SECTIONS, unit, one.key) for unit in one.units):
+                manifest.add(write_sections(one, plan.grid, session.store, context))
+        manifest.settle()
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Kinds, their settings and sensors are such that there are."""
+        try:
+            check_assets(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """Outputs of squares, objects and files that are there, and those that are due as far as is known by now."""
+        if session.survey.config.assets is None:
+            return StageState()
+        work = plan_evidence(session)
+        plan, manifest = work.plan, session.manifest
+        if plan is None:
+            return StageState()
+        made = manifest.files()
+        stale = work.evidence_due
+        if not stale:
+            stale = len(due_joins(plan, manifest)) or self._files_due(session, plan)
+        current = sum(made.get(name, 0) for name in (EVIDENCE, OBJECTS, TABLES))
+        next_run = {"asset squares": len(work.squares)} if work.squares else {}
+        return StageState(current, stale, next_run=next_run or ({"assets": stale} if stale else {}))
+
+    def _files_due(self, session: Session, plan: AssetPlan) -> int:
+        manifest, context = session.manifest, plan.context
+        key = roads_key(plan.survey)
+        tables = plan_tables(plan.kinds, manifest, key, context)
+        due = sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
+        files = plan_files(plan.kinds, manifest, plan.config, context)
+        return due + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
+
+    def folders(self) -> Sequence[str]:
+        """Evidence, objects, tables and files, classified points, bare earth."""
+        return (
+            "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
+            ASSET_FOLDER, "products/classified_points", "products/ground_sections",
+            "products/bare_earth",
+        )  # fmt: skip

@@ -1,0 +1,90 @@
+"""Horizontal slices of what stands above the ground: which cells hold returns, and what hangs together in a slice."""
+
+from __future__ import annotations
+
+from roadscan.kernels.options import kernel
+
+
+@kernel
+def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
+    """Count returns into the cells of their slice, and note the flat number of each return's cell (-1: none).
+
+    x, y, above : (n,) float64, plan and height above the ground (m), NaN where that is not known; corner : (x, y,
+    height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,) int64.
+    """
+    slices, rows, columns = counts.shape
+    for i in range(x.size):
+        cell_of[i] = -1
+        height = above[i] - corner[2]
+        if not height >= 0.0:
+            continue
+        k = int(height / slice_m)
+        u, v = (x[i] - corner[0]) / cell_m, (y[i] - corner[1]) / cell_m
+        if k >= slices or u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+            continue
+        r, c = int(v), int(u)
+        if counts[k, r, c] < 65535:
+            counts[k, r, c] += 1
+        cell_of[i] = (k * rows + r) * columns + c
+
+
+@kernel
+def label_slices(counts, labels, boxes, stack):
+    """Number of components of all slices: cells with returns that touch, corners too, within their slice.
+
+    labels : (slices, rows, columns) int32, zeroed; gets the component's number from 1; boxes : (components, 5) int32,
+    gets slice, first and last row, first and last column; stack : (cells with returns,) int64, working space.
+    """
+    slices, rows, columns = counts.shape
+    found = 0
+    for k in range(slices):
+        for r in range(rows):
+            for c in range(columns):
+                if counts[k, r, c] == 0 or labels[k, r, c] != 0:
+                    continue
+                found += 1
+                labels[k, r, c] = found
+                stack[0] = r * columns + c
+                waiting = 1
+                south, north, west, east = r, r, c, c
+                while waiting > 0:
+                    waiting -= 1
+                    at = stack[waiting]
+                    row, column = at // columns, at % columns
+                    south, north = min(south, row), max(north, row)
+                    west, east = min(west, column), max(east, column)
+                    for rr in range(max(row - 1, 0), min(row + 2, rows)):
+                        for cc in range(max(column - 1, 0), min(column + 2, columns)):
+                            if counts[k, rr, cc] != 0 and labels[k, rr, cc] == 0:
+                                labels[k, rr, cc] = found
+                                stack[waiting] = rr * columns + cc
+                                waiting += 1
+                boxes[found - 1, 0] = k
+                boxes[found - 1, 1], boxes[found - 1, 2] = south, north
+                boxes[found - 1, 3], boxes[found - 1, 4] = west, east
+    return found
+
+
+@kernel
+def slices_above_one_another(row, column, level, reach, foot, masks, scores):
+    """Give each component the number of slices that hold a component within `reach` cells of its middle.
+
+    It is 0 where none of the `foot` lowest slices does.
+    row, column, level : (n,) int64 cell of the middle, and slice (0 … 62); masks : (rows, columns) int64, zeroed;
+    scores : (n,) int64.
+    """
+    rows, columns = masks.shape
+    for i in range(row.size):
+        masks[row[i], column[i]] |= 1 << level[i]
+    for i in range(row.size):
+        mask = masks[row[i], column[i]]
+        for r in range(max(row[i] - reach, 0), min(row[i] + reach + 1, rows)):
+            for c in range(max(column[i] - reach, 0), min(column[i] + reach + 1, columns)):
+                mask |= masks[r, c]
+        ones = 0
+        if mask & ((1 << foot) - 1) == 0:
+            mask = 0
+        while mask != 0:
+            mask &= mask - 1
+            ones += 1
+        scores[i] = ones

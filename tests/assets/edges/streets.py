@@ -1,0 +1,91 @@
+"""Streets for the tests of kerbs and what lies beside them: two recordings, and a short piece of a simulated one."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import json
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from roadscan.assets.returns import Returns
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Street:
+    """Returns, their labels (where there are any), and the drive (p, 4)."""
+
+    returns: Returns
+    labels: Array
+    drive: Array
+
+
+def returns_of(xyz: Array, intensity: Array, epoch: Array, sensor: Array, passes: Array | None = None) -> Returns:
+    """Returns with what the finders of edges look at, in the order of place."""
+    n = len(xyz)
+    one = np.ones(n, np.uint8)
+    return Returns(
+        (0.0, 0.0), xyz[:, 0].copy(), xyz[:, 1].copy(), xyz[:, 2].copy(), intensity.astype(np.float32),
+        epoch.astype(np.int64), (np.zeros(n) if passes is None else passes).astype(np.uint16), np.zeros(n, np.uint8),
+        np.zeros(n, np.uint16), one, one, sensor[:, 0].copy(), sensor[:, 1].copy(), sensor[:, 2].copy(), ("lidar",),
+    )  # fmt: skip
+
+
+@functools.cache
+def kitti_street(folder: Path) -> Street:
+    """Eight sweeps of SemanticKITTI 00 in the frame of the first, with labels."""
+    with (folder / "poses.csv").open() as stream:
+        poses = [[float(v) for v in row[2:]] for row in list(csv.reader(stream))[1:]]
+    clouds, labels, sensors, epochs = [], [], [], []
+    with tarfile.open(folder / "sweeps.tar.xz") as archive:
+        files = {m.name: m for m in archive.getmembers()}
+        for i, pose in enumerate(poses[:8]):
+            body = _bytes(archive, files, f"velodyne_points/data/{i:010d}.bin")
+            cloud = np.frombuffer(body, "<f4").reshape(-1, 4).astype(np.float64)
+            label = np.frombuffer(_bytes(archive, files, f"labels/{i:010d}.label"), np.uint8)
+            t = np.array(pose).reshape(3, 4)
+            cloud[:, :3] = cloud[:, :3] @ t[:, :3].T + t[:, 3]
+            clouds.append(cloud)
+            labels.append(label)
+            sensors.append(np.broadcast_to(t[:, 3], (len(cloud), 3)))
+            epochs.append(np.full(len(cloud), i * 100_000_000))
+    cloud, sensor = np.concatenate(clouds), np.concatenate(sensors)
+    returns = returns_of(cloud[:, :3], cloud[:, 3] * 65535, np.concatenate(epochs), sensor)
+    drive = np.array([[*np.array(p).reshape(3, 4)[:, 3], 0.0] for p in poses[:8]])
+    return Street(returns, np.concatenate(labels), drive)
+
+
+def _bytes(archive: tarfile.TarFile, files: dict[str, tarfile.TarInfo], name: str) -> bytes:
+    found = archive.extractfile(next(m for n, m in files.items() if n.endswith(name)))
+    assert found is not None
+    return found.read()
+
+
+@functools.cache
+def amsterdam_street(folder: Path, tile: str = "2293_9698") -> tuple[Street, dict[str, list[shapely.Polygon]]]:
+    """A tile of 50 m of a city's cloud, which has no drive, and the city's polygons by name, from the tile's corner."""
+    import laspy
+
+    column, row = (int(v) for v in tile.split("_"))
+    corner = np.array([column * 50.0, row * 50.0, 0.0])
+    with laspy.open(io.BytesIO((folder / "pointcloud" / f"{tile}.laz").read_bytes())) as reader:
+        las = reader.read()
+    xyz = np.column_stack([las.x, las.y, las.z]) - corner
+    sensor = np.full((len(xyz), 3), np.nan)
+    epoch = np.asarray(las.gps_time) * 1e9
+    street = Street(returns_of(xyz, np.asarray(las.intensity), epoch, sensor), np.zeros(len(xyz)), np.zeros((0, 4)))
+    polygons: dict[str, list[shapely.Polygon]] = {}
+    csv.field_size_limit(10**8)
+    with (folder / "bgt" / f"{tile}.csv").open() as stream:
+        for line in list(csv.reader(stream))[1:]:
+            ring = np.array(json.loads(line[1])) - corner[:2]
+            polygons.setdefault(line[0], []).append(shapely.Polygon(ring))
+    return street, polygons

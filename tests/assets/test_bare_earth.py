@@ -1,0 +1,147 @@
+"""Bare earth against labels by hand and against the surface that a street was made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from roadscan.assets import classes
+from roadscan.assets.ground.bare_earth import ground_returns
+from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.surface import Place, is_dense
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
+from roadscan.model.asset_ground import GroundSettings
+from roadscan.simulate import Scene as Street
+from tests.assets.isprs import SAMPLES, isprs_sample
+from tests.assets.scenes import GROUND_LABELS, NOT_JUDGED, semantic_kitti_returns, semantic_kitti_scene
+from tests.assets.streets import street
+
+NO_DRIVE = np.zeros((0, 4))
+
+
+def airborne(points: np.ndarray) -> Returns:
+    """Points (n, 3) as returns of a sensor that stood nowhere known."""
+    n = len(points)
+    none, ones = np.full(n, np.nan), np.ones(n, np.uint8)
+    x, y, z = (np.ascontiguousarray(c) for c in points.T)
+    light, epoch, laser = np.zeros(n, np.float32), np.zeros(n, np.int64), np.zeros(n, np.uint16)
+    return Returns((0.0, 0.0), x, y, z, light, epoch, laser, ones, laser, ones, ones, none, none, none)
+
+
+def total_errors(recordings: Path, method: str) -> dict[str, float]:
+    """Share of wrong returns of each sample of the filter test (%), with the settings that every survey has."""
+    found = {}
+    for sample in SAMPLES:
+        points, on_ground = isprs_sample(recordings, sample)
+        window = Box(0.0, 0.0, *(np.floor(points[:, :2].max(axis=0)) + 1.0).tolist())
+        place = Place(airborne(points), window, NO_DRIVE, GroundSettings.parse({"method": method}))
+        assert not is_dense(place)
+        found[sample] = 100.0 * float(np.mean(ground_returns(place).on_ground != on_ground))
+    return found
+
+
+def test_airborne_samples_of_the_filter_test(recordings: Path) -> None:
+    # A plain simple morphological filter has 4.1 % in the mean and 9.0 % on sample 11.
+    wrong = total_errors(recordings, "morphological")
+    assert np.mean(list(wrong.values())) <= 3.9
+    assert wrong["11"] <= 8.5
+
+
+def iou(found: np.ndarray, true: np.ndarray, labels: np.ndarray) -> float:
+    judged = ~np.isin(labels, NOT_JUDGED)
+    return float((found & true & judged).sum() / ((found | true) & judged).sum())
+
+
+def test_a_street_labelled_by_hand() -> None:
+    scene, labels = semantic_kitti_scene()
+    ground = np.isin(scene.classes, (classes.GROUND, classes.ROAD))
+    assert iou(ground, np.isin(labels, GROUND_LABELS), labels) >= 0.93
+    for label in (40, 48):
+        assert ground[labels == label].mean() >= 0.99
+    assert np.isin(labels[scene.classes == classes.ROAD], (40, 44, 60)).mean() >= 0.99
+    assert (scene.classes[labels == 40] == classes.ROAD).mean() >= 0.45
+
+
+def test_planes_by_name() -> None:
+    returns, labels, drive = semantic_kitti_returns()
+    window = Box(-30.0, -30.0, 30.0, 30.0)
+    inside = window.holds(returns.x_m, returns.y_m)
+    place = Place(returns.at(inside), window, drive, GroundSettings(method="planes"))
+    ground, labels = ground_returns(place).on_ground, labels[inside]
+    assert iou(ground, np.isin(labels, GROUND_LABELS), labels) >= 0.8
+    assert ground[labels == 40].mean() >= 0.97
+    # Draws come from a square's place: what else is in the window changes nothing in it.
+    square = Box(0.0, -10.0, 10.0, 0.0)
+    wider = Box(-2.0, -12.0, 12.0, 2.0)
+    near = wider.holds(place.returns.x_m, place.returns.y_m)
+    alone = ground_returns(Place(place.returns.at(near), wider, drive, GroundSettings(method="planes"))).on_ground
+    inner = square.holds(place.returns.x_m[near], place.returns.y_m[near])
+    assert inner.sum() > 10_000
+    assert np.array_equal(alone[inner], ground[near][inner])
+
+
+def test_a_simulated_street_has_its_own_surface_again() -> None:
+    scene = Street.load("urban_street").changed(
+        length_m=6.0,
+        passes=[{"lane": 2}],
+        profilers={"on": False},
+        sick={"on": False},
+        camera={"on": False},
+        lidar={"divergence_deg": 0.0},
+    )
+    seen = street(scene)
+    window = Box(-20.0, -24.0, 16.0, 16.0)
+    inside = window.holds(seen.returns.x_m, seen.returns.y_m)
+    found = make_scene(seen.returns.at(inside), window, window, seen.drive_xyh_m)
+    ground = found.ground
+    rows, columns = ground.height_m.shape
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    easting = seen.returns.corner_m[0] + ground.x_min_m + (x + 0.5) * ground.cell_m
+    northing = seen.returns.corner_m[1] + ground.y_min_m + (y + 0.5) * ground.cell_m
+    shifts = [(a, b) for a in (-0.08, 0.0, 0.08) for b in (-0.08, 0.0, 0.08)]
+    true = np.mean([seen.surface.height_m(easting + a, northing + b) for a, b in shifts], axis=0)
+    station, offset = seen.surface.station_offset_m(easting, northing)
+    near = (station > -5.0) & (station < 10.0) & ground.seen & np.isfinite(true)
+    road, beside = near & (np.abs(offset) < 3.25), near & (np.abs(offset) > 5.0) & (np.abs(offset) < 8.5)
+    wrong = ground.height_m - true
+    assert road.sum() > 1000 and beside.sum() > 500
+    assert np.sqrt(np.mean(wrong[road] ** 2)) <= 0.008
+    assert np.sqrt(np.mean(wrong[beside] ** 2)) <= 0.015
+    assert ground.sigma_m is not None
+    z = wrong[road] / ground.sigma_m[road]
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 2.0
+    hit = seen.object_id[inside]
+    cars = [o.id for o in seen.world.objects if o.kind == "parked_car"]
+    at_car = np.isin(hit, cars) & (np.hypot(found.returns.x_m, found.returns.y_m) < 15.0)
+    left = ~np.isin(found.classes[at_car], (classes.VEHICLE, classes.GROUND, classes.ROAD, classes.LOW_NOISE))
+    assert at_car.sum() > 5000
+    assert left.mean() <= 0.08  # one side of each is seen
+
+
+def test_holes_are_filled_by_a_membrane() -> None:
+    y, x = np.mgrid[0:60, 0:80].astype(np.float32)
+    harmonic = 0.002 * (x * x - y * y) + 0.05 * x
+    known = np.ones(x.shape, np.bool_)
+    known[20:45, 30:60] = False
+    wrong = np.abs(filled(np.where(known, harmonic, 0.0).astype(np.float32), known) - harmonic)
+    assert wrong[known].max() == 0.0
+    assert wrong.max() < 0.01 * np.ptp(harmonic[20:45, 30:60])
+
+
+def test_without_returns_nothing_is_known() -> None:
+    window = Box(0.0, 0.0, 10.0, 10.0)
+    scene = make_scene(airborne(np.zeros((0, 3))), window, window, NO_DRIVE)
+    assert len(scene.returns) == 0
+    assert np.isnan(scene.ground.height_m).all() and not scene.ground.seen.any()
+
+
+@pytest.mark.parametrize("method", ["morphological", "planes"])
+def test_one_return_is_a_scene(method: str) -> None:
+    window = Box(0.0, 0.0, 10.0, 10.0)
+    settings = GroundSettings.parse({"method": method})
+    scene = make_scene(airborne(np.array([[5.0, 5.0, 3.0]])), window, window, NO_DRIVE, settings)
+    assert scene.classes.shape == (1,)

@@ -1,0 +1,53 @@
+"""Vehicles and people: returns that others labelled or framed as theirs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from roadscan.assets import classes
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Box, Scene
+from tests.assets.drives import CAR, PERSON, kitti_drive_returns
+from tests.assets.scenes import semantic_kitti_scene
+
+SET_APART = (classes.VEHICLE, classes.PERSON)
+NO_ASSET = (*SET_APART, classes.GROUND, classes.ROAD, classes.LOW_NOISE)
+WHOLE_DRIVE = slice(None)
+
+
+def test_parked_cars_are_set_apart_and_little_else() -> None:
+    scene, labels = semantic_kitti_scene()
+    cars = scene.classes[labels == 10]
+    assert 1.0 - np.isin(cars, NO_ASSET).mean() <= 0.03
+    users = np.isin(scene.classes, SET_APART)
+    lost = {label: users[labels == label].mean() for label in (50, 51, 70, 71, 80, 81)}
+    assert lost.pop(70) <= 0.01
+    assert max(lost.values()) <= 0.002, lost
+
+
+def drive(scans: slice) -> tuple[Scene, np.ndarray]:
+    returns, framed, _, path = kitti_drive_returns(scans)
+    lowest, highest = path[:, :2].min(axis=0) - 40.0, path[:, :2].max(axis=0) + 40.0
+    window = Box(*lowest.tolist(), *highest.tolist())
+    inside = window.holds(returns.x_m, returns.y_m)
+    return make_scene(returns.at(inside), window, window, path), framed[inside]
+
+
+def left_over(scene: Scene, framed: np.ndarray) -> tuple[float, float]:
+    """Shares of the returns in frames of cars and of people that could end in an asset."""
+    free = ~np.isin(scene.classes, NO_ASSET)
+    return float(free[framed == CAR].mean()), float(free[framed == PERSON].mean())
+
+
+def test_three_seconds_of_a_drive() -> None:
+    cars, people = left_over(*drive(slice(30, 40)))
+    assert cars <= 0.03
+    assert people <= 0.15  # some came into sight as they stood
+
+
+@pytest.mark.nightly
+def test_a_whole_drive() -> None:
+    cars, people = left_over(*drive(WHOLE_DRIVE))
+    assert cars <= 0.03
+    assert people <= 0.03

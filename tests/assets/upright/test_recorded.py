@@ -1,0 +1,99 @@
+"""Upright things of a recorded street whose returns were labelled by hand (SemanticKITTI, sequence 00)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from roadscan.assets.kind import asset_kinds
+from roadscan.assets.upright.plates import SignOptions, plates_of
+from roadscan.assets.upright.standing import Upright, uprights_of
+from tests.assets.scenes import NOT_JUDGED, semantic_kitti_scene
+
+BUILDING, TRUNK, POLE, SIGN = 50, 71, 80, 81
+
+
+def clusters(label: int, least: int) -> list[np.ndarray]:
+    """Returns of a label in clusters of 0.5 m, with so many returns or more."""
+    scene, labels = semantic_kitti_scene()
+    returns = scene.returns
+    rows = np.flatnonzero(labels == label)
+    tree = cKDTree(np.column_stack([returns.x_m, returns.y_m, returns.height_m])[rows])
+    _, number = connected_components(tree.sparse_distance_matrix(tree, 0.5, output_type="coo_matrix"), directed=False)
+    return [rows[number == k] for k in range(number.max() + 1) if (number == k).sum() >= least]
+
+
+def tall() -> list[Upright]:
+    scene, _ = semantic_kitti_scene()
+    return [u for u in uprights_of(scene) if u.kind != "delineator"]
+
+
+def test_poles_and_trunks_are_found_where_they_stand() -> None:
+    """The surface that returns of a shaft show lies π/4 of its radius before its axis, on the mean."""
+    scene, _ = semantic_kitti_scene()
+    returns = scene.returns
+    truth = clusters(POLE, 30) + clusters(TRUNK, 60)
+    found, errors = 0, []
+    for rows in truth:
+        best = max(tall(), key=lambda u: np.isin(u.shaft.rows, rows).sum())
+        own = best.shaft.rows[np.isin(best.shaft.rows, rows)]
+        if own.size < 0.3 * best.shaft.rows.size and own.size < 0.3 * rows.size:
+            continue
+        found += 1
+        axis = np.array(best.shaft.axis.at(float(returns.height_m[own].mean())))
+        surface = np.array([returns.x_m[own].mean(), returns.y_m[own].mean()])
+        sight = surface - [returns.sensor_x_m[own].mean(), returns.sensor_y_m[own].mean()]
+        expected = surface + np.pi / 4 * best.shaft.axis.radius_m * sight / np.hypot(*sight)
+        errors.append(float(np.hypot(*(axis - expected))))
+    assert len(truth) >= 24
+    assert found / len(truth) >= 0.85
+    assert np.quantile(errors, 0.95) <= 0.12
+
+
+def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
+    """A shaft is right that shows a labelled pole or trunk; what was not judged by those who labelled is left out."""
+    _, labels = semantic_kitti_scene()
+    known = clusters(POLE, 30) + clusters(TRUNK, 60)
+    right, wrong = 0, 0
+    for one in tall():
+        seen = labels[one.shaft.rows]
+        shows = max(np.isin(rows, one.shaft.rows).mean() for rows in known)
+        if np.isin(seen, [TRUNK, POLE, SIGN]).mean() > 0.3 or shows > 0.3:
+            right += 1
+        elif np.isin(seen, NOT_JUDGED).mean() <= 0.4:
+            wrong += 1
+    assert right / (right + wrong) >= 0.80
+
+
+def test_the_two_strong_signs_are_found_and_no_other() -> None:
+    scene, labels = semantic_kitti_scene()
+    plates = [p for p in plates_of(scene, SignOptions()) if p.probability >= 0.5]
+    wanted = clusters(SIGN, 100)
+    judged = [p for p in plates if not np.isin(labels[p.rows], NOT_JUDGED).mean() > 0.5]
+    assert len(wanted) == 2 == len(judged)
+    for rows in wanted:
+        assert any(np.isin(p.rows, rows).sum() >= 50 for p in plates)
+
+
+@pytest.mark.parametrize(("kind", "label", "least"), [("facade", BUILDING, 0.85)])
+def test_returns_of_facades(kind: str, label: int, least: float) -> None:
+    scene, labels = semantic_kitti_scene()
+    one = asset_kinds()[kind]
+    marked = np.zeros(labels.size, np.bool_)
+    for part in one.evidence(scene, one.options()).marked:
+        marked[part.rows] = True
+    judged = ~np.isin(labels, NOT_JUDGED)
+    wanted = labels == label
+    assert (marked & wanted & judged).sum() / ((marked | wanted) & judged).sum() >= least
+
+
+def test_cars_end_in_no_upright_asset() -> None:
+    scene, labels = semantic_kitti_scene()
+    marked = np.zeros(labels.size, np.bool_)
+    for kind in ("pole", "lighting", "signal", "sign", "tree", "delineator", "facade", "fence", "wall", "barrier"):
+        one = asset_kinds()[kind]
+        for part in one.evidence(scene, one.options()).marked:
+            marked[part.rows] = True
+    assert marked[labels == 10].mean() <= 0.03

@@ -1,0 +1,77 @@
+"""Objects do not depend on the tiles that their pieces were found in."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from roadscan.assets.kind import AssetObject, asset_kinds
+from roadscan.assets.scene import Box, Scene
+from roadscan.assets.upright.lines import PIECE_SCHEMA, chains_of
+from tests.assets.upright.scene import objects_of, simulated
+
+TILE_M, HALO_M = 20.0, 8.0
+
+
+@functools.cache
+def tiles() -> list[Scene]:
+    """The simulated scene as tiles of 20 m with halos of 8 m."""
+    whole, _ = simulated()
+    out = []
+    for x in np.arange(whole.tile.x_min_m, whole.tile.x_max_m, TILE_M).tolist():
+        for y in np.arange(whole.tile.y_min_m, whole.tile.y_max_m, TILE_M).tolist():
+            window = Box(x - HALO_M, y - HALO_M, x + TILE_M + HALO_M, y + TILE_M + HALO_M)
+            inside = window.holds(whole.returns.x_m, whole.returns.y_m)
+            if inside.any():
+                scene = Scene(
+                    whole.returns.at(inside), Box(x, y, x + TILE_M, y + TILE_M), window, whole.ground,
+                    whole.above_ground_m[inside], whole.classes[inside], whole.drive_xyh_m,
+                )  # fmt: skip
+                out.append(scene)
+    return out
+
+
+def joined(kind: str) -> list[AssetObject]:
+    """Objects of a kind from the pieces of all tiles."""
+    one = asset_kinds()[kind]
+    pieces = pa.concat_tables([one.evidence(scene, one.options()).pieces for scene in tiles()])
+    return list(one.objects(pieces, one.options(), {}))
+
+
+@pytest.mark.parametrize("kind", ["pole", "lighting", "tree", "delineator", "sign", "clearance"])
+def test_points_are_found_once_at_the_same_place(kind: str) -> None:
+    scene, _ = simulated()
+    whole, parts = objects_of(scene, kind), joined(kind)
+    assert len(parts) == len(whole) > 0
+    for one in whole:
+        assert min(one.geometry.distance(other.geometry) for other in parts) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["guardrail", "fence", "wall", "facade"])
+def test_lines_go_on_across_borders(kind: str) -> None:
+    scene, _ = simulated()
+    whole, parts = objects_of(scene, kind), joined(kind)
+    assert len(parts) == len(whole) > 0
+    for one, other in zip(
+        *(sorted(objects, key=lambda o: o.attributes["length_m"]) for objects in (whole, parts)), strict=True
+    ):
+        assert abs(one.attributes["length_m"] - other.attributes["length_m"]) < 0.02 * one.attributes["length_m"] + 0.3
+        assert abs(one.attributes["asset_height_m"] - other.attributes["asset_height_m"]) < 0.1
+
+
+def test_a_chain_is_the_same_whatever_order_its_pieces_come_in() -> None:
+    one = asset_kinds()["fence"]
+    parts = [one.evidence(scene, one.options()).pieces for scene in tiles()]
+    first = chains_of(pa.concat_tables(parts))
+    second = chains_of(
+        pa.concat_tables([p.take(pa.array(range(p.num_rows - 1, -1, -1), pa.int64())) for p in parts[::-1]])
+    )
+    assert first[0].xy_m.shape == second[0].xy_m.shape
+    for a, b in zip(first, second, strict=True):
+        assert (a.xy_m == b.xy_m).all() and all(
+            (a.values[n] == b.values[n])[~np.isnan(a.values[n])].all() for n in a.values
+        )
+    assert chains_of(PIECE_SCHEMA.empty_table()) == []

@@ -1,0 +1,187 @@
+"""Kernels of assets against NumPy, SciPy, and results known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+from scipy.stats import binned_statistic_2d
+
+from roadscan.kernels.assets import voxels
+from roadscan.kernels.assets.columns import columns, distinct, marked, slots, tops
+from roadscan.kernels.assets.filling import begin, halved, relax
+from roadscan.kernels.assets.ground_cells import cell_heights, on_ground, scatter
+from roadscan.kernels.assets.heights import heights_above
+from roadscan.kernels.assets.lowest import counts, lowest_returns
+from roadscan.kernels.assets.planes import planes
+from roadscan.kernels.assets.voxels import features, moments, numbered
+
+ORIGIN = np.array([2.0, -3.0])
+ROWS, COLUMNS, CELL_M = 6, 8, 0.5
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    """Points (3, n), some of them outside the raster."""
+    rng = np.random.default_rng(5)
+    x = ORIGIN[0] + rng.uniform(-0.7, COLUMNS * CELL_M + 0.7, 3000)
+    y = ORIGIN[1] + rng.uniform(-0.7, ROWS * CELL_M + 0.7, 3000)
+    return np.stack([x, y, rng.normal(10.0, 0.3, 3000)])
+
+
+def binned(points: np.ndarray, values: np.ndarray, statistic: str) -> np.ndarray:
+    edges = [ORIGIN[1] + CELL_M * np.arange(ROWS + 1), ORIGIN[0] + CELL_M * np.arange(COLUMNS + 1)]
+    return binned_statistic_2d(points[1], points[0], values, statistic, bins=edges).statistic
+
+
+def test_lowest_and_number_of_each_cell(points: np.ndarray) -> None:
+    low, many = np.full((ROWS, COLUMNS), np.inf, np.float32), np.zeros((ROWS, COLUMNS), np.int32)
+    lowest_returns(*points, ORIGIN, 1 / CELL_M, low)
+    counts(points[0], points[1], ORIGIN, 1 / CELL_M, many)
+    assert np.array_equal(many, binned(points, points[2], "count"))
+    np.testing.assert_allclose(low, binned(points, points[2], "min"), rtol=1e-6)
+
+
+def test_heights_above_a_raster_are_bilinear(points: np.ndarray) -> None:
+    ground = np.random.default_rng(1).normal(9.0, 1.0, (ROWS, COLUMNS)).astype(np.float32)
+    above = np.empty(points.shape[1], np.float32)
+    heights_above(*points, ORIGIN, 1 / CELL_M, ground, above)
+    middles = [ORIGIN[1] + CELL_M * (np.arange(ROWS) + 0.5), ORIGIN[0] + CELL_M * (np.arange(COLUMNS) + 0.5)]
+    y = np.clip(points[1], middles[0][0], middles[0][-1])
+    x = np.clip(points[0], middles[1][0], middles[1][-1])
+    expected = points[2] - RegularGridInterpolator(middles, ground.astype(float))(np.stack([y, x], axis=-1))
+    np.testing.assert_allclose(above, expected, atol=2e-6)
+
+
+def test_scatter_of_cells(points: np.ndarray) -> None:
+    above, sums = np.empty(points.shape[1], np.float32), np.zeros((ROWS, COLUMNS, 5))
+    flat = np.full((2, 2), 10.0, np.float32)
+    scatter(*points, ORIGIN, 0.25, flat, 1 / CELL_M, np.array([-0.25, 0.4, 0.2]), above, sums)
+    h = points[2] - 10.0
+    np.testing.assert_allclose(above, h, atol=1e-6)
+    near, close = (h >= -0.25) & (h <= 0.4), np.abs(h) <= 0.2
+    for column, (chosen, values) in enumerate([(near, h**0), (near, h), (near, h * h), (close, h**0), (close, h)]):
+        expected = binned(points[:, chosen], values[chosen], "sum")
+        np.testing.assert_allclose(sums[..., column], expected, atol=1e-9)
+
+
+def test_heights_of_cells(points: np.ndarray) -> None:
+    h = (points[2] - 10.0).astype(np.float32)
+    chosen = np.arange(h.size) % 3 > 0
+    middle, half = np.full((ROWS, COLUMNS), 0.1, np.float32), np.full((ROWS, COLUMNS), 0.3, np.float32)
+    sums = np.zeros((ROWS, COLUMNS, 3))
+    cell_heights(points[0], points[1], h, chosen, ORIGIN, 1 / CELL_M, middle, half, sums)
+    d = h.astype(float) - np.float64(np.float32(0.1))
+    used = chosen & (np.abs(d) <= np.float32(0.3))
+    for column in range(3):
+        np.testing.assert_allclose(sums[..., column], binned(points[:, used], d[used] ** column, "sum"), atol=1e-9)
+
+
+def test_on_the_ground_are_returns_near_it_or_as_high_as_an_even_cell_beside() -> None:
+    rough = np.zeros((1, 3), np.bool_)
+    rough[0, 1:] = True
+    even = np.full((1, 3), np.nan, np.float32)
+    even[0, 0] = 0.10
+    tolerance = np.full((1, 3), 0.15, np.float32)
+    x = np.array([0.5, 0.5, 1.5, 1.5, 2.5, 3.5])
+    above = np.array([0.14, 0.16, 0.12, 0.05, 0.10, 0.0], np.float32)
+    found = np.empty(6, np.bool_)
+    on_ground(x, np.full(6, 0.5), above, np.zeros(2), 1.0, rough, tolerance, even, 0.03, found)
+    assert found.tolist() == [True, False, True, False, False, False]
+
+
+def test_holes_are_filled_from_the_means_of_two_by_two_and_relax_to_a_harmonic_surface() -> None:
+    z = np.array([[1.0, 3.0, 7.0], [9.0, 0.0, 5.0]], np.float32)
+    known = np.array([[True, True, True], [False, False, True]])
+    coarse, coarse_known = np.empty((1, 2), np.float32), np.empty((1, 2), np.bool_)
+    halved(z, known, coarse, coarse_known)
+    assert coarse.tolist() == [[2.0, 6.0]] and coarse_known.all()
+    begin(coarse, known, z)
+    assert z[1].tolist() == [2.0, 3.0, 5.0]  # a quarter of the way to the next middle
+    column, row = np.meshgrid(np.arange(9.0), np.arange(9.0))
+    saddle = (column - 4) * (row - 4)  # the mean of its four neighbours everywhere
+    inner = np.ones((9, 9), np.bool_)
+    inner[1:-1, 1:-1] = False
+    found = np.where(inner, saddle, 0.0).astype(np.float32)
+    relax(found, inner, 200)
+    np.testing.assert_allclose(found, saddle, atol=1e-4)
+
+
+def test_slots_of_time_follow_one_another_without_the_pauses() -> None:
+    epoch = np.array([0, 10, 25, 1000, 1012, 5], np.int64)
+    found = np.empty(10, np.int64)
+    count = distinct(epoch, np.int64(10), found)
+    assert found[:count].tolist() == [0, 1, 2, 100, 101, 0]
+    assert distinct(epoch, np.int64(10), found[:2]) == 6
+    slot = np.empty(6, np.uint8)
+    slots(epoch, np.int64(10), np.unique(found[:6]), 2, slot)
+    assert slot.tolist() == [0, 0, 1, 1, 2, 0]
+
+
+def test_columns_and_their_tops() -> None:
+    above = np.array([0.05, 0.3, 0.5, 1.5, 3.0, 0.7], np.float32)
+    x = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 9.0])
+    ground = np.array([True, False, False, False, False, False])
+    levels = np.zeros((1, 1), np.uint32)
+    things, grounds = np.zeros((1, 1), np.uint64), np.zeros((1, 1), np.uint64)
+    slot = np.array([0, 1, 1, 2, 3, 4], np.uint8)
+    band = np.array([0.4, 2.5])
+    columns(x, np.full(6, 0.5), above, ground, slot, np.zeros(2), 1.0, 0.2, band, levels, things, grounds)
+    assert int(levels[0, 0]) == (1 << 1) | (1 << 2) | (1 << 7) | (1 << 15)
+    assert int(things[0, 0]) == 0b110 and int(grounds[0, 0]) == 0b1
+    top = np.empty((1, 1), np.int32)
+    for first, start, gap, expected in [(1, 5, 2, 2), (1, 5, 4, 7), (1, 5, 7, 15), (3, 5, 2, -1), (3, 8, 2, 7)]:
+        tops(levels, first, start, gap, top)
+        assert top[0, 0] == expected
+
+
+def test_marked_returns() -> None:
+    cells = np.array([[0, 1], [2, 0]], np.int32)
+    x, y = np.array([0.5, 1.5, 1.5, 0.5, 5.0]), np.array([0.5, 0.5, 0.5, 1.5, 0.5])
+    above = np.array([1.0, 1.0, 3.0, 3.0, 1.0], np.float32)
+    out = np.empty(5, np.int32)
+    marked(x, y, above, np.zeros(2), 1.0, cells, np.array([0.0, 0.0, 2.0]), np.array([9.0, 2.0, 4.0]), out)
+    assert out.tolist() == [0, 1, 0, 2, 0]
+
+
+def test_features_of_cubes_are_those_of_the_covariance_of_27_cubes() -> None:
+    rng = np.random.default_rng(3)
+    n, edge = 4000, 0.3
+    wall = np.stack([rng.uniform(0, 3, n), np.full(n, 1.0), rng.uniform(0, 3, n)])
+    line = np.stack([rng.uniform(0, 3, n // 8), np.full(n // 8, 2.5), np.full(n // 8, 2.0)])
+    ball = np.stack([rng.uniform(0, 1.5, n), rng.uniform(1.5, 2.1, n), rng.uniform(0, 1.5, n)])
+    x, y, z = np.concatenate([wall, line, ball], axis=1) + rng.normal(0, 0.01, (3, 2 * n + n // 8))
+    above, origin = np.abs(z).astype(np.float32), np.array([-0.2, -0.1])
+    index = np.full((12, 12, 12), -1, np.int32)
+    number, place = np.empty(x.size, np.int32), np.empty((x.size, 3), np.int32)
+    count = numbered(x, y, above, np.ones(x.size, np.bool_), origin, 1 / edge, index, number, place)
+    sums, found = np.zeros((count, voxels.MOMENTS)), np.empty((count, 7), np.float32)
+    moments(x, y, above, number, origin, 1 / edge, place[:count], sums)
+    features(index, place[:count], sums, found)
+    cube = np.floor(np.stack([y - origin[1], x - origin[0], above.astype(float)]) / edge).astype(int)
+    assert np.array_equal(place[number].T, cube)
+    for k in range(0, count, 7):
+        near = (np.abs(cube - place[k][:, None]) <= 1).all(axis=0)
+        values, vectors = np.linalg.eigh(np.cov(np.stack([x, y, above])[:, near] / edge, bias=True))
+        third, second, first = np.sqrt(np.maximum(values, 0.0))
+        assert found[k, voxels.NUMBER] == near.sum()
+        expected = [(first - second) / first, (second - third) / first, third / first]
+        np.testing.assert_allclose(found[k, 1:4], expected, atol=1e-4)
+        assert found[k, voxels.THICKNESS] == pytest.approx(third, abs=1e-4)
+        if second - third > 0.05:
+            assert found[k, voxels.NORMAL_UP] == pytest.approx(abs(vectors[2, 0]), abs=1e-3)
+        if first - second > 0.05:
+            assert found[k, voxels.ALONG_UP] == pytest.approx(abs(vectors[2, 2]), abs=1e-3)
+
+
+def test_repeated_planes_hold_a_road_and_its_bank_and_leave_the_rest_over() -> None:
+    rng = np.random.default_rng(9)
+    x, y = rng.uniform(0, 10, 900), rng.uniform(0, 10, 900)
+    z = np.where(x < 6, 0.02 * x, 0.12 + 0.3 * (x - 6)) + rng.normal(0, 0.01, 900)
+    z[::9] += rng.uniform(1.0, 3.0, 100)
+    found = np.empty(900, np.bool_)
+    begins, key, how = np.array([0, 900]), np.array([77], np.uint64), np.array([6, 60, 500, 40])
+    planes(x, y, z, begins, key, 0.05, 0.5, how, found)
+    on_planes = np.arange(900) % 9 > 0
+    assert found[on_planes].mean() > 0.99
+    assert found[~on_planes].mean() < 0.08  # a plane may pass through a few by chance

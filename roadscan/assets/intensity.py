@@ -251,7 +251,9 @@ def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
         first += int(place.max(initial=-1)) + 1
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 7
     unit = min((s.unit for s in ordered), default=1.0)
-    return IntensitySample((0.0, 0.0), names, *joined, unit=unit if np.isfinite(unit) else 1.0)
+    place, sensor, laser, range_m, incidence, intensity, returns = joined
+    digit = unit if np.isfinite(unit) else 1.0
+    return IntensitySample((0.0, 0.0), names, place, sensor, laser, range_m, incidence, intensity, returns, digit)
 
 
 def _values(sample: IntensitySample) -> tuple[npt.NDArray[np.generic], ...]:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.pieces import passes_of
 from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.corridors import mark_corridor
 from roadscan.model.strict import Strict
@@ -119,7 +120,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
         "vegetation": float(np.isin(scene.classes[near], _VEGETATION).mean()),
         "bright": float((returns.intensity[near] >= bright).mean()),
         "thickness_m": float(np.quantile(returns.height_m[near], 0.9) - height),
-        "passes": np.unique(returns.pass_id[near]).tolist(), "first_epoch_gps_ns": int(epochs.min()),
+        "passes": passes_of(scene, near), "first_epoch_gps_ns": int(epochs.min()),
         "last_epoch_gps_ns": int(epochs.max()),
     }  # fmt: skip
 

@@ -72,8 +72,8 @@ def edges_of(scene: Scene) -> list[Edge]:
 def edges_of_raster(raster: HeightRaster) -> list[Edge]:
     """Edges of a raster of cells alone: each cell counts as one height at its middle."""
     row, column = np.nonzero(raster.count > 0)
-    x = raster.x_min_m + (column + 0.5) * raster.cell_m
-    y = raster.y_min_m + (row + 0.5) * raster.cell_m
+    x = raster.x_min_m + (column.astype(np.float64) + 0.5) * raster.cell_m
+    y = raster.y_min_m + (row.astype(np.float64) + 0.5) * raster.cell_m
     return found_edges(raster, profiles.sorted_heights(x, y, raster.height_m[row, column]))
 
 

@@ -108,7 +108,7 @@ def _freedom(raster: HeightRaster, settings: StepSettings) -> Float64:
     """(rows, columns) cells with a height in the window around each cell, any direction of it."""
     wide = round((settings.half_along_m + settings.across_m) / raster.cell_m) + 1
     share = scipy.ndimage.uniform_filter((raster.count > 0).astype(np.float64), wide, mode="constant")
-    return share * 4.0 * settings.half_along_m * settings.across_m / raster.cell_m**2
+    return np.asarray(share * 4.0 * settings.half_along_m * settings.across_m / raster.cell_m**2)
 
 
 def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool_]:
@@ -116,7 +116,7 @@ def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool
     wide, known = round(2.0 * settings.across_m / raster.cell_m) + 1, raster.count > 0
     top = scipy.ndimage.maximum_filter(np.where(known, raster.height_m, -np.inf), wide)
     bottom = scipy.ndimage.minimum_filter(np.where(known, raster.height_m, np.inf), wide)
-    return np.isfinite(top) & (top - bottom >= settings.least_m)
+    return np.asarray(np.isfinite(top) & (top - bottom >= settings.least_m))
 
 
 def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSettings, cell_m: float) -> Float64:
@@ -129,7 +129,7 @@ def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSetti
     size = np.where(still, _STILL, np.minimum(np.abs(evidence), _CLIPPED))
     share = scipy.ndimage.uniform_filter((still | (evidence != 0.0)).astype(np.float64), wide, mode="constant")
     mean = (scipy.ndimage.uniform_filter(size, wide, mode="constant") + _PRIOR * _STILL) / (share + _PRIOR)
-    return np.maximum(mean / _MEAN_SIZE, 1.0)
+    return np.asarray(np.maximum(mean / _MEAN_SIZE, 1.0))
 
 
 def _places(raster: HeightRaster, best: Float64, settings: StepSettings) -> Places:

@@ -128,8 +128,8 @@ def trace(place, total, following, preceding, ranked, limits, chain, owner):
 
     total : (n,) evidence of the best path through each place. ranked : places, strongest first. limits : (least
     evidence to begin, least evidence to go on, distances within which a chain leaves no second one and no other side
-    of a gutter (m)). chain : (n, 2) filled, in chains one after another: the chain's number and the place. owner : (n,) −1 at first; then
-    the chain that holds the place or lies beside it.
+    of a gutter (m)). chain : (n, 2) filled, in chains one after another: the chain's number and the place. owner : (n,)
+    −1 at first; then the chain that holds the place or lies beside it.
     """
     n = total.size
     length, chains = 0, 0

@@ -18,8 +18,8 @@ def strips(weight, height_m, slope_x, slope_y, along, out):
     """Fill `out` (3, rows, columns): sum of weights of the strip around each cell, its mean height (m), and its χ².
 
     weight : (rows, columns) one over the variance of a cell's height (1/m²), 0: no height. slope_x, slope_y : slope of
-    the ground at large (m/m). along : (k, 4) of each cell of a strip its column and row from the middle (whole numbers) and
-    its place from the middle in x and y (m).
+    the ground at large (m/m). along : (k, 4) of each cell of a strip its column and row from the middle (whole numbers)
+    and its place from the middle in x and y (m).
     """
     rows, columns = weight.shape
     for row in range(rows):

@@ -38,8 +38,6 @@ def draw(axes: Any, scene: Scene, view: Box, title: str) -> None:
             shape = one.geometry if name == "lane_line" else one.geometry.exterior
             xy = shapely.get_coordinates(shape) - scene.returns.corner_m
             axes.plot(*xy.T, color=colour, linewidth=1.2)
-            if view.holds(*xy.mean(axis=0)):
-                axes.annotate(one.attributes["type"] or "", xy.mean(axis=0), color=colour, fontsize=6)
     axes.set_xlim(view.x_min_m, view.x_max_m)
     axes.set_ylim(view.y_min_m, view.y_max_m)
     axes.set_title(title, fontsize=8)
@@ -52,12 +50,16 @@ def main() -> None:
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from PIL import Image
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 4.6), layout="constrained")
     draw(left, semantic_kitti_scene(40.0)[0], Box(-13.0, -6.0, 5.0, 12.0), "recorded (SemanticKITTI 00)")
     town = street("urban_street", 100.0, 20.0).scene
     draw(right, town, town.tile, "simulated (urban_street)")
-    figure.savefig(ROOT / "docs" / "pictures" / "paint.png", dpi=90, metadata={"Software": None})
+    file = ROOT / "docs" / "pictures" / "paint.png"
+    figure.savefig(file, dpi=90, metadata={"Software": None})
+    with Image.open(file) as drawn:
+        drawn.convert("RGB").quantize(64, method=Image.Quantize.FASTOCTREE).save(file, optimize=True)
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
     ):
         spread = np.hypot(sigma, _SPREAD * level)
         odds = odds + np.clip(level * (value - level / 2) / spread**2, -most, most)
-    return found.rows[at[odds > 0.0]]
+    return np.asarray(found.rows[at[odds > 0.0]])
 
 
 def _lies_across(stripe: Stripe, road_rad: float) -> bool:

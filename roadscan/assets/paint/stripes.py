@@ -141,8 +141,8 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     ]
     reach = (along >= stripe.begin_m - AROUND_M) & (along <= stripe.end_m + AROUND_M)
     around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
-    ends_seen = {"begin_seen": seen[0], "end_seen": seen[1]}
-    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma, **ends_seen)
+    stripe = replace(stripe, begin_seen=seen[0], end_seen=seen[1])
+    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma)
 
 
 def lies_flat(found: Contrast, component: Component) -> bool:

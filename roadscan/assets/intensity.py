@@ -207,7 +207,7 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
     if min(height.shape) < 2:
         north = east = np.zeros_like(height)
     else:
-        north, east = np.gradient(height, ground.cell_m)
+        north, east = (np.asarray(g, np.float64) for g in np.gradient(height, ground.cell_m))
     size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
     slopes = []
     for slope in (east, north):

@@ -15,9 +15,8 @@ from benchmarks.timing import Figure
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.scene import Scene
 from roadscan.jobs.assets.kinds import wanted_kinds
-from roadscan.jobs.assets.load_returns import LoadedSquare, load_squares
+from roadscan.jobs.assets.load_returns import load_squares
 from roadscan.jobs.assets.plan import AssetPlan, plan_assets
 from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
@@ -68,24 +67,23 @@ def search(plan: AssetPlan) -> tuple[dict[str, float], dict[str, list[pa.Table]]
         seconds[part] = seconds.get(part, 0.0) + now - began
         return now
 
-    scenes: list[Scene] = []
+    gains: pa.Table | None = None
     for squares in plan.blocks(list(plan.keys)):
         began = time.process_time()
-        loaded: list[LoadedSquare] = list(load_squares(plan.load(squares)))
-        began = spent("loading", began)
-        for one in (one for one in loaded if len(one.returns)):
-            grid, began = plan.grid, time.process_time()
+        for one in load_squares(plan.load(squares)):
+            began = spent("loading", began)
+            if not len(one.returns):
+                continue
+            grid = plan.grid
             scene = make_scene(one.returns, grid.own_box, grid.window_box, one.drive_xyh_m, plan.config.ground)
-            spent("scenes", began)
-            scenes.append(scene)
-    gains = gains_of([intensity_sample(scene) for scene in scenes[:4]])
-    for raw in scenes:
-        began = time.process_time()
-        scene = calibrated_scene(raw, gains)
-        began = spent("intensity", began)
-        for kind, options in kinds:
-            pieces.setdefault(kind.name, []).append(kind.evidence(scene, options).pieces)
-            began = spent(kind.name, began)
+            began = spent("scenes", began)
+            if gains is None:
+                gains, began = gains_of([intensity_sample(scene)]), time.process_time()
+            scene = calibrated_scene(scene, gains)
+            began = spent("intensity", began)
+            for kind, options in kinds:
+                pieces.setdefault(kind.name, []).append(kind.evidence(scene, options).pieces)
+                began = spent(kind.name, began)
     return seconds, pieces
 
 

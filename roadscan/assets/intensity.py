@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -86,7 +86,7 @@ class _Terms(NamedTuple):
     sensors: tuple[str, ...]
     lasers: tuple[Int64, ...]
     first: tuple[int, ...]
-    count: int
+    unknowns: int
 
 
 def intensity_sample(scene: Scene) -> IntensitySample:
@@ -133,7 +133,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         return GAINS_SCHEMA.empty_table()
     terms = _terms_of(rows)
     columns, values = _design(rows, terms)
-    solution, covariance = np.zeros(terms.count), np.zeros((terms.count, terms.count))
+    solution, covariance = np.zeros(terms.unknowns), np.zeros((terms.unknowns, terms.unknowns))
     robust, scale = np.ones(rows.place.size), 1.0
     for _ in range(_ROUNDS):
         response = (values * solution[columns]).sum(axis=1)
@@ -145,7 +145,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         scale = max(1.4826 * float(np.median(np.abs(deviation))), _LEAST_SCATTER)
         robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
     solution -= _common_part(rows, terms, (columns, values), solution)
-    told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.count)
+    told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.unknowns)
     return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
 
 
@@ -205,9 +205,9 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
 
     height = ground.height_m.astype(np.float64)
     if min(height.shape) < 2:
-        north, east = np.zeros_like(height), np.zeros_like(height)
+        north = east = np.zeros_like(height)
     else:
-        north, east = np.gradient(height, ground.cell_m)
+        north, east = (np.asarray(g, np.float64) for g in np.gradient(height, ground.cell_m))
     size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
     slopes = []
     for slope in (east, north):
@@ -223,8 +223,7 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
     dz = returns.sensor_height_m - returns.height_m
     along = (dz - slope_x * dx - slope_y * dy) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
     length = np.sqrt(dx**2 + dy**2 + dz**2)
-    out: Float64 = np.degrees(np.arccos(np.clip(along / np.maximum(length, 1e-9), 0.0, 1.0)))
-    return out
+    return np.asarray(np.degrees(np.arccos(np.clip(along / np.maximum(length, 1e-9), 0.0, 1.0))))
 
 
 # --- the places of a sample ------------------------------------------------------------------------
@@ -246,17 +245,19 @@ def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
     for sample in ordered:
         kept = _chosen(sample)
         number = np.array([names.index(n) for n in sample.sensors], np.int64)
-        _, place = np.unique(sample.place[kept], return_inverse=True)
-        parts.append((place + first, number[sample.sensor[kept]], *(v[kept] for v in _values(sample))))
-        first += int(place.max(initial=-1)) + 1
-    joined = [np.concatenate(column) for column in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 7
+        _, own = np.unique(sample.place[kept], return_inverse=True)
+        parts.append((own + first, number[sample.sensor[kept]], *(v[kept] for v in _values(sample))))
+        first += int(own.max(initial=-1)) + 1
+    columns: list[npt.NDArray[Any]] = [np.zeros(0, np.int64)] * 7
+    if parts:
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     unit = min((s.unit for s in ordered), default=1.0)
-    place, sensor, laser, range_m, incidence, intensity, returns = joined
+    place, sensor, laser, range_m, incidence, intensity, returns = columns
     digit = unit if np.isfinite(unit) else 1.0
     return IntensitySample((0.0, 0.0), names, place, sensor, laser, range_m, incidence, intensity, returns, digit)
 
 
-def _values(sample: IntensitySample) -> tuple[npt.NDArray[np.generic], ...]:
+def _values(sample: IntensitySample) -> tuple[npt.NDArray[Any], ...]:
     return sample.laser, sample.range_m, sample.incidence_deg, sample.intensity, sample.returns
 
 
@@ -331,7 +332,7 @@ def _solved(
     (columns, values), (value, weights) = design, observed
     size = rows.place.size
     at = np.repeat(np.arange(size), 5)
-    matrix = sparse.csr_array((values.ravel(), (at, columns.ravel())), shape=(size, terms.count))
+    matrix = sparse.csr_array((values.ravel(), (at, columns.ravel())), shape=(size, terms.unknowns))
     in_place = sparse.csr_array((weights, (rows.place, np.arange(size))), shape=(int(rows.place.max()) + 1, size))
     total = np.maximum(np.bincount(rows.place, weights=weights), 1e-12)
     sums = in_place @ matrix
@@ -345,7 +346,7 @@ def _solved(
 
 def _prior(terms: _Terms) -> Float64:
     """Information (k, k) of what is held before anything is measured: small gains, smooth in range and incidence."""
-    out = np.zeros((terms.count, terms.count))
+    out = np.zeros((terms.unknowns, terms.unknowns))
     for lasers, first in zip(terms.lasers, terms.first, strict=True):
         if not lasers.size:
             continue
@@ -364,7 +365,7 @@ def _common_part(rows: IntensitySample, terms: _Terms, design: tuple[Int64, Floa
     """What to take from the unknowns (k,), of the lasers of all sensors, so that the mean gain of the rows is 1."""
     columns, values = design
     mean = float(np.average((values * solution[columns]).sum(axis=1), weights=rows.returns))
-    out = np.zeros(terms.count)
+    out = np.zeros(terms.unknowns)
     for lasers, first in zip(terms.lasers, terms.first, strict=True):
         out[first : first + lasers.size] = mean
     return out

@@ -40,7 +40,7 @@ def make_scene(
     settings : of bare earth; its defaults where left out.
     """
     drive = np.asarray(drive_xyh_m, np.float64).reshape(-1, 4)
-    ground = bare_earth(Place(returns, window, drive, settings if settings is not None else GroundSettings()))
+    ground = bare_earth(Place(returns, window, settings if settings is not None else GroundSettings()))
     found = np.full(len(returns), classes.UNCLASSIFIED, np.uint8)
     found[ground.on_ground] = classes.GROUND
     found[ground.below] = classes.LOW_NOISE

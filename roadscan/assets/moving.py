@@ -184,7 +184,8 @@ class Shape(NamedTuple):
             return False
         low = self.top_m <= _CAR_TOP_M
         one = 0.9 <= self.length_m <= 7.0 and 0.5 <= self.width_m <= 2.8 and self.ground >= 0.2
-        hidden = 1.1 <= self.length_m <= 3.0 and 0.45 <= self.width_m <= 2.2 and self.scattering <= 0.31
+        hidden = 1.1 <= self.length_m <= 3.0 and 0.45 <= self.width_m <= 2.2
+        hidden = hidden and self.scattering <= 0.31 and self.ground >= 0.02
         van = self.length_m >= 3.5 and self.width_m >= 1.4
         face = 1.4 <= self.length_m <= 2.3 and self.width_m >= 0.4 and self.ground >= 0.4 and self.scattering <= 0.3
         row = self.length_m > 4.0 and 1.4 <= self.width_m <= 6.5 and self.ground >= 0.5 and self.fill >= 0.25

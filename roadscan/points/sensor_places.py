@@ -7,6 +7,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.kernels.georeferencing.tick_places import between_ticks
+from roadscan.kernels.options import read_only
 from roadscan.model.crs import MapFrame
 from roadscan.model.rig import Mountings
 from roadscan.navigation.trajectory import Trajectory
@@ -17,6 +19,7 @@ Int64 = npt.NDArray[np.int64]
 _TICK_NS: Final = 20_000_000
 """Places are computed at multiples of this and are linear between: at 10 m/s² that errs by 0.5 mm."""
 _MOST_TICKS: Final = 20_000_000
+"""Epochs over a longer time (4 days) have a pose each."""
 
 
 def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings, epochs_gps_ns: Int64) -> Float64:
@@ -26,30 +29,26 @@ def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings,
     """
     if not epochs_gps_ns.size:
         return np.zeros((0, 3))
-    tick = epochs_gps_ns // _TICK_NS
-    ticks, before, after = _used(tick)
-    at = _exact(trajectory, frame, mountings, ticks * _TICK_NS)
-    share = ((epochs_gps_ns - tick * _TICK_NS) / _TICK_NS)[:, None]
-    found = at[before] * (1.0 - share) + at[after] * share
+    epochs = np.ascontiguousarray(epochs_gps_ns)
+    first = int(epochs.min()) // _TICK_NS
+    if int(epochs.max()) // _TICK_NS - first > _MOST_TICKS:
+        return _exact(trajectory, frame, mountings, epochs)
+    ticks, number = _used(epochs // _TICK_NS - first)
+    found = np.empty((epochs.size, 3))
+    at = _exact(trajectory, frame, mountings, (ticks + first) * _TICK_NS)
+    between_ticks(read_only(epochs), _TICK_NS, first, number, at, found)
     unknown = np.isnan(found[:, 0])
     if unknown.any():  # beside a gap, or at an end of the trajectory
-        found[unknown] = _exact(trajectory, frame, mountings, epochs_gps_ns[unknown])
+        found[unknown] = _exact(trajectory, frame, mountings, epochs[unknown])
     return found
 
 
-def _used(tick: Int64) -> tuple[Int64, Int64, Int64]:
-    """Ticks (k,) that are needed, and the place among them of each reading's tick and of the next (n,)."""
-    first = int(tick.min())
-    span = int(tick.max()) - first + 2
-    if span > _MOST_TICKS:
-        ticks = np.unique(np.concatenate([tick, tick + 1]))
-        return ticks, np.searchsorted(ticks, tick), np.searchsorted(ticks, tick + 1)
-    own = tick - first
-    is_used = np.zeros(span, bool)
-    is_used[own] = True
-    is_used[own + 1] = True
-    number = np.cumsum(is_used) - 1
-    return np.flatnonzero(is_used) + first, number[own], number[own + 1]
+def _used(tick: Int64) -> tuple[Int64, Int64]:
+    """Ticks (k,) at which places are needed, from 0 on, and the row among them of each tick (t,)."""
+    is_used = np.zeros(int(tick.max()) + 2, bool)
+    is_used[tick] = True
+    is_used[1:] |= is_used[:-1].copy()
+    return np.flatnonzero(is_used), np.cumsum(is_used) - 1
 
 
 def _exact(trajectory: Trajectory, frame: MapFrame, mountings: Mountings, epochs_gps_ns: Int64) -> Float64:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pyarrow.feather as feather
 import shapely
 from scipy.spatial.transform import Rotation
+from shapely.ops import substring
 
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
@@ -21,6 +22,7 @@ from tests.assets.scenes import joined, recordings_folder
 Float64 = npt.NDArray[np.float64]
 
 HALF_M = 40.0
+PIECE_M = 4.0
 _LIDARS = (("up_lidar", 0), ("down_lidar", 1))
 
 
@@ -88,24 +90,49 @@ def _returns(file: Path, poses: object, mounts: object, corner: tuple[float, flo
     )
 
 
-def ratios(scene: Scene, lines: list[shapely.LineString], others: list[shapely.LineString]) -> tuple[float, int]:
-    """Mean intensity of ground within 0.1 m of the lines, over that 0.5 to 1 m beside them; and returns on the lines.
+def ratio(scene: Scene, lines: list[shapely.LineString], away_from: list[shapely.LineString] | None = None) -> float:
+    """Intensity of the road within 0.1 m of the lines, divided by that 0.5 to 1 m beside them.
 
-    Ground near `others` is left out.
+    Lines are compared with what lies beside them in pieces of 4 m or so, since the road is not everywhere the same.
+    Left out are crossings for people, what is not for driving or farther than 30 m, and ground near `away_from`.
     """
     found = scene.returns
-    ground = np.abs(scene.above_ground_m) <= 0.1
-    points = shapely.points(found.corner_m[0] + found.x_m[ground], found.corner_m[1] + found.y_m[ground])
-    value = found.intensity[ground].astype(np.float64)
-    away, apart = (_distance(points, some) for some in (lines, others))
-    on, beside = (away <= 0.1) & (apart > 0.5), (away >= 0.5) & (away <= 1.0) & (apart > 0.5)
-    return float(value[on].mean() / value[beside].mean()), int(on.sum())
+    road = np.flatnonzero((np.abs(scene.above_ground_m) <= 0.1) & (found.range_m < 30.0))
+    points = shapely.points(found.corner_m[0] + found.x_m[road], found.corner_m[1] + found.y_m[road])
+    drivable, crossings = _areas()
+    good = shapely.contains(drivable, points) & ~shapely.contains(crossings, points)
+    if away_from is not None:
+        good[np.unique(shapely.STRtree(points).query(away_from, predicate="dwithin", distance=0.5)[1])] = False
+    road, points = road[good], points[good]
+    pieces = [
+        substring(line, i / n, (i + 1) / n, normalized=True)
+        for line in lines
+        for n in [max(1, round(line.length / PIECE_M))]
+        for i in range(n)
+    ]
+    nearest = shapely.STRtree(pieces).query_nearest(points, max_distance=1.0, return_distance=True, all_matches=False)
+    (row, piece), away = nearest
+    value = found.intensity[road[row]].astype(np.float64)
+    sums = []
+    for there in (away <= 0.1, away >= 0.5):
+        total = np.bincount(piece[there], weights=value[there], minlength=len(pieces))
+        sums.append((total, np.bincount(piece[there], minlength=len(pieces))))
+    (on, count_on), (beside, count_beside) = sums
+    both = (count_on >= 3) & (count_beside >= 3) & (beside > 0)
+    expected = beside[both] / count_beside[both] * count_on[both]
+    return float(on[both].sum() / expected.sum())
 
 
-def _distance(points: npt.NDArray[np.object_], lines: list[shapely.LineString]) -> Float64:
-    """Distance (n,) to the nearest line; infinite beyond 2 m."""
-    tree = shapely.STRtree(lines)
-    out = np.full(len(points), np.inf)
-    (row, _), away = tree.query_nearest(points, max_distance=2.0, return_distance=True, all_matches=False)
-    out[row] = away
-    return out
+@functools.cache
+def _areas() -> tuple[shapely.Geometry, shapely.Geometry]:
+    """Where the map says that one drives, 0.3 m within its edges, and crossings for people with 1 m around."""
+    folder = recordings_folder() / "av2_drive" / "map"
+    known = json.loads(next(Path(folder).glob("log_map_archive*.json")).read_text())
+    drivable = [
+        shapely.Polygon([(p["x"], p["y"]) for p in a["area_boundary"]]) for a in known["drivable_areas"].values()
+    ]
+    crossings = [
+        shapely.MultiPoint([(p["x"], p["y"]) for p in (*c["edge1"], *c["edge2"])]).convex_hull.buffer(1.0)
+        for c in known["pedestrian_crossings"].values()
+    ]
+    return shapely.union_all(drivable).buffer(-0.3), shapely.union_all(crossings)

@@ -57,7 +57,7 @@ def street(name: str, station_m: float, tile_m: float = 40.0, *, whole: bool = F
         scene = scene.model_copy(update={"roadside": roadside, "passes": [first]})
     surface, earth = Surface(scene), Earth(scene.map.crs)
     easting, northing, _ = surface.place(np.array([station_m]), np.array([0.0]))
-    corner = tuple(float(10.0 * math.floor((v[0] - tile_m / 2) / 10.0)) for v in (easting, northing))
+    corner = tuple(5.0 * round(float(v[0] - tile_m / 2) / 5.0) for v in (easting, northing))
     world = World(scene, surface)
     drive = drives_of(scene, earth, Surface(scene, ride=True))[0]
     tile = Box(0.0, 0.0, tile_m, tile_m)

@@ -38,7 +38,7 @@ def total_errors(recordings: Path, method: str) -> dict[str, float]:
     for sample in SAMPLES:
         points, on_ground = isprs_sample(recordings, sample)
         window = Box(0.0, 0.0, *(np.floor(points[:, :2].max(axis=0)) + 1.0).tolist())
-        place = Place(airborne(points), window, NO_DRIVE, GroundSettings.parse({"method": method}))
+        place = Place(airborne(points), window, GroundSettings.parse({"method": method}))
         assert not is_dense(place)
         found[sample] = 100.0 * float(np.mean(ground_returns(place).on_ground != on_ground))
     return found
@@ -67,10 +67,10 @@ def test_a_street_labelled_by_hand() -> None:
 
 
 def test_planes_by_name() -> None:
-    returns, labels, drive = semantic_kitti_returns()
+    returns, labels, _ = semantic_kitti_returns()
     window = Box(-30.0, -30.0, 30.0, 30.0)
     inside = window.holds(returns.x_m, returns.y_m)
-    place = Place(returns.at(inside), window, drive, GroundSettings(method="planes"))
+    place = Place(returns.at(inside), window, GroundSettings(method="planes"))
     ground, labels = ground_returns(place).on_ground, labels[inside]
     assert iou(ground, np.isin(labels, GROUND_LABELS), labels) >= 0.8
     assert ground[labels == 40].mean() >= 0.97
@@ -78,7 +78,7 @@ def test_planes_by_name() -> None:
     square = Box(0.0, -10.0, 10.0, 0.0)
     wider = Box(-2.0, -12.0, 12.0, 2.0)
     near = wider.holds(place.returns.x_m, place.returns.y_m)
-    alone = ground_returns(Place(place.returns.at(near), wider, drive, GroundSettings(method="planes"))).on_ground
+    alone = ground_returns(Place(place.returns.at(near), wider, GroundSettings(method="planes"))).on_ground
     inner = square.holds(place.returns.x_m[near], place.returns.y_m[near])
     assert inner.sum() > 10_000
     assert np.array_equal(alone[inner], ground[near][inner])
@@ -120,6 +120,17 @@ def test_a_simulated_street_has_its_own_surface_again() -> None:
     left = ~np.isin(found.classes[at_car], (classes.VEHICLE, classes.GROUND, classes.ROAD, classes.LOW_NOISE))
     assert at_car.sum() > 5000
     assert left.mean() <= 0.08  # one side of each is seen
+
+
+@pytest.mark.parametrize("slope", [0.2, 0.5, 0.7])
+def test_hillsides_and_banks_are_ground(slope: float) -> None:
+    draw = np.random.default_rng(0)
+    x, y = draw.uniform(0.0, 40.0, (2, 100_000))
+    window = Box(0.0, 0.0, 40.0, 40.0)
+    for height in (slope * x, slope * np.clip(x - 24.0, 0.0, 10.0)):
+        points = np.column_stack([x, y, height + draw.normal(0.0, 0.01, x.size)])
+        scene = make_scene(airborne(points), window, window, NO_DRIVE)
+        assert (scene.classes == classes.GROUND).mean() >= 0.995
 
 
 def test_holes_are_filled_by_a_membrane() -> None:

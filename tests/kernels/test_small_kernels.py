@@ -16,6 +16,7 @@ from roadscan.kernels.cracks.line_medians import keep_better, window_sums
 from roadscan.kernels.cracks.thinning import thin
 from roadscan.kernels.georeferencing.block_ranges import block_ranges
 from roadscan.kernels.georeferencing.profile_bounds import range_bounds
+from roadscan.kernels.georeferencing.tick_places import between_ticks
 from roadscan.kernels.georeferencing.tile_set import add_tile, empty, mark_zonotope, take, tile_set
 from roadscan.kernels.inertial.strapdown import geodetic_of, gravity_at, turned_frame
 from roadscan.kernels.road.curved_grid import accumulate_curved, thin_path
@@ -314,3 +315,13 @@ def test_rings_of_a_triangulation() -> None:
     units(x, y, 0, ring[1:], 6, axes)
     scale = np.array([[axes[0], 0.0], axes[1:]])
     np.testing.assert_allclose(scale @ scale.T, np.trace(mean) / 2 * 18.0 / 6 * np.eye(2), rtol=0.02, atol=1e-12)
+
+
+def test_places_between_ticks_are_linear() -> None:
+    at = np.random.default_rng(5).normal(size=(5, 3))
+    number = np.array([0, 1, 2, 2, 3, 4])  # no epoch needs tick 73
+    epochs = np.array([700, 705, 710, 719, 749, 740], np.int64)
+    found = np.empty((epochs.size, 3))
+    between_ticks(epochs, 10, 70, number, at, found)
+    for axis in range(3):
+        np.testing.assert_allclose(found[:, axis], np.interp(epochs, [700, 710, 720, 740, 750], at[:, axis]))

@@ -30,8 +30,8 @@ OBSTACLE_M: Final = (0.35, 2.2)
 """What stands between these heights above the ground ends a surface."""
 TRANSECT_COLUMNS: Final = ("width_m", "ends_down", "ends_known", "outer_height_m", "slope", "middle_height_m")
 BESIDE_PIECES: Final = line_schema((*NODE_COLUMNS, *TRANSECT_COLUMNS))
-"""Columns of a line's piece, and at each node the surface behind it: width, whether an edge down ends it and whether its
-end is known (0 or 1), height at its end and in its middle, and slope outward."""
+"""Columns of a line's piece, and at each node the surface behind it: width, whether an edge down ends it and whether
+its end is known (0 or 1), height at its end and in its middle, and slope outward."""
 _OPEN: Final = (classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE)
 
 

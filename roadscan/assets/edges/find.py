@@ -1,4 +1,4 @@
-"""Steps along the road of a scene: paths cut where their step cannot be told, and bridged where it is hidden or lowered."""
+"""Steps along the road of a scene: paths cut where no step can be told, and bridged where it is hidden or lowered."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class EdgeSettings(NamedTuple):
     least_step_m: float = 0.015
     greatest_step_m: float = 0.28
     """What is higher is a wall."""
-    seen_low_m: float = 0.85
-    """Width of the lower side, of 1.2 m, that has to be seen: where it is not, rings of a lidar make steps."""
+    seen_low: float = 0.75
+    """Share of the lower side that has to be seen: where it is not, rings of a lidar make steps."""
     seen_high_m: float = 0.25
     covered: float = 0.5
     """Share of a node's window along the edge that has to be seen on both sides."""
@@ -72,8 +72,8 @@ def edges_of(scene: Scene) -> list[Edge]:
 def edges_of_raster(raster: HeightRaster) -> list[Edge]:
     """Edges of a raster of cells alone: each cell counts as one height at its middle."""
     row, column = np.nonzero(raster.count > 0)
-    x = raster.x_min_m + (column + 0.5) * raster.cell_m
-    y = raster.y_min_m + (row + 0.5) * raster.cell_m
+    x = raster.x_min_m + (column.astype(np.float64) + 0.5) * raster.cell_m
+    y = raster.y_min_m + (row.astype(np.float64) + 0.5) * raster.cell_m
     return found_edges(raster, profiles.sorted_heights(x, y, raster.height_m[row, column]))
 
 
@@ -92,8 +92,8 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
 def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
     """Runs of nodes whose step can be told; two nodes that cannot be are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
-    low, high, scatter = (_running(c, known) for c in (nodes.seen_low_m, nodes.seen_high_m, nodes.scatter_m))
-    good = known & (nodes.step_m >= settings.least_step_m) & (low >= settings.seen_low_m)
+    low, high, scatter = (_running(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
+    good = known & (nodes.step_m >= settings.least_step_m) & (low >= settings.seen_low)
     good &= (high >= settings.seen_high_m) & (_running(nodes.step_m, known) >= settings.ratio * scatter)
     good &= _running(nodes.step_m, known) <= settings.greatest_step_m
     good &= nodes.covered >= settings.covered
@@ -181,7 +181,7 @@ def _joined(
         return Edge(_chained(a.nodes, b.nodes), np.concatenate([a.seen, b.seen]), a.evidence + b.evidence)
     line = np.concatenate([ends[:1], between, ends[1:]])
     measured = profiles.nodes_of(line, heights, raster, slopes).at(slice(1, -1))
-    seen = np.isfinite(measured.sigma_step_m) & (measured.seen_low_m >= settings.seen_low_m)
+    seen = np.isfinite(measured.sigma_step_m) & (measured.seen_low >= settings.seen_low)
     seen &= (measured.step_m > 2.0 * measured.sigma_step_m) & (measured.covered >= settings.covered)
     seen &= np.hypot(measured.x_m - between[:, 0], measured.y_m - between[:, 1]) <= settings.bridge_offset_m
     top = np.linspace(a.nodes.top_m[-1], b.nodes.top_m[0], pieces + 1)[1:-1]

@@ -20,7 +20,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 NODE_COLUMNS: Final = (
-    "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low_m",
+    "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low",
     "seen_high_m", "seen",
 )  # fmt: skip
 
@@ -98,7 +98,7 @@ def columns_of(edge: Edge) -> Float64:
     """Nodes (n, columns as `NODE_COLUMNS`) of an edge, coordinates as the scene's returns."""
     n: Nodes = edge.nodes
     return np.column_stack([
-        n.x_m, n.y_m, n.top_m, n.step_m, n.sigma_step_m, n.face_m, n.scatter_m, n.sigma_m, n.seen_low_m, n.seen_high_m,
+        n.x_m, n.y_m, n.top_m, n.step_m, n.sigma_step_m, n.face_m, n.scatter_m, n.sigma_m, n.seen_low, n.seen_high_m,
         edge.seen.astype(np.float64),
     ])  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Final, NamedTuple
 
@@ -82,7 +83,7 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
     following_limits = (settings.begin, settings.go_on, settings.beside_m, settings.gutter_m)
     number, length = trace(place, total, following, preceding, ranked, following_limits, chain, owner)
     ends = np.searchsorted(chain[:length, 0], np.arange(number + 1))
-    found = (chain[a:b, 1] for a, b in zip(ends[:-1], ends[1:], strict=True))
+    found = (chain[a:b, 1] for a, b in itertools.pairwise(ends))
     chains = (Chain(places.at(rows), _own_evidence(place[rows], quality[rows], settings)) for rows in found)
     return sorted((c for c in chains if c.evidence >= settings.begin), key=lambda c: -c.evidence)
 

@@ -26,7 +26,7 @@ WEIGHTS: Final = Weights()
 
 
 def features(line: Line) -> tuple[float, float, float]:
-    """Logarithm of the evidence, logarithm of step over scatter less that of 4, share of the lower side seen less 0.9."""
+    """Logarithms of the evidence and of step over scatter (less that of 4), share of the lower side seen (less 0.9)."""
     step, sigma, seen = line.column("step_m"), line.column("sigma_step_m"), line.column("seen") > 0.5
     known = seen & np.isfinite(step) & np.isfinite(sigma)
     if not known.any():
@@ -36,7 +36,7 @@ def features(line: Line) -> tuple[float, float, float]:
     evidence = math.sqrt(float(np.sum(score**2)) / 2.0)
     scatter = float(np.median(line.column("scatter_m")[known]))
     ratio = float(np.median(step[known])) / max(scatter, 0.002)
-    low = float(np.median(line.column("seen_low_m")[known])) / 1.2
+    low = float(np.median(line.column("seen_low")[known]))
     return math.log(max(evidence, 1e-3)), math.log(max(ratio, 1e-3) / 4.0), low - 0.9
 
 

@@ -65,9 +65,10 @@ class Nodes(NamedTuple):
     scatter_m: Float64
     """Of both sides about their lines, strip by strip."""
     returns: Float64
-    seen_low_m: Float64
-    """Width that was seen of the lower side, of at most 1.2 m."""
+    seen_low: Float64
+    """Share of the lower side that was seen, up to the farthest height of at most 1.2 m."""
     seen_high_m: Float64
+    """Width that was seen of the higher side, of at most 1.2 m."""
     sigma_m: Float64
     """Of the place, across the edge."""
     covered: Float64
@@ -170,7 +171,10 @@ def even_nodes(places: Float64, distance_m: float) -> Float64:
     fine = np.arange(0.0, length[-1] + 0.05, 0.1)
     path = np.column_stack([np.interp(fine, length, places[:, i]) for i in range(2)])
     if len(path) >= 3:
-        path = scipy.ndimage.gaussian_filter1d(path, 3.0, axis=0, mode="nearest")
+        # Mirrored at its ends through the end points, which so stay where they are.
+        more = min(len(path) - 1, 12)
+        before, behind = 2.0 * path[:1] - path[more:0:-1], 2.0 * path[-1:] - path[-2 : -2 - more : -1]
+        path = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, behind]), 3.0, axis=0)[more:-more]
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
     pieces = max(round(length[-1] / distance_m), 1)
     at = np.linspace(0.0, length[-1], pieces + 1)

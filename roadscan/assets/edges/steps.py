@@ -57,6 +57,7 @@ class Places(NamedTuple):
 DEFAULT: Final = StepSettings()
 _CLIPPED: Final = 4.0
 _STILL: Final = 0.5
+_PRIOR: Final = 0.06
 _MEAN_SIZE: Final = math.sqrt(2.0 / math.pi)
 """Mean of the absolute value of a normal variable."""
 
@@ -107,7 +108,7 @@ def _freedom(raster: HeightRaster, settings: StepSettings) -> Float64:
     """(rows, columns) cells with a height in the window around each cell, any direction of it."""
     wide = round((settings.half_along_m + settings.across_m) / raster.cell_m) + 1
     share = scipy.ndimage.uniform_filter((raster.count > 0).astype(np.float64), wide, mode="constant")
-    return share * 4.0 * settings.half_along_m * settings.across_m / raster.cell_m**2
+    return np.asarray(share * 4.0 * settings.half_along_m * settings.across_m / raster.cell_m**2)
 
 
 def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool_]:
@@ -115,7 +116,7 @@ def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool
     wide, known = round(2.0 * settings.across_m / raster.cell_m) + 1, raster.count > 0
     top = scipy.ndimage.maximum_filter(np.where(known, raster.height_m, -np.inf), wide)
     bottom = scipy.ndimage.minimum_filter(np.where(known, raster.height_m, np.inf), wide)
-    return np.isfinite(top) & (top - bottom >= settings.least_m)
+    return np.asarray(np.isfinite(top) & (top - bottom >= settings.least_m))
 
 
 def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSettings, cell_m: float) -> Float64:
@@ -127,8 +128,8 @@ def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSetti
     wide = round(settings.around_m / cell_m)
     size = np.where(still, _STILL, np.minimum(np.abs(evidence), _CLIPPED))
     share = scipy.ndimage.uniform_filter((still | (evidence != 0.0)).astype(np.float64), wide, mode="constant")
-    mean = scipy.ndimage.uniform_filter(size, wide, mode="constant") / np.maximum(share, 1e-6)
-    return np.maximum(mean / _MEAN_SIZE, 1.0)
+    mean = (scipy.ndimage.uniform_filter(size, wide, mode="constant") + _PRIOR * _STILL) / (share + _PRIOR)
+    return np.asarray(np.maximum(mean / _MEAN_SIZE, 1.0))
 
 
 def _places(raster: HeightRaster, best: Float64, settings: StepSettings) -> Places:

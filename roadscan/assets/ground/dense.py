@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid, grid_over
-from roadscan.assets.ground.growth import grown_cells
 from roadscan.assets.ground.morphological import bare_cells
 from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.kernels.assets.ground_cells import on_ground, scatter
@@ -20,6 +19,8 @@ Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 LOWEST_CELL_M: Final = 0.5
+_PIT_M: Final = 0.5
+"""A lowest return is noise where it lies below the surface around by more: a mirror image, seen in a car."""
 _CELL_M: Final = 0.25
 _NEAR_M, _CLOSE_M = (-0.25, 0.40), 0.20
 """Returns between these heights above the provisional ground tell how rough a cell is, and where the ground lies."""
@@ -48,15 +49,15 @@ class Cells(NamedTuple):
 
 
 def dense_ground(place: Place) -> Found:
-    """Returns on the ground, from cells whose lowest return goes on from the drive (:mod:`.growth`)."""
-    returns, settings = place.returns, place.settings
+    """Returns near the surface of the cells that remain when windows have opened it, where places are not rough, and
+    those as high as an even cell beside.
+    """
+    returns = place.returns
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     grid = grid_over(place.window, LOWEST_CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    known = grown_cells(lowest, grid, place.drive_xyh_m, settings.largest_object_m)
-    if known is None:
-        known = bare_cells(lowest, grid.cell_m, settings.steepest, settings.largest_object_m)
+    known = bare_cells(lowest, grid.cell_m, _PIT_M, place.settings)
     base = Surface(grid, filled(lowest, known))
     fine, above = grid_over(place.window, _CELL_M), np.empty(x.size, np.float32)
     sums = np.zeros((*fine.shape, 5))

@@ -1,9 +1,10 @@
-"""Rasters with holes, filled."""
+"""Rasters with holes, filled, and how far holes reach."""
 
 from __future__ import annotations
 
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -31,3 +32,9 @@ def filled(height_m: Float32, known: Bools) -> Float32:
         begin(filled(coarse, coarse_known), known, z)
         relax(z, known, _SWEEPS)
     return z
+
+
+def distances(found: Bools, cell_m: float) -> Float32:
+    """Distance (rows, columns) of each cell from the nearest one that is True (m)."""
+    away = cv2.distanceTransform((~found).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(away * np.float32(cell_m))

@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
+from roadscan.model.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 _GROWTH: Final = 1.15
 """Each window is wider than the one before by this factor, and by a cell at the least."""
-_PIT_M: Final = 8.0
-"""A lowest return is noise where it lies below the surface around by more: crowns with a gap are no deeper."""
 
 
 def disk(radius: int) -> npt.NDArray[np.uint8]:
@@ -45,25 +44,33 @@ def windows(largest_m: float, cell_m: float) -> list[int]:
 
 
 def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) -> Bools:
-    """Cells of a whole surface (rows, columns) that stand on the ground instead of being part of it (section 2.2)."""
-    found = np.zeros(surface.shape, np.bool_)
-    before = surface
+    """Cells of a whole surface (rows, columns) that stand on the ground instead of being part of it (section 2.2).
+
+    Beyond its edges the surface goes on as its reflection through them, so that a slope stays one: opened alone, its
+    upper edge would be cut.
+    """
+    margin = min(max(round(largest_m / cell_m), 1), *(side - 1 for side in surface.shape))
+    if margin < 1:
+        return np.zeros(surface.shape, np.bool_)
+    before = np.pad(surface, margin, mode="reflect", reflect_type="odd")
+    found = np.zeros(before.shape, np.bool_)
     for radius in windows(largest_m, cell_m):
         after = opened(before, radius)
         found |= before - after > steepest * radius * cell_m
         before = after
-    return found
+    return found[margin:-margin, margin:-margin]
 
 
-def bare_cells(lowest_m: Float32, cell_m: float, steepest: float, largest_m: float) -> Bools:
+def bare_cells(lowest_m: Float32, cell_m: float, pit_m: float, settings: GroundSettings) -> Bools:
     """Cells (rows, columns) whose lowest return lies on the ground.
 
     lowest_m : (rows, columns), inf where a cell holds no return.
+    pit_m : a lowest return is noise where it lies below the surface around by more.
     """
     known = np.isfinite(lowest_m)
     surface = filled(lowest_m, known)
-    pits = -surface - opened(-surface, 1) > _PIT_M
+    pits = -surface - opened(-surface, 1) > pit_m
     if (pits & known).any():
         known &= ~pits
         surface = filled(lowest_m, known)
-    return known & ~objects(surface, cell_m, steepest, largest_m)
+    return known & ~objects(surface, cell_m, settings.steepest, settings.largest_object_m)

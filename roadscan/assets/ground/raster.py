@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.filling import distances, filled
 from roadscan.assets.ground.grid import grid_over
-from roadscan.assets.ground.growth import distances
 from roadscan.assets.ground.surface import Found, Place
 from roadscan.assets.scene import GroundModel
 from roadscan.kernels.assets.ground_cells import cell_heights

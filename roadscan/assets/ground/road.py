@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.ground.growth import distances
+from roadscan.assets.ground.filling import distances
 from roadscan.assets.scene import GroundModel
 
 Bools = npt.NDArray[np.bool_]

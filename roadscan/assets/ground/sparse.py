@@ -19,6 +19,8 @@ from roadscan.kernels.assets.lowest import lowest_returns
 Float32 = npt.NDArray[np.float32]
 
 CELL_M: Final = 1.0
+_PIT_M: Final = 8.0
+"""A lowest return is noise where it lies below the surface around by more: gaps in crowns are no deeper."""
 _SMOOTH: Final = 0.7
 """Standard deviation of the Gaussian that smooths the ground before returns are held against it (cells)."""
 _TOLERANCE_M, _TOLERANCE_SLOPE = 0.5, 1.25
@@ -33,12 +35,12 @@ def sparse_ground(place: Place) -> Found:
     The surface of lowest returns leans to the lowest place of each cell, so it is made anew from the returns that lie
     close to it.
     """
-    returns, settings = place.returns, place.settings
+    returns = place.returns
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     grid = grid_over(place.window, CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    known = bare_cells(lowest, grid.cell_m, settings.steepest, settings.largest_object_m)
+    known = bare_cells(lowest, grid.cell_m, _PIT_M, place.settings)
     first = near(place, smoothed(Surface(grid, filled(lowest, known))), _CLOSE)
     return near(place, smoothed(remade(place, first)), 1.0)
 

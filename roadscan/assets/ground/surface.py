@@ -25,11 +25,10 @@ scanners from the air give about one."""
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What a filter gets: returns of a window, the drives through it, and the settings."""
+    """What a filter gets: the returns of a window, and the settings."""
 
     returns: Returns
     window: Box
-    drive_xyh_m: Float64
     settings: GroundSettings
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-import numpy as np
 import pyarrow as pa
 import shapely
 
@@ -15,6 +14,8 @@ from roadscan.assets.upright.cushions import PIECE_SCHEMA, boxes_of
 from roadscan.assets.upright.probability import logistic
 
 _NEAR_END_M: Final = 2.0
+_LEAST_LINE_M: Final = 4.0
+"""What is shielded is longer."""
 
 
 class Attenuator(AssetKind):
@@ -33,12 +34,14 @@ class Attenuator(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Boxes at the end of something that they shield."""
-        lines = [o.geometry for kind in self.after for o in others.get(kind, ())]
-        ends = shapely.multipoints([p for g in lines for p in (g.coords[0][:2], g.coords[-1][:2]) if g.length > 4.0])
+        lines = [o.geometry for kind in self.after for o in others.get(kind, ()) if o.geometry.length > _LEAST_LINE_M]
+        if not lines:
+            return
+        ends = shapely.multipoints([end for line in lines for end in (line.coords[0][:2], line.coords[-1][:2])])
         for row in pieces.to_pylist():
             box = shapely.Polygon([(*p, row["ground_m"]) for p in row["ring"]])
-            away = float(shapely.distance(shapely.force_2d(box), ends)) if lines else np.nan
-            if not away <= _NEAR_END_M:
+            away = float(shapely.distance(shapely.force_2d(box), ends))
+            if away > _NEAR_END_M:
                 continue
             probability = logistic(0.0, [(-1.0, away), (0.02, min(row["returns"], 100))])
             values = {name: row[name] for name in ("asset_height_m", "length_m", "width_m")}

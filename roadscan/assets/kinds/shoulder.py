@@ -38,7 +38,7 @@ class ShoulderOptions(Strict):
 
 
 class Shoulder(AssetKind):
-    """Shoulders: polygons between road edges and the lane lines nearest to them. They follow from objects of other kinds."""
+    """Shoulders: polygons between road edges and the lane lines nearest to them. They need no returns."""
 
     name: ClassVar[str] = "shoulder"
     title: ClassVar[str] = "shoulders: paved strips beyond the outer lane line"

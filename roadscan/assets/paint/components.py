@@ -13,7 +13,7 @@ from roadscan.assets.paint.contrast import CELL_M, Contrast
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-SEED_CONTRAST: Final = 0.45
+SEED_CONTRAST: Final = 0.55
 SEED_SIGMAS: Final = 4.0
 """Paint begins at cells of this contrast, in units of the surface's brightness and of the noise."""
 _EDGE_SHARE: Final = 0.4
@@ -24,7 +24,7 @@ _AROUND_M: Final = 0.3
 """Returns within this of its cells belong to a component's surroundings."""
 FEWEST_RETURNS: Final = 8
 FEWEST_LINES: Final = 3
-EVIDENCE_SIGMAS: Final = 6.0
+EVIDENCE_SIGMAS: Final = 5.0
 """Mean contrast of a component, in units of its standard deviation on a bare surface."""
 _LINE_SIGMA: Final = 0.15
 """1 σ of the contrast that a scan line as a whole has on a bare surface: what its gain does not explain."""

@@ -83,7 +83,8 @@ def contrast_of(scene: Scene) -> Contrast:
     on_ground &= (scene.classes != VEHICLE) & (scene.classes != PERSON) & window.holds(found.x_m, found.y_m)
     rows = np.flatnonzero(on_ground)
     seen = found.at(rows)
-    rows = rows[seen.sensor_height_m - seen.height_m >= _FLATTEST * seen.range_m]
+    flat = seen.sensor_height_m - seen.height_m < _FLATTEST * seen.range_m
+    rows = rows[~flat]  # where it is not known where the sensor stood, all are kept
     x, y, intensity = found.x_m[rows], found.y_m[rows], found.intensity[rows].astype(np.float64)
     level, upper = _levels(x, y, intensity, window)
     contrast = np.clip(intensity / level - 1.0, *_CLIP)

@@ -22,10 +22,11 @@ Int64 = npt.NDArray[np.int64]
 
 ACROSS_DEG: Final = 55.0
 """Bands at this angle to the road or more lie across it."""
+WIDEST_LINE_M: Final = 0.42
 _STOP_BAR_M: Final = (0.15, 1.0)
 """Narrowest band across the road that is a bar, and shortest."""
 _LEAST_AREA_M2: Final = 0.03
-_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, -2.0
+_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, 0.0
 _OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0
 _SPREAD: Final = 0.25
 """1 σ of the contrast of fresh paint from place to place, as a share of its mean."""
@@ -85,7 +86,7 @@ def _paint_of(scene: Scene) -> Paint:
     lines, patches = [], []
     for stripe, crossed in zip(bands, in_crosswalk[: len(bands)], strict=True):
         direction = road.at(*stripe.middle_m)
-        if crossed or _lies_across(stripe, direction):
+        if crossed or stripe.width_m > WIDEST_LINE_M or _lies_across(stripe, direction):
             patches.append(_of_stripe(stripe, bool(crossed), direction))
         else:
             lines.append(stripe)
@@ -112,7 +113,7 @@ def painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
     ):
         spread = np.hypot(sigma, _SPREAD * level)
         odds = odds + np.clip(level * (value - level / 2) / spread**2, -most, most)
-    return found.rows[at[odds > 0.0]]
+    return np.asarray(found.rows[at[odds > 0.0]])
 
 
 def _lies_across(stripe: Stripe, road_rad: float) -> bool:

@@ -36,7 +36,7 @@ class _Pieces:
     @property
     def length_m(self) -> Float64:
         """Lengths (n,) of the pieces."""
-        return np.hypot(*(self.ends[:, 1, :2] - self.ends[:, 0, :2]).T)
+        return np.asarray(np.hypot(*(self.ends[:, 1, :2] - self.ends[:, 0, :2]).T))
 
     def numbers(self, name: str) -> Float64:
         """A column of the table (n,)."""

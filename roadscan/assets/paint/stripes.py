@@ -17,8 +17,8 @@ Int64 = npt.NDArray[np.int64]
 CHUNK_M: Final = 5.0
 """Long components are cut at multiples of this in the map, so that each piece is straight."""
 _LONGEST_WHOLE_M: Final = 7.0
-WIDEST_M: Final = 0.42
-"""Widest band that counts as a line."""
+WIDEST_M: Final = 0.7
+"""Widest band: lines, and bars of crossings and stops."""
 _SLIMMEST: Final = 2.0
 """Length over width of a band."""
 _SHORTEST_M: Final = 0.35
@@ -80,7 +80,7 @@ class Stripe:
 
 
 def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, float]) -> list[Stripe] | None:
-    """Bands that the component consists of, end to end; None if it is of another shape. Edges of surfaces are left out."""
+    """Bands that the component consists of, end to end; None if it is of another shape. Surfaces' edges are none."""
     axis = _axis(component.cell_x_m, component.cell_y_m)
     if axis is None:
         return None
@@ -90,8 +90,10 @@ def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, flo
         return _of_parts(found, component, (middle, along, length), corner_m)
     if not straight or length < _SHORTEST_M or width > WIDEST_M + 0.15 or length < _SLIMMEST * width:
         return None
-    start = Stripe(middle, along, -length / 2, length / 2, width, 0.0, component.near, component.near, 0.0, False, False,
-                   component.evidence_sigma)  # fmt: skip
+    start = Stripe(
+        middle, along, -length / 2, length / 2, width, 0.0, component.near, component.near,
+        0.0, False, False, component.evidence_sigma,
+    )  # fmt: skip
     stripe = fitted(found, start)
     if stripe is not None and _is_an_edge(found, component, stripe):
         return []
@@ -130,7 +132,7 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     count = np.count_nonzero(inside)
     scatter = float(np.mean(noise[inside])) / max(stripe.contrast, 1e-3)
     sigma = float(np.hypot(stripe.width_m * scatter, 0.03) / np.sqrt(count) + 0.002)
-    seen = [
+    seen = [  # of bare ground beyond the begin, and beyond the end
         bool(np.any((np.abs(across) <= stripe.width_m / 2 + _SEEN_ASIDE_M) & beyond))
         for beyond in (
             (along < stripe.begin_m) & (along > stripe.begin_m - 0.3),
@@ -139,9 +141,8 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     ]
     reach = (along >= stripe.begin_m - AROUND_M) & (along <= stripe.end_m + AROUND_M)
     around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
-    return replace(
-        stripe, returns=near[inside], around=around, sigma_across_m=sigma, begin_seen=seen[0], end_seen=seen[1]
-    )
+    stripe = replace(stripe, begin_seen=seen[0], end_seen=seen[1])
+    return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma)
 
 
 def lies_flat(found: Contrast, component: Component) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.places import places_of
+from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.shafts import Shaft
 
 Float64 = npt.NDArray[np.float64]
@@ -20,6 +20,8 @@ _LEVEL_M: Final = 0.4
 _SECTORS: Final = 8
 _CROWN_REACH_M: Final = 4.5
 _ARM_REACH_M: Final = 4.5
+_BRIGHT_SHARE: Final = 0.1
+"""Heads of signals are dark; of the returns of a sign more are bright than this share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,13 +141,14 @@ def _reach(along: Float64, above: Float64) -> tuple[float, float]:
     return reach, float(np.median(above[end]))
 
 
-def signal_head(near: About, shaft: Shaft) -> tuple[float, float] | None:
+def signal_head(scene: Scene, near: About) -> tuple[float, float] | None:
     """Height of the middle above the foot, and height of a box that a shaft carries, as signals have them; else None.
 
-    A box 0.15–0.6 m wide and deep and 0.55–1.5 m high, 1.8 m above the foot or more; plates are thinner.
+    A box 0.15–0.6 m wide and deep and 0.55–1.5 m high, 1.8 m above the foot or more; plates are thinner, and bright.
     """
     close = (near.away_m < 0.75) & (near.above_m > 1.8)
-    if close.sum() < 15:
+    bright = scene.returns.intensity[near.rows[close]] >= 2.0 * ground_light(scene)
+    if close.sum() < 15 or bright.mean() > _BRIGHT_SHARE:
         return None
     right, ahead, above = near.right_m[close], near.ahead_m[close], near.above_m[close]
     low, high = np.quantile(above, [0.02, 0.98])

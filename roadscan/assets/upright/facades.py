@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import Chain
-from roadscan.assets.upright.slices import usable
+from roadscan.assets.upright.places import places_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -42,8 +42,11 @@ def beside(scene: Scene, rows: Int64) -> Int64:
     along, normal = axes[0], axes[1]
     seen = np.array([returns.sensor_x_m[rows].mean(), returns.sensor_y_m[rows].mean()]) - middle
     normal = normal if float(normal @ seen) > 0.0 else -normal
-    x, y = returns.x_m - middle[0], returns.y_m - middle[1]
-    t, away = x * along[0] + y * along[1], x * normal[0] + y * normal[1]
     begin, end = float((some @ along).min()) - 0.3, float((some @ along).max()) + 0.3
-    inside = usable(scene) & (t >= begin) & (t <= end) & (away >= -_BEHIND_M) & (away <= _BEFORE_M)
-    return np.union1d(rows, np.flatnonzero(inside))
+    near = places_of(scene).within(float(middle[0]), float(middle[1]), max(-begin, end) + _BEHIND_M)
+    x, y = returns.x_m[near] - middle[0], returns.y_m[near] - middle[1]
+    t, away = x * along[0] + y * along[1], x * normal[0] + y * normal[1]
+    inside = (t >= begin) & (t <= end) & (away >= -_BEHIND_M) & (away <= _BEFORE_M)
+    marked = np.zeros(len(returns), np.bool_)
+    marked[rows], marked[near[inside]] = True, True
+    return np.flatnonzero(marked)

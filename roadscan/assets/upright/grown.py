@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.pieces import passes_of
 from roadscan.kernels.assets.grown_cells import ground_moments
 from roadscan.model.strict import Strict
 
@@ -118,7 +119,7 @@ def _table(
                 {
                     "column": first[0] + c, "row": first[1] + r, "height_m": height,
                     "probability": float(probability[r, c]), "returns": int(part.size),
-                    "passes": np.unique(returns.pass_id[part]).tolist(), "first_epoch_gps_ns": int(epochs.min()),
+                    "passes": passes_of(scene, part), "first_epoch_gps_ns": int(epochs.min()),
                     "last_epoch_gps_ns": int(epochs.max()),
                 }
             )  # fmt: skip

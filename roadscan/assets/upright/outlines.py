@@ -12,7 +12,7 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 
 _DIRECTIONS: Final = 36
-_TRIMMED: Final = 0.003
+_TRIMMED: Final = 0.0005
 _BEYOND: Final = 0.35
 """The edge lies past the outermost return by this share of the mean distance from return to return: none of evenly
 spread returns would make it 0, a grid of them 0.5."""
@@ -47,7 +47,7 @@ def outline_of(points: Float64) -> Outline:
         columns = np.column_stack([ways, *[t(ways) for t in templates]])
         solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
         misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
-        if (solution[2:] > 0.02).all() and (best is None or misfit < best[0] - 0.002):
+        if (solution[2:] > 0.02).all() and (best is None or misfit < best[0]):
             best = (misfit, shape, solution)
     if best is None:
         low, high = points.min(axis=0), points.max(axis=0)

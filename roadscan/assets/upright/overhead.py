@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.pieces import passes_of
+from roadscan.assets.upright.places import ground_light
 from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.corridors import mark_corridor
 from roadscan.model.strict import Strict
@@ -62,8 +64,7 @@ def overhead_cells(scene: Scene, options: ClearanceOptions) -> pa.Table:
     columns = int(np.ceil((tile.x_max_m - tile.x_min_m) / CELL_M - 1e-9))
     shape = (int(np.ceil((tile.y_max_m - tile.y_min_m) / CELL_M - 1e-9)), columns)
     corner = np.array([tile.x_min_m, tile.y_min_m])
-    ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
-    bright = 2.0 * float(np.median(returns.intensity[ground])) if ground.any() else np.inf
+    bright = 2.0 * ground_light(scene)
     found: list[dict[str, Any]] = []
     for pass_id in np.unique(scene.drive_xyh_m[:, 3]).tolist():
         drive = scene.drive_xyh_m[scene.drive_xyh_m[:, 3] == pass_id]
@@ -119,7 +120,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
         "vegetation": float(np.isin(scene.classes[near], _VEGETATION).mean()),
         "bright": float((returns.intensity[near] >= bright).mean()),
         "thickness_m": float(np.quantile(returns.height_m[near], 0.9) - height),
-        "passes": np.unique(returns.pass_id[near]).tolist(), "first_epoch_gps_ns": int(epochs.min()),
+        "passes": passes_of(scene, near), "first_epoch_gps_ns": int(epochs.min()),
         "last_epoch_gps_ns": int(epochs.max()),
     }  # fmt: skip
 

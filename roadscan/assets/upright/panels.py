@@ -19,8 +19,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 STRETCH_M: Final = 1.0
-_MOST_LINES: Final = 200_000
+_MOST_LINES: Final = 150_000
 """Sight lines that are held against surfaces: every k-th return, so that no more are taken."""
+_HIGH_M: Final = 4.0
+"""What passes through higher surfaces is not asked."""
 _BESIDE_M: Final = 0.2
 """Returns of a region that lie this far beside its line or less make the surface."""
 _OPEN_DEG: Final = 1.2
@@ -137,9 +139,14 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     some = slice(None, None, step)
     taken = np.zeros(len(returns), np.bool_)
     taken[some] = True
+    low = [_is_low(p) for p in panels]
     rectangles = np.concatenate(
         [np.zeros((0, 6))]
-        + [np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08]) for p in panels]
+        + [
+            np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08])
+            for p, asked in zip(panels, low, strict=True)
+            if asked
+        ]
     )
     passed = np.zeros(len(rectangles), np.int64)
     passing_lines(
@@ -147,9 +154,17 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
         returns.sensor_y_m[some], returns.sensor_height_m[some], rectangles, passed,
     )  # fmt: skip
     out, first = [], 0
-    for p in panels:
+    for p, asked in zip(panels, low, strict=True):
         count = p.returns.size
         stopped = np.bincount(p.stretch[taken[p.rows]], minlength=count)
-        out.append(replace(p, stopped=stopped, passed=passed[first : first + count]))
-        first += count
+        through = passed[first : first + count] if asked else np.zeros(count, np.int64)
+        out.append(replace(p, stopped=stopped, passed=through))
+        first += count if asked else 0
     return out
+
+
+def _is_low(panel: Panel) -> bool:
+    """Whether it is asked what passes through a surface."""
+    above = panel.high_m - panel.ground_m
+    known = above[np.isfinite(above)]
+    return known.size > 0 and float(np.median(known)) <= _HIGH_M

@@ -46,12 +46,18 @@ def schema_of(numbers: Sequence[str], texts: Sequence[str] = ()) -> pa.Schema:
     return pa.schema([*_COMMON, *own])
 
 
+def passes_of(scene: Scene, rows: Int64) -> list[int]:
+    """Passes that saw some returns, ascending."""
+    out: list[int] = np.flatnonzero(np.bincount(scene.returns.pass_id[rows])).tolist()
+    return out
+
+
 def seen_by(scene: Scene, rows: Int64) -> dict[str, Any]:
     """Number of returns, passes (ascending), first and last epoch of some returns."""
     epochs = scene.returns.epoch_gps_ns[rows]
     return {
         "returns": int(rows.size),
-        "passes": np.unique(scene.returns.pass_id[rows]).tolist(),
+        "passes": passes_of(scene, rows),
         "first_epoch_gps_ns": int(epochs.min()),
         "last_epoch_gps_ns": int(epochs.max()),
     }

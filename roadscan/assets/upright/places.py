@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.memory import once_a_scene
 from roadscan.assets.upright.slices import usable
@@ -57,3 +58,10 @@ def places_of(scene: Scene) -> Places:
     order = np.empty(int(starts[-1]), np.int64)
     fill_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts.copy(), order)
     return Places(scene, order, starts, (rows, columns))
+
+
+@once_a_scene
+def ground_light(scene: Scene) -> float:
+    """Median intensity of the ground; infinite where there is none."""
+    ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
+    return float(np.median(scene.returns.intensity[ground])) if ground.any() else float("inf")

@@ -12,10 +12,9 @@ from pydantic import Field
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.outlines import Outline, outline_of
-from roadscan.assets.upright.places import places_of
+from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.shafts import shafts_of
@@ -85,10 +84,7 @@ def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
 
 def _bright(scene: Scene, ratio: float) -> npt.NDArray[np.bool_]:
     """Returns (n,) more than a metre above the ground, as bright as `ratio` times the median of the ground."""
-    ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
-    if not ground.any():
-        return np.zeros(len(scene.returns), np.bool_)
-    least = ratio * float(np.median(scene.returns.intensity[ground]))
+    least = ratio * ground_light(scene)
     return usable(scene) & (scene.above_ground_m > _SEARCHED_ABOVE_M) & (scene.returns.intensity >= least)
 
 

@@ -54,6 +54,7 @@ class Slices:
         return order, starts
 
 
+@once_a_scene
 def usable(scene: Scene) -> npt.NDArray[np.bool_]:
     """Returns (n,) that may belong to something upright: those of ground, vehicles, people and noise are set apart."""
     lookup = np.ones(256, np.bool_)

@@ -53,7 +53,7 @@ def uprights_of(scene: Scene) -> list[Upright]:
     crowns = [tree_probability(shaft, crown_share(a, shaft)) for (shaft, _), a in zip(probable, near, strict=True)]
     trunks = np.array([[s.axis.x_m, s.axis.y_m] for (s, _), c in zip(probable, crowns, strict=True) if c >= 0.5])
     return [
-        _told(shaft, probability, a, c, trunks.reshape(-1, 2))
+        _told(scene, shaft, probability, a, c, trunks.reshape(-1, 2))
         for (shaft, probability), a, c in zip(probable, near, crowns, strict=True)
     ]
 
@@ -107,7 +107,9 @@ def _apart(judged: list[tuple[Shaft, float]]) -> list[tuple[Shaft, float]]:
     return kept
 
 
-def _told(shaft: Shaft, probability: float, near: About, tree: float, trunks: npt.NDArray[np.float64]) -> Upright:
+def _told(
+    scene: Scene, shaft: Shaft, probability: float, near: About, tree: float, trunks: npt.NDArray[np.float64]
+) -> Upright:
     """What a shaft is, with the values of its kind."""
     diameter, lean = round(2.0 * shaft.axis.radius_m, 4), round(shaft.axis.lean_deg, 3)
     values: dict[str, float | str | None] = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter}
@@ -118,7 +120,7 @@ def _told(shaft: Shaft, probability: float, near: About, tree: float, trunks: np
         return Upright("delineator", shaft, probability, shaft.rows, values)
     values["lean_deg"] = lean
     out = arms(near, shaft)
-    if signal_head(near, shaft) is not None and shaft.top_above_m < _SIGNAL_M:
+    if signal_head(scene, near) is not None and shaft.top_above_m < _SIGNAL_M:
         values["arm_m"] = out.reach_m if out else None
         return Upright("signal", shaft, probability, shaft.rows, values)
     if out is not None and shaft.top_above_m >= _LAMP_M:

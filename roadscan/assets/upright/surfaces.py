@@ -20,6 +20,7 @@ Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 _SIMPLE_M: Final = 0.03
 _FENCE_PASSES: Final = 0.12
 """A surface that lets this share of the sight lines through is a fence."""
+_LEAST_FENCE_M: Final = 2.5
 _MOST_VEGETATION: Final = 0.5
 
 
@@ -40,9 +41,9 @@ def told(chain: Chain) -> Surface | None:
     if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5:
         return "guardrail" if chain.length_m >= 4.0 else None
     if chain.passing >= _FENCE_PASSES:
-        return "fence" if top >= 0.6 else None
+        return "fence" if top >= 0.6 and chain.length_m >= _LEAST_FENCE_M else None
     if top > 1.25:
-        return "wall"
+        return "wall" if chain.length_m >= _LEAST_FENCE_M else None
     return "barrier" if top >= 0.5 and chain.length_m >= 3.0 else None
 
 

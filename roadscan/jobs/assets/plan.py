@@ -26,8 +26,9 @@ from roadscan.tables.store import bytes_digest
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.grid import TileGrid
 
-_BLOCK_EDGE_M: Final = 160.0
-"""Edge of the squares that one task searches together, about: a lidar sees as far to both sides."""
+_BLOCK_SQUARES: Final = 16
+"""Edge of the largest block of squares that one task searches: a lidar sees 100 m to both sides, and row groups that
+touch several blocks are read for each."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class AssetPlan:
     keys: Mapping[TileId, str]
     """Key of what was seen in each square, by row and column."""
     readings: Mapping[TileId, int]
-    """About how many returns each square and its halo hold."""
+    """About how many returns each square holds."""
 
     @property
     def context(self) -> ProductContext:
@@ -54,11 +55,13 @@ class AssetPlan:
 
     def blocks(self, squares: Sequence[TileId], workers: int = 1) -> list[tuple[TileId, ...]]:
         """Neighbouring squares that fit into memory together; fewer where there are few for that many workers."""
-        edge = max(1, round(_BLOCK_EDGE_M / self.grid.edge_m))
-        while edge > 1 and len(squares) < edge * edge * workers:
-            edge //= 2
         readings = {square: self.readings[square] for square in squares}
-        return [b.tiles for b in cut_blocks(readings, edge, self.config.max_block_returns)]
+        edge = _BLOCK_SQUARES
+        blocks = cut_blocks(readings, edge, self.config.max_block_returns)
+        while edge > 1 and workers > 1 and len(blocks) < 2 * workers:
+            edge //= 2
+            blocks = cut_blocks(readings, edge, self.config.max_block_returns)
+        return [b.tiles for b in blocks]
 
     def load(self, squares: tuple[TileId, ...]) -> ReturnsTask:
         """What loads the returns of some squares."""
@@ -98,9 +101,9 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     readings: dict[TileId, int] = {}
     squares = {grid.of_tile(tile) for tile in tiles.ids}
     for square in sorted(squares, key=lambda t: (t.row, t.column)):
-        numbers = [tiles.number[t] for t in grid.tiles_under(square) if t in tiles.number]
-        keys[square] = key_of(common, [(str(tiles.ids[n]), tiles.keys[n]) for n in numbers])
-        readings[square] = int(tiles.readings[numbers].sum())
+        under = [t for t in grid.tiles_under(square) if t in tiles.number]
+        keys[square] = key_of(common, [(str(t), tiles.keys[tiles.number[t]]) for t in under])
+        readings[square] = sum(int(tiles.readings[tiles.number[t]]) for t in under if grid.of_tile(t) == square)
     return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), keys, readings)
 
 

@@ -11,8 +11,8 @@ from roadscan.kernels.options import kernel
 def low_heights(x_m, y_m, z_m, grid, depth_m, count, mean_m, variance_m2):
     """Fill (rows, columns) `count`, `mean_m` and `variance_m2` of the returns that lie lowest in each cell.
 
-    x_m, y_m, z_m : (n,) returns (m). grid : (x_min_m, y_min_m, cell_m). depth_m : returns up to this above the lowest of
-    the cell count. Cells without a return keep 0 returns.
+    x_m, y_m, z_m : (n,) returns (m). grid : (x_min_m, y_min_m, cell_m). depth_m : returns up to this above the lowest
+    of the cell count. Cells without a return keep 0 returns.
     """
     rows, columns = count.shape
     lowest = np.full((rows, columns), np.inf)

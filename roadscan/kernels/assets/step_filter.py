@@ -17,9 +17,9 @@ MIN_STRIPS = 3
 def strips(weight, height_m, slope_x, slope_y, along, out):
     """Fill `out` (3, rows, columns): sum of weights of the strip around each cell, its mean height (m), and its χ².
 
-    weight : (rows, columns) one over the variance of a cell's height (1/m²), 0: no height. slope_x, slope_y : slope of the
-    ground at large (m/m). along : (k, 4) of each cell of a strip its column and row from the middle (whole numbers) and
-    its place from the middle in x and y (m).
+    weight : (rows, columns) one over the variance of a cell's height (1/m²), 0: no height. slope_x, slope_y : slope of
+    the ground at large (m/m). along : (k, 4) of each cell of a strip its column and row from the middle (whole numbers)
+    and its place from the middle in x and y (m).
     """
     rows, columns = weight.shape
     for row in range(rows):
@@ -47,7 +47,8 @@ def strips(weight, height_m, slope_x, slope_y, along, out):
 def side_line(strip, row, column, across, side, slope_precision, slope):
     """Height of a side's line at the edge (m), its variance (m²), its slope, χ² of its strips, and their number.
 
-    slope : what is expected of it, with `slope_precision`. The variance is infinite where too few strips are known. Distances count from the edge, away from it.
+    slope : what is expected of it, with `slope_precision`. The variance is infinite where too few strips are
+    known. Distances count from the edge, away from it.
     """
     rows, columns = strip.shape[1:]
     s0, s1, s2, t0, t1, q, chi2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -80,8 +81,8 @@ def step_response(strip, freedom, active, slope, across, constants, step_m, evid
     """Fill (rows, columns) `step_m`, height of the right side above the left one, and `evidence`, the step over its σ.
 
     strip : (3, rows, columns) of :func:`strips`. freedom : (rows, columns) cells with a height near, for the degrees of
-    freedom of χ². active : where to look. slope : (rows, columns) slope of the ground at large to the right (m/m), what is
-    expected of each side. across : (s, 3) of each strip of the right side its column and row from the edge and its
+    freedom of χ². active : where to look. slope : (rows, columns) slope of the ground at large to the right (m/m), what
+    is expected of each side. across : (s, 3) of each strip of the right side its column and row from the edge and its
     distance from it (m). constants : (precision of the slope of a side (m/m)⁻², floor of a step's σ (m)).
     """
     rows, columns = active.shape
@@ -91,10 +92,10 @@ def step_response(strip, freedom, active, slope, across, constants, step_m, evid
             evidence[row, column] = 0.0
             if not active[row, column]:
                 continue
-            right, var_right, _, chi_right, n_right = side_line(
+            right, var_right, _, chi_right, _ = side_line(
                 strip, row, column, across, 1, constants[0], slope[row, column]
             )
-            left, var_left, _, chi_left, n_left = side_line(
+            left, var_left, _, chi_left, _ = side_line(
                 strip, row, column, across, -1, constants[0], -slope[row, column]
             )
             if not (np.isfinite(var_right) and np.isfinite(var_left)):

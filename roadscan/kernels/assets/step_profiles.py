@@ -26,8 +26,9 @@ def fit_nodes(node, x_m, y_m, z_m, order, starts, bins, along_m, search, prior, 
     sorted by bin, as in `edge_links`. along_m : half the length of the window along the edge. search : (farthest offset
     (m), least and greatest face (m), depth of a side (m)). prior : (σ of a side's slope (m/m), σ of a height (m)).
     OFFSET : from the node to the upper edge, to the right. SCATTER : of strips of 0.1 m about their side's line.
-    SEEN_LOW, SEEN_HIGH : width with heights on each side, of at most 1.2 m. COVERED : share of the window along the edge
-    with heights near it on both sides.
+    SEEN_LOW : share of strips of 0.1 m with heights on the lower side, up to the farthest of at most 1.2 m; 0 of fewer
+    than four. SEEN_HIGH : width with heights on the higher side, of at most 1.2 m. COVERED : share of the window along
+    the edge with heights near it on both sides.
     """
     columns = int(bins[4])
     profile, near = np.empty((4, 2 * HALF_BINS)), np.empty((2, QUARTERS))
@@ -146,7 +147,7 @@ def scatter(profile, a, b, low, slope_low, high, slope_high, out):
     """Fill SCATTER, SEEN_LOW and SEEN_HIGH from strips of 0.1 m beyond both ends of the face."""
     total, strips = 0.0, 0
     for side in range(2):
-        seen = 0
+        seen, last = 0, 0
         for j in range(12):
             n, rest = 0.0, 0.0
             for k in range(10):
@@ -160,8 +161,12 @@ def scatter(profile, a, b, low, slope_low, high, slope_high, out):
                     rest += profile[2, at] - profile[0, at] * level
             if n > 0.0:
                 seen += 1
+                last = j + 1
                 # What lies farther off may bend away.
                 total += min(abs(rest / n), 0.1) / (1.0 + 0.15 * j)
                 strips += 1
-        out[SEEN_LOW + side] = 0.1 * seen
+        if side == 0:
+            out[SEEN_LOW] = seen / last if seen >= 4 else 0.0
+        else:
+            out[SEEN_HIGH] = 0.1 * seen
     out[SCATTER] = total / max(strips, 1)

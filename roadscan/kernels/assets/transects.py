@@ -9,12 +9,12 @@ from roadscan.kernels.options import kernel
 RESULTS = 5
 WIDTH, END, OUTER_HEIGHT, SLOPE, MIDDLE_HEIGHT = range(RESULTS)
 UNSEEN, OBSTACLE, STEP_DOWN, STEP_UP, BENT, FAR = range(6)
-"""What ends a walk: nothing is known on, something stands there, an edge down or up, a slope or a rough surface, none."""
+"""What ends a walk: nothing is known on, something stands there, an edge down or up, a bend or a rough place, none."""
 
 
 @kernel
 def walk(node, height_m, rough_m, blocked, edge_x, edge_y, grid, limits, out):
-    """Fill `out` (n, RESULTS): width (m), what ends it, height at the end (m), slope outward (m/m), height in the middle.
+    """Fill `out` (n, RESULTS): width (m), its end, height at the end (m), slope outward (m/m), height in the middle.
 
     node : (n, 4) x, y (m) and the unit vector outward. height_m, rough_m : (rows, columns) smooth height, NaN where
     nothing is known near, and roughness (m). blocked : cells where something stands. edge_x, edge_y : unit vector to
@@ -61,6 +61,16 @@ def walk(node, height_m, rough_m, blocked, edge_x, edge_y, grid, limits, out):
             before = levels[k - 5] if k > 5 else np.nan
             if rough_m[r, c] > limits[4] or abs(z - before) > limits[3] * 5.0 * step:
                 end = BENT
+                # Smooth heights bend before the edge that they bend at.
+                for m in range(1, 6):
+                    ahead = t + m * step
+                    c = int(np.floor((node[i, 0] + ahead * node[i, 2] - grid[0]) / step))
+                    r = int(np.floor((node[i, 1] + ahead * node[i, 3] - grid[1]) / step))
+                    if 0 <= c < columns and 0 <= r < rows:
+                        outward = edge_x[r, c] * node[i, 2] + edge_y[r, c] * node[i, 3]
+                        if abs(outward) > 0.5:
+                            end, known_at = STEP_DOWN if outward < 0.0 else STEP_UP, ahead
+                            break
                 break
             known_at = t
             n += 1.0

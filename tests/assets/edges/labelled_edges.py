@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from tests.assets.edges.streets import Street
+from roadscan.assets.returns import Returns
 
 Array = np.ndarray[Any, Any]
 ROAD_SIDE, SIDEWALK = (40, 44, 60), 48
@@ -23,10 +23,12 @@ class LabelledEdges(NamedTuple):
     step_m: Array
 
 
-def labelled_edges(street: Street) -> LabelledEdges:
-    """Edges at most one cell wide between cells of 0.2 m that hold road (40, 44, 60) and such that hold sidewalk (48)."""
-    r, labels = street.returns, street.labels
-    road, walk = np.isin(labels, ROAD_SIDE), labels == SIDEWALK
+def labelled_edges(r: Returns, labels: Array, beyond: tuple[int, ...] = (SIDEWALK,)) -> LabelledEdges:
+    """Edges at most one cell wide between cells of 0.2 m of road (40, 44, 60) and such of sidewalk (48).
+
+    beyond : other labels that may lie beyond the edge.
+    """
+    road, walk = np.isin(labels, ROAD_SIDE), np.isin(labels, beyond)
     keep = road | walk
     cell = np.column_stack([np.floor(r.x_m[keep] / CELL_M), np.floor(r.y_m[keep] / CELL_M)]).astype(int)
     cells, inverse = np.unique(cell, axis=0, return_inverse=True)

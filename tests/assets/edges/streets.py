@@ -1,4 +1,4 @@
-"""Streets for the tests of kerbs and what lies beside them: two recordings, and a short piece of a simulated one."""
+"""A recorded city street for the tests of kerbs, with the city's polygons."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import csv
 import functools
 import io
 import json
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,36 +36,6 @@ def returns_of(xyz: Array, intensity: Array, epoch: Array, sensor: Array, passes
         epoch.astype(np.int64), (np.zeros(n) if passes is None else passes).astype(np.uint16), np.zeros(n, np.uint8),
         np.zeros(n, np.uint16), one, one, sensor[:, 0].copy(), sensor[:, 1].copy(), sensor[:, 2].copy(), ("lidar",),
     )  # fmt: skip
-
-
-@functools.cache
-def kitti_street(folder: Path) -> Street:
-    """Eight sweeps of SemanticKITTI 00 in the frame of the first, with labels."""
-    with (folder / "poses.csv").open() as stream:
-        poses = [[float(v) for v in row[2:]] for row in list(csv.reader(stream))[1:]]
-    clouds, labels, sensors, epochs = [], [], [], []
-    with tarfile.open(folder / "sweeps.tar.xz") as archive:
-        files = {m.name: m for m in archive.getmembers()}
-        for i, pose in enumerate(poses[:8]):
-            body = _bytes(archive, files, f"velodyne_points/data/{i:010d}.bin")
-            cloud = np.frombuffer(body, "<f4").reshape(-1, 4).astype(np.float64)
-            label = np.frombuffer(_bytes(archive, files, f"labels/{i:010d}.label"), np.uint8)
-            t = np.array(pose).reshape(3, 4)
-            cloud[:, :3] = cloud[:, :3] @ t[:, :3].T + t[:, 3]
-            clouds.append(cloud)
-            labels.append(label)
-            sensors.append(np.broadcast_to(t[:, 3], (len(cloud), 3)))
-            epochs.append(np.full(len(cloud), i * 100_000_000))
-    cloud, sensor = np.concatenate(clouds), np.concatenate(sensors)
-    returns = returns_of(cloud[:, :3], cloud[:, 3] * 65535, np.concatenate(epochs), sensor)
-    drive = np.array([[*np.array(p).reshape(3, 4)[:, 3], 0.0] for p in poses[:8]])
-    return Street(returns, np.concatenate(labels), drive)
-
-
-def _bytes(archive: tarfile.TarFile, files: dict[str, tarfile.TarInfo], name: str) -> bytes:
-    found = archive.extractfile(next(m for n, m in files.items() if n.endswith(name)))
-    assert found is not None
-    return found.read()
 
 
 @functools.cache

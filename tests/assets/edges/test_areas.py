@@ -1,0 +1,132 @@
+"""Sidewalks, medians, road edges and shoulders against the surface that they were made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from roadscan.assets.edges.across import edge_along
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.kinds.median import Median, MedianOptions
+from roadscan.assets.kinds.road_edge import RoadEdge, RoadEdgeOptions
+from roadscan.assets.kinds.shoulder import Shoulder, ShoulderOptions
+from roadscan.assets.kinds.sidewalk import Sidewalk, SidewalkOptions
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Box, Scene
+from roadscan.simulate import Scene as SimulatedScene
+from roadscan.simulate.surface import Surface
+from tests.assets.edges.simulated import SimulatedStreet, town_street
+from tests.assets.edges.streets import returns_of
+from tests.assets.edges.test_kerbs import truth_line
+
+FACADE_M = 9.2
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedStreet:
+    return town_street(30.0, 4)
+
+
+@pytest.fixture(scope="module")
+def town(street: SimulatedStreet) -> Scene:
+    x, y = truth_line(street, 1.0, 0.0, np.array([0.0, 29.0])).T
+    box = Box(x.min() - 9.0, y.min() - 9.0, x.max() + 9.0, y.max() + 9.0)
+    inside = box.holds(street.street.returns.x_m, street.street.returns.y_m)
+    return make_scene(street.street.returns.at(inside), box, box, street.street.drive)
+
+
+def ribbon(street: SimulatedStreet, side: float, near_m: float, far_m: float) -> shapely.Polygon:
+    station = np.arange(2.0, 28.0, 0.5)
+    ring = [truth_line(street, side, near_m, station), truth_line(street, side, far_m, station[::-1])]
+    return shapely.Polygon(np.concatenate(ring))
+
+
+def test_sidewalks_reach_from_the_kerb_to_the_facade(street: SimulatedStreet, town: Scene) -> None:
+    kind = Sidewalk()
+    found = list(kind.objects(kind.evidence(town, SidewalkOptions()).pieces, SidewalkOptions(), {}))
+    whole = shapely.union_all([shapely.force_2d(s.geometry) for s in found])
+    truth = shapely.union_all([ribbon(street, side, 5.27, FACADE_M) for side in (-1.0, 1.0)])
+    stretch = shapely.union_all([ribbon(street, side, 3.0, 14.0) for side in (-1.0, 1.0)])
+    assert whole.intersection(truth).area / truth.area >= 0.90
+    assert whole.intersection(truth).area / whole.intersection(stretch).area >= 0.90
+    largest = max(found, key=lambda s: s.geometry.area)
+    assert largest.attributes["width_m"] == pytest.approx(FACADE_M - 5.27, abs=0.45)
+    # The verge falls 2 % away from the road in this scene's sign: it rises outward.
+    assert largest.attributes["cross_slope"] == pytest.approx(0.02, abs=0.005)
+    assert largest.attributes["kerb_height_m"] == pytest.approx(0.12, abs=0.008)
+
+
+def test_road_edges_lie_at_the_kerbs_on_their_sides(street: SimulatedStreet, town: Scene) -> None:
+    kind = RoadEdge()
+    found = list(kind.objects(kind.evidence(town, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        lines = [np.array(o.geometry.coords) for o in found if o.attributes["side"] == side]
+        places = np.concatenate(lines)
+        _, offset = street.surface.station_offset_m(
+            places[:, 0] + street.corner_m[0], places[:, 1] + street.corner_m[1]
+        )
+        assert np.median(offset) == pytest.approx(sign * 5.26, abs=0.05)
+        assert np.mean(np.abs(offset - sign * 5.26) <= 0.1) >= 0.95
+        assert sum(o.attributes["length_m"] for o in found if o.attributes["side"] == side) > 25.0
+        assert {o.attributes["type"] for o in found} == {"kerb"}
+
+
+def island(width_m: float, height_m: float) -> Scene:
+    """A road of 16 m with a raised strip in its middle, seen by returns every 4 cm with 5 mm of noise."""
+    rng = np.random.default_rng(5)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 30.0, 0.05), np.arange(-8.0, 8.0, 0.05)))
+    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    z = 100.0 + 0.01 * x - 0.02 * np.abs(y) + np.where(np.abs(y) < width_m / 2, height_m, 0.0)
+    z += rng.normal(0.0, 0.005, z.size)
+    sensor = np.column_stack([x, np.full(x.size, -4.0), np.full(x.size, 102.0)])
+    returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
+    drive = np.column_stack([np.arange(0.0, 30.0), np.full(30, -4.0), np.full(30, 102.0), np.ones(30)])
+    box = Box(0.0, -8.0, 30.0, 8.0)
+    return make_scene(returns, box, box, drive)
+
+
+def test_a_median_has_width_and_height() -> None:
+    scene, kind = island(2.4, 0.15), Median()
+    found = list(kind.objects(kind.evidence(scene, MedianOptions()).pieces, MedianOptions(), {}))
+    assert len(found) == 1
+    assert found[0].attributes["width_m"] == pytest.approx(2.4, abs=0.15)
+    assert found[0].attributes["asset_height_m"] == pytest.approx(0.15, abs=0.008)
+    assert found[0].geometry.area == pytest.approx(2.4 * 30.0, rel=0.1)
+    walks = Sidewalk()
+    assert not list(walks.objects(walks.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
+
+
+def test_the_edge_of_a_road_without_kerbs_is_where_its_verge_begins() -> None:
+    """The simulated highway with a verge that falls by 15 % beyond a shoulder of 5 %, 8 mm of noise a cell."""
+    plain = SimulatedScene.load("highway_three_lanes")
+    scene = plain.changed(road={"verge_slope": 0.15})
+    surface, paved = Surface(scene), scene.road.paved_m
+    station, offset = np.arange(10.0, 60.0, 0.5), np.arange(1.0, paved + 4.0, 0.1)
+    e, n, _ = surface.place(station[:, None], np.broadcast_to(offset, (station.size, offset.size)))
+    height = surface.height_m(e, n, texture=False)
+    height += np.random.default_rng(2).normal(0.0, 0.008, height.shape)
+    found = edge_along(height, np.full(height.shape, 0.008), (0.5, 0.1))
+    assert np.median(np.abs(offset[found.cell] - paved)) <= 0.15
+    assert np.mean(np.abs(offset[found.cell] - paved) <= 0.3) >= 0.9
+    assert found.evidence.min() > 0.5
+
+
+def test_a_shoulder_lies_between_line_and_edge() -> None:
+    def line(y: float, z: float, **attributes: Any) -> AssetObject:
+        geometry = shapely.LineString([(x, y, z) for x in np.arange(0.0, 41.0, 2.0)])
+        return AssetObject(geometry, 0.03, 0.01, 0.9, 100, 1, 0, 1, attributes)
+
+    others = {
+        "road_edge": [line(-6.0, 9.9, side="right", type="verge")],
+        "lane_line": [line(-4.0, 10.0), line(0.0, 10.1)],
+    }
+    kind = Shoulder()
+    found = list(kind.objects(kind.piece_schema.empty_table(), ShoulderOptions(), others))
+    assert len(found) == 1
+    assert found[0].attributes["width_m"] == pytest.approx(2.0, abs=0.01)
+    assert found[0].attributes["length_m"] == pytest.approx(40.0, abs=1.0)
+    assert found[0].attributes["cross_slope"] == pytest.approx(0.05, abs=0.002)
+    assert found[0].geometry.area == pytest.approx(80.0, rel=0.02)

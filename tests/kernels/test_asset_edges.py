@@ -1,0 +1,167 @@
+"""Kernels of edges against least squares, a search of all paths, and steps drawn by hand."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from roadscan.kernels.assets.edge_across import best_path, step_and_bend
+from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
+from roadscan.kernels.assets.low_heights import low_heights
+from roadscan.kernels.assets.step_filter import step_response, strips, thin
+from roadscan.kernels.assets.step_profiles import FACE, OFFSET, RESULTS, SIGMA_STEP, STEP, TOP, fit_nodes
+from roadscan.kernels.assets.transects import (
+    END,
+    OBSTACLE,
+    SLOPE,
+    STEP_DOWN,
+    UNSEEN,
+    WIDTH,
+    walk,
+)
+from roadscan.kernels.assets.transects import RESULTS as WALK_RESULTS
+
+RNG = np.random.default_rng(8)
+
+
+def test_low_heights_leave_out_what_stands_above() -> None:
+    x = np.array([0.05, 0.05, 0.05, 0.15, 0.95])
+    z = np.array([1.0, 1.06, 1.5, 2.0, 9.0])
+    count, mean, variance = np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.zeros((1, 2))
+    low_heights(x, np.full(5, 0.05), z, (0.0, 0.0, 0.1), 0.12, count, mean, variance)
+    assert count.tolist() == [[2, 1]]
+    assert mean[0] == pytest.approx([1.03, 2.0])
+    assert variance[0] == pytest.approx([0.03**2, 0.0])
+
+
+def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
+    """A step of 10 cm between columns 9 and 10 on ground that rises by 3 % along the edge and by 2 % across it."""
+    row, column = np.mgrid[0:25, 0:20]
+    height = 0.1 * 0.03 * row + 0.1 * 0.02 * column + np.where(column >= 10, 0.1, 0.0)
+    height = height + RNG.normal(0.0, 0.002, height.shape)
+    weight = np.full(height.shape, 0.005**-2)
+    slope_x, slope_y = np.full(height.shape, 0.02), np.full(height.shape, 0.03)
+    k = np.arange(-5, 6)
+    along = np.column_stack([0 * k, k, 0.0 * k, 0.1 * k])
+    strip = np.empty((3, *height.shape))
+    strips(weight, height, slope_x, slope_y, along, strip)
+    assert strip[1, 12, 5] == pytest.approx(np.mean(height[7:18, 5] - 0.003 * k), abs=1e-12)
+    assert strip[0, 12, 5] == pytest.approx(11 * 0.005**-2)
+    j = np.arange(1, 5)
+    across = np.column_stack([j, 0 * j, 0.1 * j])
+    step, evidence = np.empty(height.shape), np.empty(height.shape)
+    freedom, active = np.full(height.shape, 80.0), np.ones(height.shape, np.bool_)
+    step_response(strip, freedom, active, slope_x, across, (0.05**-2, 0.005), step, evidence)
+    assert np.abs(step[12, 9:11]) == pytest.approx([0.1, 0.1], abs=0.015)
+    assert evidence[12, 9:11].min() > 8.0
+    assert np.abs(evidence[12, 4]) < 3.0
+    best = np.zeros((4, *height.shape))
+    thin(step, evidence, 3.0, (1.0, 0.0), (4.0, 0.015, 0.3), best)
+    assert set(np.argmax(best[0, 5:-5], axis=1).tolist()) <= {9, 10}
+    assert best[2, 12].max() == 3.0
+
+
+def brute(evidence: np.ndarray, reach: int, cost: float) -> float:
+    stations, offsets = evidence.shape
+    best = -np.inf
+    for path in itertools.product(range(offsets), repeat=stations):
+        moves = np.abs(np.diff(path))
+        if moves.max() <= reach:
+            best = max(best, evidence[np.arange(stations), path].sum() - cost * moves.sum())
+    return best
+
+
+def test_the_best_path_is_that_of_a_search_of_all() -> None:
+    evidence = RNG.normal(size=(5, 6))
+    total, before, path = np.empty((5, 6)), np.empty((5, 6), np.int64), np.zeros(5, np.int64)
+    best_path(evidence, 2, 0.4, total, before, path)
+    value = evidence[np.arange(5), path].sum() - 0.4 * np.abs(np.diff(path)).sum()
+    assert value == pytest.approx(brute(evidence, 2, 0.4))
+
+
+def test_steps_and_bends_across_are_those_of_straight_lines() -> None:
+    """Least squares by NumPy on both sides of a cell."""
+    height = RNG.normal(0.0, 0.01, (5, 12)) + 0.02 * np.arange(12) + np.where(np.arange(12) > 6, 0.05, 0.0)
+    weight = np.full(height.shape, 1e4)
+    step, bend = np.empty(height.shape), np.empty(height.shape)
+    step_and_bend(height, weight, 0.1, (1, 4), (0.0, 0.0), step, bend)
+    found, rest, sums = [], 0.0, []
+    for side in (-1, 1):
+        j = np.arange(1, 5)
+        z = (height[1:4][:, 6 + side * j] - height[1:4, 6][:, None]).ravel()
+        design = np.column_stack([np.ones(12), np.tile(side * 0.1 * j, 3)])
+        solution, square = np.linalg.lstsq(design, z, rcond=None)[:2]
+        rest += square[0] * 1e4
+        found.append(solution)
+        sums.append(np.diag(np.linalg.inv(design.T @ design)) / 1e4)
+    spread = max(1.0, rest / 20.0)
+    expected = (found[1] - found[0]) / np.sqrt((sums[0] + sums[1]) * spread)
+    assert [step[2, 6], bend[2, 6]] == pytest.approx(expected)
+    assert np.isnan(step[2, 0])
+
+
+def test_links_lead_forward_and_the_strongest_chain_is_traced() -> None:
+    """Places along x, one that looks back, and a weak one beside them."""
+    n = 12
+    place = np.column_stack([0.2 * np.arange(n), np.zeros(n), np.ones(n), np.zeros(n)])
+    place = np.concatenate([place, [[1.0, 0.3, -1.0, 0.0], [1.0, -0.1, 1.0, 0.0]]])
+    quality = np.append(np.full(n, 4.0), [4.0, 0.5])
+    m = len(place)
+    links, lengths, gains = np.full((m, MAX_LINKS), -1), np.zeros((m, MAX_LINKS)), np.zeros((m, MAX_LINKS))
+    order, starts = np.arange(m), np.array([0, m])
+    bins = (-1.0, -1.0, 10.0, 1.0, 1.0)
+    find_links(place, quality, order, starts, bins, (0.5, 1.5), (0.3, 0.85, 1.0, 5.0), links, lengths, gains)
+    assert set(links[3][links[3] >= 0].tolist()) == {4, 5, n + 1}
+    assert links[3, 0] in {4, 5}
+    assert links[n][0] == -1
+    ahead, behind = np.zeros(m), np.zeros(m)
+    following, preceding = np.full(m, -1), np.full(m, -1)
+    best_ways(links, lengths, gains, 5.0, 50, ahead, following, behind, preceding)
+    # Each link of 0.2 m gains 0.8, and what follows fades with e^(−0.2 / 5).
+    expected = sum(0.8 * np.exp(-0.2 / 5.0 * k) for k in range(n - 1))
+    assert ahead[0] == pytest.approx(expected, rel=0.05)
+    total = ahead + behind
+    chain, owner = np.zeros((m, 2), np.int64), np.full(m, -1)
+    number, length = trace(
+        place, total, following, preceding, np.argsort(-total, kind="stable"), (3.0, 1.0, 0.25, 0.6), chain, owner
+    )
+    assert number >= 1
+    assert set(chain[:length, 1].tolist()) >= set(range(0, n, 2)) or set(chain[:length, 1].tolist()) >= set(
+        range(2, n - 2)
+    )
+    assert owner[n + 1] == 0
+
+
+def test_a_step_is_found_where_it_was_drawn() -> None:
+    """A step of 9 cm with a face of 6 cm, 12 cm to the right of the node, on a cross slope of 3 %."""
+    t, d = RNG.uniform(-0.5, 0.5, 4000), RNG.uniform(-1.2, 1.2, 4000)
+    z = 50.0 + 0.02 * t + 0.03 * d + 0.09 * np.clip((d - 0.12) / 0.06 + 0.5, 0.0, 1.0)
+    z = z + RNG.normal(0.0, 0.004, z.size)
+    node = np.array([[0.0, 0.0, 1.0, 0.0, 50.0, 0.02, 0.03]])
+    out = np.empty((1, RESULTS))
+    fit_nodes(
+        node, t, -d, z, np.arange(4000), np.array([0, 4000]), (-2.0, -2.0, 10.0, 1.0, 1.0), 0.5,
+        (0.2, 0.02, 0.24, 0.35), (0.05, 0.015), out,
+    )  # fmt: skip
+    assert out[0, STEP] == pytest.approx(0.09 + 0.06 * 0.03, abs=0.004)
+    assert out[0, OFFSET] - 0.5 * out[0, FACE] == pytest.approx(0.12, abs=0.011)
+    assert out[0, FACE] == pytest.approx(0.06, abs=0.025)
+    assert out[0, TOP] == pytest.approx(0.09 + 0.15 * 0.03, abs=0.004)
+    assert 0.0 < out[0, SIGMA_STEP] < 0.002
+
+
+def test_a_walk_ends_at_what_stands_and_at_an_edge() -> None:
+    height = np.tile(0.02 * 0.1 * np.arange(60), (3, 1))
+    rough, blocked = np.zeros(height.shape), np.zeros(height.shape, np.bool_)
+    edge_x, edge_y = np.zeros(height.shape), np.zeros(height.shape)
+    blocked[0, 35] = True
+    edge_x[1, 25] = -1.0
+    height[2, 40:] = np.nan
+    node = np.array([[0.05, 0.05 + 0.1 * r, 1.0, 0.0] for r in range(3)])
+    out = np.empty((3, WALK_RESULTS))
+    walk(node, height, rough, blocked, edge_x, edge_y, (0.0, 0.0, 0.1), (0.3, 5.0, 0.8, 0.15, 0.03), out)
+    assert out[:, END].tolist() == [OBSTACLE, STEP_DOWN, UNSEEN]
+    assert out[:, WIDTH] == pytest.approx([3.4, 2.5, 3.9], abs=0.11)
+    assert out[:, SLOPE] == pytest.approx([0.02, 0.02, 0.02], abs=1e-6)

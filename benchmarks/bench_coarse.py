@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.timing import Figure
-from roadscan.model.segmentation import SegmentationConfig
+from roadscan.model.settings.segmentation import SegmentationConfig
 from roadscan.points.readings import ScanGeometry
 from roadscan.points.segmentation import segmented
 from roadscan.surfaces.coarse import CoarseModel, CoarseSettings, Stretch, coarse_model

@@ -16,8 +16,8 @@ import shapely
 
 from benchmarks.bench_cracks import BENT, CLEAN, FEW, MANY, SEEDS, Faults, Seen, scores, seen
 from benchmarks.timing import Figure
-from roadscan.model.distress import CrackDetection, CrackJoining
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.distress import CrackDetection, CrackJoining
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.distress.crack_network import Crack, join_cracks
 from roadscan.surfaces.distress.cracks import crack_pieces
 from roadscan.surfaces.lowest import LowestReadings

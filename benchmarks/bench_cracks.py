@@ -18,8 +18,8 @@ import numpy.typing as npt
 import shapely
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.model.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.distress.crack_network import Crack, join_cracks

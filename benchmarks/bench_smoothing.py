@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.sparse.linalg import cg, spsolve
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.smoothing import Smoothing, smooth_surface, steps
 from tests.surfaces.patches import (
     CLASSES_M,

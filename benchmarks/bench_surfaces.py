@@ -24,7 +24,7 @@ from benchmarks.calibration_yard import (
     profiler_yard,
 )
 from benchmarks.timing import Figure
-from roadscan.model.calibration import CalibrationSettings
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Calibration, calibrate
 from roadscan.navigation.calibration.evidence import Evidence, Orientation
 from roadscan.navigation.calibration.surfaces.heads import HeadTies, agreement

@@ -141,5 +141,7 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
     rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")
     assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
     assert not [
-        p for p in reached if p.startswith(("roadscan.model.smoothing:Smoother", "roadscan.model.calibration:C"))
+        p
+        for p in reached
+        if p.startswith(("roadscan.model.settings.smoothing:Smoother", "roadscan.model.settings.calibration:C"))
     ]

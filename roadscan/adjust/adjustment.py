@@ -21,7 +21,7 @@ from roadscan.adjust.process import RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
-from roadscan.model.adjustment import AdjustmentSettings
+from roadscan.model.settings.adjustment import AdjustmentSettings
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from roadscan.kernels.adjust.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.tie_settings import PlaceSettings
+from roadscan.model.settings.tie_settings import PlaceSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

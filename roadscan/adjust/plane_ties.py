@@ -20,7 +20,7 @@ from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie import COUNTS, PLANE, TOO_FAR, End, Tie
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.tie_settings import TieSettings
+from roadscan.model.settings.tie_settings import TieSettings
 from roadscan.navigation.calibration.surfels import plane_moments
 
 Float64 = npt.NDArray[np.float64]

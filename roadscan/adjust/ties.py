@@ -18,7 +18,7 @@ from roadscan.adjust.plane_ties import plane_ties
 from roadscan.adjust.shift_ties import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.tie import SAME_PASS, Tie
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.tie_settings import TieSettings
+from roadscan.model.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, GroundModel, Scene
 from roadscan.assets.surroundings import surroundings
 from roadscan.kernels.assets.columns import marked
-from roadscan.model.asset_ground import GroundSettings
+from roadscan.model.settings.asset_ground import GroundSettings
 
 _ABOVE_M: Final = 0.1
 """Returns are looked at that do not lie on the ground and stand higher above it."""

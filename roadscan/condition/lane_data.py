@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.cracks_on_lane import CrackOnLane
-from roadscan.model.condition import SectionConfig
+from roadscan.model.settings.condition import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
 

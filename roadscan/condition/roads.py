@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
 from roadscan.kernels.road.curved_grid import thin_path
-from roadscan.model.condition import ConditionConfig
+from roadscan.model.settings.condition import ConditionConfig
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

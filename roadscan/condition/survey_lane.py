@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.kernels.condition.sampling import CellTable, sample
-from roadscan.model.condition import SectionConfig
+from roadscan.model.settings.condition import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import scipy.sparse
 import shapely
 
-from roadscan.model.inventory import Matching
+from roadscan.model.settings.inventory import Matching
 from roadscan.tables.asset_schema import asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY
 from roadscan.tables.store import bytes_digest

@@ -19,7 +19,7 @@ from roadscan.inventory.values import iso_column
 from roadscan.inventory.visibility import NOT_KNOWN, Visibility
 from roadscan.model.errors import SchemaError
 from roadscan.model.gpstime import utc_from_gps_ns
-from roadscan.model.inventory import Matching
+from roadscan.model.settings.inventory import Matching
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table

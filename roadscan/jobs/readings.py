@@ -19,7 +19,7 @@ from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting, Mountings
-from roadscan.model.segmentation import RoadSegmentation
+from roadscan.model.settings.segmentation import RoadSegmentation
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.movement import NO_CORRECTION, Allowance
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory

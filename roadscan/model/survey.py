@@ -8,21 +8,21 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.adjust import AdjustConfig
-from roadscan.model.assets import AssetsConfig
-from roadscan.model.calibration import CalibrationEvidence, CalibrationSettings
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
-from roadscan.model.condition import ConditionConfig
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
-from roadscan.model.inventory import InventoryConfig
 from roadscan.model.rig import Rig, Sensor
-from roadscan.model.segmentation import RoadSegmentation
-from roadscan.model.smoothing import SmootherConfig, SplineConfig
+from roadscan.model.settings.adjust import AdjustConfig
+from roadscan.model.settings.assets import AssetsConfig
+from roadscan.model.settings.calibration import CalibrationEvidence, CalibrationSettings
+from roadscan.model.settings.condition import ConditionConfig
+from roadscan.model.settings.inventory import InventoryConfig
+from roadscan.model.settings.segmentation import RoadSegmentation
+from roadscan.model.settings.smoothing import SmootherConfig, SplineConfig
+from roadscan.model.settings.surface import SurfaceConfig
 from roadscan.model.strict import NAME_PATTERN, Strict, load_toml
-from roadscan.model.surface import SurfaceConfig
 
 
 class AnchorConfig(Strict):

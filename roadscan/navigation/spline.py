@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.model.smoothing import SplineConfig
+from roadscan.model.settings.smoothing import SplineConfig
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.trajectory import Trajectory
 

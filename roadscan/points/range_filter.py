@@ -26,7 +26,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.segmentation import RangeFilter
+from roadscan.model.settings.segmentation import RangeFilter
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

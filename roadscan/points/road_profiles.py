@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.kernels.georeferencing.readings import NO_RETURN
 from roadscan.kernels.road.road_ranges import keep_road
 from roadscan.model.rig import Mounting, Mountings
-from roadscan.model.segmentation import RangeFilter, RoadSegmentation
+from roadscan.model.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.classes import KEPT, NOT_ROAD, OVERLAPPING
 from roadscan.points.range_filter import kept_in_turns

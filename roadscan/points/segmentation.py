@@ -53,7 +53,7 @@ import numpy.typing as npt
 
 from roadscan.kernels.options import read_only
 from roadscan.kernels.road.segmentation import segment_profiles
-from roadscan.model.segmentation import SegmentationConfig
+from roadscan.model.settings.segmentation import SegmentationConfig
 from roadscan.points.readings import ScanGeometry
 
 UInt8 = npt.NDArray[np.uint8]

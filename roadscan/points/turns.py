@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.segmentation import RangeFilter
+from roadscan.model.settings.segmentation import RangeFilter
 from roadscan.navigation.trajectory import Poses, Trajectory
 from roadscan.points.range_filter import limits_of_turns
 

@@ -45,7 +45,7 @@ from roadscan.kernels.cracks.line_medians import (
     window_sums,
 )
 from roadscan.kernels.cracks.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.distress.faint_cracks import REACH as STRIP_REACH
 from roadscan.surfaces.distress.faint_cracks import Chains, no_strips
 

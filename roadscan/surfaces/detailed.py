@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.model.settings.surface import SlopeKind
 from roadscan.model.strict import Strict
-from roadscan.model.surface import SlopeKind
 from roadscan.surfaces.clough_tocher import CubicSurface, cubic_surface
 from roadscan.surfaces.normals import RINGS, slopes_at
 from roadscan.surfaces.sites import sites

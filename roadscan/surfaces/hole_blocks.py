@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.surface.ground import depths, grounds, slopes
-from roadscan.model.distress import PotholeDetection
+from roadscan.model.settings.distress import PotholeDetection
 from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
 
 Float64 = npt.NDArray[np.float64]

@@ -47,7 +47,7 @@ from roadscan.kernels.surface.spline_gradients import WORK, spline_gradients
 from roadscan.kernels.surface.vertex_gradients import FITTED, LEVEL, vertex_gradients
 from roadscan.kernels.surface.vertex_neighbourhoods import MOST, neighbourhoods
 from roadscan.kernels.surface.vertex_rings import MOST_RINGS
-from roadscan.model.surface import SlopeKind
+from roadscan.model.settings.surface import SlopeKind
 from roadscan.surfaces.sites import Sites
 from roadscan.surfaces.triangulation import Triangulation
 

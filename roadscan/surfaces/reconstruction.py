@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.ids import TileId
-from roadscan.model.surface import SurfaceConfig
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface import SurfaceConfig
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.points.cloud import QUANTUM_M, TilePoints
 from roadscan.surfaces.clough_tocher import cubic_surface
 from roadscan.surfaces.detailed import DetailedSettings

@@ -24,7 +24,7 @@ import shapely
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 
 from roadscan.kernels.surface.coarse import PATCH_SUMS, sum_patches
-from roadscan.model.surface_regions import RegionSettings
+from roadscan.model.settings.surface_regions import RegionSettings
 from roadscan.surfaces.coarse import CoarseModel
 
 Float64 = npt.NDArray[np.float64]

@@ -58,7 +58,7 @@ from roadscan.kernels.surface.directional_filters import choose_filters
 from roadscan.kernels.surface.smoothing import REACH as STEP_REACH
 from roadscan.kernels.surface.smoothing import descend
 from roadscan.model.errors import RoadscanError
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH as MEDIAN_REACH
 from roadscan.surfaces.detail_median import detail_median
 

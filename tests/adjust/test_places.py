@@ -9,7 +9,7 @@ import pytest
 
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.model.errors import NavigationError
-from roadscan.model.tie_settings import PlaceSettings
+from roadscan.model.settings.tie_settings import PlaceSettings
 
 SPEED = 25.0
 

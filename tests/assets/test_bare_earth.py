@@ -14,7 +14,7 @@ from roadscan.assets.ground.surface import Place, is_dense
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.model.asset_ground import GroundSettings
+from roadscan.model.settings.asset_ground import GroundSettings
 from roadscan.simulate import Scene as Street
 from tests.assets.isprs import SAMPLES, isprs_sample
 from tests.assets.scenes import GROUND_LABELS, NOT_JUDGED, semantic_kitti_returns, semantic_kitti_scene

@@ -9,7 +9,7 @@ import pytest
 from roadscan.condition.cracks_on_lane import located
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
-from roadscan.model.condition import ConditionConfig
+from roadscan.model.settings.condition import ConditionConfig
 
 Float64 = npt.NDArray[np.float64]
 

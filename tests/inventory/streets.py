@@ -16,7 +16,7 @@ from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.visibility import Unknown, Visibility
 from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.inventory import Matching
+from roadscan.model.settings.inventory import Matching
 from roadscan.tables.asset_schema import asset_schema
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.store import Store, bytes_digest

@@ -22,7 +22,7 @@ from roadscan.inventory.home import Content, Home, Mark, Sheet
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Rules
 from roadscan.inventory.state import State, live_commits, state_at
-from roadscan.model.inventory import Matching
+from roadscan.model.settings.inventory import Matching
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.inventory_schema import asset_table
 from roadscan.tables.store import Store

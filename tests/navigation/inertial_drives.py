@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.imu import IMU_GRADES, ImuErrors, ImuGrade
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.readings import (
     GnssSolutions,

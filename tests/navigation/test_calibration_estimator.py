@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import ConfigError, NavigationError
 from roadscan.model.frames import ENU_FROM_NED
 from roadscan.model.rig import Mounting, Sensor
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Estimate, ObjectPose, Prior, calibrate, priors_of
 from roadscan.navigation.calibration.evidence import Directions, Known, Orientation, Seen, Ties, Traverse
 from roadscan.navigation.calibration.observations import observations

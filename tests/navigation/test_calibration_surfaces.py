@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_surfaces import overlap_mm, solved
 from benchmarks.calibration_yard import mounting_error, profiler_yard
 from roadscan.kernels.calibration.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import NavigationError
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import calibrate
 from roadscan.navigation.calibration.surfaces.heights import HeightTies, rows_of
 from roadscan.navigation.calibration.surfaces.planes import PlaneTies

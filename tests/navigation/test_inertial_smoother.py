@@ -14,7 +14,7 @@ from roadscan.kernels.inertial.kalman_states import NAVIGATION, WITHOUT_SCALES
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.imu import IMU_GRADES, ImuGrade
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial import smoother
 from roadscan.navigation.inertial.readings import ImuReadings, Solution
 from roadscan.navigation.inertial.smoother import solve

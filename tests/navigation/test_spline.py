@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.smoothing import SmootherConfig, SplineConfig
+from roadscan.model.settings.smoothing import SmootherConfig, SplineConfig
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.spline import Smoothed, smoothed
 from roadscan.navigation.trajectory import Trajectory

@@ -13,13 +13,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.crs import world_from_geodetic
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
 from roadscan.model.gpstime import NS_PER_S, WEEK_S
 from roadscan.model.imu import IMU_GRADES
 from roadscan.model.rig import Mounting, Rig
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Prior, calibrate
 from roadscan.navigation.calibration.orientations import joint_covariance
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation

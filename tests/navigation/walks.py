@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.imu import IMU_GRADES
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, Solution, VehicleSensors
 from roadscan.simulate.drive import Poses

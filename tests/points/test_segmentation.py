@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.kernels.road.segmentation import height_threshold
-from roadscan.model.segmentation import SegmentationConfig
+from roadscan.model.settings.segmentation import SegmentationConfig
 from roadscan.points.classes import LAS_CLASSES, READING_CLASSES
 from roadscan.points.readings import ScanGeometry
 from roadscan.points.segmentation import road_only, segmented

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.rig import Mounting, Mountings
-from roadscan.model.segmentation import RangeFilter, RoadSegmentation
+from roadscan.model.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.classes import OVERLAPPING
 from roadscan.points.readings import ScanGeometry

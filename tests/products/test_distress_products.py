@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.model.crs import MapFrame
-from roadscan.model.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
 from roadscan.model.errors import ConfigError, StoreError
 from roadscan.model.ids import TileId
+from roadscan.model.settings.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
 from roadscan.products.base import product_named
 from roadscan.products.distress.crack_pieces import CrackPieces
 from roadscan.products.distress.cracks import Cracks

@@ -12,7 +12,7 @@ import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
 from roadscan.kernels.cracks.quantiles_along import quantiles_along
-from roadscan.model.distress import CrackDetection, CrackJoining
+from roadscan.model.settings.distress import CrackDetection, CrackJoining
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended

@@ -13,8 +13,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.kernels.cracks.cross_sections import cross_sections
-from roadscan.model.distress import CrackDetection, CrackJoining
 from roadscan.model.errors import ConfigError, RoadscanError
+from roadscan.model.settings.distress import CrackDetection, CrackJoining
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.distress.crack_network import join_cracks

@@ -14,8 +14,8 @@ from roadscan.kernels.cracks.faint_cracks import (
     line_depths,
     mark_peaks,
 )
-from roadscan.model.surface import SurfaceConfig
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface import SurfaceConfig
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH, detail_median
 from roadscan.surfaces.distress.faint_cracks import confirmed_strips
 from roadscan.surfaces.smoothing import Smoothing, smooth_surface

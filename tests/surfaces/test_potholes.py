@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.model.distress import PotholeDetection, PotholeJoining
 from roadscan.model.errors import ConfigError
+from roadscan.model.settings.distress import PotholeDetection, PotholeJoining
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surfaces.distress.potholes import around_cells, join_potholes, pothole_pieces

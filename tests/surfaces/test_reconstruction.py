@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from roadscan.model.ids import TileId
-from roadscan.model.surface import SurfaceConfig
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface import SurfaceConfig
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces import reconstruction
 from roadscan.surfaces.reconstruction import Patch, SurfaceGrid, surface_of
 from roadscan.surfaces.smoothing import halo_cells, smooth_surface

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import eigsh, spsolve
 from roadscan.kernels.cracks.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
 from roadscan.kernels.cracks.supports import CrackCells, Shapes, heights_by_support, least_risk
 from roadscan.model.errors import RoadscanError
-from roadscan.model.surface_smoothing import SurfaceSmoothing
+from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surfaces.detail_median import REACH, detail_median, detail_pairs, lines_onward
 from roadscan.surfaces.smoothing import FILTER_BOUND, Smoothing, halo_cells, smooth_surface, steps
 from tests.surfaces.patches import (

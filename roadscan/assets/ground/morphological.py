@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
-from roadscan.model.asset_ground import GroundSettings
+from roadscan.model.settings.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

@@ -33,7 +33,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.session import Session
-from roadscan.model.tie_settings import PlaceSettings
+from roadscan.model.settings.tie_settings import PlaceSettings
 from roadscan.navigation.movement import largest
 from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord

@@ -20,10 +20,10 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.readings import Ground, read_groups
-from roadscan.model.adjust import AdjustConfig, TargetConfig
 from roadscan.model.errors import ConfigError
 from roadscan.model.frames import rotation_from_rph, rph_from_rotation
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.settings.adjust import AdjustConfig, TargetConfig
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.publish import published
 from roadscan.jobs.readings import CORRECTION_SIGMAS, load_all_corrections
-from roadscan.model.adjust import AdjustConfig
+from roadscan.model.settings.adjust import AdjustConfig
 from roadscan.navigation.trajectory import Corrections
 from roadscan.tables.held import held_path, read_held, write_held
 from roadscan.tables.store import Store

@@ -24,8 +24,8 @@ from roadscan.jobs.adjust.tracks import span_of
 from roadscan.jobs.navigate.pose_sigma import median_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import load_recorded
-from roadscan.model.adjust import PosePriors
-from roadscan.model.adjustment import AdjustmentSettings
+from roadscan.model.settings.adjust import PosePriors
+from roadscan.model.settings.adjustment import AdjustmentSettings
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

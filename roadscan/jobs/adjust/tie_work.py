@@ -19,7 +19,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.readings import Ground
-from roadscan.model.tie_settings import TieSettings
+from roadscan.model.settings.tie_settings import TieSettings
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest

@@ -24,9 +24,9 @@ from roadscan.jobs.engine.compute import reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tile_files import publish_file
 from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.model.asset_ground import GroundSettings
 from roadscan.model.errors import SchemaError
 from roadscan.model.ids import TileId
+from roadscan.model.settings.asset_ground import GroundSettings
 from roadscan.model.strict import Strict
 from roadscan.products.assets.bare_earth import within, write_bare_earth
 from roadscan.products.assets.classified_points import classified_points, write_classified

@@ -20,8 +20,8 @@ from roadscan.jobs.engine.compute import reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tile_files import publish_file
 from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.model.asset_ground import GroundSettings
 from roadscan.model.ids import TileId
+from roadscan.model.settings.asset_ground import GroundSettings
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import bytes_digest

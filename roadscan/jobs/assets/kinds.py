@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.code_reach import code_digest, name_of
 from roadscan.jobs.engine.fingerprint import key_of
-from roadscan.model.assets import AssetsConfig
 from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.settings.assets import AssetsConfig
 from roadscan.model.strict import Strict
 from roadscan.tables.asset_schema import AssetSchema, asset_schema
 

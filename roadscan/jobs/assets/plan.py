@@ -17,9 +17,9 @@ from roadscan.jobs.products import product_context
 from roadscan.jobs.readings import ReadingSource, TrajectorySource, geometry_of
 from roadscan.jobs.tiles.footprints import FootprintRanges
 from roadscan.jobs.tiles.tile_plan import TilePlan, plan_tiles
-from roadscan.model.assets import AssetsConfig
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.ids import TileId
+from roadscan.model.settings.assets import AssetsConfig
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext
 from roadscan.tables.store import bytes_digest

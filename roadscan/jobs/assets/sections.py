@@ -20,8 +20,8 @@ from roadscan.jobs.assets.evidence import BARE_EARTH
 from roadscan.jobs.condition.lines import Roads
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tile_files import publish_file
-from roadscan.model.assets import GroundSectionsConfig
 from roadscan.model.ids import TileId
+from roadscan.model.settings.assets import GroundSectionsConfig
 from roadscan.products.assets.bare_earth import read_bare_earth
 from roadscan.products.assets.layers import Layer, write_dxf
 from roadscan.products.base import ProductContext

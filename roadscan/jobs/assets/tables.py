@@ -18,7 +18,7 @@ from roadscan.jobs.assets.objects import OBJECTS
 from roadscan.jobs.condition.lines import Roads
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tile_files import publish_file
-from roadscan.model.assets import AssetsConfig
+from roadscan.model.settings.assets import AssetsConfig
 from roadscan.products.assets.layers import GEOMETRIES, Layer, write_dxf, write_geojson, write_geopackage
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table, write_geo_table

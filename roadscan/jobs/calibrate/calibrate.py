@@ -15,10 +15,10 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import CALIBRATION, keep_file, picture_key
 from roadscan.jobs.plan.plan import DatedMountings, SurveyPlan, plan_survey
 from roadscan.jobs.readings import load_mountings
-from roadscan.model.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.model.errors import ConfigError, DamagedError, RunError, nearest
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.ids import ALL_RUNS
+from roadscan.model.settings.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.model.survey import Survey
 from roadscan.navigation.calibration.estimator import Calibration, Prior, calibrate
 from roadscan.navigation.calibration.evidence import Directions, Evidence, Orientation, Ties, Traverse

@@ -16,7 +16,10 @@ from roadscan.jobs.navigate.navigation_logs import imu_readings
 from roadscan.jobs.navigate.pose_sigma import usual_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
 from roadscan.jobs.readings import load_trajectory
-from roadscan.model.calibration import (
+from roadscan.model.crs import LOCAL_WORLD, MapFrame
+from roadscan.model.errors import ConfigError, RunError, nearest
+from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.model.settings.calibration import (
     Area,
     CalibrationEvidence,
     CalibrationSettings,
@@ -25,9 +28,6 @@ from roadscan.model.calibration import (
     ReferenceEvidence,
     StopAndGoEvidence,
 )
-from roadscan.model.crs import LOCAL_WORLD, MapFrame
-from roadscan.model.errors import ConfigError, RunError, nearest
-from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.navigation.calibration.evidence import Evidence, Seen, Traverse
 from roadscan.navigation.calibration.reference import ReferenceOptions, register
 from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation

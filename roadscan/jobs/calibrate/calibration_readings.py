@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import ReadingSource, geometry_of, load_trajectory, read_rows
-from roadscan.model.calibration import Area
 from roadscan.model.errors import ConfigError, RunError, nearest
+from roadscan.model.settings.calibration import Area
 from roadscan.navigation.calibration.surfaces.readings import Readings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.readings import ScanGeometry

@@ -20,13 +20,13 @@ from roadscan.jobs.navigate.pose_sigma import pose_sigma
 from roadscan.jobs.plan.plan import trajectory_source
 from roadscan.jobs.readings import load_trajectory, read_groups
 from roadscan.jobs.surfaces.taken_pictures import taken_pictures
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.camera import Interior
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import ConfigError, FormatError, RunError, nearest
 from roadscan.model.frames import body_from_axes, rph_from_rotation
 from roadscan.model.rig import Mounting, Rig, Sensor
 from roadscan.model.rig_text import update_rig_file
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.model.survey import Survey
 from roadscan.navigation.calibration.chessboard import (
     Board,

@@ -22,10 +22,10 @@ from roadscan.jobs.navigate.pose_sigma import usual_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
 from roadscan.jobs.products import product_context
 from roadscan.jobs.readings import TrajectorySource, read_groups
-from roadscan.model.condition import ConditionConfig
 from roadscan.model.crs import MapFrame, add_grid_folder
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import LanePass, PassId
+from roadscan.model.settings.condition import ConditionConfig
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table, write_geo_table

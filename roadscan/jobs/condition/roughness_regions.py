@@ -22,7 +22,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.ids import TileId
-from roadscan.model.roughness_regions import RoughnessRegionsConfig
+from roadscan.model.settings.roughness_regions import RoughnessRegionsConfig
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import write_geo_table
 from roadscan.products.pictures.roughness_regions import DrawnSection, draw_regions

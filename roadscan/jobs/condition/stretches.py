@@ -25,8 +25,8 @@ from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.model.condition import SectionConfig
 from roadscan.model.ids import TileId
+from roadscan.model.settings.condition import SectionConfig
 from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema

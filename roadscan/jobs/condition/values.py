@@ -23,7 +23,7 @@ from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, STRETCH_
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.model.condition import SectionConfig
+from roadscan.model.settings.condition import SectionConfig
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded

@@ -28,8 +28,8 @@ from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups,
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.condition import ConditionConfig
 from roadscan.model.ids import TileId
+from roadscan.model.settings.condition import ConditionConfig
 from roadscan.tables.manifest import OutputRecord
 
 MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES, REGIONS, REGION_SECTIONS, REGION_PICTURES)

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.jobs.readings import TrajectorySource, read_groups
-from roadscan.model.calibration import CalibrationSettings
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.tables.logs import LogRecord
 from roadscan.tables.store import Store
 

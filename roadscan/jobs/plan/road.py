@@ -8,7 +8,7 @@ from typing import Final
 from roadscan.jobs.readings import ReadingSource
 from roadscan.model.errors import ConfigError
 from roadscan.model.rig import Mounting
-from roadscan.model.segmentation import RoadSegmentation
+from roadscan.model.settings.segmentation import RoadSegmentation
 
 _LEAST_COSINE: Final = 0.5
 """Of the angle between a profile's normal and the driving direction, and between the sensor's z and straight down."""

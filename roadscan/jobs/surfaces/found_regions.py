@@ -28,7 +28,7 @@ from roadscan.jobs.tiles.footprints import FootprintRanges
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.ids import TileId
-from roadscan.model.surface_regions import RegionSettings
+from roadscan.model.settings.surface_regions import RegionSettings
 from roadscan.points.place import Placement, ProfilePoints
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table, write_geo_table

@@ -19,7 +19,7 @@ from roadscan.jobs.tiles.tile_plan import TILE, TilePlan, TileTask
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
-from roadscan.model.surface import SurfaceConfig
+from roadscan.model.settings.surface import SurfaceConfig
 from roadscan.model.survey import Survey
 from roadscan.products.base import ProductContext
 from roadscan.surfaces.reconstruction import SurfaceGrid

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import ConfigError
 from roadscan.model.rig import Mounting
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.evidence import Evidence, Traverse
 from roadscan.navigation.calibration.observability import Observability, observe
 from roadscan.navigation.calibration.observations import Observations, observations

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.camera import Interior
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.rig import Mounting
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.estimator import Calibrated, Calibration, Estimate, Prior, calibrate
 from roadscan.navigation.calibration.evidence import Known, Seen, Ties, Traverse
 from roadscan.navigation.calibration.rotations import exponential, logarithm

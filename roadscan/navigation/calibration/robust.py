@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.model.calibration import CalibrationSettings
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.observations import Observations
 
 Float64 = npt.NDArray[np.float64]

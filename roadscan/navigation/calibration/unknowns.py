@@ -14,9 +14,9 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.calibration import CalibrationSettings
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.rig import Mounting, Sensor
+from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.evidence import Traverse
 from roadscan.navigation.calibration.rotations import exponential, left_jacobian
 

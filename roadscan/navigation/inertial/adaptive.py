@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.noise import fixes_of, usable
 from roadscan.navigation.inertial.readings import (

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
 from roadscan.kernels.inertial.kalman_states import Fixes
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 
 Float64 = npt.NDArray[np.float64]

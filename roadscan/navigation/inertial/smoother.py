@@ -23,7 +23,7 @@ from roadscan.kernels.inertial.kalman_states import NAVIGATION, Layout, Model, N
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import quaternion_from_rotation
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.alignment import Alignment, align
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.noise import usable

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from roadscan.kernels.inertial.kalman_states import Fixes, Nodes, Steps
 from roadscan.kernels.inertial.strapdown import increments
-from roadscan.model.smoothing import SmootherConfig
+from roadscan.model.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.standing import odometer_distance

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.model.distress import CrackDetection
 from roadscan.model.errors import ConfigError
+from roadscan.model.settings.distress import CrackDetection
 from roadscan.model.strict import Strict
 from roadscan.products.base import ProductContext, SurfaceProduct
 from roadscan.products.geo_table import check_geo_table, read_geo_table, write_geo_table

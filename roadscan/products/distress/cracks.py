@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
-from roadscan.model.distress import CrackJoining
+from roadscan.model.settings.distress import CrackJoining
 from roadscan.model.strict import Strict
 from roadscan.products.base import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.products.distress.crack_pieces import read_pieces

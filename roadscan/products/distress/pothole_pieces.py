@@ -8,8 +8,8 @@ from typing import ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
-from roadscan.model.distress import PotholeDetection
 from roadscan.model.errors import ConfigError
+from roadscan.model.settings.distress import PotholeDetection
 from roadscan.model.strict import Strict
 from roadscan.products.base import ProductContext, SurfaceProduct
 from roadscan.products.distress.crack_pieces import check_cells, height_window

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.model.distress import CrackJoining
+from roadscan.model.settings.distress import CrackJoining
 from roadscan.surfaces.distress.crack_gaps import bridges_of, outwards
 from roadscan.surfaces.distress.crack_parts import Network, components, grouped, parts_of, united
 from roadscan.surfaces.distress.cracks import CrackPiece

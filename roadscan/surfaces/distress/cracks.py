@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from roadscan.kernels.cracks.cross_sections import cross_sections
 from roadscan.kernels.cracks.quantiles_along import HALF_ALONG
-from roadscan.model.distress import CrackDetection
+from roadscan.model.settings.distress import CrackDetection
 from roadscan.surfaces.distress import valleys
 from roadscan.surfaces.distress.crack_depths import ValleyCells, blended, bottom_depths
 from roadscan.surfaces.distress.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, trimmed

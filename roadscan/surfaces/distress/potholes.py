@@ -24,7 +24,7 @@ from rasterio.features import shapes
 from scipy.ndimage import label
 
 from roadscan.kernels.cracks.crack_response import fill_holes
-from roadscan.model.distress import PotholeDetection, PotholeJoining
+from roadscan.model.settings.distress import PotholeDetection, PotholeJoining
 from roadscan.surfaces.heights import HEIGHT_STEP_M, HeightWindow
 from roadscan.surfaces.hole_blocks import Blocks, block_cells, blocks_around
 

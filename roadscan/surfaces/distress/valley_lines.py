@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.cracks.crack_response import add_bend, deepen, fill_holes, line_sums
-from roadscan.model.distress import CrackDetection
+from roadscan.model.settings.distress import CrackDetection
 from roadscan.surfaces.heights import HEIGHT_STEP_M
 from roadscan.surfaces.lowest import CROWD_CELLS
 

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.cracks.thinning import thin
-from roadscan.model.distress import CrackDetection
+from roadscan.model.settings.distress import CrackDetection
 from roadscan.surfaces.distress.valley_lines import (
     DIRECTIONS,
     FAR,

@@ -12,10 +12,10 @@ from roadscan.jobs.assets.along_roads import along_roads
 from roadscan.jobs.assets.load_returns import _Columns, in_order
 from roadscan.jobs.assets.objects import clustered
 from roadscan.jobs.condition.lines import Roads
-from roadscan.model.assets import AssetsConfig
 from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
 from roadscan.model.rig import Mounting, Mountings
+from roadscan.model.settings.assets import AssetsConfig
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.sensor_places import sensor_places
 from roadscan.tiles.grid import TileGrid

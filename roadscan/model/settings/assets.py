@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.asset_ground import GroundSettings
+from roadscan.model.settings.asset_ground import GroundSettings
 from roadscan.model.strict import Strict
 
 

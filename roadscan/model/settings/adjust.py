@@ -7,9 +7,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.adjustment import SolverSettings
+from roadscan.model.settings.adjustment import SolverSettings
+from roadscan.model.settings.tie_settings import PlaceSettings, TieSettings
 from roadscan.model.strict import Strict
-from roadscan.model.tie_settings import PlaceSettings, TieSettings
 
 AdjustMode = Literal["joint", "each_pass", "vertical", "helmert"]
 """What is adjusted."""

@@ -7,9 +7,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.settings.surface_regions import RegionSettings
+from roadscan.model.settings.surface_smoothing import SmoothingWeights, SurfaceSmoothing
 from roadscan.model.strict import Strict
-from roadscan.model.surface_regions import RegionSettings
-from roadscan.model.surface_smoothing import SmoothingWeights, SurfaceSmoothing
 
 SlopeKind = Literal["quadratic", "cubic"]
 """How the slopes of the detailed model are found."""

@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.roughness_regions import RoughnessRegionsConfig
+from roadscan.model.settings.roughness_regions import RoughnessRegionsConfig
 from roadscan.model.strict import NAME_PATTERN, Strict
 
 

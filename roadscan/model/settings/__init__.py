@@ -1,0 +1,1 @@
+"""Settings: a file a section of the survey file."""

@@ -35,7 +35,7 @@ ON_GROUND_M: Final = 0.1
 """Returns within this of the ground model tell of gains, and are on the ground."""
 _MOST_PLACES: Final = 4000
 """Places of a sample; which ones is told by a counter keyed by place."""
-_SLOPE_OVER_M: Final = 1.0
+_SLOPE_OVER_M: Final = 3.0
 """The ground's normal is that of a plane of this size."""
 _ROUNDS: Final = 8
 _EXCESS: Final = (-0.9, 2.0)

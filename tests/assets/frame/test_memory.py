@@ -22,7 +22,8 @@ def test_no_kind_keeps_a_scene_in_memory() -> None:
     ones, far = np.ones(x.size, np.uint8), np.full(x.size, 6.0)
     returns = Returns(
         (0.0, 0.0), x, y, height, 100.0 * np.ones(x.size, np.float32), np.arange(x.size) + 10**18,
-        ones.astype(np.uint16), 0 * ones, 0 * ones.astype(np.uint16), ones, ones, far, far, np.full(x.size, 2.0), ("roof",),
+        ones.astype(np.uint16), 0 * ones, 0 * ones.astype(np.uint16), ones, ones, far, far, np.full(x.size, 2.0),
+        ("roof",),
     )  # fmt: skip
     box, drive = Box(0.0, 0.0, 12.0, 12.0), np.array([[6.0, v, 2.0, 1.0] for v in np.arange(0.5, 12.0, 0.5)])
     for name, kind in asset_kinds().items():

@@ -204,15 +204,8 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
     from scipy import ndimage
 
     height = ground.height_m.astype(np.float64)
-<<<<<<< HEAD
-    if min(height.shape) < 2:
-        north = east = np.zeros_like(height)
-    else:
-        north, east = (np.asarray(g, np.float64) for g in np.gradient(height, ground.cell_m))
-=======
     small = min(height.shape) < 2
     north, east = np.zeros((2, *height.shape)) if small else np.array(list(np.gradient(height, ground.cell_m)))
->>>>>>> a-paint
     size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
     slopes = []
     for slope in (east, north):

@@ -35,7 +35,7 @@ ON_GROUND_M: Final = 0.1
 """Returns within this of the ground model tell of gains, and are on the ground."""
 _MOST_PLACES: Final = 4000
 """Places of a sample; which ones is told by a counter keyed by place."""
-_SLOPE_OVER_M: Final = 1.0
+_SLOPE_OVER_M: Final = 3.0
 """The ground's normal is that of a plane of this size."""
 _ROUNDS: Final = 8
 _EXCESS: Final = (-0.9, 2.0)
@@ -204,10 +204,8 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
     from scipy import ndimage
 
     height = ground.height_m.astype(np.float64)
-    if min(height.shape) < 2:
-        north = east = np.zeros_like(height)
-    else:
-        north, east = (np.asarray(g, np.float64) for g in np.gradient(height, ground.cell_m))
+    small = min(height.shape) < 2
+    north, east = np.zeros((2, *height.shape)) if small else np.array(list(np.gradient(height, ground.cell_m)))
     size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
     slopes = []
     for slope in (east, north):

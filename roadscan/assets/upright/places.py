@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
-from roadscan.assets.scene import Scene
+from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.memory import once_a_scene
 from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
@@ -23,14 +24,16 @@ _CELL_M: Final = 1.0
 class Places:
     """Returns that may belong to something upright, sorted by cells of a metre."""
 
-    scene: Scene
+    window: Box
+    returns: Returns
+    """Those of the scene, which is not held itself: what is remembered of it would keep it in memory."""
     rows: Int64
     starts: Int64
     shape: tuple[int, int]
 
     def within(self, x_m: float, y_m: float, reach_m: float) -> Int64:
         """Returns within reach of a place, seen from above, in order of their number."""
-        window = self.scene.window
+        window = self.window
         u, v = (x_m - window.x_min_m) / _CELL_M, (y_m - window.y_min_m) / _CELL_M
         reach = reach_m / _CELL_M
         first, last = max(int(u - reach), 0), min(int(u + reach), self.shape[1] - 1)
@@ -40,7 +43,7 @@ class Places:
                 begin = row * self.shape[1]
                 parts.append(self.rows[self.starts[begin + first] : self.starts[begin + last + 1]])
         rows = np.concatenate(parts)
-        returns = self.scene.returns
+        returns = self.returns
         near = (returns.x_m[rows] - x_m) ** 2 + (returns.y_m[rows] - y_m) ** 2 <= reach_m**2
         return np.sort(rows[near])
 
@@ -57,7 +60,7 @@ def places_of(scene: Scene) -> Places:
     count_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts)
     order = np.empty(int(starts[-1]), np.int64)
     fill_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts.copy(), order)
-    return Places(scene, order, starts, (rows, columns))
+    return Places(window, returns, order, starts, (rows, columns))
 
 
 @once_a_scene

@@ -39,6 +39,8 @@ class SignOptions(Strict):
     """Least intensity of a retroreflecting return, as a multiple of the median of the ground about."""
     least_height_m: float = Field(default=1.524, ge=0.0)
     """Least height of the plate's middle above the ground (m): 5 feet."""
+    greatest_height_m: float = Field(default=9.0, gt=1.0)
+    """Greatest height of the plate's middle above the ground (m)."""
     least_size_m: float = Field(default=0.4, gt=0.05)
     """Least width and height of a plate (m); plates of 0.85 of it are still looked at."""
     greatest_size_m: float = Field(default=1.6, gt=0.1)
@@ -169,7 +171,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     ground = float(scene.ground.height_at(place[0], place[1]))
     above = float(place[2]) - ground
-    if not _has_size(outline, options) or not above >= options.least_height_m:
+    if not _has_size(outline, options) or not options.least_height_m <= above <= options.greatest_height_m:
         return None
     large = outline.width_m > options.greatest_size_m or outline.height_m > options.greatest_size_m
     share = float(bright[rows].mean())

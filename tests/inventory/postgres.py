@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the tests' own on loopback, with PostGIS; Debian: `apt-get install postgresql postgresql-postgis`."""
+"""A PostgreSQL server of the tests' own on loopback, with PostGIS."""
 
 from __future__ import annotations
 

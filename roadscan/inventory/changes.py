@@ -29,6 +29,7 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 
 _MISSED_BY_A_PASS: Final = 0.1
 _FALSE_SHARE: Final = 0.01
+_MOST_SIGMAS: Final = 38.0
 _SAMPLES: Final = 16
 _POLYGON: Final = 3
 
@@ -170,7 +171,7 @@ def _sigmas(chance: float) -> float:
     """σ of a normal variable that is exceeded to both sides with a probability; at most 38, where numbers end."""
     from scipy.stats import norm
 
-    return min(float(norm.isf(0.5 * max(chance, 1e-300))), 38.0)
+    return min(float(norm.isf(0.5 * max(chance, 1e-300))), _MOST_SIGMAS)
 
 
 class _Compared:
@@ -204,8 +205,8 @@ def _compare_places(pair: _Pair, unit_m: float, compared: _Compared) -> None:
 
     def change(at: int) -> Change:
         row = pair.now.slice(at, 1)
-        place = (38.0, None, float(away_m[at]), row[GEOMETRY][0].as_py())
-        return Change("moved", row["asset_id"][0].as_py(), pair.kind, GEOMETRY, None, None, *place)
+        one, shape = row["asset_id"][0].as_py(), row[GEOMETRY][0].as_py()
+        return Change("moved", one, pair.kind, GEOMETRY, None, None, _MOST_SIGMAS, None, float(away_m[at]), shape)
 
     compared.add(chance, change)
 
@@ -228,9 +229,9 @@ def _compare_values(pair: _Pair, compared: _Compared) -> None:
 def _value_changes(pair: _Pair, name: str, places: Ints, *, is_text: bool) -> Callable[[int], Change]:
     def change(at: int) -> Change:
         row = int(places[at])
-        values = encoded(pair.then[name][row].as_py()), encoded(pair.now[name][row].as_py())
-        place = (None if is_text else 38.0, None, None, pair.now[GEOMETRY][row].as_py())
-        return Change("changed", pair.now["asset_id"][row].as_py(), pair.kind, name, *values, *place)
+        one, shape = pair.now["asset_id"][row].as_py(), pair.now[GEOMETRY][row].as_py()
+        was, now = encoded(pair.then[name][row].as_py()), encoded(pair.now[name][row].as_py())
+        return Change("changed", one, pair.kind, name, was, now, None if is_text else _MOST_SIGMAS, None, None, shape)
 
     return change
 

@@ -138,6 +138,8 @@ def _compare_kind(side: _Side, changes: Changes) -> None:
 
 def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> dict[int, str]:
     """Ids of rows that lost theirs, or never got one since they were first read."""
+    if None not in ids:
+        return {}
     present = {one for one in ids if one is not None}
     by_fid = {
         fid: one for one, fid in zip(side.before["asset_id"].to_pylist(), side.before[FID].to_pylist(), strict=True)

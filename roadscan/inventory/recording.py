@@ -18,8 +18,13 @@ from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
 from roadscan.inventory.visibility import NOT_KNOWN, Visibility
 from roadscan.model.errors import SchemaError
+<<<<<<< HEAD
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.settings.inventory import Matching
+=======
+from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
+from roadscan.model.settings.inventory import Matching
+>>>>>>> inventory
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
@@ -152,7 +157,7 @@ class _Recording:
         taken.update(made.values())
         ids = [made[at] if at in made else str(assets.ids[match[at]]) for at in range(table.num_rows)]
         held = assets.evidence["valid_from"].to_pylist()
-        days = [utc_from_gps_ns(one).date() for one in table[_EPOCH].to_pylist()]
+        days = _days(table[_EPOCH].to_numpy())
         firsts = [held[match[at]] if match[at] >= 0 else None for at in range(table.num_rows)]
         return ids, [min(day, first or day) for day, first in zip(days, firsts, strict=True)]
 
@@ -190,6 +195,14 @@ class _Recording:
                 array = shapely.transform(array, lambda xy: xy * self.rules.unit_m)
             placed[kind] = Placed(np.array(ids, dtype=str), array)
         return placed
+
+
+def _days(epoch_gps_ns: npt.NDArray[np.int64]) -> list[dt.date]:
+    """Days (UTC) of epochs."""
+    gps_s = epoch_gps_ns // NS_PER_S
+    unix_s = gps_s + GPS_EPOCH_UNIX_S - leap_seconds_at_gps(gps_s)
+    days: list[dt.date] = unix_s.astype("datetime64[s]").astype("datetime64[D]").tolist()
+    return days
 
 
 def _none(kind: str) -> Assets:

@@ -192,7 +192,8 @@ class AssetTruth:
     def _clear(self, number: int) -> None:
         for folder in _ROWS.values():
             for file in self.store.files(folder):
-                if int(file.rpartition("/")[2].split("-")[0]) >= number:
+                stated = file.rpartition("/")[2].split("-")[0]
+                if stated.isdigit() and int(stated) >= number:
                     self.store.remove(file)
 
     def keep_published(self, token: str, rows: pa.Table) -> None:

@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the tests' own on loopback, with PostGIS; Debian: `apt-get install postgresql postgis`."""
+"""A PostgreSQL server of the tests' own on loopback, with PostGIS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-WANTED = "PostgreSQL with PostGIS is not installed: `apt-get install postgresql postgresql-15-postgis-3`"
+WANTED = "PostgreSQL with PostGIS is not installed: `apt-get install postgresql postgresql-postgis`"
 
 
 def _programs() -> Path | None:

@@ -185,6 +185,23 @@ def test_publishing_over_changes_that_were_not_pulled_is_refused(street: Invento
     assert person.layer(file_of(street), "poles")["condition"].isna().all()
 
 
+def test_what_is_saved_while_a_publication_is_written_is_not_overwritten(
+    street: Inventory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = ids_by_station(street)[0]
+    write = GeoPackage._write_layers
+
+    def saved_meanwhile(self: GeoPackage, *given: object) -> None:
+        write(self, *given)
+        person.edit(self.file, "poles", first, condition=7)
+
+    monkeypatch.setattr(GeoPackage, "_write_layers", saved_meanwhile)
+    with pytest.raises(HomeError, match="it was edited in this moment"):
+        street.publish()
+    monkeypatch.undo()
+    assert street.pull().edits[0].new == "7"
+
+
 INVALID = shapely.Polygon([(EAST, NORTH, 1), (EAST + 2, NORTH + 2, 1), (EAST + 2, NORTH, 1), (EAST, NORTH + 2, 1)])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pytest
 import shapely
@@ -19,14 +21,22 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from roadscan.inventory.home import Content, Home, Mark, Sheet
+from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Rules
 from roadscan.inventory.state import State, live_commits, state_at
+<<<<<<< HEAD
 from roadscan.model.settings.inventory import Matching
+=======
+from roadscan.model.settings.inventory import Matching
+from roadscan.tables.asset_schema import asset_schema
+>>>>>>> inventory
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.inventory_schema import asset_table
 from roadscan.tables.store import Store
-from tests.inventory.streets import EAST, NORTH, SPRING, Everywhere, asset, found
+from tests.inventory import qgis_edits as person
+from tests.inventory.postgres import server
+from tests.inventory.streets import CRS, EAST, NORTH, SPRING, Everywhere, asset, found
 
 KINDS = ("pole", "sign")
 COUNT = 8
@@ -282,7 +292,8 @@ class Street(RuleBasedStateMachine):
     # --- what has to hold
 
     def home_rows(self, kind: str) -> list[dict[str, Any]]:
-        return self.home.read().rows[kind].to_pylist()
+        rows: list[dict[str, Any]] = self.home.read().rows[kind].to_pylist()
+        return rows
 
     def values_of_home(self) -> dict[tuple[str, str], Any]:
         editable = ("condition", "comments", "asset_height_m", "geometry")
@@ -375,3 +386,91 @@ def test_no_sequence_loses_an_edit() -> None:
 @pytest.mark.timeout(3600)
 def test_no_sequence_of_two_hundred_loses_an_edit() -> None:
     run(Street, sequences=200, steps=30)
+
+
+class InFile(GeoPackage):
+    """A GeoPackage that a person edits through OGR."""
+
+    def edit(self, kind: str, at: int, **values: Any) -> None:
+        values = {n: shapely.from_wkb(v) if n == "geometry" else v for n, v in values.items()}
+        table = asset_schema(kind).table
+        frame = person.layer(self.file, table)
+        for name, value in values.items():
+            if name == "geometry":
+                shapes = list(frame.geometry)
+                shapes[at] = value
+                frame = frame.set_geometry(shapes, crs=frame.crs)
+            else:
+                column = frame[name].astype(object)
+                column.iloc[at] = value
+                frame[name] = column if isinstance(value, str) else pd.to_numeric(column)
+        person.replace(self.file, table, frame)
+
+    def delete(self, kind: str, at: int) -> None:
+        table = asset_schema(kind).table
+        frame = person.layer(self.file, table)
+        person.replace(self.file, table, frame.drop(frame.index[at]))
+
+    def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
+        person.draw(self.file, asset_schema(kind).table, shapely.from_wkb(geometry), **values)
+
+
+class StreetInFile(Street):
+    """The same with a real file."""
+
+    new_home = staticmethod(lambda folder: InFile(folder / "inventory.gpkg", CRS, KINDS))
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(7200)
+def test_no_sequence_loses_an_edit_of_a_geopackage() -> None:
+    run(StreetInFile, sequences=int(os.environ.get("ROADSCAN_SEQUENCES", "200")), steps=20)
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(7200)
+def test_no_sequence_loses_an_edit_of_postgis() -> None:
+    psycopg = pytest.importorskip("psycopg")
+    from roadscan.inventory.homes.postgis import PostGis
+
+    class InDatabase(PostGis):
+        """Tables that a person edits by SQL."""
+
+        def _do(self, statement: str, values: list[Any]) -> None:
+            with psycopg.connect(self._address) as connection:
+                connection.execute(statement, values)
+
+        def _value(self, name: str, value: Any) -> tuple[str, Any]:
+            if name == "geometry":
+                return "ST_SetSRID(ST_GeomFromWKB(%s), 32632)", value
+            return "%s", value
+
+        def _row(self, kind: str, at: int) -> int:
+            return int(self.read().rows[kind]["fid"][at].as_py())
+
+        def edit(self, kind: str, at: int, **values: Any) -> None:
+            given = {("geom" if n == "geometry" else n): self._value(n, v) for n, v in values.items()}
+            sets = ", ".join(f"{n} = {form}" for n, (form, _) in given.items())
+            table = f"{self.schema}.{asset_schema(kind).table}"
+            self._do(
+                f"UPDATE {table} SET {sets} WHERE fid = %s", [*(v for _, v in given.values()), self._row(kind, at)]
+            )
+
+        def delete(self, kind: str, at: int) -> None:
+            self._do(f"DELETE FROM {self.schema}.{asset_schema(kind).table} WHERE fid = %s", [self._row(kind, at)])
+
+        def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
+            form, value = self._value("geometry", geometry)
+            table = f"{self.schema}.{asset_schema(kind).table}"
+            self._do(f"INSERT INTO {table} (geom, comments) VALUES ({form}, %s)", [value, values["comments"]])
+
+    with server() as address:
+
+        class StreetInDatabase(Street):
+            """The same with a server."""
+
+            @staticmethod
+            def new_home(folder: Path) -> Any:
+                return InDatabase(address, f"s{folder.name.lower().replace('-', '_')}", 32632)
+
+        run(StreetInDatabase, sequences=int(os.environ.get("ROADSCAN_SEQUENCES", "200")), steps=20)

@@ -40,6 +40,8 @@ class GeoPackage(Home):
         self.file = file
         self.crs = crs
         self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
+        self._as_read: tuple[int, int] | None = None
+        """Size and time of the file when its rows were read."""
 
     @property
     def name(self) -> str:
@@ -98,7 +100,15 @@ class GeoPackage(Home):
                     file=self.file,
                 )
             rows[kind] = self._read_layer(kind, table)
-        return Content(rows, self._decisions(layers))
+        content = Content(rows, self._decisions(layers))
+        self._as_read = self._stamp()
+        return content
+
+    def _stamp(self) -> tuple[int, int] | None:
+        if not self.file.exists():
+            return None
+        held = self.file.stat()
+        return held.st_size, held.st_mtime_ns
 
     def _read_layer(self, kind: str, table: str) -> pa.Table:
         meta, found = _read(self.file, table)
@@ -165,7 +175,9 @@ class GeoPackage(Home):
                 self._write_layers(scratch, content.rows, sheets, mark)
             with scratch.open("rb+") as stream:
                 os.fsync(stream.fileno())
+            self._check_unchanged()
             scratch.replace(self.file)
+            self._as_read = None
         except OSError as error:
             raise self._unwritable(error) from error
         finally:
@@ -206,8 +218,14 @@ class GeoPackage(Home):
         self._check_writable()
         try:
             pyogrio.write_arrow(_mark_rows(mark), self.file, layer=MARKS, driver="GPKG", append=True)
+            self._as_read = None
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, RuntimeError) as error:
             raise self._unwritable(error) from error
+
+    def _check_unchanged(self) -> None:
+        """HomeError where somebody saved into the file since its rows were read."""
+        if self._as_read is not None and self._stamp() != self._as_read:
+            raise HomeError("it was edited in this moment", change="pull, and publish again", file=self.file)
 
     def _check_writable(self) -> None:
         """HomeError for a file without a right to write; the system does not hold its administrator to that."""

@@ -18,13 +18,8 @@ from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
 from roadscan.inventory.visibility import NOT_KNOWN, Visibility
 from roadscan.model.errors import SchemaError
-<<<<<<< HEAD
-from roadscan.model.gpstime import utc_from_gps_ns
-from roadscan.model.settings.inventory import Matching
-=======
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
 from roadscan.model.settings.inventory import Matching
->>>>>>> inventory
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table

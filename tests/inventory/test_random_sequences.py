@@ -25,12 +25,8 @@ from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Rules
 from roadscan.inventory.state import State, live_commits, state_at
-<<<<<<< HEAD
-from roadscan.model.settings.inventory import Matching
-=======
 from roadscan.model.settings.inventory import Matching
 from roadscan.tables.asset_schema import asset_schema
->>>>>>> inventory
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.inventory_schema import asset_table
 from roadscan.tables.store import Store

@@ -12,16 +12,18 @@ import tempfile
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from distributed import Security
 from distributed.comm import connect
 
+from roadscan.jobs.engine import embedded as embedded_module
 from roadscan.jobs.engine.compute_on import compute_on
 from roadscan.jobs.engine.embedded import embedded
 from roadscan.jobs.engine.on_dask import OnDask
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, RunError
 from roadscan.private_folder import UnsafeFolderError
 
 PATIENCE_S = 3.0
@@ -162,6 +164,30 @@ def test_a_dashboard_is_served_where_one_is_asked_for() -> None:
         with urllib.request.urlopen(address, timeout=30) as page:
             assert b"Bokeh" in page.read()
         assert {ip for ip, _ in listening() - before} == {"127.0.0.1"}
+
+
+def test_workers_that_die_while_they_start_are_started_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, tries = embedded_module.closed_cluster, []
+
+    def dying(*rest: Any, **named: Any) -> Any:
+        tries.append(rest)
+        if len(tries) == 1:
+            raise RuntimeError("Nanny failed to start worker process")
+        return start(*rest, **named)
+
+    monkeypatch.setattr(embedded_module, "closed_cluster", dying)
+    with embedded(1) as cluster:
+        assert [done.result for done in cluster.map(abs, [-3])] == [3]
+    assert len(tries) == 2
+
+
+def test_workers_that_never_start_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def dying(*_: Any, **__: Any) -> Any:
+        raise RuntimeError("Nanny failed to start worker process")
+
+    monkeypatch.setattr(embedded_module, "closed_cluster", dying)
+    with pytest.raises(RunError, match="could not be started"), embedded(2):
+        pass
 
 
 @pytest.mark.parametrize(("where", "words"), [({"workers": 0}, "this process"), ({"scheduler": "tls://h:1"}, "h:1")])

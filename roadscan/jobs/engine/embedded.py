@@ -22,7 +22,7 @@ from distributed.worker_memory import parse_memory_limit
 from tornado.ioloop import PeriodicCallback
 
 from roadscan.jobs.engine.on_dask import QUIET_CLIENT, OnDask
-from roadscan.model.errors import ConfigError
+from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.stopping import Stopped
 from roadscan.private_folder import Code, check_private
 
@@ -70,6 +70,7 @@ again when a worker dies, :meth:`OnDask.map` decides; and a worker that dies twi
 started anew, but closed. The last two are of the dashboard: it hands no request on to other machines, and no page of
 another site that is open in a browser may read it."""
 
+_STARTS = 3
 _LOST_S = 30.0
 """Without a worker for so long, a nanny has given up."""
 
@@ -109,6 +110,8 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
         A dashboard is asked for, and Bokeh, which draws it, is not installed.
     UnsafeFolderError
         Others could change the folder for temporary files: Dask loads code from there.
+    RunError
+        The workers end as soon as they start.
     """
     if dashboard is not None and find_spec("bokeh") is None:
         raise ConfigError(
@@ -119,9 +122,7 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
         opened.enter_context(dask.config.set(QUIET_CLUSTER | {"temporary-directory": opened.enter_context(_scratch())}))
         with _held_back(), _without_interrupts():
             number = workers or dask.system.CPU_COUNT
-            cluster = opened.enter_context(
-                closed_cluster(number, Security.temporary(), with_dashboard=dashboard is not None)
-            )
+            cluster = opened.enter_context(_started(number, with_dashboard=dashboard is not None))
         client = opened.enter_context(Client(cluster))
         if dashboard is not None:
             dashboard(f"http://{LOOPBACK}:{cluster.scheduler.http_server.port}/status")
@@ -132,6 +133,21 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
             logging.disable()  # what closes from here on is bound to miss its workers
             _kill(cluster)
             raise
+
+
+def _started(workers: int, *, with_dashboard: bool) -> SpecCluster:
+    """The cluster, open; where a worker dies while it starts, all are started anew."""
+    reason: Exception | None = None
+    for _ in range(_STARTS):
+        try:
+            return closed_cluster(workers, Security.temporary(), with_dashboard=with_dashboard)
+        except (RuntimeError, OSError) as error:
+            reason = error
+    raise RunError(
+        f"the {workers} workers could not be started ({reason})",
+        expected="processes that live long enough to say that they are there",
+        change="look for what ends them (memory, limits of processes), or compute in this process: --workers 0",
+    ) from reason
 
 
 def closed_cluster(workers: int, security: Security, *, with_dashboard: bool = False) -> SpecCluster:

@@ -65,6 +65,7 @@ def worker(deployed: PrefectApi, survey_file: Path, tmp_path: Path) -> Iterator[
         yield
 
 
+@pytest.mark.nightly
 def test_the_schedule_plans_a_run_each_night(deployed: PrefectApi, client: SyncPrefectClient) -> None:
     nightly = client.read_deployment_by_name("survey/city")
     assert nightly.work_pool_name == POOL
@@ -82,6 +83,7 @@ def test_nothing_is_fetched() -> None:
     assert [list(step) for step in steps["pull"]] == [["prefect.deployments.steps.set_working_directory"]]
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("worker")
 def test_a_worker_runs_the_deployments(
     deployed: PrefectApi, client: SyncPrefectClient, survey_file: Path, simulated: SimulatedSurvey

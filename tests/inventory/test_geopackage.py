@@ -49,11 +49,11 @@ def test_table_1_is_there_with_its_attributes_and_types(tmp_path: Path) -> None:
         "medians": {"Width": "REAL", "Height": "REAL", "Length": "REAL"},
         "guard_rails": {"Height": "REAL", "Length": "REAL"}, "fencing": {"Height": "REAL", "Length": "REAL"},
         "lighting": {"Height": "REAL", "Type": "TEXT"}, "landscape_areas": {"Area of landscaping": "REAL"},
-        "delineators": {"Height": "REAL", "Type of delineator": "TEXT"}, "lanes": {"Type of striping": "TEXT"},
+        "delineators": {"Height": "REAL", "Type of delineator": "TEXT"}, "lane_lines": {"Type of striping": "TEXT"},
     }  # fmt: skip
     shapes = {"sidewalks": "POLYGON", "medians": "POLYGON", "guard_rails": "LINESTRING", "fencing": "LINESTRING",
               "lighting": "POINT", "landscape_areas": "POLYGON", "delineators": "POINT",
-              "lanes": "LINESTRING"}  # fmt: skip
+              "lane_lines": "LINESTRING"}  # fmt: skip
     with sqlite3.connect(file_of(made)) as db:
         for table, attributes in paper.items():
             types = {name: kind for _, name, kind, *_ in db.execute(f"PRAGMA table_info({table})")}

@@ -132,7 +132,17 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
     before = {p: store.fs.modified(store.path(p)) for p in outputs(store)}
     run = finished.run()
     assert run.raw_bytes_read == 0
-    stages = ("ingest:", "navigate:", "footprints:", "adjust:", "tiles:", "surfaces:", "products:", "condition:")
+    stages = (
+        "ingest:",
+        "navigate:",
+        "footprints:",
+        "adjust:",
+        "tiles:",
+        "surfaces:",
+        "products:",
+        "condition:",
+        "assets:",
+    )
     assert all(line.startswith(("known:", "report:", *stages)) for line in _lines(run))
     assert {p: store.fs.modified(store.path(p)) for p in outputs(store)} == before
     assert survey_status(Session(Survey.load(finished.survey_file), store)).is_complete

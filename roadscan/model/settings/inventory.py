@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from pydantic import Field
 
-from roadscan.model.strict import NAME_PATTERN, Strict
+from roadscan.model.strict import NAME_PATTERN, Strict, pattern_in_words
+
+_SCHEMA_NAME: Final = pattern_in_words(
+    r"^[a-z_][a-z0-9_]{0,30}$", "1 to 31 small letters (a–z), digits and '_', of which the first is no digit"
+)
 
 
 class Matching(Strict):
@@ -36,7 +41,7 @@ class InventoryConfig(Strict):
     postgis: str | None = None
     """Address of a PostGIS database in place of the GeoPackage, such as "postgresql://editor@host/assets"; the
     environment's ROADSCAN_POSTGIS comes before it. Keep passwords in the environment or in `~/.pgpass`."""
-    schema_name: str = Field(default="inventory", pattern=r"^[a-z_][a-z0-9_]{0,30}$")
+    schema_name: str = Field(default="inventory", pattern=_SCHEMA_NAME)
     """Schema of the tables in PostGIS."""
     matching: Matching = Matching()
     """How assets are known again."""

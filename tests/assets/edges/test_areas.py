@@ -44,6 +44,7 @@ def ribbon(street: SimulatedStreet, side: float, near_m: float, far_m: float) ->
     return shapely.Polygon(np.concatenate(ring))
 
 
+@pytest.mark.nightly
 def test_sidewalks_reach_from_the_kerb_to_the_facade(street: SimulatedStreet, town: Scene) -> None:
     kind = Sidewalk()
     found = list(kind.objects(kind.evidence(town, SidewalkOptions()).pieces, SidewalkOptions(), {}))
@@ -59,6 +60,7 @@ def test_sidewalks_reach_from_the_kerb_to_the_facade(street: SimulatedStreet, to
     assert largest.attributes["kerb_height_m"] == pytest.approx(0.12, abs=0.008)
 
 
+@pytest.mark.nightly
 def test_road_edges_lie_at_the_kerbs_on_their_sides(street: SimulatedStreet, town: Scene) -> None:
     kind = RoadEdge()
     found = list(kind.objects(kind.evidence(town, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))

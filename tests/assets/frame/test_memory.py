@@ -6,6 +6,7 @@ import gc
 import weakref
 
 import numpy as np
+import pytest
 
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
@@ -13,6 +14,7 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 
 
+@pytest.mark.nightly
 def test_no_kind_keeps_a_scene_in_memory() -> None:
     """A plane with a post on it, looked at by every kind."""
     random = np.random.default_rng(11)

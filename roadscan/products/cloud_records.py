@@ -8,10 +8,10 @@ import laspy
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.codecs.las import ONE_OF_ONE, Layout
+from roadscan.codecs.las import Layout
 from roadscan.model.crs import MapFrame
 from roadscan.points.cloud import TilePoints
-from roadscan.products.las import adjusted_gps_s, copy_recorded
+from roadscan.products.las import fill_record
 from roadscan.products.las_axes import axis, set_coordinates
 from roadscan.tiles.grid import TileGrid
 
@@ -50,12 +50,7 @@ def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
     set_coordinates(record, (axes[0], axes[1], axes[2]))
     for name, one, offset in zip("XYZ", axes, lattice.offsets, strict=True):
         record[name] += np.int32(round((one.offset - offset) / one.scale))
-    record["intensity"] = points.intensity
-    record["classification"] = points.classification
-    record["point_source_id"] = points.pass_id
-    record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
-    record.array["bit_fields"] = ONE_OF_ONE
-    copy_recorded(record, points)
+    fill_record(record, points)
     held: npt.NDArray[np.void] = record.array
     return held
 

@@ -209,19 +209,19 @@ def _further(points: TilePoints) -> list[str]:
 def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     set_coordinates(record, axes)
-    record["intensity"] = points.intensity
-    record["classification"] = points.classification
-    record["point_source_id"] = points.pass_id
-    record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
-    record.array["bit_fields"] = ONE_OF_ONE
-    copy_recorded(record, points)
+    fill_record(record, points)
     for column in _further(points):
         record[_RENAMED.get(column, column)] = points.extra[column]
     return record
 
 
-def copy_recorded(record: Any, points: TilePoints) -> None:
-    """Fill the dimensions of LAS that hold what a vendor's program recorded."""
+def fill_record(record: Any, points: TilePoints) -> None:
+    """Fill the dimensions of LAS, but for coordinates: those that all points have, and what a vendor recorded."""
+    record["intensity"] = points.intensity
+    record["classification"] = points.classification
+    record["point_source_id"] = points.pass_id
+    record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
+    record.array["bit_fields"] = ONE_OF_ONE
     extra = points.extra
     for name in _AS_RECORDED:
         if name in extra:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
@@ -17,6 +16,7 @@ from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, CutEdge, columns_of, cut_at, dense
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
@@ -31,7 +31,6 @@ KERB_EVIDENCE: Final = 6.0
 BARRIER_EVIDENCE: Final = 3.0
 LEAST_EVIDENCE: Final = 0.6
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
-_EDGES: Final[weakref.WeakKeyDictionary[Scene, list[CutEdge]]] = weakref.WeakKeyDictionary()
 
 
 class Track(NamedTuple):
@@ -73,14 +72,9 @@ def _stations(part: Float64, earlier: Float64) -> Iterator[Track]:
             yield Track(places[rows], heading[rows])
 
 
+@once_a_scene
 def road_edges(scene: Scene) -> list[CutEdge]:
     """Edges beside the drives within the scene's tile: nodes (n, `EDGE_COLUMNS`) in the direction of the drive."""
-    if scene not in _EDGES:
-        _EDGES[scene] = _found(scene)
-    return _EDGES[scene]
-
-
-def _found(scene: Scene) -> list[CutEdge]:
     raster = raster_of(scene)
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
 from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.kernels.assets import transects as kernel
 
@@ -45,21 +45,17 @@ class Beside(NamedTuple):
     edge_y: Float64
 
 
-_PIECES: Final[weakref.WeakKeyDictionary[Scene, pa.Table]] = weakref.WeakKeyDictionary()
-
-
+@once_a_scene
 def pieces_beside(scene: Scene) -> pa.Table:
     """Rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
-    if scene not in _PIECES:
-        raster, edges = raster_of(scene), edges_of(scene)
-        parts = []
-        if edges:
-            beside = beside_of(scene, raster, [columns_of(e) for e in edges])
-            parts = [
-                part for edge in edges for part in cut_at(_with_transects(columns_of(edge), beside, raster), scene.tile)
-            ]
-        _PIECES[scene] = pieces_table(parts, scene, raster, BESIDE_PIECES)
-    return _PIECES[scene]
+    raster, edges = raster_of(scene), edges_of(scene)
+    parts = []
+    if edges:
+        beside = beside_of(scene, raster, [columns_of(e) for e in edges])
+        parts = [
+            part for edge in edges for part in cut_at(_with_transects(columns_of(edge), beside, raster), scene.tile)
+        ]
+    return pieces_table(parts, scene, raster, BESIDE_PIECES)
 
 
 def beside_of(scene: Scene, raster: HeightRaster, edges: list[Float64]) -> Beside:

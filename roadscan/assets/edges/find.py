@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from roadscan.assets.edges.paths import paths_of
 from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.edges.steps import step_places
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
@@ -57,16 +57,14 @@ class Edge(NamedTuple):
 
 
 DEFAULT: Final = EdgeSettings()
-_EDGES: Final[weakref.WeakKeyDictionary[Scene, list[Edge]]] = weakref.WeakKeyDictionary()
 
 
+@once_a_scene
 def edges_of(scene: Scene) -> list[Edge]:
-    """Edges in the window of a scene, the best seen first; found once a scene."""
-    if scene not in _EDGES:
-        raster = raster_of(scene)
-        ground = scene.returns.at(raster.used)
-        _EDGES[scene] = found_edges(raster, profiles.sorted_heights(ground.x_m, ground.y_m, ground.height_m))
-    return _EDGES[scene]
+    """Edges in the window of a scene, the best seen first."""
+    raster = raster_of(scene)
+    ground = scene.returns.at(raster.used)
+    return found_edges(raster, profiles.sorted_heights(ground.x_m, ground.y_m, ground.height_m))
 
 
 def edges_of_raster(raster: HeightRaster) -> list[Edge]:

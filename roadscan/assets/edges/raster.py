@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import weakref
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 import scipy.ndimage
 
 from roadscan.assets import classes
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.kernels.assets.low_heights import low_heights
 
@@ -82,17 +82,9 @@ def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
     return near & ~np.isin(scene.classes, NOT_GROUND)
 
 
-_RASTERS: Final[weakref.WeakKeyDictionary[Scene, HeightRaster]] = weakref.WeakKeyDictionary()
-
-
+@once_a_scene
 def raster_of(scene: Scene) -> HeightRaster:
     """The raster of a scene's window; its cells are those of a grid that all tiles share."""
-    if scene not in _RASTERS:
-        _RASTERS[scene] = _made(scene)
-    return _RASTERS[scene]
-
-
-def _made(scene: Scene) -> HeightRaster:
     window, used = scene.window, may_be_ground(scene)
     x_min, y_min = (CELL_M * math.floor(v / CELL_M + 1e-6) for v in window[:2])
     columns = max(math.ceil((window.x_max_m - x_min) / CELL_M - 1e-6), 8)

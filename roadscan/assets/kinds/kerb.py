@@ -62,7 +62,7 @@ class Kerb(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Lines joined across tiles, a kerb for each run of one type."""
-        settings = KerbOptions.parse(options.model_dump()) if isinstance(options, Strict) else KerbOptions()
+        settings: KerbOptions = options
         for line in joined_lines(pieces):
             probability = kerb_probability(line)
             if line.length_m < settings.least_length_m or probability < settings.least_probability:

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.paint.detection import paint_of
+from roadscan.assets.paint.detection import paint_of, rows_of_paint
 from roadscan.assets.paint.lane_lines import lane_lines
-from roadscan.assets.paint.line_pieces import LINE_PIECES, line_pieces, line_rows
+from roadscan.assets.paint.line_pieces import LINE_PIECES, line_pieces
 from roadscan.assets.scene import Scene
 from roadscan.model.strict import Strict
 
@@ -37,7 +37,7 @@ class LaneLine(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Straight pieces of lines in the tile."""
         paint = paint_of(scene)
-        return Evidence(line_pieces(scene, paint), (Marked(line_rows(scene, paint), MARKING),))
+        return Evidence(line_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.lines), MARKING),))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

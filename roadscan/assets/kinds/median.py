@@ -49,7 +49,7 @@ class Median(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Runs of a joined line with a surface behind it that an edge down ends, each median once."""
-        settings = MedianOptions.parse(options.model_dump()) if isinstance(options, Strict) else MedianOptions()
+        settings: MedianOptions = options
         found: list[shapely.Polygon] = []
         for line in joined_lines(pieces):
             probability = kerb_probability(line)

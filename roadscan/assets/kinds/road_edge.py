@@ -43,7 +43,7 @@ class RoadEdge(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Lines joined across tiles, an edge for each run of one type."""
-        settings = RoadEdgeOptions.parse(options.model_dump()) if isinstance(options, Strict) else RoadEdgeOptions()
+        settings: RoadEdgeOptions = options
         for right in (False, True):
             side = [i for i, row in enumerate(pieces["right"].to_pylist()) if (row[0] > 0.5) == right]
             for line in joined_lines(pieces.take(side)):

@@ -9,9 +9,9 @@ import pyarrow as pa
 
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.paint.detection import paint_of
+from roadscan.assets.paint.detection import paint_of, rows_of_paint
 from roadscan.assets.paint.markings import markings
-from roadscan.assets.paint.patch_pieces import PATCH_PIECES, patch_pieces, patch_rows
+from roadscan.assets.paint.patch_pieces import PATCH_PIECES, patch_pieces
 from roadscan.assets.scene import Scene
 
 
@@ -25,7 +25,7 @@ class RoadMarking(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Polygons of markings in the tile."""
         paint = paint_of(scene)
-        return Evidence(patch_pieces(scene, paint), (Marked(patch_rows(scene, paint), MARKING),))
+        return Evidence(patch_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.patches), MARKING),))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

@@ -59,7 +59,7 @@ class Shoulder(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """A shoulder for each run of a road edge with a lane line inside it."""
-        settings = ShoulderOptions.parse(options.model_dump()) if isinstance(options, Strict) else ShoulderOptions()
+        settings: ShoulderOptions = options
         lines = others.get("lane_line", ())
         if not lines:
             return

@@ -48,7 +48,7 @@ class Sidewalk(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Runs of a joined line with a surface behind it that no edge down ends."""
-        settings = SidewalkOptions.parse(options.model_dump()) if isinstance(options, Strict) else SidewalkOptions()
+        settings: SidewalkOptions = options
         for line in joined_lines(pieces):
             probability = kerb_probability(line)
             if probability < settings.least_probability:

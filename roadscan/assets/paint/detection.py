@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.paint.components import Component, components_of
 from roadscan.assets.paint.contrast import CELL_M, Contrast, contrast_of
 from roadscan.assets.paint.crosswalks import Bar, crosswalk_bars, is_round
@@ -60,17 +61,9 @@ class Paint:
     patches: tuple[Patch, ...]
 
 
-_known: weakref.WeakKeyDictionary[Scene, Paint] = weakref.WeakKeyDictionary()
-
-
+@once_a_scene
 def paint_of(scene: Scene) -> Paint:
-    """Paint of a scene; it is sought once for all kinds that ask for it."""
-    if scene not in _known:
-        _known[scene] = _paint_of(scene)
-    return _known[scene]
-
-
-def _paint_of(scene: Scene) -> Paint:
+    """Paint of a scene."""
     found = contrast_of(scene)
     road = RoadDirection(scene)
     bands: list[Stripe] = []
@@ -98,7 +91,12 @@ def _paint_of(scene: Scene) -> Paint:
     return Paint(found, tuple(lines), tuple(patches))
 
 
-def painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
+def rows_of_paint(found: Contrast, shapes: Sequence[Stripe | Patch]) -> Int64:
+    """Rows of the scene's returns that are paint of some shapes, ascending."""
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *(_painted_rows(found, one) for one in shapes)]))
+
+
+def _painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
     """Rows of the scene for the returns of a shape that are paint, as its outline, they and those near them tell.
 
     Logarithms of odds add up: of the outline (worn paint has holes, edges are ragged), of the return's own contrast,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.assets.paint.detection import Paint, painted_rows
+from roadscan.assets.paint.detection import Paint
 from roadscan.assets.paint.stripes import Stripe
 from roadscan.assets.scene import Box, Scene
 
@@ -39,12 +39,6 @@ def line_pieces(scene: Scene, paint: Paint) -> pa.Table:
     """Pieces of lines within the scene's tile, in the order of the paint's lines."""
     rows = [piece for stripe in paint.lines if (piece := _piece(scene, paint, stripe)) is not None]
     return pa.Table.from_pylist(rows, schema=LINE_PIECES)
-
-
-def line_rows(scene: Scene, paint: Paint) -> npt.NDArray[np.int64]:
-    """Rows of the scene's returns that lie on lines."""
-    found = [painted_rows(paint.contrast, s) for s in paint.lines]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))
 
 
 def _piece(scene: Scene, paint: Paint, stripe: Stripe) -> dict[str, object] | None:

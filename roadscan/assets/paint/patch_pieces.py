@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from roadscan.assets.paint.detection import Paint, Patch, painted_rows
+from roadscan.assets.paint.detection import Paint, Patch
 from roadscan.assets.paint.line_pieces import height_sigma
 from roadscan.assets.scene import Scene
 
@@ -42,12 +41,6 @@ def patch_pieces(scene: Scene, paint: Paint) -> pa.Table:
         if shape.area > 0.0:
             rows.append(_piece(scene, paint, patch, shape))
     return pa.Table.from_pylist(rows, schema=PATCH_PIECES)
-
-
-def patch_rows(scene: Scene, paint: Paint) -> npt.NDArray[np.int64]:
-    """Rows of the scene's returns that lie on patches."""
-    found = [painted_rows(paint.contrast, p) for p in paint.patches]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))
 
 
 def _piece(scene: Scene, paint: Paint, patch: Patch, shape: shapely.Geometry) -> dict[str, object]:

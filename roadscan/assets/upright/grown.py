@@ -9,11 +9,10 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 from pydantic import Field
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
+from roadscan.assets.touching import touching
 from roadscan.assets.upright.pieces import passes_of
 from roadscan.kernels.assets.grown_cells import ground_moments
 from roadscan.model.strict import Strict
@@ -133,14 +132,7 @@ def components(column: Int64, row: Int64) -> list[Int64]:
     order = np.lexsort((column, row))
     width = int(column.max() - column.min()) + 3
     flat = (row[order] - row.min()) * width + (column[order] - column.min())
-    edges = []
-    for step in (1, width):
-        at = np.searchsorted(flat, flat + step)
-        met = (at < flat.size) & (flat[np.minimum(at, flat.size - 1)] == flat + step)
-        edges.append(np.column_stack([np.flatnonzero(met), at[met]]))
-    joined = np.concatenate(edges)
-    graph = sparse.coo_matrix((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(flat.size,) * 2)
-    _, label = connected_components(graph, directed=False)
+    label = touching(flat, (1, width))
     by_label = np.argsort(label, kind="stable")
     parts = np.split(order[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
     return sorted(parts, key=lambda p: (int(row[p[0]]), int(column[p[0]])))

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.memory import once_a_scene
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.kernels.assets.upright_voxels import passing_lines
 

@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from roadscan.assets.scene import Scene
+from roadscan.assets.touching import touching
 from roadscan.assets.upright.outlines import Outline, outline_of
 from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.probability import logistic
@@ -121,14 +120,7 @@ def _clusters(scene: Scene, rows: Int64) -> list[Int64]:
         for i in (-1, 0, 1)
         if (k, j, i) > (0, 0, 0)
     ]
-    pairs = []
-    for step in steps:
-        at = np.searchsorted(voxels, voxels + step)
-        met = (at < voxels.size) & (voxels[np.minimum(at, voxels.size - 1)] == voxels + step)
-        pairs.append(np.column_stack([np.flatnonzero(met), at[met]]))
-    edges = np.concatenate(pairs)
-    graph = sparse.coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(voxels.size,) * 2)
-    _, label = connected_components(graph, directed=False)
+    label = touching(voxels, steps)
     order = np.argsort(label[owner], kind="stable")
     parts = np.split(rows[order], np.flatnonzero(np.diff(label[owner][order])) + 1)
     return [np.sort(p) for p in parts if p.size >= _LEAST_BRIGHT]

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.memory import once_a_scene
 from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.memory import once_a_scene
 from roadscan.kernels.assets.slices import fill_slices, label_slices
 
 Float64 = npt.NDArray[np.float64]

@@ -9,9 +9,9 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, signal_head
-from roadscan.assets.upright.memory import once_a_scene
 from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import Shaft, shafts_of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from itertools import cycle
 from typing import Any, Final
@@ -15,18 +14,13 @@ import shapely
 from roadscan.jobs.assets.tables import TABLES, read_layer
 from roadscan.jobs.products import product_context
 from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
+from roadscan.jobs.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.jobs.report.section import Material, Section
 from roadscan.products.assets.layers import Layer
 from roadscan.tables.asset_schema import AssetSchema, asset_schema, asset_tables
 
-_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-"""Okabe and Ito (2008): told apart by all eyes."""
-_WIDTH: Final = 1000.0
-_MARGIN: Final = 40.0
-_HIGHEST: Final = 900.0
 _CROSS: Final = 3.0
 _MOST_LINES: Final = 6000
-_LEAST_EXTENT_M: Final = 1.0
 
 Float64 = npt.NDArray[np.float64]
 
@@ -94,24 +88,17 @@ def _words(value: Any) -> str:
 
 def _drawing(held: Sequence[tuple[AssetSchema, Layer]]) -> Drawing:
     """All assets on the map, a colour a kind."""
-    every = np.concatenate([shapely.get_coordinates(layer.shapes_m) for _, layer in held])
-    low, high = every.min(axis=0), every.max(axis=0)
-    extent = np.maximum(high - low, _LEAST_EXTENT_M)
-    scale = min((_WIDTH - 2 * _MARGIN) / extent[0], (_HIGHEST - 2 * _MARGIN) / extent[1])
-    height = extent[1] * scale + 2 * _MARGIN
+    page = MapPage.around(np.concatenate([shapely.get_coordinates(layer.shapes_m) for _, layer in held]))
     lines: list[Line] = []
     legend: list[tuple[str, str]] = []
-    for (schema, layer), colour in zip(held, cycle(_COLOURS), strict=False):
+    for (schema, layer), colour in zip(held, cycle(COLOURS), strict=False):
         legend.append((colour, schema.title))
         for shape in layer.shapes_m:
-            place = shapely.get_coordinates(shape)
-            x = _MARGIN + (place[:, 0] - low[0]) * scale
-            y = height - _MARGIN - (place[:, 1] - low[1]) * scale
-            lines += [Line(points, colour) for points in _points(np.column_stack([x, y]))]
-    bar_m = 10.0 ** math.floor(math.log10(max(extent.max() / 4, 1.0)))
+            place = page.on_page(shapely.get_coordinates(shape))
+            lines += [Line(points, colour) for points in _points(place)]
     shown = "" if len(lines) <= _MOST_LINES else f" The map shows {_MOST_LINES:,} lines of {len(lines):,}."
     return Drawing(
-        _WIDTH, height, lines[:_MOST_LINES], scale_bar=(bar_m * scale, f"{bar_m:g} m"), legend=legend,
+        WIDTH, page.height, lines[:_MOST_LINES], scale_bar=page.scale_bar, legend=legend,
         caption=f"Assets in the coordinates of the map; points are crosses.{shown}",
     )  # fmt: skip
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from roadscan.jobs.plan.drives import Drives
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
+from roadscan.jobs.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.report.sections.recorded import seconds_of
 from roadscan.jobs.tiles.tile_plan import TILE
@@ -21,13 +22,8 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import OutputRecord
 
-RUN_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-"""Okabe and Ito (2008): told apart by all eyes."""
 _ONE_PASS: Final = "#cfd6dd"
 _OVERLAPPED: Final = "#9fb4c7"
-_WIDTH: Final = 1000.0
-_MARGIN: Final = 40.0
-_HIGHEST: Final = 900.0
 _MOST_SQUARES: Final = 4000
 _MOST_POINTS: Final = 1500
 
@@ -67,28 +63,17 @@ class Coverage(Section):
 
 def _drawing(paths: dict[str, Float64], tiles: Sequence[OutputRecord], size_m: float) -> Drawing:
     corners = _corners(tiles, size_m)
-    every = np.concatenate([*paths.values(), corners, corners + size_m])
-    low, high = every.min(axis=0), every.max(axis=0)
-    extent = np.maximum(high - low, 1.0)
-    scale = min((_WIDTH - 2 * _MARGIN) / extent[0], (_HIGHEST - 2 * _MARGIN) / extent[1])
-    height = extent[1] * scale + 2 * _MARGIN
-
-    def on_page(places_m: Float64) -> Float64:
-        return np.stack(
-            [_MARGIN + (places_m[:, 0] - low[0]) * scale, height - _MARGIN - (places_m[:, 1] - low[1]) * scale], -1
-        )
-
-    colours = dict(zip(sorted(paths), cycle(RUN_COLOURS), strict=False))
-    lines = [Line(_points(on_page(paths[run])), colours[run]) for run in sorted(paths)]
+    page = MapPage.around(np.concatenate([*paths.values(), corners, corners + size_m]))
+    colours = dict(zip(sorted(paths), cycle(COLOURS), strict=False))
+    lines = [Line(_points(page.on_page(paths[run])), colours[run]) for run in sorted(paths)]
     squares, edge_m = _squares(tiles, size_m)
-    placed = on_page(np.array([[s[0], s[1] + edge_m] for s in squares]).reshape(-1, 2))
-    bar_m = 10.0 ** math.floor(math.log10(max(extent.max() / 4, 1.0)))
+    placed = page.on_page(np.array([[s[0], s[1] + edge_m] for s in squares]).reshape(-1, 2))
     legend = [(colours[run], f"run {run}") for run in sorted(paths)]
     legend += [(_ONE_PASS, "tiles with readings"), (_OVERLAPPED, "most of it seen by two passes or more")]
     return Drawing(
-        _WIDTH, height, lines,
-        squares=[(x, y, edge_m * scale, s[2]) for (x, y), s in zip(placed.tolist(), squares, strict=True)],
-        scale_bar=(bar_m * scale, f"{bar_m / 1000:g} km" if bar_m >= 1000 else f"{bar_m:g} m"), legend=legend,
+        WIDTH, page.height, lines,
+        squares=[(x, y, edge_m * page.scale, s[2]) for (x, y), s in zip(placed.tolist(), squares, strict=True)],
+        scale_bar=page.scale_bar, legend=legend,
         caption="Runs over the tiles that hold readings, in the coordinates of the map.",
     )  # fmt: skip
 

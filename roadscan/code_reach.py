@@ -12,7 +12,9 @@ leads there: each of these belongs to the keys of its own outputs.
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
+import gc
 import hashlib
 import importlib.util
 from collections.abc import Iterable, Iterator
@@ -112,16 +114,48 @@ def _module(name: str) -> _Module:
     if file is None:
         raise LookupError(f"there is no module {name}")
     source = file.read_text(encoding="utf-8")
-    lines, tree, package = source.splitlines(), ast.parse(source), _package_of(name, file)
+    with _uncollected():
+        return _read_module(name, source, _package_of(name, file))
+
+
+def _read_module(name: str, source: str, package: str) -> _Module:
+    lines, tree = source.splitlines(), ast.parse(source)
     module = _Module(texts={_EFFECTS: ""}, uses={_EFFECTS: []})
     defined = [(own, node) for node in tree.body for own in _names_of(node)]
     for node in tree.body:
         module.imports |= _imported(node, package)
     known = {own for own, _ in defined}
     for own, node in defined:
-        module.texts[own] = module.texts.get(own, "") + _text(node, lines)
-        module.uses[own] = module.uses.get(own, []) + _used(node, known, module.imports, name, package)
+        parts = list(_parts(node))
+        module.texts[own] = module.texts.get(own, "") + _text(node, parts, lines)
+        module.uses[own] = module.uses.get(own, []) + _used(parts, known, module.imports, name, package)
     return module
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Python's collector rests: it would look through a syntax tree again and again while that grows."""
+    resting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if resting:
+            gc.enable()
+
+
+def _parts(node: ast.AST) -> Iterator[ast.AST]:
+    """A statement and all below it, but operators and contexts."""
+    waiting = [node]
+    while waiting:
+        part = waiting.pop()
+        yield part
+        for name in part._fields:
+            below = getattr(part, name, None)
+            if isinstance(below, list):
+                waiting += [one for one in below if isinstance(one, ast.AST)]
+            elif isinstance(below, ast.AST) and name not in ("ctx", "op"):
+                waiting.append(below)
 
 
 def _names_of(node: ast.stmt) -> list[str]:
@@ -141,37 +175,38 @@ def _names_of(node: ast.stmt) -> list[str]:
     return [_EFFECTS]
 
 
-def _text(node: ast.stmt, lines: list[str]) -> str:
+def _text(node: ast.stmt, parts: Iterable[ast.AST], lines: list[str]) -> str:
     """Lines of a definition, without docstrings and lines that hold nothing but a comment."""
     decorators = getattr(node, "decorator_list", [])
     first = min([node.lineno, *(d.lineno for d in decorators)])
-    told = {number for said in _docstrings(node) for number in range(said.lineno, (said.end_lineno or 0) + 1)}
+    told = {
+        number
+        for part in parts  # docstrings, and the texts under fields
+        if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)
+        for number in range(part.lineno, (part.end_lineno or 0) + 1)
+    }
     kept = (lines[number - 1].rstrip() for number in range(first, (node.end_lineno or first) + 1) if number not in told)
     return "\n".join(line for line in kept if line and not line.lstrip().startswith("#")) + "\n"
 
 
-def _docstrings(node: ast.stmt) -> Iterator[ast.stmt]:
-    """Statements that are nothing but a text: docstrings, and the texts under fields."""
-    for part in ast.walk(node):
-        if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str):
-            yield part
-
-
-def _used(node: ast.stmt, known: set[str], imports: dict[str, Place], module: str, package: str) -> list[Place]:
+def _used(parts: list[ast.AST], known: set[str], imports: dict[str, Place], module: str, package: str) -> list[Place]:
     """What the names in a definition stand for, as far as a package of ours defines it."""
     within: dict[str, Place] = {}
-    for part in ast.walk(node):
-        within |= _imported(part, package)
+    for part in parts:
+        if isinstance(part, _IMPORTS):
+            within |= _imported(part, package)
     found: dict[Place, None] = {}
-    for part in ast.walk(node):
-        for name in _names_in(part):
-            if name in within:
-                found[within[name]] = None
-            elif name in known:
-                found[module, name] = None
-            elif name in imports:
-                found[imports[name]] = None
+    for name in dict.fromkeys(name for part in parts for name in _names_in(part)):
+        if name in within:
+            found[within[name]] = None
+        elif name in known:
+            found[module, name] = None
+        elif name in imports:
+            found[imports[name]] = None
     return list(found)
+
+
+_IMPORTS = (ast.Import, ast.ImportFrom, ast.If)
 
 
 def _names_in(part: ast.AST) -> Iterator[str]:

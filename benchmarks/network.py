@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from benchmarks.course import CRS, START_GPS_NS
 from benchmarks.surveys import LINE_SPACING_M, LINE_SPEED_M_PER_S
-from roadscan.jobs.engine.fingerprint import code_version, key_of
+from roadscan.code_reach import code_digest
+from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import Ground, ReadingSource, TrajectorySource
 from roadscan.jobs.tiles.footprints import FootprintRanges
@@ -95,7 +96,7 @@ class Region:
             sources=tuple(sources),
             passes=tuple(passes),
             centre_lines=None,
-            tile_key=key_of(code_version(), grid.cell_m),
+            tile_key=key_of(code_digest("roadscan.jobs.tiles.tiles:compute_tiles"), grid.cell_m),
         )
         return cls(plan, _joined(plan, rows), length_m)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from pathlib import Path
 
 import laspy
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
+import benchmarks
 from benchmarks import skilled_user, surveys
 from benchmarks.by_hand import CELL_M, ByHand, from_store
 from benchmarks.course import HOUR_UTC, START_GPS_NS
@@ -136,3 +139,8 @@ def test_roofline() -> None:
     line = Roofline(bytes_per_reading=10, readings_per_s=1e9, bandwidth_bytes_per_s=40e9)
     assert line.limit_readings_per_s == 4e9
     assert line.fraction == 0.25
+
+
+@pytest.mark.parametrize("name", sorted(m.name for m in pkgutil.iter_modules(benchmarks.__path__)))
+def test_every_module_finds_what_it_imports(name: str) -> None:
+    importlib.import_module(f"benchmarks.{name}")

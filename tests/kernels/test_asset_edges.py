@@ -27,13 +27,15 @@ RNG = np.random.default_rng(8)
 
 
 def test_low_heights_leave_out_what_stands_above() -> None:
-    x = np.array([0.05, 0.05, 0.05, 0.15, 0.95])
-    z = np.array([1.0, 1.06, 1.5, 2.0, 9.0])
-    count, mean, variance = np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.zeros((1, 2))
-    low_heights(x, np.full(5, 0.05), z, (0.0, 0.0, 0.1), 0.12, count, mean, variance)
-    assert count.tolist() == [[2, 1]]
-    assert mean[0] == pytest.approx([1.03, 2.0])
-    assert variance[0] == pytest.approx([0.03**2, 0.0])
+    cell = np.array([0, 0, 0, 1, -1, 0], np.int32)
+    z = np.array([1.0, 1.06, 1.5, 2.0, 9.0, 0.1])
+    used = np.array([True, True, True, True, True, False])
+    count, mean, variance = np.zeros(2, np.int32), np.zeros(2), np.zeros(2)
+    low_heights(cell, z, used, 0.12, count, mean, variance)
+    assert count.tolist() == [2, 1]
+    assert mean == pytest.approx([1.03, 2.0])
+    assert variance == pytest.approx([0.03**2, 0.0])
+    assert used.tolist() == [True, True, False, True, False, False]
 
 
 def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
@@ -125,8 +127,9 @@ def test_links_lead_forward_and_the_strongest_chain_is_traced() -> None:
     total = ahead + behind
     chain, owner = np.zeros((m, 2), np.int64), np.full(m, -1)
     number, length = trace(
-        place, total, following, preceding, np.argsort(-total, kind="stable"), (3.0, 1.0, 0.25, 0.6), chain, owner
-    )
+        place, total, following, preceding, np.argsort(-total, kind="stable"), order, starts, bins,
+        (3.0, 1.0, 0.25, 0.6), chain, owner,
+    )  # fmt: skip
     assert number >= 1
     assert set(chain[:length, 1].tolist()) >= set(range(0, n, 2)) or set(chain[:length, 1].tolist()) >= set(
         range(2, n - 2)
@@ -142,8 +145,8 @@ def test_a_step_is_found_where_it_was_drawn() -> None:
     node = np.array([[0.0, 0.0, 1.0, 0.0, 50.0, 0.02, 0.03]])
     out = np.empty((1, RESULTS))
     fit_nodes(
-        node, t, -d, z, np.arange(4000), np.array([0, 4000]), (-2.0, -2.0, 10.0, 1.0, 1.0), 0.5,
-        (0.2, 0.02, 0.24, 0.35), (0.05, 0.015), out,
+        node, t, -d, z, np.array([0, 4000]), (-2.0, -2.0, 10.0, 1.0, 1.0), 0.5, (0.2, 0.02, 0.24, 0.35), (0.05, 0.015),
+        out,
     )  # fmt: skip
     assert out[0, STEP] == pytest.approx(0.09 + 0.06 * 0.03, abs=0.004)
     assert out[0, OFFSET] - 0.5 * out[0, FACE] == pytest.approx(0.12, abs=0.011)

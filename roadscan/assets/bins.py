@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.assets.buckets import by_number, raster_cells
+from roadscan.kernels.assets.columns import distinct
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -33,3 +34,13 @@ def cells_of(
     cell = np.empty(x_m.size, np.int32)
     raster_cells(x_m, y_m, grid, shape, cell)
     return cell
+
+
+def distinct_steps(epoch_gps_ns: Int64, step_ns: int) -> Int64:
+    """Steps of time (k,) that hold one of some epochs (n,), as whole numbers, ascending."""
+    found = np.empty(4096, np.int64)
+    count = distinct(epoch_gps_ns, step_ns, found)
+    if count > found.size:
+        found = np.empty(count, np.int64)
+        distinct(epoch_gps_ns, step_ns, found)
+    return np.unique(found[:count])

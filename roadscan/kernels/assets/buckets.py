@@ -36,6 +36,19 @@ def by_number(number, starts, order):
 
 
 @kernel
+def rows_within(x, y, box, rows):
+    """Numbers of the places within a box, ascending, to `rows` (n,) int64; returns how many there are.
+
+    x, y : (n,) whole numbers. box : (4,) least x and y, which belong to it, and those that it ends before.
+    """
+    found = 0
+    for i in range(x.size):
+        rows[found] = i
+        found += 1 if box[0] <= x[i] < box[2] and box[1] <= y[i] < box[3] else 0
+    return found
+
+
+@kernel
 def raster_cells(x, y, grid, shape, cell):
     """Flat number of each place's cell of a raster: cell (n,) int32; −1 outside.
 

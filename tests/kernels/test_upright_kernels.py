@@ -33,7 +33,7 @@ def test_slices_and_their_components() -> None:
     labels = np.zeros(counts.shape, np.int32)
     most = int((counts > 0).sum())
     boxes = np.empty((most, 5), np.int32)
-    found = label_slices(counts, labels, boxes, np.empty(most, np.int64))
+    found = label_slices(counts, np.flatnonzero(counts), labels, boxes, np.empty(most, np.int64))
     flat = np.zeros((3, 3, 3), int)
     flat[1] = 1
     wanted, number = ndimage.label(counts > 0, structure=flat)

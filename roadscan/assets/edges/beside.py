@@ -7,7 +7,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import scipy.ndimage
 
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of
@@ -15,6 +14,7 @@ from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, 
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.smoothing import gaussian
 from roadscan.kernels.assets import transects as kernel
 
 Float64 = npt.NDArray[np.float64]
@@ -78,8 +78,8 @@ def beside_of(scene: Scene) -> Beside:
 
 def smooth(values: Float64, known: npt.NDArray[np.bool_], sigma_cells: float) -> Float64:
     """Mean (rows, columns) of known values around each cell; NaN where none is near."""
-    weight = scipy.ndimage.gaussian_filter(known.astype(np.float64), sigma_cells, truncate=2.5)
-    total = scipy.ndimage.gaussian_filter(values, sigma_cells, truncate=2.5)
+    weight = gaussian(known.astype(np.float64), sigma_cells, 2.5)
+    total = gaussian(values, sigma_cells, 2.5)
     return np.where(weight > 0.02, total / np.maximum(weight, 0.02), np.nan)
 
 

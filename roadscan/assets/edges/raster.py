@@ -10,12 +10,12 @@ from typing import Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.smoothing import gaussian
 from roadscan.kernels.assets.low_heights import low_heights
 
 Float64 = npt.NDArray[np.float64]
@@ -71,8 +71,8 @@ class HeightRaster:
         sigma = COARSE_M / self.cell_m
         known = (self.count > 0).astype(np.float64)
         level = self.level_m
-        weight = scipy.ndimage.gaussian_filter(known, sigma, truncate=3.0)
-        total = scipy.ndimage.gaussian_filter(np.where(known > 0, self.height_m - level, 0.0), sigma, truncate=3.0)
+        weight = gaussian(known, sigma, 3.0)
+        total = gaussian(np.where(known > 0, self.height_m - level, 0.0), sigma, 3.0)
         smooth = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0.0)
         down, right = np.gradient(smooth, self.cell_m)
         near = weight > 1e-2

@@ -24,6 +24,8 @@ import pyarrow as pa
 
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
+from roadscan.kernels.assets.beams import log_gains, meet_ground
+from roadscan.kernels.options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -166,13 +168,13 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
     """
     log_gain = np.zeros(len(returns))
     on_ground = np.abs(returns.height_m - ground.height_at(returns.x_m, returns.y_m)) <= 3 * ON_GROUND_M
-    incidence, range_m = incidence_deg(returns, ground), returns.range_m
+    range_m, incidence = _beams(returns, ground, on_ground)
     sensors = gains["sensor"].to_numpy(zero_copy_only=False)
     kinds = gains["term"].to_numpy(zero_copy_only=False)
     nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
     for number, name in enumerate(returns.sensors):
-        mine = np.flatnonzero(returns.sensor == number)
-        if not mine.size or not (sensors == name).any():
+        mine = returns.sensor == number
+        if not mine.any() or not (sensors == name).any():
             continue
 
         def of(term: str, name: str = name) -> tuple[Float64, Float64]:
@@ -183,9 +185,7 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
         lasers, of_laser = of("laser")
         by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
         by_laser[lasers.astype(np.int64)] = of_laser
-        log_gain[mine] += by_laser[returns.laser[mine]]
-        log_gain[mine] += np.interp(range_m[mine], *of("range"))
-        log_gain[mine] += np.where(on_ground[mine], np.interp(incidence[mine], *of("incidence")), 0.0)
+        log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser, of("range"), of("incidence"), log_gain)
     log_gain[np.isnan(log_gain)] = 0.0  # it is not known where the sensor stood
     intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
     return replace(returns, intensity=intensity, calibrated=True)
@@ -201,6 +201,11 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
 
     Where the ground is not known, it is taken as level.
     """
+    return _beams(returns, ground, np.ones(len(returns), np.bool_))[1]
+
+
+def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
+    """Range (n,) of each return (m), and the angle of incidence of those that are wanted (deg); 0 of all others."""
     from scipy import ndimage
 
     height = ground.height_m.astype(np.float64)
@@ -213,15 +218,12 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
         share = ndimage.uniform_filter(known.astype(np.float64), size, mode="nearest")
         mean = ndimage.uniform_filter(np.where(known, slope, 0.0), size, mode="nearest")
         slopes.append(np.where(share > 0.0, mean / np.maximum(share, 1e-9), 0.0))
-    rows, columns = height.shape
-    row = np.clip(((returns.y_m - ground.y_min_m) / ground.cell_m).astype(np.int64), 0, rows - 1)
-    column = np.clip(((returns.x_m - ground.x_min_m) / ground.cell_m).astype(np.int64), 0, columns - 1)
-    slope_x, slope_y = slopes[0][row, column], slopes[1][row, column]
-    dx, dy = returns.sensor_x_m - returns.x_m, returns.sensor_y_m - returns.y_m
-    dz = returns.sensor_height_m - returns.height_m
-    along = (dz - slope_x * dx - slope_y * dy) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    length = np.sqrt(dx**2 + dy**2 + dz**2)
-    return np.asarray(np.degrees(np.arccos(np.clip(along / np.maximum(length, 1e-9), 0.0, 1.0))))
+    range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
+    place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
+    sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
+    grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
+    meet_ground(place, sensor, grid, slopes[0], slopes[1], wanted, range_m, cosine)
+    return range_m, np.degrees(np.arccos(cosine))
 
 
 # --- the places of a sample ------------------------------------------------------------------------

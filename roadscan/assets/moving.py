@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import distinct_steps
 from roadscan.assets.cubes import Cubes
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.returns import Returns
@@ -100,12 +101,7 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
 
 def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
     """Slot (n,) of each epoch: those in which nothing was seen are left out, so that passes follow one another."""
-    found = np.empty(4096, np.int64)
-    count = columns.distinct(epoch_gps_ns, SLOT_NS, found)
-    if count > found.size:
-        found = np.empty(count, np.int64)
-        columns.distinct(epoch_gps_ns, SLOT_NS, found)
-    steps = np.unique(found[:count])
+    steps = distinct_steps(epoch_gps_ns, SLOT_NS)
     slot = np.empty(epoch_gps_ns.size, np.uint8)
     columns.slots(epoch_gps_ns, SLOT_NS, steps, max(1, -(-steps.size // _SLOTS)), slot)
     return slot

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.returns import Returns
+from roadscan.kernels.assets.beams import ground_heights
+from roadscan.kernels.options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -45,18 +47,11 @@ class GroundModel:
 
     def height_at(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Float64:
         """Height (as the points) of bare earth, bilinear between cells; NaN where it is not known."""
-        x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
-        rows, columns = self.height_m.shape
-        u = np.clip((x - self.x_min_m) / self.cell_m - 0.5, 0.0, columns - 1.0)
-        v = np.clip((y - self.y_min_m) / self.cell_m - 0.5, 0.0, rows - 1.0)
-        c0, r0 = np.minimum(u.astype(np.int64), columns - 2), np.minimum(v.astype(np.int64), rows - 2)
-        c0, r0 = np.maximum(c0, 0), np.maximum(r0, 0)
-        c1, r1 = np.minimum(c0 + 1, columns - 1), np.minimum(r0 + 1, rows - 1)
-        fu, fv = u - c0, v - r0
-        z = self.height_m.astype(np.float64)
-        south = z[r0, c0] * (1 - fu) + z[r0, c1] * fu
-        north = z[r1, c0] * (1 - fu) + z[r1, c1] * fu
-        return np.asarray(south * (1 - fv) + north * fv)
+        x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        out, places = np.empty(x.size), (np.ascontiguousarray(v).reshape(-1) for v in (x, y))
+        grid = (float(self.x_min_m), float(self.y_min_m), float(self.cell_m))
+        ground_heights(*map(read_only, places), grid, self.height_m, out)
+        return out.reshape(x.shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,8 @@ from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.kernels.assets import voxels
+from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
+from roadscan.kernels.options import read_only
 
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
@@ -39,6 +41,10 @@ _WIRE_LINEAR, _WIRE_LEVEL, _WIRE_M, _WIRE_LENGTH_M = 0.8, 0.4, 4.0, 3.0
 """A wire is linear, level, above the ground by so much, and so long."""
 _NEAR_M: Final = 15.0
 """A return alone in nine tenths of a metre is noise, so near to the sensor."""
+_CODES: Final = (
+    classes.UNCLASSIFIED, classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
+    classes.BUILDING, classes.WIRE, classes.HIGH_NOISE,
+)  # fmt: skip
 _LOW_M: Final = 0.3
 """Returns within this of the ground that do not lie on it are low vegetation, where the ground is rough."""
 
@@ -48,30 +54,17 @@ def surroundings(
 ) -> npt.NDArray[np.uint8]:
     """Classes (n,): those of `found`, and in place of `UNCLASSIFIED` what stands there."""
     grid = grid_over(window, EDGE_M)
-    free = found == classes.UNCLASSIFIED
-    held = free & (cubes.number >= 0)
-    number = np.where(held, cubes.number, 0)
+    features, bits = cubes.features, np.zeros(len(cubes.place), np.uint8)
+    if bits.size:
+        bits |= LEAFY * leaves(cubes, grid).view(np.uint8)
+        bits |= WALL * (near_walls(cubes, grid) & (features[:, voxels.SCATTERING] <= _IN_LEAVES)).view(np.uint8)
+        bits |= WIRE * wires(cubes, grid).view(np.uint8)
+        bits |= ALONE * (features[:, voxels.NUMBER] <= 1).view(np.uint8)
+    place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
+    sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
     out = found.copy()
-    out[free & (np.abs(above_m) < _LOW_M)] = classes.LOW_VEGETATION
-    if not len(cubes.place):
-        return out
-    features = cubes.features
-    at_wall = near_walls(cubes, grid)[number] & (features[number, voxels.SCATTERING] <= _IN_LEAVES)
-    at_wire = wires(cubes, grid)[number]
-    alone = (features[number, voxels.NUMBER] <= 1) & (returns.range_m < _NEAR_M)
-    leafy = leaves(cubes, grid)[number]
-    out[held & leafy] = by_height(above_m[held & leafy])
-    out[held & ~leafy & (out == classes.LOW_VEGETATION)] = classes.UNCLASSIFIED
-    out[held & at_wall] = classes.BUILDING
-    out[held & at_wire] = classes.WIRE
-    out[held & alone] = classes.HIGH_NOISE
+    standing_classes(above_m, cubes.number, bits, place, sensor, (_LOW_M, _MEDIUM_M, _HIGH_M, _NEAR_M), _CODES, out)
     return out
-
-
-def by_height(above_m: Float32) -> npt.NDArray[np.uint8]:
-    """Class of vegetation at heights above the ground (n,) (m)."""
-    codes = np.array([classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION], np.uint8)
-    return np.asarray(codes[np.searchsorted([_MEDIUM_M, _HIGH_M], above_m, side="right")])
 
 
 def leaves(cubes: Cubes, grid: Grid) -> Bools:

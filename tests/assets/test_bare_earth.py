@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from roadscan.assets import classes
 from roadscan.assets.ground.bare_earth import ground_returns
 from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.morphological import opened
 from roadscan.assets.ground.surface import Place, is_dense
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
@@ -156,3 +158,12 @@ def test_one_return_is_a_scene(method: str) -> None:
     settings = GroundSettings.parse({"method": method})
     scene = make_scene(airborne(np.array([[5.0, 5.0, 3.0]])), window, window, NO_DRIVE, settings)
     assert scene.classes.shape == (1,)
+
+
+@pytest.mark.parametrize("radius", [1, 4, 11, 40])
+def test_an_opening_is_that_of_opencv(radius: int) -> None:
+    """The same heights to the bit, also by a disk that is larger than the surface."""
+    surface = np.random.default_rng(radius).normal(size=(33, 47)).astype(np.float32)
+    away = np.arange(-radius, radius + 1)
+    disk = (away[:, None] ** 2 + away**2 <= radius * radius).astype(np.uint8)
+    assert (opened(surface, radius) == cv2.dilate(cv2.erode(surface, disk), disk)).all()

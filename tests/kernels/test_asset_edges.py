@@ -10,7 +10,7 @@ import pytest
 from roadscan.kernels.assets.edge_across import best_path, step_and_bend
 from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
 from roadscan.kernels.assets.low_heights import low_heights
-from roadscan.kernels.assets.step_filter import step_response, strips, thin
+from roadscan.kernels.assets.step_filter import CHUNK, FRAME, WORK, step_response, strips, thin
 from roadscan.kernels.assets.step_profiles import FACE, OFFSET, RESULTS, SIGMA_STEP, STEP, TOP, fit_nodes
 from roadscan.kernels.assets.transects import (
     END,
@@ -27,13 +27,15 @@ RNG = np.random.default_rng(8)
 
 
 def test_low_heights_leave_out_what_stands_above() -> None:
-    x = np.array([0.05, 0.05, 0.05, 0.15, 0.95])
-    z = np.array([1.0, 1.06, 1.5, 2.0, 9.0])
-    count, mean, variance = np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.zeros((1, 2))
-    low_heights(x, np.full(5, 0.05), z, (0.0, 0.0, 0.1), 0.12, count, mean, variance)
-    assert count.tolist() == [[2, 1]]
-    assert mean[0] == pytest.approx([1.03, 2.0])
-    assert variance[0] == pytest.approx([0.03**2, 0.0])
+    cell = np.array([0, 0, 0, 1, -1, 0], np.int32)
+    z = np.array([1.0, 1.06, 1.5, 2.0, 9.0, 0.1])
+    used = np.array([True, True, True, True, True, False])
+    count, mean, variance = np.zeros(2, np.int32), np.zeros(2), np.zeros(2)
+    low_heights(cell, z, used, 0.12, count, mean, variance)
+    assert count.tolist() == [2, 1]
+    assert mean == pytest.approx([1.03, 2.0])
+    assert variance == pytest.approx([0.03**2, 0.0])
+    assert used.tolist() == [True, True, False, True, False, False]
 
 
 def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
@@ -43,17 +45,25 @@ def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
     height = height + RNG.normal(0.0, 0.002, height.shape)
     weight = np.full(height.shape, 0.005**-2)
     slope_x, slope_y = np.full(height.shape, 0.02), np.full(height.shape, 0.03)
+    frame = ((FRAME, FRAME), (FRAME, FRAME + CHUNK - 20))
+    inner = (slice(None), slice(FRAME, -FRAME), slice(FRAME, FRAME + 20))
     k = np.arange(-5, 6)
     along = np.column_stack([0 * k, k, 0.0 * k, 0.1 * k])
-    strip = np.empty((3, *height.shape))
-    strips(weight, height, slope_x, slope_y, along, strip)
+    field = [np.pad(raster, frame) for raster in (weight, height, slope_x, slope_y)]
+    framed, work = np.zeros((3, *field[0].shape)), np.empty((WORK, CHUNK))
+    strips(*field, along, np.ones((25, 1), np.bool_), work, framed)
+    strip = framed[inner]
     assert strip[1, 12, 5] == pytest.approx(np.mean(height[7:18, 5] - 0.003 * k), abs=1e-12)
     assert strip[0, 12, 5] == pytest.approx(11 * 0.005**-2)
     j = np.arange(1, 5)
     across = np.column_stack([j, 0 * j, 0.1 * j])
-    step, evidence = np.empty(height.shape), np.empty(height.shape)
-    freedom, active = np.full(height.shape, 80.0), np.ones(height.shape, np.bool_)
-    step_response(strip, freedom, active, slope_x, across, (0.05**-2, 0.005), step, evidence)
+    wide = (25, CHUNK)
+    step, evidence = np.empty(wide), np.empty(wide)
+    freedom, active = np.full(wide, 80.0), np.zeros(wide, np.bool_)
+    active[:, :20] = True
+    step_response(framed, freedom, active, np.full(wide, 0.02), across, (0.05**-2, 0.005), work, step, evidence)
+    assert (step[:, 20:] == 0.0).all()
+    step, evidence = step[:, :20].copy(), evidence[:, :20].copy()
     assert np.abs(step[12, 9:11]) == pytest.approx([0.1, 0.1], abs=0.015)
     assert evidence[12, 9:11].min() > 8.0
     assert np.abs(evidence[12, 4]) < 3.0
@@ -125,8 +135,9 @@ def test_links_lead_forward_and_the_strongest_chain_is_traced() -> None:
     total = ahead + behind
     chain, owner = np.zeros((m, 2), np.int64), np.full(m, -1)
     number, length = trace(
-        place, total, following, preceding, np.argsort(-total, kind="stable"), (3.0, 1.0, 0.25, 0.6), chain, owner
-    )
+        place, total, following, preceding, np.argsort(-total, kind="stable"), order, starts, bins,
+        (3.0, 1.0, 0.25, 0.6), chain, owner,
+    )  # fmt: skip
     assert number >= 1
     assert set(chain[:length, 1].tolist()) >= set(range(0, n, 2)) or set(chain[:length, 1].tolist()) >= set(
         range(2, n - 2)
@@ -142,8 +153,8 @@ def test_a_step_is_found_where_it_was_drawn() -> None:
     node = np.array([[0.0, 0.0, 1.0, 0.0, 50.0, 0.02, 0.03]])
     out = np.empty((1, RESULTS))
     fit_nodes(
-        node, t, -d, z, np.arange(4000), np.array([0, 4000]), (-2.0, -2.0, 10.0, 1.0, 1.0), 0.5,
-        (0.2, 0.02, 0.24, 0.35), (0.05, 0.015), out,
+        node, t, -d, z, np.array([0, 4000]), (-2.0, -2.0, 10.0, 1.0, 1.0), 0.5, (0.2, 0.02, 0.24, 0.35), (0.05, 0.015),
+        out,
     )  # fmt: skip
     assert out[0, STEP] == pytest.approx(0.09 + 0.06 * 0.03, abs=0.004)
     assert out[0, OFFSET] - 0.5 * out[0, FACE] == pytest.approx(0.12, abs=0.011)

@@ -9,7 +9,7 @@ from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
 from roadscan.kernels.assets.corridors import mark_corridor
 from roadscan.kernels.assets.cylinders import fit_cylinder, radius_across
 from roadscan.kernels.assets.grown_cells import ground_moments
-from roadscan.kernels.assets.slices import fill_slices, label_slices, slices_above_one_another
+from roadscan.kernels.assets.slices import fill_slices, label_slices, owners, slices_above_one_another
 from roadscan.kernels.assets.upright_voxels import (
     gather_moments,
     grow_regions,
@@ -33,13 +33,22 @@ def test_slices_and_their_components() -> None:
     labels = np.zeros(counts.shape, np.int32)
     most = int((counts > 0).sum())
     boxes = np.empty((most, 5), np.int32)
-    found = label_slices(counts, labels, boxes, np.empty(most, np.int64))
+    found = label_slices(counts, np.flatnonzero(counts), labels, boxes, np.empty(most, np.int64))
     flat = np.zeros((3, 3, 3), int)
     flat[1] = 1
     wanted, number = ndimage.label(counts > 0, structure=flat)
     assert found == number and (labels == wanted).all()
     for k, (level, rows, columns) in enumerate(ndimage.find_objects(wanted)):
         assert boxes[k].tolist() == [level.start, rows.start, rows.stop - 1, columns.start, columns.stop - 1]
+    # Every other component is one that returns may belong to.
+    number_of = np.full(found + 1, -1, np.int32)
+    number_of[1::2] = np.arange(number_of[1::2].size)
+    owner, sums = np.empty(300, np.int32), np.zeros((number_of[1::2].size, 3))
+    owners(x, y, cell, labels.reshape(-1), number_of, owner, sums)
+    own = np.where(cell >= 0, number_of[labels.ravel()[cell]], -1)
+    assert (owner == own).all()
+    assert (sums[:, 0] == np.bincount(own[own >= 0], minlength=len(sums))).all()
+    assert (sums[:, 1] == np.bincount(own[own >= 0], x[own >= 0], minlength=len(sums))).all()
 
 
 def test_slices_above_one_another() -> None:

@@ -79,7 +79,7 @@ def road_edges(scene: Scene) -> list[CutEdge]:
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []
     kerbs = [columns_of(edge) for edge in edges_of(scene)]
-    beside = beside_of(scene, raster, kerbs)
+    beside = beside_of(scene)
     parts: list[CutEdge] = []
     for track in tracks_of(scene.drive_xyh_m):
         for right in (False, True):
@@ -123,7 +123,8 @@ def _one_side(
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
         r, c = raster.cells_of(line[:, 0], line[:, 1])
         level = beside.height_m[r, c]
-        level = np.where(np.isfinite(level), level, np.nanmedian(beside.height_m))
+        if not np.isfinite(level).all():
+            level = np.where(np.isfinite(level), level, np.nanmedian(beside.height_m))
         nodes = np.zeros((len(rows), len(EDGE_COLUMNS)))
         nodes[:, 3:5] = np.nan
         nodes[:, :3] = np.column_stack([line, level])

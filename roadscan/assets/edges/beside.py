@@ -7,7 +7,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import scipy.ndimage
 
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of
@@ -15,6 +14,7 @@ from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, 
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.smoothing import gaussian
 from roadscan.kernels.assets import transects as kernel
 
 Float64 = npt.NDArray[np.float64]
@@ -51,22 +51,24 @@ def pieces_beside(scene: Scene) -> pa.Table:
     raster, edges = raster_of(scene), edges_of(scene)
     parts = []
     if edges:
-        beside = beside_of(scene, raster, [columns_of(e) for e in edges])
+        beside = beside_of(scene)
         parts = [
             part for edge in edges for part in cut_at(_with_transects(columns_of(edge), beside, raster), scene.tile)
         ]
     return pieces_table(parts, scene, raster, BESIDE_PIECES)
 
 
-def beside_of(scene: Scene, raster: HeightRaster, edges: list[Float64]) -> Beside:
-    """Rasters of a scene for walks that end at its edges (n, columns as `NODE_COLUMNS`)."""
+@once_a_scene
+def beside_of(scene: Scene) -> Beside:
+    """Rasters of a scene for walks that end at its edges."""
+    raster = raster_of(scene)
     known = raster.count > 0
     height = smooth(np.where(known, raster.height_m, 0.0), known, 1.5)
     rest = np.where(known, np.square(np.where(known, raster.height_m, 0.0) - np.nan_to_num(height)), 0.0)
     rough = np.sqrt(np.nan_to_num(smooth(rest, known, 3.0)))
     edge_x, edge_y = np.zeros(known.shape), np.zeros(known.shape)
-    for nodes in edges:
-        x, y = dense(nodes[:, :2], raster.cell_m / 2)
+    for edge in edges_of(scene):
+        x, y = dense(columns_of(edge)[:, :2], raster.cell_m / 2)
         ux, uy = np.gradient(x), np.gradient(y)
         length = np.maximum(np.hypot(ux, uy), 1e-9)
         row, column = raster.cells_of(x, y)
@@ -76,19 +78,17 @@ def beside_of(scene: Scene, raster: HeightRaster, edges: list[Float64]) -> Besid
 
 def smooth(values: Float64, known: npt.NDArray[np.bool_], sigma_cells: float) -> Float64:
     """Mean (rows, columns) of known values around each cell; NaN where none is near."""
-    weight = scipy.ndimage.gaussian_filter(known.astype(np.float64), sigma_cells, truncate=2.5)
-    total = scipy.ndimage.gaussian_filter(values, sigma_cells, truncate=2.5)
+    weight = gaussian(known.astype(np.float64), sigma_cells, 2.5)
+    total = gaussian(values, sigma_cells, 2.5)
     return np.where(weight > 0.02, total / np.maximum(weight, 0.02), np.nan)
 
 
 def _blocked(scene: Scene, raster: HeightRaster) -> npt.NDArray[np.bool_]:
     """Cells where two returns or more stand above the ground."""
-    above, returns = np.nan_to_num(scene.above_ground_m), scene.returns
-    stands = (above > OBSTACLE_M[0]) & (above < OBSTACLE_M[1]) & ~np.isin(scene.classes, _OPEN)
-    stands &= scene.window.holds(returns.x_m, returns.y_m)
-    row, column = raster.cells_of(returns.x_m[stands], returns.y_m[stands])
-    columns = raster.count.shape[1]
-    number = np.bincount(row * columns + column, minlength=raster.count.size)
+    above, closed = scene.above_ground_m, np.ones(256, np.bool_)
+    closed[list(_OPEN)] = False
+    stands = (above > OBSTACLE_M[0]) & (above < OBSTACLE_M[1]) & closed[scene.classes] & (raster.cell >= 0)
+    number = np.bincount(raster.cell[stands], minlength=raster.count.size)
     return np.asarray(number.reshape(raster.count.shape) >= 2)
 
 

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
+import scipy.spatial
 
 from roadscan.assets.edges import profiles
 from roadscan.assets.edges.paths import paths_of
@@ -62,9 +63,9 @@ DEFAULT: Final = EdgeSettings()
 @once_a_scene
 def edges_of(scene: Scene) -> list[Edge]:
     """Edges in the window of a scene, the best seen first."""
-    raster = raster_of(scene)
-    ground = scene.returns.at(raster.used)
-    return found_edges(raster, profiles.sorted_heights(ground.x_m, ground.y_m, ground.height_m))
+    raster, returns = raster_of(scene), scene.returns
+    ground = [column[raster.used] for column in (returns.x_m, returns.y_m, returns.height_m)]
+    return found_edges(raster, profiles.sorted_heights(*ground))
 
 
 def edges_of_raster(raster: HeightRaster) -> list[Edge]:
@@ -79,7 +80,7 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     """Edges of a raster, with the heights that their places and steps are measured from."""
     if not (raster.count > 0).any():
         return []
-    slopes = raster.slopes()
+    slopes = raster.slopes
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
         nodes = profiles.nodes_of(profiles.chain_line(chain), heights, raster, slopes)
@@ -119,9 +120,8 @@ def _bridged(
     """Parts joined over gaps, the shortest gaps first."""
     gaps = sorted(
         (gap, i, j)
-        for i, a in enumerate(parts)
-        for j, b in enumerate(parts)
-        if i != j and (gap := _gap_m(a.nodes, b.nodes, settings)) is not None
+        for i, j in _near_pairs(parts, settings.bridge_m)
+        if (gap := _gap_m(parts[i].nodes, parts[j].nodes, settings)) is not None
     )
     after: dict[int, int] = {}
     before: dict[int, int] = {}
@@ -140,6 +140,16 @@ def _bridged(
         if enough and float(edge.seen.sum() - 1) * NODE_M >= settings.least_length_m:
             edges.append(edge)
     return edges
+
+
+def _near_pairs(parts: list[Edge], reach_m: float) -> list[tuple[int, int]]:
+    """Pairs of parts of which the first ends near where the second begins."""
+    if not parts:
+        return []
+    ends = np.array([[p.nodes.x_m[-1], p.nodes.y_m[-1]] for p in parts])
+    begins = np.array([[p.nodes.x_m[0], p.nodes.y_m[0]] for p in parts])
+    near = scipy.spatial.cKDTree(begins).query_ball_point(ends, reach_m + 1e-6)
+    return [(i, j) for i, some in enumerate(near) for j in some if i != j]
 
 
 def _leads_to(after: dict[int, int], start: int, end: int) -> bool:

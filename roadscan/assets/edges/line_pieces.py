@@ -180,9 +180,11 @@ def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> lis
         )
         free = label[row, column] < 0
         label[row[free], column[free]] = number
-    rows = np.flatnonzero(raster.used)
-    at = label[raster.cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows])]
-    rows, at = rows[at >= 0], at[at >= 0]
+    if not lines:
+        return []
+    at = np.where(raster.used, label.ravel()[raster.cell], -1)
+    rows = np.flatnonzero(at >= 0)
+    at = at[rows]
     return gathered(at, len(lines), scene.returns.pass_id[rows], scene.returns.epoch_gps_ns[rows])
 
 
@@ -192,10 +194,11 @@ def gathered(owner: Int64, number: int, pass_id: npt.NDArray[np.uint16], epoch_g
     first, last = np.full(number, np.iinfo(np.int64).max), np.full(number, np.iinfo(np.int64).min)
     np.minimum.at(first, owner, epoch_gps_ns)
     np.maximum.at(last, owner, epoch_gps_ns)
-    pairs = np.unique(np.column_stack([owner, pass_id.astype(np.int64)]), axis=0)
+    passed = int(pass_id.max(initial=0)) + 1
+    pairs = np.bincount(owner * passed + pass_id, minlength=number * passed).reshape(number, passed) > 0
     found = []
     for i in range(number):
-        passes = tuple(int(p) for p in pairs[pairs[:, 0] == i, 1])
+        passes = tuple(np.flatnonzero(pairs[i]).tolist())
         found.append(Seen(int(count[i]), passes, int(first[i]), int(last[i])) if count[i] else Seen(0, (), 0, 0))
     return found
 

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import in_bins
 from roadscan.assets.edges.steps import Places
 from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
 
@@ -81,7 +82,9 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
     ranked = np.lexsort((np.arange(n), -total))
     chain, owner = np.zeros((n, 2), np.int64), np.full(n, -1, np.int64)
     following_limits = (settings.begin, settings.go_on, settings.beside_m, settings.gutter_m)
-    number, length = trace(place, total, following, preceding, ranked, following_limits, chain, owner)
+    number, length = trace(
+        place, total, following, preceding, ranked, order, starts, bins, following_limits, chain, owner
+    )
     ends = np.searchsorted(chain[:length, 0], np.arange(number + 1))
     found = (chain[a:b, 1] for a, b in itertools.pairwise(ends))
     chains = (Chain(places.at(rows), _own_evidence(place[rows], quality[rows], settings)) for rows in found)
@@ -100,6 +103,5 @@ def _bins(places: Places, size_m: float) -> tuple[Int64, Int64, tuple[float, flo
     column, row = ((places.x_m - x_min) / size_m).astype(np.int64), ((places.y_m - y_min) / size_m).astype(np.int64)
     columns, rows = int(column.max()) + 1, int(row.max()) + 1
     number = row * columns + column
-    order = np.argsort(number, kind="stable")
-    starts = np.searchsorted(number[order], np.arange(rows * columns + 1))
+    starts, order = in_bins(number, rows * columns)
     return order, starts, (x_min, y_min, size_m, float(rows), float(columns))

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import scipy.linalg
 import scipy.ndimage
 
+from roadscan.assets.bins import in_bins
 from roadscan.assets.edges.paths import Chain
 from roadscan.assets.edges.raster import HeightRaster
 from roadscan.kernels.assets import step_profiles as kernel
@@ -37,14 +38,15 @@ _BIN_M: Final = 0.5
 
 
 class Heights(NamedTuple):
-    """Heights of the ground, sorted by place for the kernel."""
+    """Heights of the ground, sorted by place for the kernel: by bins of half a metre."""
 
     x_m: Float64
     y_m: Float64
     height_m: Float64
-    order: Int64
     starts: Int64
+    """First height of each bin, and last where all end."""
     bins: tuple[float, float, float, float, float]
+    """Corner of the first bin, edge of a bin (m), rows and columns."""
 
 
 class Nodes(NamedTuple):
@@ -82,14 +84,14 @@ class Nodes(NamedTuple):
 def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
     """Heights (n,) at places (n,), sorted by bins of half a metre; the order of equal bins is that given."""
     if x_m.size == 0:
-        return Heights(x_m, y_m, height_m, np.zeros(0, np.int64), np.zeros(2, np.int64), (0.0, 0.0, _BIN_M, 1.0, 1.0))
+        return Heights(x_m, y_m, height_m, np.zeros(2, np.int64), (0.0, 0.0, _BIN_M, 1.0, 1.0))
     x_min, y_min = _BIN_M * np.floor(x_m.min() / _BIN_M), _BIN_M * np.floor(y_m.min() / _BIN_M)
     column, row = ((x_m - x_min) / _BIN_M).astype(np.int64), ((y_m - y_min) / _BIN_M).astype(np.int64)
     columns, rows = int(column.max()) + 1, int(row.max()) + 1
     number = row * columns + column
-    order = np.argsort(number, kind="stable")
-    starts = np.searchsorted(number[order], np.arange(rows * columns + 1))
-    return Heights(x_m, y_m, height_m, order, starts, (float(x_min), float(y_min), _BIN_M, float(rows), float(columns)))
+    starts, order = in_bins(number, rows * columns)
+    bins = (float(x_min), float(y_min), _BIN_M, float(rows), float(columns))
+    return Heights(x_m[order], y_m[order], height_m[order], starts, bins)
 
 
 def chain_line(chain: Chain) -> Float64:
@@ -207,4 +209,4 @@ def _level(raster: HeightRaster, row: Int64, column: Int64) -> Float64:
     near, known = raster.height_m[r, c], raster.count[r, c] > 0
     number = known.sum(axis=(1, 2))
     total = np.where(known, near, 0.0).sum(axis=(1, 2))
-    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nanmedian(raster.height_m)))
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), raster.level_m))

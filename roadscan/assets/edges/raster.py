@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.assets import classes
+from roadscan.assets.bins import cells_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.smoothing import gaussian
 from roadscan.kernels.assets.low_heights import low_heights
 
 Float64 = npt.NDArray[np.float64]
@@ -48,19 +51,28 @@ class HeightRaster:
     """(rows, columns) standard deviation of the mean; NaN where there is none."""
     used: npt.NDArray[np.bool_]
     """(n,) returns of the scene that count as ground; none where the raster was made of cells."""
+    cell: npt.NDArray[np.int32]
+    """(n,) flat number of the cell of each return, −1 outside; none where the raster was made of cells."""
 
     @property
     def weight(self) -> Float64:
         """(rows, columns) one over the variance of a height (1/m²), 0 where there is none."""
         return np.where(self.count > 0, 1.0 / np.square(np.where(self.count > 0, self.sigma_m, 1.0)), 0.0)
 
-    def slopes(self, sigma_m: float = COARSE_M) -> tuple[Float64, Float64]:
+    @cached_property
+    def level_m(self) -> float:
+        """Median height of its cells; 0 where none has one."""
+        known = self.count > 0
+        return float(np.median(self.height_m[known])) if known.any() else 0.0
+
+    @cached_property
+    def slopes(self) -> tuple[Float64, Float64]:
         """Slope (rows, columns) of the ground at large along x and y (m/m)."""
-        sigma = sigma_m / self.cell_m
+        sigma = COARSE_M / self.cell_m
         known = (self.count > 0).astype(np.float64)
-        level = float(np.nanmedian(self.height_m)) if known.any() else 0.0
-        weight = scipy.ndimage.gaussian_filter(known, sigma, truncate=3.0)
-        total = scipy.ndimage.gaussian_filter(np.where(known > 0, self.height_m - level, 0.0), sigma, truncate=3.0)
+        level = self.level_m
+        weight = gaussian(known, sigma, 3.0)
+        total = gaussian(np.where(known > 0, self.height_m - level, 0.0), sigma, 3.0)
         smooth = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0.0)
         down, right = np.gradient(smooth, self.cell_m)
         near = weight > 1e-2
@@ -77,44 +89,37 @@ class HeightRaster:
 
 def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
     """Returns (n,) of the scene that edges of the ground may be made of."""
-    above = scene.above_ground_m
-    near = np.isnan(above) | (np.abs(above) <= REACH_M)
-    return near & ~np.isin(scene.classes, NOT_GROUND)
+    above, looked_at = scene.above_ground_m, np.ones(256, np.bool_)
+    looked_at[list(NOT_GROUND)] = False
+    return (np.isnan(above) | (np.abs(above) <= REACH_M)) & looked_at[scene.classes]
 
 
 @once_a_scene
 def raster_of(scene: Scene) -> HeightRaster:
     """The raster of a scene's window; its cells are those of a grid that all tiles share."""
-    window, used = scene.window, may_be_ground(scene)
+    window, used, returns = scene.window, may_be_ground(scene), scene.returns
     x_min, y_min = (CELL_M * math.floor(v / CELL_M + 1e-6) for v in window[:2])
     columns = max(math.ceil((window.x_max_m - x_min) / CELL_M - 1e-6), 8)
     rows = max(math.ceil((window.y_max_m - y_min) / CELL_M - 1e-6), 8)
-    count = np.zeros((rows, columns), np.int32)
-    mean, variance = np.zeros((rows, columns)), np.zeros((rows, columns))
-    returns = scene.returns
-    grid = HeightRaster(x_min, y_min, CELL_M, count, mean, variance, used)
-    used &= ~_beside_vehicles(scene, grid)
-    low_heights(
-        returns.x_m[used], returns.y_m[used], returns.height_m[used], (x_min, y_min, CELL_M), DEPTH_M, count, mean,
-        variance,
-    )  # fmt: skip
-    raster = of_cells(x_min, y_min, CELL_M, count, mean, np.sqrt(variance))
-    row, column = raster.cells_of(returns.x_m[used], returns.y_m[used])
-    used[used] = returns.height_m[used] <= raster.height_m[row, column] + DEPTH_M
-    return replace(raster, used=used)
+    cell = cells_of(returns.x_m, returns.y_m, (x_min, y_min, CELL_M), (rows, columns))
+    used &= ~_beside_vehicles(scene, cell, (rows, columns))
+    count = np.zeros(rows * columns, np.int32)
+    mean, variance = np.zeros(rows * columns), np.zeros(rows * columns)
+    low_heights(cell, returns.height_m, used, DEPTH_M, count, mean, variance)
+    cells = (count, mean, np.sqrt(variance))
+    raster = of_cells(x_min, y_min, CELL_M, *(column.reshape(rows, columns) for column in cells))
+    return replace(raster, used=used, cell=cell)
 
 
-def _beside_vehicles(scene: Scene, grid: HeightRaster) -> npt.NDArray[np.bool_]:
+def _beside_vehicles(scene: Scene, cell: npt.NDArray[np.int32], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """Returns (n,) at vehicles: what is seen of the ground there ends at their outline, and steps go along it."""
-    x, y, rows, columns = scene.returns.x_m, scene.returns.y_m, *grid.count.shape
-    vehicle = scene.classes == classes.VEHICLE
-    row, column = grid.cells_of(x[vehicle], y[vehicle])
-    number = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
-    cells = math.ceil(BESIDE_VEHICLE_M / grid.cell_m)
-    reach = np.arange(-cells, cells + 1) * grid.cell_m
+    vehicle = cell[scene.classes == classes.VEHICLE]
+    number = np.bincount(vehicle[vehicle >= 0], minlength=shape[0] * shape[1]).reshape(shape)
+    cells = math.ceil(BESIDE_VEHICLE_M / CELL_M)
+    reach = np.arange(-cells, cells + 1) * CELL_M
     disc = np.hypot(reach, reach[:, None]) <= BESIDE_VEHICLE_M + 1e-9
-    near = scipy.ndimage.binary_dilation(number >= 2, disc)
-    return np.asarray(near[grid.cells_of(x, y)])
+    near = cv2.dilate((number >= 2).view(np.uint8), disc.astype(np.uint8)) > 0
+    return np.append(near.ravel(), False)[cell]
 
 
 def of_cells(
@@ -139,5 +144,5 @@ def of_cells(
     sigma = np.sqrt(UNEVENNESS_M**2 + max(noise, 0.001) ** 2 / np.maximum(count, 1))
     return HeightRaster(
         x_min_m, y_min_m, cell_m, count, np.where(known, mean_m, np.nan), np.where(known, sigma, np.nan),
-        np.zeros(0, np.bool_),
+        np.zeros(0, np.bool_), np.zeros(0, np.int32),
     )  # fmt: skip

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 
 from roadscan.assets.edges.raster import HeightRaster
-from roadscan.kernels.assets.step_filter import step_response, strips, thin
+from roadscan.kernels.assets.smoothing import window_means
+from roadscan.kernels.assets.step_filter import (
+    CHUNK,
+    FRAME,
+    WORK,
+    sizes_of,
+    step_response,
+    strips,
+    take_excess,
+    thin,
+)
 
 Float64 = npt.NDArray[np.float64]
 
@@ -69,25 +80,82 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
     the difference of both lines at the edge, and its evidence the step over its σ, which grows with the scatter of the
     cells about the lines. A place is kept for the direction that tells most, where no neighbour across tells more.
     """
-    shape = raster.count.shape
-    best = np.zeros((4, *shape))
-    slope_x, slope_y = raster.slopes()
-    weight, level = raster.weight, float(np.nanmedian(raster.height_m)) if (raster.count > 0).any() else 0.0
-    height = np.where(raster.count > 0, raster.height_m - level, 0.0)
-    freedom, active = _freedom(raster, settings), _active(raster, settings)
-    still = (raster.count > 0) & ~active
-    strip, step, evidence = np.empty((3, *shape)), np.empty(shape), np.empty(shape)
+    best = np.zeros((4, *raster.count.shape))
+    field = _framed(raster)
+    active = _active(raster, settings)
+    still = field.inner((raster.count > 0) & ~active)
+    freedom, active = field.inner(_freedom(raster, settings)), field.inner(active)
+    slopes = [field.inner(slope) for slope in raster.slopes]
+    reach = round(settings.across_m / raster.cell_m)
+    wanted = cv2.dilate(active.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    wanted = wanted.reshape(len(wanted), -1, CHUNK).max(axis=2) > 0
+    strip, work = np.zeros((3, *field.weight.shape)), np.empty((WORK, CHUNK))
+    step, evidence = np.empty(active.shape), np.empty(active.shape)
+    surroundings = _Surroundings.of(active.shape, round(settings.around_m / raster.cell_m))
     constants = (settings.slope_sigma**-2, settings.floor_m)
     limits = (settings.least_evidence, settings.least_m, settings.greatest_m)
     for k in range(settings.directions):
         angle = math.pi * k / settings.directions
         u, v = (math.cos(angle), math.sin(angle)), (math.sin(angle), -math.cos(angle))
-        strips(weight, height, slope_x, slope_y, _along(u, settings, raster.cell_m), strip)
-        slope = slope_x * v[0] + slope_y * v[1]
-        step_response(strip, freedom, active, slope, _across(v, settings, raster.cell_m), constants, step, evidence)
-        evidence /= _excess(evidence, still, settings, raster.cell_m)
+        strips(*field, _along(u, settings, raster.cell_m), wanted, work, strip)
+        strip[:, :, FRAME + raster.count.shape[1] :] = 0.0  # no strip lies beyond the raster
+        slope = slopes[0] * v[0] + slopes[1] * v[1]
+        across = _across(v, settings, raster.cell_m)
+        step_response(strip, freedom, active, slope, across, constants, work, step, evidence)
+        surroundings.take_excess(evidence, still)
         thin(step, evidence, float(k), v, limits, best)
     return _places(raster, best, settings)
+
+
+class _Field(NamedTuple):
+    """Rasters with a frame, and columns up to a whole number of chunks, as the kernels want them."""
+
+    weight: Float64
+    height_m: Float64
+    slope_x: Float64
+    slope_y: Float64
+
+    def inner(self, raster: Any) -> Any:
+        """A raster without a frame (rows, columns up to a whole number of chunks); what is added is 0 or False."""
+        columns = self.weight.shape[1] - 2 * FRAME
+        return np.pad(raster, ((0, 0), (0, columns - raster.shape[1])))
+
+
+def _framed(raster: HeightRaster) -> _Field:
+    more = -raster.count.shape[1] % CHUNK
+    height = np.where(raster.count > 0, raster.height_m - raster.level_m, 0.0)
+    frame = ((FRAME, FRAME), (FRAME, FRAME + more))
+    return _Field(*(np.pad(one, frame) for one in (raster.weight, height, *raster.slopes)))
+
+
+class _Surroundings(NamedTuple):
+    """Room for the means of what lies around cells."""
+
+    size: int
+    """Width of the surroundings (cells)."""
+    counted: Float64
+    sizes: Float64
+    means: Float64
+    between: Float64
+    line: Float64
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], size: int) -> Self:
+        """For rasters of a shape."""
+        rows, columns = shape
+        between, line = np.zeros((rows + 2, columns)), np.zeros(columns + size)
+        return cls(size, np.empty(shape), np.empty(shape), np.empty((2, *shape)), between, line)
+
+    def take_excess(self, evidence: Float64, still: npt.NDArray[np.bool_]) -> None:
+        """Divide steps over their σ by how much more than by chance steps of one direction scatter around each cell.
+
+        Rings of a lidar whose lasers or sweeps disagree make steps along themselves everywhere around; a kerb is alone.
+        still : cells without a step of any kind near.
+        """
+        sizes_of(evidence, still, (_STILL, _CLIPPED), self.counted, self.sizes)
+        for value, mean in ((self.counted, self.means[0]), (self.sizes, self.means[1])):
+            window_means(value, self.size, self.between, self.line, mean)
+        take_excess(evidence, *self.means, (_PRIOR, _PRIOR * _STILL), _MEAN_SIZE)
 
 
 def _along(u: tuple[float, float], settings: StepSettings, cell_m: float) -> Float64:
@@ -114,22 +182,10 @@ def _freedom(raster: HeightRaster, settings: StepSettings) -> Float64:
 def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool_]:
     """Cells near which heights differ by as much as the least step."""
     wide, known = round(2.0 * settings.across_m / raster.cell_m) + 1, raster.count > 0
-    top = scipy.ndimage.maximum_filter(np.where(known, raster.height_m, -np.inf), wide)
-    bottom = scipy.ndimage.minimum_filter(np.where(known, raster.height_m, np.inf), wide)
+    window = np.ones((wide, wide), np.uint8)
+    top = cv2.dilate(np.where(known, raster.height_m, -np.inf), window, borderType=cv2.BORDER_REPLICATE)
+    bottom = cv2.erode(np.where(known, raster.height_m, np.inf), window, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(np.isfinite(top) & (top - bottom >= settings.least_m))
-
-
-def _excess(evidence: Float64, still: npt.NDArray[np.bool_], settings: StepSettings, cell_m: float) -> Float64:
-    """(rows, columns) how much more than by chance steps of one direction scatter around each cell; 1 at least.
-
-    Rings of a lidar whose lasers or sweeps disagree make steps along themselves everywhere around; a kerb is alone.
-    still : cells without a step of any kind near.
-    """
-    wide = round(settings.around_m / cell_m)
-    size = np.where(still, _STILL, np.minimum(np.abs(evidence), _CLIPPED))
-    share = scipy.ndimage.uniform_filter((still | (evidence != 0.0)).astype(np.float64), wide, mode="constant")
-    mean = (scipy.ndimage.uniform_filter(size, wide, mode="constant") + _PRIOR * _STILL) / (share + _PRIOR)
-    return np.asarray(np.maximum(mean / _MEAN_SIZE, 1.0))
 
 
 def _places(raster: HeightRaster, best: Float64, settings: StepSettings) -> Places:

@@ -23,15 +23,27 @@ _GROWTH: Final = 1.15
 """Each window is wider than the one before by this factor, and by a cell at the least."""
 
 
-def disk(radius: int) -> npt.NDArray[np.uint8]:
-    """Cells (2 r + 1, 2 r + 1) whose middles lie within `radius` cells of the middle one."""
-    away = np.arange(-radius, radius + 1)
-    return (away[:, None] ** 2 + away**2 <= radius * radius).astype(np.uint8)
-
-
 def opened(z: Float32, radius: int) -> Float32:
     """Opening of a surface (rows, columns) by a disk of so many cells; what lies outside does not count."""
-    return np.asarray(cv2.dilate(cv2.erode(z, disk(radius)), disk(radius)))
+    return _over_disk(_over_disk(z, radius, np.minimum), radius, np.maximum)
+
+
+def _over_disk(z: Float32, radius: int, extreme: np.ufunc) -> Float32:
+    """Least or greatest height within a disk about each cell: of the cells whose middles lie within `radius` cells.
+
+    Pieces of rows grow cell by cell, and each row of the disk takes the piece of its own width.
+    """
+    out, line = z.copy(), z.copy()
+    widths = [math.isqrt(radius * radius - up * up) for up in range(min(radius + 1, len(z)))]
+    for width in range(radius + 1):
+        if 0 < width < z.shape[1]:
+            extreme(line[:, width:], z[:, :-width], out=line[:, width:])
+            extreme(line[:, :-width], z[:, width:], out=line[:, :-width])
+        for up in (k for k, own in enumerate(widths) if own == width):
+            rest = len(z) - up
+            extreme(out[up:], line[:rest], out=out[up:])
+            extreme(out[:rest], line[up:], out=out[:rest])
+    return out
 
 
 def windows(largest_m: float, cell_m: float) -> list[int]:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -19,7 +20,7 @@ from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut_at, dense, joined_lines, pieces_table
 from roadscan.assets.edges.probability import kerb_probability
-from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
 from roadscan.model.strict import Strict
@@ -56,7 +57,7 @@ class Kerb(AssetKind):
         """Parts of the scene's steps within its tile."""
         parts = [part for edge in edges_of(scene) for part in cut_at(columns_of(edge), scene.tile)]
         raster = raster_of(scene)
-        return Evidence(pieces_table(parts, scene, raster), _marked([p.nodes for p in parts], scene, raster.used))
+        return Evidence(pieces_table(parts, scene, raster), _marked([p.nodes for p in parts], scene, raster))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
@@ -122,7 +123,7 @@ def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject
     )
 
 
-def _marked(parts: Sequence[Float64], scene: Scene, used: npt.NDArray[np.bool_]) -> tuple[Marked, ...]:
+def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tuple[Marked, ...]:
     """Returns on the faces of kerbs."""
     if not parts:
         return ()
@@ -135,13 +136,24 @@ def _marked(parts: Sequence[Float64], scene: Scene, used: npt.NDArray[np.bool_])
         places.append(np.column_stack([x, y]))
         levels.append(np.column_stack([np.interp(at, length, nodes[:, 2]), np.interp(at, length, step)]))
     returns, level = scene.returns, np.concatenate(levels)
-    rows = np.flatnonzero(used & scene.tile.holds(returns.x_m, returns.y_m))
+    near = _cells_near(np.concatenate(places), raster)
+    rows = np.flatnonzero(raster.used & near[raster.cell])
+    rows = rows[scene.tile.holds(returns.x_m[rows], returns.y_m[rows])]
     tree = scipy.spatial.cKDTree(np.concatenate(places))
     distance, at = tree.query(
         np.column_stack([returns.x_m[rows], returns.y_m[rows]]), distance_upper_bound=FACE_REACH_M
     )
-    near = np.isfinite(distance)
-    rows, at = rows[near], at[near]
+    reached = np.isfinite(distance)
+    rows, at = rows[reached], at[reached]
     above = returns.height_m[rows] - level[at, 0] + level[at, 1]
     on_face = (above > 0.01) & (above < level[at, 1] + 0.03)
     return (Marked(rows[on_face], classes.KERB),)
+
+
+def _cells_near(places: Float64, raster: HeightRaster) -> npt.NDArray[np.bool_]:
+    """Flat cells (rows · columns + 1,) that hold all returns within reach of some places (k, 2); none is the last."""
+    reach = math.ceil(FACE_REACH_M / raster.cell_m)
+    near = np.zeros(raster.count.shape, np.uint8)
+    near[raster.cells_of(places[:, 0], places[:, 1])] = 1
+    around = cv2.dilate(near, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    return np.append(around.ravel() > 0, False)

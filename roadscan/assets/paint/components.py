@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import in_bins
 from roadscan.assets.paint.contrast import CELL_M, Contrast
+from roadscan.kernels.assets.contrasts import distinct_in_groups
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -112,9 +115,8 @@ def _evidence(found: Contrast, own: Int64, count: int) -> tuple[Float64, Int64]:
     returns = np.maximum(np.bincount(own, minlength=count + 1), 1)
     mean = np.bincount(own, weights=found.contrast, minlength=count + 1) / returns
     variance = np.bincount(own, weights=found.noise**2, minlength=count + 1) / returns**2
-    there = own > 0
-    pairs = np.unique(np.stack([own[there], found.line[there]]), axis=1)
-    lines = np.bincount(pairs[0], minlength=count + 1)
+    lines = np.empty(count + 1, np.int64)
+    distinct_in_groups(*in_bins(np.where(own > 0, own, -1), count + 1), found.line, lines)
     out: Float64 = mean / np.sqrt(variance + _LINE_SIGMA**2 / np.maximum(lines, 1))
     return out, lines
 
@@ -123,5 +125,11 @@ def _nearest(label: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Label of the nearest labelled cell within reach, else 0."""
     from scipy import ndimage
 
-    away, at = ndimage.distance_transform_edt(label == 0, return_indices=True)
-    return np.where(away <= _AROUND_M / CELL_M, label[tuple(at)], 0)
+    reach = math.ceil(_AROUND_M / CELL_M) + 1
+    rows, columns = (np.flatnonzero(label.any(axis=axis)) for axis in (1, 0))
+    part = tuple(slice(max(int(one[0]) - reach, 0), int(one[-1]) + reach + 1) for one in (rows, columns))
+    near = label[part]
+    away, at = ndimage.distance_transform_edt(near == 0, return_indices=True)
+    out = np.zeros_like(label)
+    out[part] = np.where(away <= _AROUND_M / CELL_M, near[tuple(at)], 0)
+    return out

@@ -8,9 +8,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
+from roadscan.kernels.assets.contrasts import contrasts, paint_sums
 from roadscan.kernels.assets.paint_levels import paint_levels
 
 Float64 = npt.NDArray[np.float64]
@@ -82,54 +84,55 @@ def contrast_of(scene: Scene) -> Contrast:
     window = scene.window
     on_ground &= (scene.classes != VEHICLE) & (scene.classes != PERSON) & window.holds(found.x_m, found.y_m)
     rows = np.flatnonzero(on_ground)
-    seen = found.at(rows)
-    flat = seen.sensor_height_m - seen.height_m < _FLATTEST * seen.range_m
-    rows = rows[~flat]  # where it is not known where the sensor stood, all are kept
+    rows = rows[~_seen_flat(found, rows)]
     x, y, intensity = found.x_m[rows], found.y_m[rows], found.intensity[rows].astype(np.float64)
-    level, upper = _levels(x, y, intensity, window)
-    contrast = np.clip(intensity / level - 1.0, *_CLIP)
-    noise = np.maximum(upper / level - 1.0, _LEAST_NOISE)
+    contrast, noise = np.empty(rows.size), np.empty(rows.size)
+    grid = (float(window.x_min_m), float(window.y_min_m), _LEVEL_CELL_M)
+    contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
     shape = tuple(round(v / CELL_M) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
     column = np.clip(((x - window.x_min_m) / CELL_M).astype(np.int64), 0, shape[1] - 1)
     row = np.clip(((y - window.y_min_m) / CELL_M).astype(np.int64), 0, shape[0] - 1)
     cell = row * shape[1] + column
     mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows].astype(np.float64), (shape[0], shape[1]))
     return Contrast(
-        rows, x, y, found.height_m[rows], contrast, noise, _lines(found.at(rows)), cell, window, mean, sigma
+        rows, x, y, found.height_m[rows], contrast, noise, _lines(found, rows), cell, window, mean, sigma
     )
 
 
-def _lines(ground: Returns) -> Int64:
-    """Number (n,) of the scan line of each return."""
-    slot = ground.epoch_gps_ns // _LINE_NS
+def _seen_flat(found: Returns, rows: Int64) -> npt.NDArray[np.bool_]:
+    """Which of the returns at `rows` a beam met at a small angle; none where it is not known where the sensor stood."""
+    up = found.sensor_height_m[rows] - found.height_m[rows]
+    dx, dy = found.x_m[rows] - found.sensor_x_m[rows], found.y_m[rows] - found.sensor_y_m[rows]
+    return np.asarray(up < _FLATTEST * np.sqrt(dx**2 + dy**2 + up**2))
+
+
+def _lines(found: Returns, rows: Int64) -> Int64:
+    """Number (n,) of the scan line of each return at `rows`."""
+    slot = found.epoch_gps_ns[rows] // _LINE_NS
     slot = slot - (slot.min() if slot.size else 0)
-    beam = ground.sensor.astype(np.int64) * (1 << 16) + ground.laser
+    beam = found.sensor[rows].astype(np.int64) * (1 << 16) + found.laser[rows]
     return np.asarray(slot * (1 << 24) + beam, np.int64)
 
 
 def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Float64, Float64]:
-    """Brightness of the surface around each return (n,), and what 84 % of the returns on it do not reach."""
+    """Brightness (rows, columns) of the surface around cells, and what 84 % of the returns on it do not reach."""
     from scipy import ndimage
 
     edge = _LEVEL_CELL_M
     shape = tuple(int(np.ceil(v / edge)) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
     u, v = (y - window.y_min_m) / edge, (x - window.x_min_m) / edge
     own = np.clip(u.astype(np.int64), 0, shape[0] - 1) * shape[1] + np.clip(v.astype(np.int64), 0, shape[1] - 1)
-    order = np.argsort(own, kind="stable")
-    first = np.searchsorted(own[order], np.arange(shape[0] * shape[1] + 1))
+    first, order = in_bins(own, shape[0] * shape[1])
     level, upper = np.empty(shape), np.empty(shape)
     paint_levels(intensity[order], first, _LEVEL_HALF, level, upper)
     known = np.isfinite(level)
     if not known.any():
-        return np.ones(x.size), np.ones(x.size)
+        return np.ones(shape), np.ones(shape)
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    place = [u - 0.5, v - 0.5]
     filled = level[tuple(nearest)]
     usual = ndimage.median_filter(filled[::_USUAL_STEP, ::_USUAL_STEP], _USUAL_SIZE, mode="nearest")
     usual = np.maximum(usual.repeat(_USUAL_STEP, 0).repeat(_USUAL_STEP, 1)[: shape[0], : shape[1]], 1e-6)
-    surfaces = (np.maximum(filled, _DARKEST * usual), upper[tuple(nearest)])
-    out = [ndimage.map_coordinates(a, place, order=1, mode="nearest") for a in surfaces]
-    return out[0], out[1]
+    return np.maximum(filled, _DARKEST * usual), upper[tuple(nearest)]
 
 
 def _means(
@@ -138,20 +141,21 @@ def _means(
     """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough."""
     import cv2
 
-    size = shape[0] * shape[1]
+    sums = np.zeros((shape[0] * shape[1], 5))
+    paint_sums(cell, contrast, noise, height, sums)
+    number, contrasted, noisy, high, squares = (column.astype(np.float32).reshape(shape) for column in sums.T)
 
-    def raster(weights: Float64 | None, sigma_m: float) -> Float32:
-        counts = np.bincount(cell, weights=weights, minlength=size).astype(np.float32).reshape(shape)
+    def raster(counts: Float32, sigma_m: float) -> Float32:
         reach = 2 * int(np.ceil(3 * sigma_m / CELL_M)) + 1
         blurred = cv2.GaussianBlur(counts, (reach, reach), sigma_m / CELL_M, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(blurred, np.float32)
 
-    weight = raster(None, SMOOTH_M)
+    weight = raster(number, SMOOTH_M)
     area = 4.0 * np.pi * (SMOOTH_M / CELL_M) ** 2
     known = weight >= _FEWEST_PER_M2 * CELL_M**2
-    near = np.maximum(raster(None, _ROUGH_M), 1e-9)
-    middle = raster(height, _ROUGH_M) / near
-    known &= raster(height**2, _ROUGH_M) / near - middle**2 <= _ROUGHEST_M**2
-    mean = np.where(known, raster(contrast, SMOOTH_M) / np.maximum(weight, 1e-9), 0.0)
-    variance = raster(noise**2, SMOOTH_M / np.sqrt(2.0)) / area / np.maximum(weight, 1e-9) ** 2
+    near = np.maximum(raster(number, _ROUGH_M), 1e-9)
+    middle = raster(high, _ROUGH_M) / near
+    known &= raster(squares, _ROUGH_M) / near - middle**2 <= _ROUGHEST_M**2
+    mean = np.where(known, raster(contrasted, SMOOTH_M) / np.maximum(weight, 1e-9), 0.0)
+    variance = raster(noisy, SMOOTH_M / np.sqrt(2.0)) / area / np.maximum(weight, 1e-9) ** 2
     return mean.astype(np.float32), np.where(known, np.sqrt(variance), np.inf).astype(np.float32)

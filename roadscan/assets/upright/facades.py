@@ -8,6 +8,7 @@ import numpy.typing as npt
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import Chain
 from roadscan.assets.upright.places import places_of
+from roadscan.kernels.assets.corridors import mark_strip
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -43,10 +44,8 @@ def beside(scene: Scene, rows: Int64) -> Int64:
     seen = np.array([returns.sensor_x_m[rows].mean(), returns.sensor_y_m[rows].mean()]) - middle
     normal = normal if float(normal @ seen) > 0.0 else -normal
     begin, end = float((some @ along).min()) - 0.3, float((some @ along).max()) + 0.3
-    near = places_of(scene).within(float(middle[0]), float(middle[1]), max(-begin, end) + _BEHIND_M)
-    x, y = returns.x_m[near] - middle[0], returns.y_m[near] - middle[1]
-    t, away = x * along[0] + y * along[1], x * normal[0] + y * normal[1]
-    inside = (t >= begin) & (t <= end) & (away >= -_BEHIND_M) & (away <= _BEFORE_M)
-    marked = np.zeros(len(returns), np.bool_)
-    marked[rows], marked[near[inside]] = True, True
-    return np.flatnonzero(marked)
+    places, inside = places_of(scene), np.zeros(len(returns), np.bool_)
+    inside[rows] = True
+    box = np.array([begin, end, -_BEHIND_M, _BEFORE_M])
+    mark_strip(places.x_m, places.y_m, places.rows, middle, np.stack([along, normal]), box, inside)
+    return np.flatnonzero(inside)

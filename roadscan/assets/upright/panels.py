@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.kernels.assets.upright_voxels import passing_lines
@@ -84,8 +86,8 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     past = np.column_stack([returns.x_m[rows], returns.y_m[rows]]) - region.middle_xy_m
     beside = np.array([-region.along[1], region.along[0]])
     t, d = past @ region.along, past @ beside
-    begin, end = np.quantile(t, [0.003, 0.997])
-    count = max(1, round(float(end - begin) / STRETCH_M))
+    begin, end = quantiles(t, [0.003, 0.997])
+    count = max(1, round((end - begin) / STRETCH_M))
     edges = np.linspace(begin, end, count + 1)
     stretch = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
     middle = _medians(d, stretch, count)
@@ -99,11 +101,12 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     xy = region.middle_xy_m + edges[:, None] * region.along + at_edges[:, None] * beside
     low, bulk, high = (np.full(count, np.nan) for _ in range(3))
     open_top = np.zeros(count, np.bool_)
+    starts, order = in_bins(stretch, count)
     for k in range(count):
-        own = rows[stretch == k]
+        own = rows[order[starts[k] : starts[k + 1]]]
         if own.size >= 4:
             heights = returns.height_m[own]
-            low[k], bulk[k], high[k] = np.quantile(heights, [0.02, 0.15, 0.98])
+            low[k], bulk[k], high[k] = quantiles(heights, [0.02, 0.15, 0.98])
             top = own[np.argmax(heights)]
             flat = math.hypot(returns.x_m[top] - returns.sensor_x_m[top], returns.y_m[top] - returns.sensor_y_m[top])
             rise = float(returns.height_m[top] - returns.sensor_height_m[top])
@@ -121,10 +124,11 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
 def _medians(d: Float64, stretch: Int64, count: int) -> Float64:
     """Median of d in each stretch (count,); where fewer than 5 are known, as beside it."""
     out = np.full(count, np.nan)
+    starts, order = in_bins(stretch, count)
     for k in range(count):
-        own = d[stretch == k]
+        own = d[order[starts[k] : starts[k + 1]]]
         if own.size >= 5:
-            out[k] = np.median(own)
+            out[k] = median(own)
     known = np.isfinite(out)
     if not known.any():
         return np.full(count, float(np.median(d)))

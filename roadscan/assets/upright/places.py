@@ -16,6 +16,7 @@ from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
 
 Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
 
 _CELL_M: Final = 1.0
 
@@ -28,6 +29,9 @@ class Places:
     returns: Returns
     """Those of the scene, which is not held itself: what is remembered of it would keep it in memory."""
     rows: Int64
+    x_m: Float64
+    """Places of these rows."""
+    y_m: Float64
     starts: Int64
     shape: tuple[int, int]
 
@@ -41,11 +45,10 @@ class Places:
         for row in range(max(int(v - reach), 0), min(int(v + reach), self.shape[0] - 1) + 1):
             if last >= first:
                 begin = row * self.shape[1]
-                parts.append(self.rows[self.starts[begin + first] : self.starts[begin + last + 1]])
-        rows = np.concatenate(parts)
-        returns = self.returns
-        near = (returns.x_m[rows] - x_m) ** 2 + (returns.y_m[rows] - y_m) ** 2 <= reach_m**2
-        return np.sort(rows[near])
+                some = slice(self.starts[begin + first], self.starts[begin + last + 1])
+                near = (self.x_m[some] - x_m) ** 2 + (self.y_m[some] - y_m) ** 2 <= reach_m**2
+                parts.append(self.rows[some][near])
+        return np.sort(np.concatenate(parts))
 
 
 @once_a_scene
@@ -60,7 +63,7 @@ def places_of(scene: Scene) -> Places:
     count_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts)
     order = np.empty(int(starts[-1]), np.int64)
     fill_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts.copy(), order)
-    return Places(window, returns, order, starts, (rows, columns))
+    return Places(window, returns, order, returns.x_m[order], returns.y_m[order], starts, (rows, columns))
 
 
 @once_a_scene

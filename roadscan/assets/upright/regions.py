@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import usable
@@ -89,16 +90,15 @@ def regions_of(scene: Scene) -> list[Region]:
     elements[:, 1:3] += corner[:2]
     groups = [members[starts[k] : starts[k + 1]] for k in range(1, count + 1)]
     groups = [g for g in groups if g.size >= 3]
-    held = np.flatnonzero(voxel >= 0)
-    order = held[np.argsort(voxel[held], kind="stable")]
-    first = np.searchsorted(voxel[order], np.arange(found + 1))
-    out = []
-    for group in _joined(elements, groups):
-        near = np.concatenate([order[first[j] : first[j + 1]] for j in group.tolist()])
-        one = _region(scene, elements[group], np.sort(near))
-        if one is not None:
-            out.append(one)
-    return out
+    joined = _joined(elements, groups)
+    group_of = np.full(found + 1, -1, np.int32)
+    for number, group in enumerate(joined):
+        group_of[group] = number
+    first, order = in_bins(group_of[voxel], len(joined))  # voxel −1 is the last one, which belongs to none
+    regions = (
+        _region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined)
+    )
+    return [one for one in regions if one is not None]
 
 
 def _line(elements: Float64) -> tuple[Float64, Float64, float, float]:

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.kernels.assets.slices import fill_slices, label_slices
+from roadscan.kernels.assets.slices import fill_slices, label_slices, owners
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -49,8 +50,7 @@ class Slices:
 
     def members(self) -> tuple[Int64, Int64]:
         """Returns sorted by their component, and where each component begins (k + 1,)."""
-        order = np.argsort(self.owner, kind="stable")
-        starts = np.searchsorted(self.owner[order], np.arange(self.level.size + 1))
+        starts, order = in_bins(self.owner, self.level.size)
         return order, starts
 
 
@@ -73,21 +73,17 @@ def slices_of(scene: Scene) -> Slices:
     cell = np.empty(len(returns), np.int64)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
     fill_slices(returns.x_m, returns.y_m, above, corner, CELL_M, SLICE_M, counts, cell)
-    most = int(np.count_nonzero(counts))
-    labels, boxes = np.zeros(counts.shape, np.int32), np.empty((most, 5), np.int32)
-    found = label_slices(counts, labels, boxes, np.empty(max(most, 1), np.int64))
+    cells = np.flatnonzero(counts)
+    labels, boxes = np.zeros(counts.shape, np.int32), np.empty((cells.size, 5), np.int32)
+    found = label_slices(counts, cells, labels, boxes, np.empty(max(cells.size, 1), np.int64))
     boxes = boxes[:found]
     widest = round(WIDEST_M / CELL_M)
     compact = (boxes[:, 2] - boxes[:, 1] < widest) & (boxes[:, 4] - boxes[:, 3] < widest)
     number = np.full(found + 1, -1, np.int32)
     number[1:][compact] = np.arange(int(compact.sum()), dtype=np.int32)
-    owner = np.full(len(returns), -1, np.int32)
-    inside = cell >= 0
-    owner[inside] = number[labels.ravel()[cell[inside]]]
-    held = owner >= 0
-    n = np.bincount(owner[held], minlength=int(compact.sum()))
-    x = np.bincount(owner[held], returns.x_m[held], minlength=n.size) / n
-    y = np.bincount(owner[held], returns.y_m[held], minlength=n.size) / n
+    owner, sums = np.empty(len(returns), np.int32), np.zeros((int(compact.sum()), 3))
+    owners(returns.x_m, returns.y_m, cell, labels.reshape(-1), number, owner, sums)
+    x, y = sums[:, 1] / sums[:, 0], sums[:, 2] / sums[:, 0]
     return Slices((window.x_min_m, window.y_min_m), counts, boxes[compact, 0].astype(np.int64), x, y, owner)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, chains_of, pieces_of_panels
 from roadscan.assets.upright.panels import panels_of
@@ -56,6 +58,19 @@ def probability_of(chain: Chain) -> float:
     )  # fmt: skip
 
 
+@once_a_scene
+def _names_of_panels(scene: Scene) -> list[set[Surface | None]]:
+    """What the chains of each panel look like."""
+    whole = replace(scene, tile=scene.window)
+    return [{told(c) for c in chains_of(pieces_of_panels(whole, [panel]))} for panel in panels_of(scene)]
+
+
+@once_a_scene
+def _pieces_of_all(scene: Scene) -> pa.Table:
+    """Pieces of all panels inside the scene's tile."""
+    return pieces_of_panels(scene, panels_of(scene))
+
+
 class SurfaceKind(AssetKind):
     """A kind of upright surfaces: its evidence are the pieces of all of them, told apart once they are joined."""
 
@@ -64,17 +79,12 @@ class SurfaceKind(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Pieces of all upright surfaces in the tile; marked are the returns of those that look like this kind."""
-        panels = panels_of(scene)
-        whole = Scene(
-            scene.returns, scene.window, scene.window, scene.ground, scene.above_ground_m, scene.classes,
-            scene.drive_xyh_m,
-        )  # fmt: skip
-        marked = []
-        for panel in panels:
-            chains = chains_of(pieces_of_panels(whole, [panel]))
-            if any(told(c) == self.name for c in chains):
-                marked.append(Marked(self.marks(scene, panel.rows), self.code))
-        return Evidence(pieces_of_panels(scene, panels), tuple(marked))
+        marked = [
+            Marked(self.marks(scene, panel.rows), self.code)
+            for panel, names in zip(panels_of(scene), _names_of_panels(scene), strict=True)
+            if self.name in names
+        ]
+        return Evidence(_pieces_of_all(scene), tuple(marked))
 
     def marks(self, scene: Scene, rows: Any) -> Any:
         """Returns that belong to a surface of these rows."""

@@ -10,11 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.bins import distinct_steps
 from roadscan.assets.returns import Returns
 from roadscan.assets.tiling import AssetGrid
 from roadscan.jobs.plan.centre_line import load_buffer
 from roadscan.jobs.readings import Placer, RawSlice, ReadingSource, TrajectorySource, geometry_of, load_trajectory
 from roadscan.jobs.tiles.tile_plan import TileTask
+from roadscan.kernels.assets.buckets import rows_within
 from roadscan.model.ids import TileId
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.navigation.trajectory import Trajectory
@@ -111,9 +113,9 @@ class _Block:
         west, south = ((n * grid.per_edge - first) * size for n, first in zip(square, self._corner, strict=True))
         halo, edge = round(grid.halo_m * QUANTA_PER_M), grid.per_edge * size
         c = self._columns
-        inside = (c.x >= west - halo) & (c.x < west + edge + halo)
-        inside &= (c.y >= south - halo) & (c.y < south + edge + halo)
-        own = c.at(np.flatnonzero(inside))
+        box = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
+        rows = np.empty(c.x.size, np.int64)
+        own = c.at(rows[: rows_within(c.x, c.y, box, rows)])
         corner = grid.corner_m(square)
         x, y = _metres(own.x - np.int64(west)), _metres(own.y - np.int64(south))
         if self._centre is not None:
@@ -221,18 +223,20 @@ class _Block:
         found = [np.zeros((0, 4))]
         seen: set[int] = set()
         for number, rows in _by_source(own.source, len(self._sources)):
-            for one in np.unique(own.pass_id[rows]).tolist():
+            held = np.flatnonzero(np.bincount(own.pass_id[rows])).tolist()
+            for one in held:
                 if one in seen:
                     continue
-                tick = np.unique(own.epoch_gps_ns[rows][own.pass_id[rows] == one] // _DRIVE_TICK_NS)
+                epochs = own.epoch_gps_ns[rows]
+                tick = distinct_steps(epochs if len(held) == 1 else epochs[own.pass_id[rows] == one], _DRIVE_TICK_NS)
                 places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
                 places[:, :2] -= grid.corner_m(square)
                 places = places[grid.window_box.holds(places[:, 0], places[:, 1])]
                 if len(places):
                     seen.add(one)
                     found.append(np.column_stack([thinned(places), np.full(len(thinned(places)), float(one))]))
-        held = np.concatenate(found)
-        return held[np.argsort(held[:, 3], kind="stable")]
+        drives = np.concatenate(found)
+        return drives[np.argsort(drives[:, 3], kind="stable")]
 
 
 def _metres(quanta: npt.NDArray[np.integer[Any]]) -> Float64:

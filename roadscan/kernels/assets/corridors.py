@@ -31,3 +31,19 @@ def mark_corridor(x, y, reach_m, corner, cell_m, inside):
                 share = min(max((px * wx + py * wy) / square, 0.0), 1.0) if square > 0.0 else 0.0
                 if math.hypot(px - share * wx, py - share * wy) <= reach_m:
                     inside[r, c] = True
+
+
+@kernel
+def mark_strip(x, y, rows, middle, axes, box, marked):
+    """Mark the returns of a rectangle seen from above: `marked` (n,) bool at their numbers.
+
+    x, y : (k,) places (m) and rows : (k,) numbers of returns. middle : (2,) where axes (2, 2) begin, unit vectors. box :
+    (4,) least and greatest place along the first axis, then along the second (m).
+    """
+    for i in range(x.size):
+        dx, dy = x[i] - middle[0], y[i] - middle[1]
+        along = dx * axes[0, 0] + dy * axes[0, 1]
+        if box[0] <= along <= box[1]:
+            across = dx * axes[1, 0] + dy * axes[1, 1]
+            if box[2] <= across <= box[3]:
+                marked[rows[i]] = True

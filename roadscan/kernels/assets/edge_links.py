@@ -83,7 +83,10 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
     following, preceding : (n,) the next place of the best way, −1 where it ends.
     """
     n = ahead.size
-    new = np.zeros(n)
+    new, fade = np.zeros(n), np.empty(lengths.shape)
+    for i in range(n):
+        for k in range(links.shape[1]):
+            fade[i, k] = np.exp(-lengths[i, k] / memory_m)
     for _ in range(rounds):
         changed = False
         for i in range(n):
@@ -92,7 +95,7 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
                 j = links[i, k]
                 if j < 0:
                     break
-                value = gains[i, k] + ahead[j] * np.exp(-lengths[i, k] / memory_m)
+                value = gains[i, k] + ahead[j] * fade[i, k]
                 if value > best:
                     best, then = value, j
             new[i] = best
@@ -110,7 +113,7 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
                 j = links[i, k]
                 if j < 0:
                     break
-                value = gains[i, k] + behind[i] * np.exp(-lengths[i, k] / memory_m)
+                value = gains[i, k] + behind[i] * fade[i, k]
                 if value > new[j]:
                     new[j] = value
                     preceding[j] = i
@@ -123,12 +126,12 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
 
 
 @kernel
-def trace(place, total, following, preceding, ranked, limits, chain, owner):
+def trace(place, total, following, preceding, ranked, order, starts, bins, limits, chain, owner):
     """Follow the best ways from the strongest places on; returns the number of chains.
 
-    total : (n,) evidence of the best path through each place. ranked : places, strongest first. limits : (least
-    evidence to begin, least evidence to go on, distances within which a chain leaves no second one and no other side
-    of a gutter (m)). chain : (n, 2) filled, in chains one after another: the chain's number and the place. owner : (n,)
+    total : (n,) evidence of the best path through each place. ranked : places, strongest first. order, starts, bins :
+    places sorted by bin, as in :func:`find_links`. limits : (least evidence to begin, least evidence to go on,
+    distances within which a chain leaves no second one and no other side of a gutter (m)). chain : (n, 2) filled, in chains one after another: the chain's number and the place. owner : (n,)
     −1 at first; then the chain that holds the place or lies beside it.
     """
     n = total.size
@@ -158,27 +161,40 @@ def trace(place, total, following, preceding, ranked, limits, chain, owner):
             chain[length, 0], chain[length, 1] = chains, at
             length += 1
             at = following[at]
-        cover(place, chain, length, chains, limits[2], limits[3], owner)
+        cover(place, chain, length, chains, order, starts, bins, (limits[2], limits[3]), owner)
         chains += 1
     return chains, length
 
 
 @inlined
-def cover(place, chain, length, number, beside_m, gutter_m, owner):
-    """Give all places within `beside_m` of the chain that ends the list to it, and the other sides of its gutter."""
-    begin = length
-    while begin > 0 and chain[begin - 1, 0] == number:
-        begin -= 1
-    for i in range(owner.size):
-        if owner[i] >= 0:
-            continue
-        for k in range(begin, length):
-            j = chain[k, 1]
-            ex, ey = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
-            apart = ex * ex + ey * ey
-            # The other side of a gutter: each lies on the lower side, the left, of the other.
-            against = place[i, 2] * place[j, 2] + place[i, 3] * place[j, 3] < -0.7
-            gutter = against and ex * place[j, 3] - ey * place[j, 2] < 0.0 and apart <= gutter_m * gutter_m
-            if gutter or apart <= beside_m * beside_m:
-                owner[i] = number
-                break
+def cover(place, chain, length, number, order, starts, bins, reach, owner):
+    """Give all places beside the chain that ends the list to it, and the other sides of its gutter.
+
+    reach : distances within which places lie beside it, and within which they are the other side of a gutter (m).
+    """
+    rows, columns = int(bins[3]), int(bins[4])
+    far = max(reach[0], reach[1])
+    for k in range(length - 1, -1, -1):
+        if chain[k, 0] != number:
+            break
+        j = chain[k, 1]
+        west, east = (
+            int(np.floor((place[j, 0] - far - bins[0]) / bins[2])),
+            int((place[j, 0] + far - bins[0]) / bins[2]),
+        )
+        south, north = (
+            int(np.floor((place[j, 1] - far - bins[1]) / bins[2])),
+            int((place[j, 1] + far - bins[1]) / bins[2]),
+        )
+        for r in range(max(south, 0), min(north + 1, rows)):
+            for at in range(starts[r * columns + max(west, 0)], starts[r * columns + min(east, columns - 1) + 1]):
+                i = order[at]
+                if owner[i] >= 0:
+                    continue
+                ex, ey = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
+                apart = ex * ex + ey * ey
+                # The other side of a gutter: each lies on the lower side, the left, of the other.
+                against = place[i, 2] * place[j, 2] + place[i, 3] * place[j, 3] < -0.7
+                gutter = against and ex * place[j, 3] - ey * place[j, 2] < 0.0 and apart <= reach[1] * reach[1]
+                if gutter or apart <= reach[0] * reach[0]:
+                    owner[i] = number

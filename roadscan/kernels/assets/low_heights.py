@@ -8,30 +8,32 @@ from roadscan.kernels.options import kernel
 
 
 @kernel
-def low_heights(x_m, y_m, z_m, grid, depth_m, count, mean_m, variance_m2):
-    """Fill (rows, columns) `count`, `mean_m` and `variance_m2` of the returns that lie lowest in each cell.
+def low_heights(cell, z_m, used, depth_m, count, mean_m, variance_m2):
+    """Fill (cells,) `count`, `mean_m` and `variance_m2` of the returns that lie lowest in each cell.
 
-    x_m, y_m, z_m : (n,) returns (m). grid : (x_min_m, y_min_m, cell_m). depth_m : returns up to this above the lowest
-    of the cell count. Cells without a return keep 0 returns.
+    cell : (n,) number of each return's cell, −1 of none. z_m : (n,) heights (m). used : (n,) returns that are looked
+    at; then those among them up to `depth_m` above their cell's mean. depth_m : returns up to this above the lowest of
+    the cell count. Cells without a return keep 0 returns.
     """
-    rows, columns = count.shape
-    lowest = np.full((rows, columns), np.inf)
-    for i in range(x_m.size):
-        column, row = int(np.floor((x_m[i] - grid[0]) / grid[2])), int(np.floor((y_m[i] - grid[1]) / grid[2]))
-        if 0 <= row < rows and 0 <= column < columns and z_m[i] < lowest[row, column]:
-            lowest[row, column] = z_m[i]
-    for i in range(x_m.size):
-        column, row = int(np.floor((x_m[i] - grid[0]) / grid[2])), int(np.floor((y_m[i] - grid[1]) / grid[2]))
-        if 0 <= row < rows and 0 <= column < columns:
-            above = z_m[i] - lowest[row, column]
+    lowest = np.full(count.size, np.inf)
+    for i in range(z_m.size):
+        if cell[i] < 0:
+            used[i] = False
+        if used[i] and z_m[i] < lowest[cell[i]]:
+            lowest[cell[i]] = z_m[i]
+    for i in range(z_m.size):
+        if used[i]:
+            at = cell[i]
+            above = z_m[i] - lowest[at]
             if above <= depth_m:
-                count[row, column] += 1
-                mean_m[row, column] += above
-                variance_m2[row, column] += above * above
-    for row in range(rows):
-        for column in range(columns):
-            n = count[row, column]
-            if n > 0:
-                mean = mean_m[row, column] / n
-                variance_m2[row, column] = max(variance_m2[row, column] / n - mean * mean, 0.0)
-                mean_m[row, column] = lowest[row, column] + mean
+                count[at] += 1
+                mean_m[at] += above
+                variance_m2[at] += above * above
+    for at in range(count.size):
+        n = count[at]
+        if n > 0:
+            mean = mean_m[at] / n
+            variance_m2[at] = max(variance_m2[at] / n - mean * mean, 0.0)
+            mean_m[at] = lowest[at] + mean
+    for i in range(z_m.size):
+        used[i] = used[i] and z_m[i] <= mean_m[cell[i]] + depth_m

@@ -18,12 +18,12 @@ OFFSET, STEP, SIGMA_STEP, FACE, TOP, SCATTER, RETURNS, SEEN_LOW, SEEN_HIGH, SIGM
 
 
 @kernel
-def fit_nodes(node, x_m, y_m, z_m, order, starts, bins, along_m, search, prior, out):
+def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
     """Fill `out` (n, RESULTS) with the step at each node; SIGMA_STEP is NaN where it cannot be told.
 
     node : (n, 7) x, y (m), unit vector along the edge (higher side to its right), height (m) and the ground's slope at
-    large along and across it (to the right). x_m, y_m, z_m : (m,) heights of the ground. order, starts, bins : heights
-    sorted by bin, as in `edge_links`. along_m : half the length of the window along the edge. search : (farthest offset
+    large along and across it (to the right). x_m, y_m, z_m : (m,) heights of the ground, sorted by bin. starts : the
+    first of each bin. bins : (x_min_m, y_min_m, size_m, rows, columns). along_m : half the length of the window along the edge. search : (farthest offset
     (m), least and greatest face (m), depth of a side (m)). prior : (σ of a side's slope (m/m), σ of a height (m)).
     OFFSET : from the node to the upper edge, to the right. SCATTER : of strips of 0.1 m about their side's line.
     SEEN_LOW : share of strips of 0.1 m with heights on the lower side, up to the farthest of at most 1.2 m; 0 of fewer
@@ -32,8 +32,10 @@ def fit_nodes(node, x_m, y_m, z_m, order, starts, bins, along_m, search, prior, 
     """
     columns = int(bins[4])
     profile, near = np.empty((4, 2 * HALF_BINS)), np.empty((2, QUARTERS))
-    sums = np.empty((6, 2 * HALF_BINS + 1))
+    sums, lines = np.empty((6, 2 * HALF_BINS + 1)), np.empty((7, 2 * HALF_BINS + 1))
     reach = np.sqrt(along_m * along_m + (BIN_M * HALF_BINS) ** 2)
+    # How far from the middle of a bin its heights lie at most.
+    corner = 0.708 * bins[2]
     for i in range(node.shape[0]):
         profile[:] = 0.0
         near[:] = 0.0
@@ -46,8 +48,11 @@ def fit_nodes(node, x_m, y_m, z_m, order, starts, bins, along_m, search, prior, 
         ux, uy = node[i, 2], node[i, 3]
         for r in range(r_low, r_high + 1):
             for c in range(c_low, c_high + 1):
-                for k in range(starts[r * columns + c], starts[r * columns + c + 1]):
-                    j = order[k]
+                ex = bins[0] + (c + 0.5) * bins[2] - node[i, 0]
+                ey = bins[1] + (r + 0.5) * bins[2] - node[i, 1]
+                if abs(ex * ux + ey * uy) > along_m + corner or abs(ex * uy - ey * ux) > BIN_M * HALF_BINS + corner:
+                    continue
+                for j in range(starts[r * columns + c], starts[r * columns + c + 1]):
                     ex, ey = x_m[j] - node[i, 0], y_m[j] - node[i, 1]
                     t, d = ex * ux + ey * uy, ex * uy - ey * ux
                     b = int(np.floor(d / BIN_M)) + HALF_BINS
@@ -62,7 +67,7 @@ def fit_nodes(node, x_m, y_m, z_m, order, starts, bins, along_m, search, prior, 
                                 1.0
                             )
         accumulate(profile, sums)
-        search_step(profile, sums, search, prior, node[i, 6], out[i])
+        search_step(profile, sums, lines, search, prior, node[i, 6], out[i])
         out[i, COVERED] = np.sum(near[0] * near[1]) / QUARTERS
 
 
@@ -99,28 +104,51 @@ def line_between(sums, a, b, at_m, slope, precision):
 
 
 @inlined
-def search_step(profile, sums, search, prior, slope, out):
+def side_lines(profile, sums, ends, bounds, slope, precision, lines):
+    """Fill `lines` with the lines of both sides at each bin that a face may begin or end at.
+
+    ends : first and last bin of the lower and the higher side. bounds : first and last bin that is asked for. lines :
+    height, rest and returns of the lower side's line, then those of the higher side's, then the mean place of the bin's
+    heights (bins).
+    """
+    for b in range(bounds[0], bounds[1] + 1):
+        at = (b - HALF_BINS) * BIN_M
+        low, _, rest_low, n_low, _ = line_between(sums, ends[0], b, at, slope, precision)
+        high, _, rest_high, n_high, _ = line_between(sums, b, ends[1], at, slope, precision)
+        lines[0, b], lines[1, b], lines[2, b] = low, rest_low, n_low
+        lines[3, b], lines[4, b], lines[5, b] = high, rest_high, n_high
+        n = profile[0, b]
+        lines[6, b] = profile[1, b] / n / BIN_M + HALF_BINS if n > 0.0 else 0.0
+
+
+@inlined
+def search_step(profile, sums, lines, search, prior, slope, out):
     """Find offset and face of least rest, and fill a row of results; all candidates are held against the same bins."""
     precision = (prior[1] / prior[0]) ** 2
     farthest, narrow, wide = int(search[0] / BIN_M), int(search[1] / BIN_M), int(search[2] / BIN_M)
     first, last = HALF_BINS - farthest - int(search[3] / BIN_M), HALF_BINS + farthest + int(search[3] / BIN_M)
+    bounds = (HALF_BINS - farthest - wide // 2, HALF_BINS + farthest + wide - wide // 2)
+    side_lines(profile, sums, (first, last), bounds, slope, precision, lines)
     best, a, b = np.inf, -1, -1
     for face in range(narrow, wide + 1, 2):
+        # A face wider than needed has to explain more than chance would.
+        doubt = 1.0 + 0.002 * (face - narrow)
         for e in range(-farthest, farthest + 1):
             begin = HALF_BINS + e - face // 2
             end = begin + face
-            low, _, rest_low, n_low, _ = line_between(sums, first, begin, (begin - HALF_BINS) * BIN_M, slope, precision)
-            high, _, rest_high, n_high, _ = line_between(sums, end, last, (end - HALF_BINS) * BIN_M, slope, precision)
-            if n_low < 4.0 or n_high < 4.0 or high < low:
+            low, high = lines[0, begin], lines[3, end]
+            if lines[2, begin] < 4.0 or lines[5, end] < 4.0 or high < low:
                 continue
-            rest = rest_low + rest_high
+            rest = lines[1, begin] + lines[4, end]
             for k in range(begin, end):
+                # It only grows.
+                if rest * doubt >= best:
+                    break
                 n = profile[0, k]
                 if n > 0.0:
-                    z = low + (profile[1, k] / n / BIN_M + HALF_BINS - begin) / face * (high - low)
+                    z = low + (lines[6, k] - begin) / face * (high - low)
                     rest += max(profile[3, k] - 2.0 * z * profile[2, k] + n * z * z, 0.0)
-            # A face wider than needed has to explain more than chance would.
-            rest *= 1.0 + 0.002 * (face - narrow)
+            rest *= doubt
             if rest < best:
                 best, a, b = rest, begin, end
     if a < 0:

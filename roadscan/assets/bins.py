@@ -1,0 +1,46 @@
+"""Things sorted by the bin that they lie in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.kernels.assets.buckets import by_number, raster_cells
+from roadscan.kernels.assets.columns import distinct
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+
+def in_bins(number: npt.NDArray[np.integer[Any]], bins: int) -> tuple[Int64, Int64]:
+    """Where each bin begins (bins + 1,), and things (k,) by their bin, ascending in each.
+
+    number : (n,) bin of each thing; those of a negative one are left out.
+    """
+    starts, order = np.zeros(bins + 1, np.int64), np.empty(number.size, np.int64)
+    by_number(np.ascontiguousarray(number, np.int32), starts, order)
+    return starts, order[: starts[-1]]
+
+
+def cells_of(
+    x_m: Float64, y_m: Float64, grid: tuple[float, float, float], shape: tuple[int, int]
+) -> npt.NDArray[np.int32]:
+    """Flat number (n,) of the cell of places (n,): row · columns + column; −1 outside.
+
+    grid : x and y of the raster's corner, edge of a cell (m). shape : its rows and columns.
+    """
+    cell = np.empty(x_m.size, np.int32)
+    raster_cells(x_m, y_m, grid, shape, cell)
+    return cell
+
+
+def distinct_steps(epoch_gps_ns: Int64, step_ns: int) -> Int64:
+    """Steps of time (k,) that hold one of some epochs (n,), as whole numbers, ascending."""
+    found = np.empty(4096, np.int64)
+    count = distinct(epoch_gps_ns, step_ns, found)
+    if count > found.size:
+        found = np.empty(count, np.int64)
+        distinct(epoch_gps_ns, step_ns, found)
+    return np.unique(found[:count])

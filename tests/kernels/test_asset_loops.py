@@ -1,0 +1,141 @@
+"""Loops over returns and rasters of assets against NumPy, SciPy and sums by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.ndimage
+
+from roadscan.kernels.assets.beams import ground_heights, log_gains, meet_ground
+from roadscan.kernels.assets.buckets import by_number, raster_cells, rows_within
+from roadscan.kernels.assets.contrasts import contrasts, distinct_in_groups, paint_sums
+from roadscan.kernels.assets.corridors import mark_strip
+from roadscan.kernels.assets.smoothing import convolve, window_means
+from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
+from roadscan.kernels.assets.step_filter import sizes_of, take_excess
+from roadscan.kernels.options import read_only
+
+RNG = np.random.default_rng(23)
+
+
+def test_things_are_sorted_by_their_number_as_a_stable_sort_does() -> None:
+    number = RNG.integers(-1, 5, 60).astype(np.int32)
+    starts, order = np.zeros(6, np.int64), np.empty(60, np.int64)
+    by_number(number, starts, order)
+    kept = np.flatnonzero(number >= 0)
+    assert order[: starts[-1]].tolist() == kept[np.argsort(number[kept], kind="stable")].tolist()
+    assert np.diff(starts).tolist() == np.bincount(number[kept], minlength=5).tolist()
+
+
+def test_places_find_their_cell_and_those_outside_none() -> None:
+    cell = np.empty(4, np.int32)
+    raster_cells(np.array([0.05, 0.25, -0.01, 0.1]), np.array([0.05, 0.15, 0.0, 0.2]), (0.0, 0.0, 0.1), (2, 3), cell)
+    assert cell.tolist() == [0, 5, -1, -1]
+
+
+def test_rows_within_a_box_hold_its_least_edges_and_not_its_greatest() -> None:
+    x, y = np.array([0, 9, 10, 5, -1], np.int32), np.array([0, 9, 5, 10, 5], np.int32)
+    rows = np.empty(5, np.int64)
+    count = rows_within(x, y, np.array([0, 0, 10, 10], np.int64), rows)
+    assert rows[:count].tolist() == [0, 1]
+
+
+def test_ground_between_cells_is_that_of_scipy() -> None:
+    height = RNG.normal(size=(7, 9)).astype(np.float32)
+    x, y = RNG.uniform(0.0, 4.5, 40), RNG.uniform(0.0, 3.5, 40)
+    out = np.empty(40)
+    ground_heights(read_only(x), read_only(y), (0.0, 0.0, 0.5), height, out)
+    expected = scipy.ndimage.map_coordinates(height, [y / 0.5 - 0.5, x / 0.5 - 0.5], np.float64, 1, "nearest")
+    assert out == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_beam_that_comes_down_one_in_one_meets_level_ground_at_45_degrees() -> None:
+    place = tuple(map(read_only, (np.array([0.5, 0.5]), np.array([0.5, 0.5]), np.zeros(2))))
+    sensor = tuple(map(read_only, (np.array([3.5, 3.5]), np.array([0.5, 0.5]), np.array([3.0, 3.0]))))
+    slope = np.zeros((1, 1))
+    range_m, cosine = np.empty(2), np.empty(2)
+    meet_ground(place, sensor, (0.0, 0.0, 1.0), slope, slope, np.array([True, False]), range_m, cosine)
+    assert range_m == pytest.approx([3.0 * np.sqrt(2.0)] * 2)
+    assert cosine == pytest.approx([np.sqrt(0.5), 1.0])
+    # On ground that rises to the sensor as steeply as the beam comes down, it runs along the ground.
+    meet_ground(place, sensor, (0.0, 0.0, 1.0), slope + 1.0, slope, np.array([True, False]), range_m, cosine)
+    assert cosine[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_gains_between_nodes_are_those_of_numpy() -> None:
+    nodes, levels = np.array([1.0, 2.0, 4.0, 9.0]), RNG.normal(size=4)
+    value, degrees = np.append(RNG.uniform(0.0, 10.0, 48), [2.0, 9.0]), RNG.uniform(0.0, 10.0, 50)
+    mine, ground = RNG.random(50) < 0.7, RNG.random(50) < 0.5
+    laser, by_laser = RNG.integers(0, 3, 50).astype(np.uint16), np.array([0.1, 0.2, 0.4])
+    out = np.zeros(50)
+    log_gains(mine, laser, value, degrees, ground, by_laser, (nodes, levels), (nodes, 2.0 * levels), out)
+    expected = by_laser[laser] + np.interp(value, nodes, levels)
+    expected += np.where(ground, np.interp(degrees, nodes, 2.0 * levels), 0.0)
+    assert (out == np.where(mine, expected, 0.0)).all()
+
+
+def test_contrasts_are_those_to_a_surface_between_cells() -> None:
+    level, upper = RNG.uniform(50.0, 60.0, (5, 6)), RNG.uniform(61.0, 70.0, (5, 6))
+    x, y = RNG.uniform(-0.2, 3.2, 60), RNG.uniform(-0.2, 2.7, 60)
+    intensity, contrast, noise = RNG.uniform(10.0, 200.0, 60), np.empty(60), np.empty(60)
+    contrasts(x, y, intensity, (0.0, 0.0, 0.5), level, upper, (-0.5, 2.0, 0.06), contrast, noise)
+    place = [y / 0.5 - 0.5, x / 0.5 - 0.5]
+    here, most = (scipy.ndimage.map_coordinates(a, place, order=1, mode="nearest") for a in (level, upper))
+    assert contrast == pytest.approx(np.clip(intensity / here - 1.0, -0.5, 2.0))
+    assert noise == pytest.approx(np.maximum(most / here - 1.0, 0.06))
+
+
+def test_sums_of_paint_are_those_of_its_cells() -> None:
+    cell = np.array([0, 2, 2])
+    sums = np.zeros((3, 5))
+    paint_sums(cell, np.array([0.5, 1.0, 2.0]), np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]), sums)
+    assert sums[0] == pytest.approx([1.0, 0.5, 0.01, 1.0, 1.0])
+    assert sums[1].tolist() == [0.0] * 5
+    assert sums[2] == pytest.approx([2.0, 3.0, 0.13, 5.0, 13.0])
+
+
+def test_values_of_a_group_count_once() -> None:
+    out = np.empty(3, np.int64)
+    distinct_in_groups(np.array([0, 3, 3, 5]), np.array([4, 0, 2, 1, 3]), np.array([7, 9, 7, 9, 8]), out)
+    assert out.tolist() == [2, 0, 1]
+
+
+def test_a_strip_marks_the_returns_inside_it() -> None:
+    x, y, marked = np.array([1.0, 1.0, 3.0, 1.0]), np.array([0.0, 0.6, 0.0, -0.4]), np.zeros(6, np.bool_)
+    box = np.array([0.0, 2.0, -0.5, 0.5])
+    mark_strip(x, y, np.array([5, 4, 3, 2]), np.zeros(2), np.eye(2), box, marked)
+    assert np.flatnonzero(marked).tolist() == [2, 5]
+
+
+def test_means_of_windows_and_weights_are_those_of_scipy() -> None:
+    value = RNG.normal(size=(23, 31))
+    out, between = np.empty(value.shape), np.zeros((25, 31))
+    window_means(value, 6, between, np.zeros(31 + 6), out)
+    assert (out == scipy.ndimage.uniform_filter(value, 6, mode="constant")).all()
+    weights = np.array([0.4, 0.2, 0.1])
+    convolve(read_only(value), weights, np.empty(31 + 4), np.empty(value.shape), out)
+    whole = np.concatenate([weights[:0:-1], weights])
+    expected = scipy.ndimage.correlate1d(scipy.ndimage.correlate1d(value, whole, axis=0), whole, axis=1)
+    assert (out == expected).all()
+
+
+def test_steps_that_scatter_everywhere_count_less() -> None:
+    evidence = np.array([[0.0, 3.0, -6.0]])
+    still, counted, size = np.array([[True, False, False]]), np.empty((1, 3)), np.empty((1, 3))
+    sizes_of(evidence, still, (0.5, 4.0), counted, size)
+    assert counted.tolist() == [[1.0, 1.0, 1.0]]
+    assert size.tolist() == [[0.5, 3.0, 4.0]]
+    take_excess(evidence, np.full((1, 3), 0.5), np.full((1, 3), 2.0), (0.0, 0.0), 0.8)
+    assert evidence[0] == pytest.approx([0.0, 3.0 / 5.0, -6.0 / 5.0])
+
+
+def test_what_stands_has_the_class_of_its_cube() -> None:
+    above = np.array([0.1, 0.1, 0.6, 3.0, 1.0, 5.0, 1.0, 1.0, 1.0], np.float32)
+    number = np.array([-1, 0, 1, 1, 2, 3, 4, 4, 0], np.int32)
+    cubes = np.array([0, LEAFY, LEAFY | WALL, WALL | WIRE, ALONE], np.uint8)
+    place = tuple(read_only(np.zeros(9)) for _ in range(3))
+    sensor = (read_only(np.array([0.0] * 6 + [5.0, 20.0, 0.0])), *place[1:])
+    out = np.ones(9, np.uint8)
+    out[8] = 64
+    standing_classes(above, number, cubes, place, sensor, (0.3, 0.5, 2.0, 15.0), (1, 3, 4, 5, 6, 14, 18), out)
+    assert out.tolist() == [3, 1, 4, 5, 6, 14, 18, 1, 64]

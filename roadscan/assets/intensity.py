@@ -37,15 +37,20 @@ ON_GROUND_M: Final = 0.1
 """Returns within this of the ground model tell of gains, and are on the ground."""
 _MOST_PLACES: Final = 4000
 """Places of a sample; which ones is told by a counter keyed by place."""
-_SLOPE_OVER_M: Final = 3.0
-"""The ground's normal is that of a plane of this size."""
-_ROUNDS: Final = 8
+_SLOPE_OVER_M: Final = 5.0
+"""The ground's normal is that of the plane through the ground that was seen in a square of this size."""
+_EVEN_M2: Final = 0.01
+"""Added to the variance of places across the plane, so that a row of cells leaves it level across (m²)."""
+_MOST_ROUNDS, _STILL = 60, 2e-3
+"""The fit ends when no logarithmic gain moves by more, or after so many rounds."""
 _EXCESS: Final = (-0.9, 2.0)
 _SCATTER, _LEAST_SCATTER = 0.3, 0.02
 _LASER_PRIOR: Final = 0.7
 """1 σ of a laser's logarithmic gain before anything is measured."""
-_LEVEL_PRIOR: Final = 1.0
-_BEND_PRIOR: Final = 0.10
+_LEVEL_PRIOR: Final = 0.3
+"""1 σ of the logarithmic gains of range and of incidence, as a root mean square over their nodes: on a level road both
+tell the same trend, and a sum of two large ones would pass on the noise of the normals."""
+_BEND_PRIOR: Final = 0.05
 """1 σ of the second differences of the functions of range and incidence from node to node."""
 
 GAINS_SCHEMA: Final = pa.schema(
@@ -137,7 +142,8 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
     columns, values = _design(rows, terms)
     solution, covariance = np.zeros(terms.unknowns), np.zeros((terms.unknowns, terms.unknowns))
     robust, scale = np.ones(rows.place.size), 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
+        before = solution
         response = (values * solution[columns]).sum(axis=1)
         mean = _place_means(rows, response, robust)
         excess = np.clip(rows.intensity / mean - 1.0, *_EXCESS)
@@ -146,6 +152,8 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         deviation = _without_places(rows, excess, weights)
         scale = max(1.4826 * float(np.median(np.abs(deviation))), _LEAST_SCATTER)
         robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
+        if np.abs(solution - before).max() <= _STILL:
+            break
     solution -= _common_part(rows, terms, (columns, values), solution)
     told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.unknowns)
     return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
@@ -206,24 +214,43 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
 
 def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
     """Range (n,) of each return (m), and the angle of incidence of those that are wanted (deg); 0 of all others."""
-    from scipy import ndimage
-
-    height = ground.height_m.astype(np.float64)
-    small = min(height.shape) < 2
-    north, east = np.zeros((2, *height.shape)) if small else np.array(list(np.gradient(height, ground.cell_m)))
-    size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
-    slopes = []
-    for slope in (east, north):
-        known = np.isfinite(slope)
-        share = ndimage.uniform_filter(known.astype(np.float64), size, mode="nearest")
-        mean = ndimage.uniform_filter(np.where(known, slope, 0.0), size, mode="nearest")
-        slopes.append(np.where(share > 0.0, mean / np.maximum(share, 1e-9), 0.0))
+    east, north = _slopes(ground)
     range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
     place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
     sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
     grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
-    meet_ground(place, sensor, grid, slopes[0], slopes[1], wanted, range_m, cosine)
+    meet_ground(place, sensor, grid, east, north, wanted, range_m, cosine)
     return range_m, np.degrees(np.arccos(cosine))
+
+
+def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:
+    """Slopes (rows, columns) to the east and to the north (m/m) of the least-squares plane through the cells around
+    each cell in which ground was seen; 0 where there are none.
+    """
+    import cv2
+
+    known = ground.seen & np.isfinite(ground.height_m)
+    weight = known.astype(np.float64)
+    size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
+    level = float(np.mean(ground.height_m[known], dtype=np.float64)) if known.any() else 0.0
+    z = np.where(known, ground.height_m.astype(np.float64) - level, 0.0)
+    y, x = (ground.cell_m * (at - at.mean()) for at in np.indices(z.shape).astype(np.float64))
+
+    def total(value: Float64) -> Float64:
+        return np.asarray(
+            cv2.boxFilter(value, cv2.CV_64F, (size, size), None, (-1, -1), False, cv2.BORDER_CONSTANT), np.float64
+        )
+
+    number = np.maximum(total(weight), 1.0)
+
+    def mean(value: Float64) -> Float64:
+        return total(weight * value) / number
+
+    mx, my, mz = mean(x), mean(y), mean(z)
+    xx, yy, xy = mean(x * x) - mx * mx + _EVEN_M2, mean(y * y) - my * my + _EVEN_M2, mean(x * y) - mx * my
+    xz, yz = mean(x * z) - mx * mz, mean(y * z) - my * mz
+    both = xx * yy - xy * xy
+    return (yy * xz - xy * yz) / both, (xx * yz - xy * xz) / both
 
 
 # --- the places of a sample ------------------------------------------------------------------------

@@ -78,7 +78,7 @@ def test_paint_stands_out_of_a_recorded_road_after_calibration_and_bare_boundari
     scene = av2_scene()
     painted, bare = boundaries()
     after = calibrated_scene(scene, gains_of([intensity_sample(scene)]))
-    assert ratio(after, painted) >= 1.45  # the aim is 1.6
+    assert ratio(after, painted) >= 1.6  # 1.77; 1.59 as recorded
     assert 0.9 <= ratio(after, bare, away_from=painted) <= 1.1
     flat = replace(after, returns=replace(after.returns, intensity=np.ones_like(after.returns.intensity)))
     assert ratio(flat, painted) == 1.0

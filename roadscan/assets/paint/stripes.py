@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.paint.components import Component
+from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 
 Float64 = npt.NDArray[np.float64]
@@ -30,7 +30,8 @@ _EDGE_M: Final = 0.03
 _BEND_M: Final = 0.02
 """A road's surface rises or falls less than this at its lines, against the mean of both sides."""
 _UNEVEN: Final = 0.5
-"""Paint lies on one surface: its sides differ by less than this share of its contrast to them."""
+"""Paint lies on one surface: its sides differ by less than this share of its contrast to them, or it is as bright as
+paint against the brighter one too, as where fresh bitumen lies along a line."""
 _FLAT_M: Final = 0.02
 _STEEPEST: Final = 0.15
 _STEP_M: Final = 0.04
@@ -171,7 +172,7 @@ def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
     bend, slope = abs((left + right) / 2 - inside), abs(left - right) / (stripe.width_m + _EDGE_M + _BESIDE_M)
     lone = max(np.nan_to_num(abs(left - inside)), np.nan_to_num(abs(right - inside)))
     above = levels[0] - (levels[1] + levels[2]) / 2
-    uneven = abs(levels[1] - levels[2]) > _UNEVEN * above
+    uneven = abs(levels[1] - levels[2]) > _UNEVEN * above and levels[0] - max(levels[1], levels[2]) < SEED_CONTRAST
     return bool(bend > _BEND_M or slope > _STEEPEST or lone > _STEP_M or uneven)
 
 

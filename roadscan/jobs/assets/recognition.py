@@ -23,6 +23,9 @@ _TEXT_PX: Final = 320
 """Cut-outs are enlarged to this height before text is sought."""
 _LEAST_TEXT: Final = 0.5
 _SQUARE_PX: Final = 64
+_ONE_THREAD: Final = {
+    "EngineConfig.onnxruntime.intra_op_num_threads": 1, "EngineConfig.onnxruntime.inter_op_num_threads": 1,
+}  # fmt: skip
 """Edge of the input of a model that takes any size."""
 
 
@@ -145,7 +148,7 @@ def _ocr() -> Any:
         raise ConfigError("assets.pictures.text needs the package rapidocr", change='pip install "roadscan[ocr]"')
     import rapidocr
 
-    return rapidocr.RapidOCR(params={"Global.log_level": "error"})
+    return rapidocr.RapidOCR(params={"Global.log_level": "error", **_ONE_THREAD})
 
 
 def _labels(path: Path, session: Any) -> list[str]:

@@ -44,8 +44,8 @@ SIGNS = [
 ]  # fmt: skip
 COLOURS = ["red", "blue", "red", "yellow", "white"]
 BACK, BEHIND_VAN = 5, 6
-FOCAL, SIZE = 420.0, (480, 300)
-CAMERA = {"on": True, "colour": True, "every_m": 2.5, "width_px": SIZE[0], "height_px": SIZE[1], "focal_px": FOCAL,
+FOCAL, SIZE = 350.0, (400, 250)
+CAMERA = {"on": True, "colour": True, "every_m": 3.0, "width_px": SIZE[0], "height_px": SIZE[1], "focal_px": FOCAL,
           "noise": 1.0, "mount": {"lever_arm_body_m": [0.9, -0.25, -1.15], "pitch_deg": -2.0}}  # fmt: skip
 SCENE = (
     Scene.load("demo")

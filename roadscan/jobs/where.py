@@ -14,7 +14,7 @@ from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import TileId
-from roadscan.points.views import PictureRule, seen_in
+from roadscan.points.views import PictureRule, sights
 from roadscan.tiles.grid import Bounds
 
 REACH_M: Final = 60.0
@@ -63,14 +63,16 @@ def pictures_of_place(
     rule = PictureRule((), reach_m, _ANY_ANGLE_DEG, _BORDER_PX)
     pictures = plan_pictures(session.plan, rule).near(Bounds(easting_m, northing_m, easting_m, northing_m))
     frame, place = session.plan.ground.map, np.array([[easting_m, northing_m, height_m]])
-    worlds = [frame.world_from_map(world, place)[0] for world in pictures.worlds]
+    worlds = [frame.world_from_map(world, place)[None] for world in pictures.worlds]
+    no_front = [np.full((1, 3), np.nan)] * len(worlds)
+    near = ((number, np.zeros(1, np.int64)) for number in range(len(pictures)))
+    seen = sights(worlds, no_front, pictures.views, rule, near)
     found = []
-    for seen in seen_in(worlds, pictures.views, rule):
-        log = pictures.logs[pictures.log[seen.view]]
-        u, v = seen.pixel
-        found.append(
-            PictureOfPlace(log.run, log.sensor, pictures.path(seen.view), u, v, seen.distance_m, seen.resolution_m)
-        )
+    for view, (u, v), distance, resolution in zip(
+        seen.view.tolist(), seen.pixel.tolist(), seen.distance_m.tolist(), seen.resolution_m.tolist(), strict=True
+    ):
+        log = pictures.logs[pictures.log[view]]
+        found.append(PictureOfPlace(log.run, log.sensor, pictures.path(view), u, v, distance, resolution))
     return found
 
 

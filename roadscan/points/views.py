@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -19,9 +19,12 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
 
-__all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Views", "best_views", "sampled", "seen_in"]
+__all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
+           "best_views", "sampled", "sights"]  # fmt: skip
 
 NO_VIEW: Final = -1
+_LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
+"""Least cosine between the ray and the direction that a front looks to."""
 
 
 @dataclass(frozen=True)
@@ -139,40 +142,79 @@ def best_views(
     return Shown(chosen, pixel)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A picture that may show a place."""
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """Pictures that may show objects: n pairs, object by object, that with the finest look at it first."""
 
-    view: int
-    """Number of the picture."""
-    pixel: tuple[float, float]
-    """u, v from the centre of the upper left pixel."""
-    distance_m: float
-    resolution_m: float
-    """What a pixel spans there, across the ray (m)."""
+    item: Int64
+    """(n,) number of the object."""
+    view: Int64
+    """(n,) number of the picture."""
+    pixel: Float64
+    """(n, 2) u, v of the object's first place, from the centre of the upper left pixel."""
+    distance_m: Float64
+    """(n,) from the camera to that place."""
+    resolution_m: Float64
+    """(n,) what a pixel spans there, across the ray (m)."""
+
+    def __len__(self) -> int:
+        """Pairs."""
+        return len(self.item)
+
+    def at(self, rows: Int64 | Bool) -> Sights:
+        """Some of them."""
+        return Sights(
+            self.item[rows], self.view[rows], self.pixel[rows], self.distance_m[rows], self.resolution_m[rows]
+        )
 
 
-def seen_in(point_world_m: Sequence[Float64], views: Views, rule: PictureRule) -> list[Seen]:
-    """The pictures that may show one place, that with the finest resolution first.
+def sights(
+    places_world_m: Sequence[Float64],
+    facing_world: Sequence[Float64],
+    views: Views,
+    rule: PictureRule,
+    near: Iterable[tuple[int, Int64]],
+) -> Sights:
+    """Which pictures show objects, each object's best first.
 
-    Whether something stands between is not looked at.
+    A picture shows an object where all its places lie in it, within the rule's reach, and where its front is turned
+    to the camera by 10 degrees or more. Best is what spans the least of the object with a pixel: distance over focal
+    length, over the cosine of the angle between ray and front; of equals the earlier picture. Whether something
+    stands between is not looked at.
 
     Parameters
     ----------
-    point_world_m : (3,) the place in each of the world frames that the views count.
+    places_world_m : (m, k, 3) places of the objects in each of the world frames that the views count.
+    facing_world : (m, 3) unit vectors that their fronts look to, likewise; NaN where an object has no front.
+    near : pictures, and the objects that each may show.
     """
-    found: list[Seen] = []
-    for number in range(len(views)):
-        place = point_world_m[views.world[number]].reshape(1, 3)
-        alone = views.picked(np.array([number]))
-        shown = best_views([place] * len(point_world_m), alone, rule)
-        if shown.view[0] == NO_VIEW:
+    found: list[tuple[Int64, Int64, Float64, Float64, Float64, Float64]] = []
+    limits = rule.limits()
+    for number, items in near:
+        if not items.size:
             continue
-        distance = float(np.linalg.norm(place[0] - views.eye_world_m[number]))
-        focal_px = float(np.sqrt(np.prod(views.lenses[views.lens[number]].parameters[:2])))
-        u, v = shown.pixel[0].tolist()
-        found.append(Seen(number, (u, v), distance, distance / focal_px))
-    return sorted(found, key=lambda one: (one.resolution_m, one.view))
+        world, lens = int(views.world[number]), views.lenses[views.lens[number]]
+        places = places_world_m[world][items]
+        count = places.shape[0] * places.shape[1]
+        best, chosen, pixel = np.full(count, np.inf), np.full(count, NO_VIEW, np.int32), np.full((count, 2), np.nan)
+        take_better(
+            np.ascontiguousarray(places.reshape(-1, 3)), views.eye_world_m[number], views.opencv_from_world[number],
+            views.up_world[number], lens.parameters, limits, lens.hidden, 0, best, chosen, pixel,
+        )  # fmt: skip
+        ray = views.eye_world_m[number] - places[:, 0]
+        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        turned = np.einsum("ij,ij->i", ray, facing_world[world][items]) / np.maximum(distance, 1e-9)
+        turned = np.where(np.isnan(turned), 1.0, turned)
+        kept = (chosen.reshape(places.shape[:2]) != NO_VIEW).all(axis=1) & (turned >= _LEAST_TURNED)
+        resolution = distance[kept] / float(np.sqrt(np.prod(lens.parameters[:2])))
+        first = pixel.reshape(*places.shape[:2], 2)[kept, 0]
+        view = np.full(len(first), number, np.int64)
+        found.append((items[kept], view, first, distance[kept], resolution, resolution / turned[kept]))
+    if not found:
+        none, empty = np.zeros(0, np.int64), np.zeros(0)
+        return Sights(none, none, np.zeros((0, 2)), empty, empty)
+    item, view, first, distance, resolution, span = (np.concatenate(c) for c in zip(*found, strict=True))
+    return Sights(item, view, first, distance, resolution).at(np.lexsort((view, span, item)))
 
 
 def sampled(picture: UInt8, pixel: Float64) -> UInt8:

@@ -42,6 +42,11 @@ _RAIL_POST_RADIUS_M: Final = 0.05
 _PLATE_BEFORE_POST_M: Final = 0.04
 _PLATE_M: Final = 1e-6
 """From a sign's face to its back: two thin bodies, of which a beam meets the one on its side (m)."""
+_PLATES: Final = {
+    "rectangle": body.WALL, "round": body.DISC, "triangle": body.TRIANGLE, "octagon": body.OCTAGON,
+    "diamond": body.DIAMOND,
+}  # fmt: skip
+_HEIGHT_SHARE: Final = {"round": 1.0, "triangle": math.sqrt(3.0) / 2.0, "octagon": 1.0, "diamond": 1.0}
 _ARM_M: Final = 0.12
 _LAMP_M: Final = (0.5, 0.25, 0.12)
 _WHEEL_M: Final = (0.62, 0.20, 0.60)
@@ -138,6 +143,12 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
             on_road = _on_road(one, *scene.stations_m)
             for station in _stations(on_road, *scene.stations_m):
                 yield kind, on_road, station
+
+
+def described_signs(scene: Scene) -> list[tuple[int, Sign]]:
+    """Numbers and descriptions of the signs that stand beside the road."""
+    numbered = enumerate(_standing(scene), 1)
+    return [(number, one) for number, (_, one, _) in numbered if isinstance(one, Sign)]
 
 
 def _on_road(one: Standing | Barrier, first_m: float, last_m: float) -> Standing | Barrier:
@@ -292,11 +303,11 @@ def _made(one: object, place: _Place, surface: Surface) -> tuple[tuple[float, fl
 @_made.register
 def _(one: Sign, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     z = place.enh_m[2]
-    height = one.width_m if one.shape == "round" else one.height_m
+    height = one.width_m * _HEIGHT_SHARE[one.shape] if one.shape in _HEIGHT_SHARE else one.height_m
     low, high = z + one.clearance_m, z + one.clearance_m + height
     side = 1.0 if one.faces == "forward" else -1.0
     at = place.beside(side * _PLATE_BEFORE_POST_M, 0.0, place.heading_rad)
-    kind = body.DISC if one.shape == "round" else body.WALL
+    kind = _PLATES[one.shape]
     behind = place.beside(side * (_PLATE_BEFORE_POST_M - _PLATE_M), 0.0, place.heading_rad)
     face, back = (
         _body(kind, middle, place.heading_rad + math.pi / 2, (one.width_m / 2, 0.0), (low, high), shade)

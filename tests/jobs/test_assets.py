@@ -27,7 +27,7 @@ from roadscan.jobs.assets.evidence import EVIDENCE
 from roadscan.jobs.assets.objects import OBJECTS
 from roadscan.jobs.assets.work import MADE, due_joins, plan_evidence
 from roadscan.jobs.engine.compute import Done, Inline
-from roadscan.jobs.report.blocks import Drawing, Table
+from roadscan.jobs.report.blocks import Drawing, Picture, Table
 from roadscan.jobs.report.page import report_page
 from roadscan.jobs.report.section import Material
 from roadscan.jobs.report.sections.assets import Assets as AssetsSection
@@ -123,6 +123,7 @@ def test_posts_stand_where_the_truth_has_them(street: Simulated) -> None:
     side = np.sign(true["offset_m"].to_numpy()[away.argmin(axis=1)][known.index])
     assert (np.sign(known["offset_m"]) == side).all()
     assert found["object"].is_unique
+    assert found["pictures"].isna().all()
 
 
 def test_every_file_holds_the_same_posts(street: Simulated) -> None:
@@ -350,9 +351,10 @@ def test_python_gets_a_geodataframe(street: Simulated) -> None:
 def test_the_report_shows_the_posts(street: Simulated) -> None:
     own = session(street)
     blocks = list(AssetsSection().blocks(Material(own)))
-    counts, drawing, table = blocks
+    counts, drawing, thumbnails, table = blocks
     assert isinstance(counts, Table) and counts.rows[0][:2] == ("Pole", "3")
     assert isinstance(drawing, Drawing) and len(drawing.lines) == 6
+    assert isinstance(thumbnails, Picture) and thumbnails.content[:4] == b"\x89PNG"
     assert isinstance(table, Table) and len(table.rows) == 3
     assert table.full_table == "poles"
     assert "Pole" in report_page(own)

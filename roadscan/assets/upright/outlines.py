@@ -58,6 +58,8 @@ def outline_of(points: Float64) -> Outline:
     width, height = float(solution[2]), float(solution[-1])
     beyond = _BEYOND * math.sqrt(width * height / len(points))
     width, height = width + 2.0 * beyond, height + 2.0 * beyond
+    if shape.startswith("triangle"):
+        height = width * math.sqrt(3.0) / 2.0
     if shape == "rectangle" and abs(width - height) < _SQUARE * max(width, height):
         shape = "square"
     return Outline(shape.split()[0], (float(solution[0]), float(solution[1])), width, height, misfit)

@@ -17,6 +17,7 @@ from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.screens import screens_of
 from roadscan.code_reach import code_digest
 from roadscan.jobs.assets.load_returns import LoadedSquare, ReturnsTask, load_squares
 from roadscan.jobs.assets.plan import AssetPlan
@@ -39,7 +40,9 @@ EVIDENCE: Final = "asset_evidence"
 """Manifest name of the pieces of a kind in a square."""
 CLASSIFIED: Final = "classified_points"
 BARE_EARTH: Final = "bare_earth"
-OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH)
+SCREENS: Final = "asset_screens"
+"""Manifest name of what hides things from cameras."""
+OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
@@ -56,6 +59,7 @@ class SquareWork:
     """Names of the kinds whose evidence is due, with its key."""
     classified_key: str = ""
     bare_earth_key: str = ""
+    screens_key: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,12 +100,14 @@ def due_squares(
         keys = {name: key_of(own, key) for name, own in kind_keys.items()}
         classified = key_of(code, key, sorted(keys.items()), plan.context.survey_id) if plan.config.classified else ""
         bare = key_of(code, key, plan.context.survey_id) if plan.config.bare_earth else ""
+        screens = key_of(code, key, SCREENS) if plan.wants_pictures else ""
         if square not in anew:
             keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
             classified = "" if manifest.is_current(CLASSIFIED, unit, classified) else classified
             bare = "" if manifest.is_current(BARE_EARTH, unit, bare) else bare
-        if keys or classified or bare:
-            found.append(SquareWork(square, tuple(keys.items()), classified, bare))
+            screens = "" if manifest.is_current(SCREENS, unit, screens) else screens
+        if keys or classified or bare or screens:
+            found.append(SquareWork(square, tuple(keys.items()), classified, bare, screens))
     return found
 
 
@@ -183,6 +189,8 @@ class _Search:
                 self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
         if self._work.bare_earth_key:
             yield self._write_bare_earth(scene)
+        if self._work.screens_key:
+            yield self._write_screens(scene)
         if self._work.classified_key and not self.failures:
             yield self._write_classified(scene, marked)
 
@@ -191,7 +199,7 @@ class _Search:
         square, w = self._work.square, self._work
         for name, key in w.kinds:
             yield OutputRecord(EVIDENCE, evidence_unit(name, square), key, "", 0, "", _told(0))
-        for product, key in ((BARE_EARTH, w.bare_earth_key), (CLASSIFIED, w.classified_key)):
+        for product, key in ((BARE_EARTH, w.bare_earth_key), (CLASSIFIED, w.classified_key), (SCREENS, w.screens_key)):
             if key:
                 yield OutputRecord(product, str(square), key, "", 0, "", _told(0))
 
@@ -216,6 +224,15 @@ class _Search:
         detail = json.dumps({"cells": known, "seen": int(np.count_nonzero(model.seen))})
         target = f"products/{BARE_EARTH}/{square}.tif"
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
+
+    def _write_screens(self, scene: Scene) -> OutputRecord:
+        square, key, screens = str(self._work.square), self._work.screens_key, screens_of(scene)
+        if not screens.num_rows:
+            return OutputRecord(SCREENS, square, key, "", 0, "", _told(0))
+        path = self._folder / "screens.parquet"
+        pq.write_table(screens, path, compression="zstd", write_page_checksum=True, version="2.6")
+        target = f"tables/{SCREENS}/{square}.parquet"
+        return publish_file(self._task.store, path, target, SCREENS, square, key, _told(screens.num_rows))
 
     def _write_classified(self, scene: Scene, marked: Sequence[Marked]) -> OutputRecord:
         square, key = self._work.square, self._work.classified_key

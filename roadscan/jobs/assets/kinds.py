@@ -38,7 +38,8 @@ class WantedKind:
     def objects_key(self) -> str:
         """Key of what shapes its objects."""
         code = code_digest("roadscan.jobs.assets.objects:join_objects", name_of(type(self.kind)))
-        return key_of(self.name, code, self.options.model_dump(mode="json"))
+        columns = [[c.name, c.type] for c in self.schema.columns]
+        return key_of(self.name, code, self.options.model_dump(mode="json"), columns)
 
 
 def wanted_kinds(config: AssetsConfig) -> tuple[WantedKind, ...]:

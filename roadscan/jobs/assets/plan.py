@@ -11,10 +11,13 @@ import numpy as np
 from roadscan.assets.tiling import AssetGrid
 from roadscan.jobs.assets.kinds import WantedKind, wanted_kinds
 from roadscan.jobs.assets.load_returns import ReturnsTask
+from roadscan.jobs.assets.picture_rule import picture_rule
+from roadscan.jobs.assets.recognition import check_recognition
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
 from roadscan.jobs.products import product_context
 from roadscan.jobs.readings import ReadingSource, TrajectorySource, geometry_of
+from roadscan.jobs.surfaces.pictures import rule_cameras
 from roadscan.jobs.tiles.footprints import FootprintRanges
 from roadscan.jobs.tiles.tile_plan import TilePlan, plan_tiles
 from roadscan.model.errors import ConfigError, nearest
@@ -52,6 +55,13 @@ class AssetPlan:
     def context(self) -> ProductContext:
         """What files need to know of the survey."""
         return self.tiles.context
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether pictures of assets are wanted, and the rig has a camera that could take them."""
+        settings = self.config.pictures
+        cameras = [one for one in self.survey.survey.rig.sensors.values() if one.kind == "camera"]
+        return settings.on and bool(settings.cameras or any(one.interior is not None for one in cameras))
 
     def blocks(self, squares: Sequence[TileId], workers: int = 1) -> list[tuple[TileId, ...]]:
         """Neighbouring squares that fit into memory together; fewer where there are few for that many workers."""
@@ -128,6 +138,10 @@ def check_assets(survey: Survey) -> None:
     if config is None:
         return
     wanted_kinds(config)
+    pictures = config.pictures
+    check_recognition(pictures, None if pictures.recogniser is None else survey.resolve(pictures.recogniser))
+    if pictures.on and pictures.cameras:
+        rule_cameras(survey.rig, picture_rule(pictures))
     named = {log.sensor for run in survey.config.runs for log in run.logs if log.sensor is not None}
     known = sorted({*survey.rig.sensors, *named, "cloud"})
     for name in config.sensors or ():

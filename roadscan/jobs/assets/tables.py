@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ from roadscan.code_reach import code_digest
 from roadscan.jobs.assets.along_roads import along_roads
 from roadscan.jobs.assets.kinds import WantedKind
 from roadscan.jobs.assets.objects import OBJECTS
+from roadscan.jobs.assets.picture_work import PicturePlan
 from roadscan.jobs.condition.lines import Roads
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tile_files import publish_file
@@ -36,6 +38,8 @@ class TableTask:
 
     schema: AssetSchema
     objects: tuple[OutputRecord, ...]
+    seen: tuple[OutputRecord, ...]
+    """What pictures told of them."""
     key: str
 
     @property
@@ -55,7 +59,7 @@ class FileTask:
 
 
 def plan_tables(
-    kinds: Sequence[WantedKind], manifest: Manifest, lines_key: str, context: ProductContext
+    kinds: Sequence[WantedKind], manifest: Manifest, lines_key: str, context: ProductContext, pictures: PicturePlan
 ) -> list[TableTask]:
     """A table for each kind."""
     code = code_digest("roadscan.jobs.assets.tables:write_table")
@@ -65,8 +69,10 @@ def plan_tables(
         own = tuple(r for unit, r in sorted(held.items()) if unit.startswith(f"{one.name}/") and r.path)
         schema = one.schema
         said = [[c.name, c.type] for c in schema.columns]
-        key = key_of(code, said, schema.geometry, [(r.unit, r.digest) for r in own], lines_key, context.map)
-        tasks.append(TableTask(schema, own, key))
+        seen = pictures.records(one.name, manifest)
+        read = [(r.unit, r.digest) for r in (*own, *seen)]
+        key = key_of(code, said, schema.geometry, read, lines_key, context.map)
+        tasks.append(TableTask(schema, own, seen, key))
     return tasks
 
 
@@ -114,6 +120,7 @@ def write_table(task: TableTask, roads: Roads, store: Store, context: ProductCon
     for name, values in told.items():
         index = rows.schema.get_field_index(name)
         rows = rows.set_column(index, rows.schema.field(index), values)
+    rows = _with_pictures(rows, [store.parse_table(read_recorded(store, r), r.path) for r in task.seen])
     rows = rows.sort_by([(name, "ascending") for name in ("road", "station_m", "easting_m", "northing_m", "object")])
     shapes = shapely.from_wkb(rows["geometry"].to_numpy())
     with store.scratch() as folder:
@@ -122,6 +129,22 @@ def write_table(task: TableTask, roads: Roads, store: Store, context: ProductCon
         write_geo_table(path, rows.drop_columns(["geometry"]), "geometry", shapes, [kind], context)
         detail = f'{{"objects": {rows.num_rows}}}'
         return publish_file(store, path, f"{ASSET_FOLDER}/{task.unit}", TABLES, task.unit, task.key, detail)
+
+
+def _with_pictures(rows: pa.Table, seen: Sequence[pa.Table]) -> pa.Table:
+    """Rows of objects with what pictures told of them."""
+    if not seen:
+        return rows
+    told = {one["object"]: one for part in seen for one in part.to_pylist()}
+    values = [json.loads(told[name]["told"]) if name in told else {} for name in rows["object"].to_pylist()]
+    named = [told[name]["pictures"] if name in told else None for name in rows["object"].to_pylist()]
+    columns: dict[str, list[Any]] = {"pictures": named}
+    for name in sorted({name for one in values for name in one}):
+        columns[name] = [one.get(name, known) for one, known in zip(values, rows[name].to_pylist(), strict=True)]
+    for name, column in columns.items():
+        index = rows.schema.get_field_index(name)
+        rows = rows.set_column(index, rows.schema.field(index), pa.array(column, rows.schema.field(index).type))
+    return rows
 
 
 def write_file(task: FileTask, store: Store, context: ProductContext) -> OutputRecord:

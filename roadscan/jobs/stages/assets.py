@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
 from roadscan.jobs.assets.gains import current_gains, find_samples, sample_tasks, write_gains
 from roadscan.jobs.assets.objects import OBJECTS, Cluster, join_objects, plan_joins
+from roadscan.jobs.assets.picture_work import PicturePlan, picture_tasks, plan_asset_pictures
+from roadscan.jobs.assets.pictures import FOLDER as PICTURE_FOLDER
+from roadscan.jobs.assets.pictures import find_pictures
 from roadscan.jobs.assets.plan import AssetPlan, check_assets
 from roadscan.jobs.assets.sections import SECTIONS, plan_sections, write_sections
 from roadscan.jobs.assets.tables import TABLES, plan_files, plan_tables, write_file, write_table
@@ -42,7 +45,7 @@ class Assets(Stage):
         if work.plan is not None:
             self._search(session, work, work.plan)
             self._join(session, work.plan)
-            self._write(session, work.plan)
+            self._write(session, work.plan, self._look(session, work.plan))
 
     def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
         """Gains of the intensity: samples of some squares, then the table."""
@@ -78,12 +81,29 @@ class Assets(Stage):
                 failed = run_units(join_objects, due, manifest, session.compute, bar)
                 session.failed(self.name, failed)
 
-    def _write(self, session: Session, plan: AssetPlan) -> None:
+    def _look(self, session: Session, plan: AssetPlan) -> PicturePlan:
+        """Hold objects against pictures, where there are any."""
+        manifest = session.manifest
+        pictures = plan_asset_pictures(plan, manifest)
+        for note in pictures.notes:
+            session.note(f"assets: {note}")
+        due = pictures.due(manifest)
+        if pictures.pictures is not None and due:
+            tasks = picture_tasks(plan, pictures.pictures, due, manifest, session.compute.workers)
+            bar = session.bar("squares whose assets are sought in pictures")
+            session.failed(self.name, run_units(find_pictures, tasks, manifest, session.compute, bar))
+        manifest.remove(pictures.gone(manifest))
+        unreadable = pictures.unreadable(manifest)
+        if unreadable:
+            session.note(f"assets: {len(unreadable):,} pictures cannot be read: {'; '.join(unreadable[:5])}")
+        return pictures
+
+    def _write(self, session: Session, plan: AssetPlan, pictures: PicturePlan) -> None:
         manifest, context = session.manifest, plan.context
         roads, key = survey_roads(plan.survey, manifest)
         if plan.kinds and not roads.lines:
             session.note("assets: no run has a trajectory of 20 m or more, so assets have no road, station and offset")
-        for table in plan_tables(plan.kinds, manifest, key, context):
+        for table in plan_tables(plan.kinds, manifest, key, context, pictures):
             if not manifest.is_current(TABLES, table.unit, table.key):
                 manifest.add([write_table(table, roads, session.store, context)])
         for file in plan_files(plan.kinds, manifest, plan.config, context):
@@ -123,8 +143,9 @@ class Assets(Stage):
     def _files_due(self, session: Session, plan: AssetPlan) -> int:
         manifest, context = session.manifest, plan.context
         key = roads_key(plan.survey)
-        tables = plan_tables(plan.kinds, manifest, key, context)
-        due = sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
+        pictures = plan_asset_pictures(plan, manifest)
+        tables = plan_tables(plan.kinds, manifest, key, context, pictures)
+        due = len(pictures.due(manifest)) + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
         files = plan_files(plan.kinds, manifest, plan.config, context)
         return due + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
 
@@ -132,6 +153,6 @@ class Assets(Stage):
         """Evidence, objects, tables and files, classified points, bare earth."""
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
-            ASSET_FOLDER, "products/classified_points", "products/ground_sections",
-            "products/bare_earth",
+            "tables/asset_screens", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
+            "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

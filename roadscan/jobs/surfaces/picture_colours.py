@@ -57,7 +57,7 @@ class ColourSource:
             again = []
             for number in np.unique(shown.view[shown.view != NO_VIEW]).tolist():
                 own = np.flatnonzero(shown.view == number)
-                picture = self._picture(pictures, number)
+                picture = self.picture(pictures, number)
                 if picture is None:
                     unreadable[number] = self._unreadable[pictures.name(number)]
                     again.append(left[own])
@@ -68,7 +68,7 @@ class ColourSource:
         told = tuple(f"{pictures.name(n)}: {reason}" for n, reason in sorted(unreadable.items()))
         return PointColours(colour, seen, len(used), told)
 
-    def _picture(self, pictures: Pictures, number: int) -> UInt8 | None:
+    def picture(self, pictures: Pictures, number: int) -> UInt8 | None:
         """A picture (height, width, 3), red first; None where it cannot be read."""
         name = pictures.name(number)
         if name in self._unreadable:
@@ -91,15 +91,15 @@ def _shown(pictures: Pictures, enh_m: Float64, without: Collection[int]) -> Show
     parts = []
     for start in range(0, len(enh_m), _POINTS_AT_ONCE):
         part = enh_m[start : start + _POINTS_AT_ONCE]
-        worlds = [_world_m(pictures, world, part) for world in pictures.worlds]
+        worlds = [world_places(pictures, world, part) for world in pictures.worlds]
         parts.append(best_views(worlds, pictures.views, pictures.rule, without))
     return Shown(np.concatenate([p.view for p in parts]), np.concatenate([p.pixel for p in parts]))
 
 
-def _world_m(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
+def world_places(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
     """Points (m, 3) of the map in a world frame."""
     if len(enh_m) == 1:  # NumPy multiplies one row in another order than several
-        return _world_m(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
+        return world_places(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
     return np.ascontiguousarray(pictures.map.world_from_map(world, enh_m))
 
 

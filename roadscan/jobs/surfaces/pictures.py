@@ -63,6 +63,8 @@ class Pictures:
     logs: tuple[PictureLog, ...]
     log: Int64
     """(n,) number of each picture's log."""
+    epochs_gps_ns: Int64
+    """(n,) when they were taken."""
     files: tuple[str, ...]
     """(n,) relative to the log's folder."""
     lens_key: str
@@ -112,7 +114,8 @@ class Pictures:
     def _picked(self, index: Int64) -> Pictures:
         return replace(
             self, views=self.views.picked(index), place_m=self.place_m[index], reach_m=self.reach_m[index],
-            log=self.log[index], files=tuple(self.files[i] for i in index.tolist()), notes=(),
+            log=self.log[index], epochs_gps_ns=self.epochs_gps_ns[index],
+            files=tuple(self.files[i] for i in index.tolist()), notes=(),
         )  # fmt: skip
 
 
@@ -174,7 +177,7 @@ def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
     return Pictures(
         rule, plan.ground.map, plan.ground.grids, worlds, views.picked(order),
         np.concatenate([one.place_m for one in placed])[order], np.concatenate([one.reach_m for one in placed])[order],
-        tuple(one.log for one in placed), log[order], tuple(files[i] for i in order.tolist()),
+        tuple(one.log for one in placed), log[order], epoch[order], tuple(files[i] for i in order.tolist()),
         _lens_key(cameras), tuple(notes),
     )  # fmt: skip
 

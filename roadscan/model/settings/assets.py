@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.settings.asset_ground import GroundSettings
+from roadscan.model.settings.asset_pictures import AssetPicturesSettings
 from roadscan.model.strict import Strict
 
 
@@ -42,6 +43,8 @@ class AssetsConfig(Strict):
     squares tell (table `intensity_gains`), or as recorded. Classified points always hold recorded ones."""
     ground: GroundSettings = GroundSettings()
     """Bare earth."""
+    pictures: AssetPicturesSettings = AssetPicturesSettings()
+    """Pictures of assets."""
     options: dict[str, dict[str, Any]] = {}
     """Settings by kind, for example { pole = { least_height_m = 1.5 } }."""
     exports: list[Literal["gpkg", "geojson", "dxf"]] = ["gpkg", "geojson", "dxf"]

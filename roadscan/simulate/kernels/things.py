@@ -15,14 +15,16 @@ from roadscan.simulate.kernels.options import compiled, inlined
 
 Float64 = npt.NDArray[np.float64]
 
-BOX, CYLINDER, ELLIPSOID, WALL, DISC = 0.0, 1.0, 2.0, 3.0, 4.0
-"""Kinds of bodies. Walls and discs are thin, and seen from both sides."""
+BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
+"""Kinds of bodies. Walls, discs and those after them are thin, and seen from both sides."""
 
 # Columns of a body.
 KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
 LOW_END, HIGH_END, SKIRT, ALONG, BAY, WINDOW, STOREY = 9, 10, 11, 12, 13, 14, 15
 INTENSITY, DENSITY = 16, 17
 BODY_COLUMNS = 18
+_OCTAGON_CUT = math.sqrt(2.0)
+"""Sum of both shares of the half width at which a regular octagon's slanting sides lie."""
 # Easting, northing: its middle. Sine, cosine: of the grid heading of its length. Half length: radius of a cylinder, of
 # an ellipsoid seen from above, of a disc. A wall runs along its length from LOW … HIGH at its start to LOW_END …
 # HIGH_END; it goes on SKIRT below that, and if BAY > 0 it has windows of WINDOW by WINDOW in bays and storeys, whose
@@ -58,7 +60,7 @@ def meet(
     x, y = ox - rows[i, EASTING], oy - rows[i, NORTHING]
     sine, cosine = rows[i, SINE], rows[i, COSINE]
     ahead, right = x * sine + y * cosine, x * cosine - y * sine
-    if kind in (BOX, WALL, DISC):
+    if kind not in (CYLINDER, ELLIPSOID):
         ahead_per_m, right_per_m = dx * sine + dy * cosine, dx * cosine - dy * sine
         if kind == BOX:
             return meet_box(rows, i, ahead, right, oz, ahead_per_m, right_per_m, dz)
@@ -103,9 +105,18 @@ def meet_plate(
     half = rows[i, HALF_LENGTH]
     if abs(along) > half:
         return np.nan
-    if rows[i, KIND] == DISC:
-        up = z - 0.5 * (rows[i, LOW] + rows[i, HIGH])
-        inside = along * along + up * up <= half * half
+    kind = rows[i, KIND]
+    if kind != WALL:
+        aside, up = abs(along) / half, 2.0 * (z - rows[i, LOW]) / (rows[i, HIGH] - rows[i, LOW]) - 1.0
+        if kind == DISC:
+            up = z - 0.5 * (rows[i, LOW] + rows[i, HIGH])
+            inside = along * along + up * up <= half * half
+        elif kind == TRIANGLE:
+            inside = up >= -1.0 and 2.0 * aside + up <= 1.0
+        elif kind == DIAMOND:
+            inside = aside + abs(up) <= 1.0
+        else:
+            inside = abs(up) <= 1.0 and aside + abs(up) <= _OCTAGON_CUT
     else:
         share = 0.5 + 0.5 * along / half
         low = rows[i, LOW] + share * (rows[i, LOW_END] - rows[i, LOW]) - rows[i, SKIRT]

@@ -224,7 +224,7 @@ class Encoder(Strict):
 
 
 class Camera(Strict):
-    """A camera: grey pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it)."""
+    """A camera: pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it)."""
 
     on: bool = False
     """Whether the rig carries it."""
@@ -242,8 +242,10 @@ class Camera(Strict):
     """k1, k2, p1, p2, k3."""
     range_max_m: float = Field(default=80.0, gt=5.0, le=500.0)
     """What lies farther away is sky (m)."""
+    colour: bool = False
+    """Whether its pictures have colours; grey where not."""
     noise: float = Field(default=2.0, ge=0.0, le=50.0)
-    """Noise of the grey values."""
+    """Noise of the pixels' values."""
     jpeg_quality: int = Field(default=90, ge=10, le=100)
     """Quality of the pictures' compression."""
     mount: Mount = Mount(lever_arm_body_m=(0.9, -0.25, -1.15), roll_deg=0.3, pitch_deg=-12.0, heading_deg=1.5)

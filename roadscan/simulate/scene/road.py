@@ -250,7 +250,7 @@ class TyreMark(Strict):
 
 
 class Marking(Strict):
-    """A painted line along the road: intensity only."""
+    """A painted line along the road: intensity, and a colour in pictures with colours."""
 
     offset_m: float
     """Offset of its middle (m)."""
@@ -260,6 +260,8 @@ class Marking(Strict):
     """Length of a dash (m); 0: a solid line."""
     gap_m: float = Field(default=0.0, ge=0.0)
     """Length of the gap between dashes (m)."""
+    colour: Literal["white", "yellow"] = "white"
+    """Colour."""
     start_m: float = Field(default=float("-inf"), allow_inf_nan=True)
     """First station (m)."""
     end_m: float = Field(default=float("inf"), allow_inf_nan=True)

@@ -5,12 +5,14 @@ Things stand at a station and an offset of the road, upright, turned with it. Le
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from roadscan.model.strict import Strict
 from roadscan.simulate.scene.road import Shade
+
+SignColour: TypeAlias = Literal["white", "red", "blue", "yellow", "green", "brown", "orange", "black"]
 
 
 class Standing(Strict):
@@ -29,12 +31,12 @@ class Standing(Strict):
 class Sign(Standing):
     """A traffic sign: a plate on a post."""
 
-    shape: Literal["round", "rectangle"] = "rectangle"
-    """Outline of the plate."""
+    shape: Literal["round", "rectangle", "triangle", "octagon", "diamond"] = "rectangle"
+    """Outline of the plate; a triangle has equal sides and stands on one of them, a diamond on a corner."""
     width_m: float = Field(default=0.6, gt=0.1, le=10.0)
     """Width of the plate, or its diameter (m)."""
     height_m: float = Field(default=0.6, gt=0.1, le=6.0)
-    """Height of a rectangular plate (m)."""
+    """Height of a rectangular plate (m); that of others follows from the width."""
     clearance_m: float = Field(default=2.2, ge=0.0, le=8.0)
     """From the ground to the plate's lower edge (m)."""
     faces: Literal["forward", "backward"] = "backward"
@@ -43,6 +45,12 @@ class Sign(Standing):
     """Intensity of the plate's face (retroreflecting)."""
     back_shade: Shade = 90.0
     """Intensity of its back."""
+    colour: SignColour = "white"
+    """Colour of the face, in pictures with colours."""
+    rim: SignColour | None = None
+    """Colour of a rim around it."""
+    text: str = Field(default="", max_length=12)
+    """Text on the face (ASCII)."""
 
 
 class Pole(Standing):

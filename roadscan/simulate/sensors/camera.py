@@ -19,6 +19,7 @@ from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.colours import Tints
 from roadscan.simulate.sensors.picture import EYE, picture
 
 Int64 = npt.NDArray[np.int64]
@@ -45,8 +46,10 @@ def write_camera(
     epochs = exposures_gps_ns(scene, drive)
     names = [f"{number:06d}.jpg" for number in range(epochs.size)]
     quality = [int(cv2.IMWRITE_JPEG_QUALITY), scene.camera.jpeg_quality]
+    tints = Tints(world) if scene.camera.colour else None
     for number, (epoch, name) in enumerate(zip(epochs.tolist(), names, strict=True)):
-        _, encoded = cv2.imencode(".jpg", _exposed(scene, world, drive, epoch, number), quality)
+        taken = picture(world, drive, epoch, number, tints)
+        _, encoded = cv2.imencode(".jpg", _exposed(scene, drive, taken, number), quality)
         (folder / name).write_bytes(encoded.tobytes())
         yield 1
     stamps = pa.table([names, clock.stamps_ns(epochs)], schema=_STAMPS)
@@ -54,13 +57,13 @@ def write_camera(
     pq.write_table(_true_poses(scene, drive, epochs, names), truth_file)
 
 
-def _exposed(scene: Scene, world: World, drive: Drive, epoch_gps_ns: int, number: int) -> npt.NDArray[np.uint8]:
-    """Grey values (height, width) as the camera's chip gives them."""
-    grey = picture(world, drive, epoch_gps_ns, number)
+def _exposed(scene: Scene, drive: Drive, taken: npt.NDArray[np.float32], number: int) -> npt.NDArray[np.uint8]:
+    """Values (height, width), or (height, width, 3) with blue first, as the camera's chip gives them."""
     if scene.camera.noise > 0.0:
         rng = stream(scene.seed, drive.number, "camera", number)
-        grey = grey + np.float32(scene.camera.noise) * rng.standard_normal(grey.shape, dtype=np.float32)
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+        taken = taken + np.float32(scene.camera.noise) * rng.standard_normal(taken.shape, dtype=np.float32)
+    values = np.clip(np.rint(taken), 0, 255).astype(np.uint8)
+    return values if values.ndim == 2 else np.ascontiguousarray(values[:, :, ::-1])
 
 
 def _true_poses(scene: Scene, drive: Drive, epochs: Int64, names: list[str]) -> pa.Table:

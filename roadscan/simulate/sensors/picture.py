@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Camera
+from roadscan.simulate.sensors.colours import SKY, Tints
 from roadscan.simulate.sensors.lens import Lens
 
 Float32 = npt.NDArray[np.float32]
@@ -46,22 +47,25 @@ _INSIDE_PX: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 _AROUND: Final = tuple((i, j) for i in (0, -1, 1) for j in (0, -1, 1))
 
 
-def picture(world: World, drive: Drive, epoch_gps_ns: int, number: int) -> Float32:
-    """Grey values (height, width) of an exposure without noise: 0 … 255 and beyond, where a sensor saturates.
+def picture(world: World, drive: Drive, epoch_gps_ns: int, number: int, tints: Tints | None = None) -> Float32:
+    """Values (height, width) or (height, width, 3) of an exposure without noise: 0 … 255 and beyond, where a sensor
+    saturates.
 
     number : of the exposure in its pass, from 0; it changes which rays the gaps of trees and fences let through.
+    tints : colours of the world; grey values where left out. With them the last axis is red, green, blue.
     """
-    eye = _Eye(world, drive, epoch_gps_ns, number)
+    eye = _Eye(world, drive, epoch_gps_ns, number, tints)
     camera = world.scene.camera
     rows, columns = np.indices((camera.height_px, camera.width_px), dtype=np.float32)
     seen = eye.look(columns.ravel(), rows.ravel())
     shape = (camera.height_px, camera.width_px)
     plane = _planes(seen, shape)
-    tone = eye.tones(seen, plane).reshape(shape)
-    edges = np.flatnonzero((maximum_filter(tone, 3) - minimum_filter(tone, 3) > _EDGE).ravel())
+    tone = eye.tones(seen, plane)
+    grey = tone.reshape(*shape, -1).mean(axis=-1)
+    edges = np.flatnonzero((maximum_filter(grey, 3) - minimum_filter(grey, 3) > _EDGE).ravel())
     if edges.size:
-        tone.ravel()[edges] = _closer(eye, seen, plane, edges, shape)
-    return tone
+        tone[edges] = _closer(eye, seen, plane, edges, shape)
+    return tone.reshape(*shape, *tone.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class _Seen:
     """(n,) 0: the road, −1: nothing."""
     is_glass: Flags
     """(n,)"""
+    tint: Float32 | None = None
+    """(n, 3) shares of red, green, blue."""
 
     @property
     def point_m(self) -> Float32:
@@ -88,8 +94,9 @@ class _Seen:
 class _Eye:
     """A camera at the instant of an exposure; its shutter opens for no time."""
 
-    def __init__(self, world: World, drive: Drive, epoch_gps_ns: int, number: int) -> None:
+    def __init__(self, world: World, drive: Drive, epoch_gps_ns: int, number: int, tints: Tints | None) -> None:
         self._world = world
+        self._tints = tints
         self._drive = drive
         self._camera: Camera = world.scene.camera
         self._lens = Lens.of(self._camera)
@@ -113,17 +120,21 @@ class _Eye:
             hits = self._cast(ray, np.zeros_like(ray), self._camera.range_max_m)
             shade = hits.intensity[0]
             glass = np.isnan(shade) & np.isfinite(hits.enh_m[0, :, 0])
-            parts.append((ray, hits.range_m[0], shade, hits.object_id[0], glass))
-        ray, range_m, shade, object_id, glass = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+            tint = np.zeros((len(ray), 3)) if self._tints is None else self._tints.of(hits)
+            parts.append((ray, hits.range_m[0], shade, hits.object_id[0], glass, tint))
+        ray, range_m, shade, object_id, glass, tint = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         single = np.float32
-        return _Seen(ray.astype(single), range_m.astype(single), shade.astype(single), object_id, glass)
+        shares = None if self._tints is None else tint.astype(single)
+        return _Seen(ray.astype(single), range_m.astype(single), shade.astype(single), object_id, glass, shares)
 
     def tones(self, seen: _Seen, plane: Float32) -> Float32:
-        """Grey values (n,) of what rays have met on surfaces with the normals (n, 3; NaN: not known)."""
+        """Values (n,) or (n, 3) of what rays have met on surfaces with the normals (n, 3; NaN: not known)."""
         up = -seen.ray @ self.down.astype(np.float32)
         sky = np.where(up >= 0.0, _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(np.maximum(up, 0.0)), _LAND)
         light = self._light(seen, plane)
         near = np.exp(-np.nan_to_num(seen.range_m) / _HAZE_M)
+        if seen.tint is not None:
+            return _coloured(seen, light, near, sky)
         tone = np.where(np.isnan(seen.shade), sky, seen.shade * light * near + _HORIZON * (1.0 - near))
         out: Float32 = np.where(seen.is_glass, _GLASS, tone).astype(np.float32)
         return out
@@ -150,6 +161,15 @@ class _Eye:
         direction = np.ascontiguousarray(ray)[None]
         key, self._key = self._key, self._key + count
         return self._world.cast(self._drive, self._camera.mount, EYE, self._epoch, direction, pattern, key)
+
+
+def _coloured(seen: _Seen, light: Float32, near: Float32, sky: Float64) -> Float32:
+    """Values (n, 3) of what rays have met in a light (n,), at a nearness (n,) of 1 … 0, before a sky (n,)."""
+    tint = seen.tint if seen.tint is not None else np.ones((len(light), 3), np.float32)
+    shade = np.nan_to_num(seen.shade)
+    lit = (shade * light * near)[:, None] * tint + (_HORIZON * (1.0 - near))[:, None] * SKY
+    out = np.where(np.isnan(seen.shade)[:, None], sky[:, None] * SKY, lit)
+    return np.asarray(np.where(seen.is_glass[:, None], _GLASS, out), np.float32)
 
 
 def _planes(seen: _Seen, shape: tuple[int, int]) -> Float32:
@@ -181,7 +201,7 @@ def _step(point: Float32, object_id: Int32, axis: int) -> Float32:
 
 
 def _closer(eye: _Eye, seen: _Seen, plane: Float32, edges: npt.NDArray[np.int64], shape: tuple[int, int]) -> Float32:
-    """Grey values (n,) of pixels with more than one thing in them: the mean of four rays through each."""
+    """Values (n,) or (n, 3) of pixels with more than one thing in them: the mean of four rays through each."""
     row, column = (a.astype(np.float32) for a in np.unravel_index(edges, shape))
     inside = [eye.look(column + x, row + y) for x, y in _INSIDE_PX]
     tones = (eye.tones(one, _plane_beside(one, seen, plane, edges, shape)) for one in inside)

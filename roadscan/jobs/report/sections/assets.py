@@ -13,7 +13,8 @@ import shapely
 
 from roadscan.jobs.assets.tables import TABLES, read_layer
 from roadscan.jobs.products import product_context
-from roadscan.jobs.report.blocks import Block, Drawing, Line, Table
+from roadscan.jobs.report.asset_thumbnails import Thumbnails
+from roadscan.jobs.report.blocks import Block, Drawing, Line, Picture, Table
 from roadscan.jobs.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.jobs.report.section import Material, Section
 from roadscan.products.assets.layers import Layer
@@ -21,6 +22,7 @@ from roadscan.tables.asset_schema import AssetSchema, asset_schema, asset_tables
 
 _CROSS: Final = 3.0
 _MOST_LINES: Final = 6000
+_SEEN: Final = "some of the most probable ones, in pictures or as returns in the colours of their classes"
 
 Float64 = npt.NDArray[np.float64]
 
@@ -33,7 +35,7 @@ class Assets(Section):
     position = 600
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A row a kind; a map; the assets of each kind that was found."""
+        """A row a kind; a map; the assets of each kind that was found, and what some of them look like."""
         layers = _layers(material)
         if not layers:
             return
@@ -43,7 +45,11 @@ class Assets(Section):
         held = [(schema, layer) for schema, layer in layers if layer.rows.num_rows]
         if held:
             yield _drawing(held)
+        thumbnails = Thumbnails(material.session)
         for schema, layer in held:
+            some = thumbnails.of(layer)
+            if some is not None:
+                yield Picture(some, f"{schema.title}: {_SEEN}")
             shown = ["road", "station_m", "offset_m", *(c.name for c in schema.own), "probability"]
             head = [next(c.title for c in schema.columns if c.name == name) for name in shown]
             rows = [[_words(row[name]) for name in shown] for row in layer.rows.select(shown).to_pylist()]

@@ -1,0 +1,121 @@
+"""What is looked for in the pictures of an asset: the contract of a reader, and the registry that finds readers.
+
+A reader is one file of `roadscan/assets/pictures/readers/` (or an entry point of the group
+``roadscan.asset_picture_readers``) with a subclass of :class:`PictureReader` that has the name of a kind of assets. A
+kind without one still gets the pictures that show it best.
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.object_table import reference_point
+from roadscan.plugins import found_kinds
+
+Float64 = npt.NDArray[np.float64]
+UInt8 = npt.NDArray[np.uint8]
+
+ENTRY_POINT_GROUP: Final = "roadscan.asset_picture_readers"
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What of an object a picture has to show. Coordinates are easting, northing and height of the map (m)."""
+
+    places_m: Float64
+    """(k, 3) places that all have to lie in the picture; the first is the one whose pixel is told."""
+    facing: Float64 | None = None
+    """(3,) unit vector that its front looks to: pictures of its back do not show it; None where it has no front."""
+
+
+@dataclass(frozen=True, eq=False)
+class CutOut:
+    """The part of a picture around an object."""
+
+    pixels: UInt8
+    """(h, w, 3) red, green, blue."""
+    outline_px: Float64
+    """(k, 2) the outline in it: u to the right, v downwards, from the centre of the upper left pixel."""
+    resolution_m: float
+    """What a pixel spans at the object (m)."""
+    is_grey: bool
+    """Whether the picture has no colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColourPlaces:
+    """Places of an object whose colours tell something, and others beside it to hold them against; (n, 3), (m, 3)."""
+
+    own_m: Float64
+    beside_m: Float64
+
+
+class Recognition(ABC):
+    """Reads what stands on a cut-out. Where nothing reads, both say None."""
+
+    @abstractmethod
+    def text(self, cut_out: CutOut) -> tuple[str, float] | None:
+        """Text on it and the probability that it is read right."""
+
+    @abstractmethod
+    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
+        """What it is, in the words of a model, and its probability."""
+
+
+class PictureReader:
+    """What is looked for in the pictures of a kind. All of it is a pure function of the objects and the pictures."""
+
+    name: ClassVar[str]
+    """Of the kind."""
+
+    def sight(self, one: AssetObject) -> Sight:
+        """What pictures have to show of an object: its reference point, unless a reader knows better."""
+        return Sight(np.array([reference_point(one.geometry)]))
+
+
+class CutOutReader(PictureReader, ABC):
+    """A reader that looks at cut-outs of the best pictures."""
+
+    @abstractmethod
+    def outline_m(self, one: AssetObject) -> Float64 | None:
+        """Outline (k, 3) of an object on the map (m); None for one that is not to be cut out."""
+
+    @abstractmethod
+    def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
+        """Columns of the kind that the cut-outs of an object tell, that with the best view first."""
+
+
+class ColourReader(PictureReader, ABC):
+    """A reader that looks at colours of places."""
+
+    @abstractmethod
+    def places(self, one: AssetObject) -> ColourPlaces:
+        """Places whose colours are wanted."""
+
+    @abstractmethod
+    def read(self, own: UInt8, beside: UInt8) -> Mapping[str, Any]:
+        """Columns of the kind that colours (n, 3) of an object and (m, 3) beside it tell.
+
+        Places that no picture shows are left out; there may be none.
+        """
+
+
+@functools.cache
+def picture_readers() -> dict[str, CutOutReader | ColourReader]:
+    """All readers by the kind that they read."""
+    found = found_kinds("roadscan.assets.pictures.readers", PictureReader, ENTRY_POINT_GROUP)
+    return {name: kind() for name, kind in found.items()}
+
+
+def sight_of(kind: str, one: AssetObject) -> Sight:
+    """What pictures have to show of an object: what the reader of its kind says, else its reference point."""
+    reader = picture_readers().get(kind)
+    return Sight(np.array([reference_point(one.geometry)])) if reader is None else reader.sight(one)

@@ -1,0 +1,55 @@
+"""Road markings in pictures: the colour of the paint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.pictures.paint_colours import paint_colour
+from roadscan.assets.pictures.reader import ColourPlaces, ColourReader
+
+Float64 = npt.NDArray[np.float64]
+
+_INSIDE_M: Final = 0.05
+_BESIDE_M: Final = 0.3
+_MOST_PLACES: Final = 200
+
+
+class RoadMarkingReader(ColourReader):
+    """Road markings: places within the outline, and around it."""
+
+    name = "road_marking"
+
+    def places(self, one: AssetObject) -> ColourPlaces:
+        """A grid of 0.1 m or more within the outline; the same number of places around it."""
+        flat = shapely.force_2d(one.geometry)
+        inner = flat.buffer(-_INSIDE_M)
+        inner = flat if inner.is_empty else inner
+        step = max(0.1, float(np.sqrt(inner.area / _MOST_PLACES)))
+        west, south, east, north = inner.bounds
+        grid = np.stack(np.meshgrid(np.arange(west + step / 2, east, step), np.arange(south + step / 2, north, step)))
+        places = grid.reshape(2, -1).T
+        own = places[shapely.contains_xy(inner, places)]
+        ring = flat.buffer(_BESIDE_M).exterior
+        count = min(max(int(ring.length / 0.2), 8), _MOST_PLACES)
+        around = shapely.get_coordinates(
+            shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
+        )
+        return ColourPlaces(_with_heights(own, one), _with_heights(around, one))
+
+    def read(self, own: npt.NDArray[np.uint8], beside: npt.NDArray[np.uint8]) -> Mapping[str, Any]:
+        """Columns colour and colour_probability."""
+        return paint_colour(own, beside)
+
+
+def _with_heights(places_m: Float64, one: AssetObject) -> Float64:
+    """Places (n, 3) with the height of the plane through the outline's corners."""
+    corners = shapely.get_coordinates(one.geometry, include_z=True)
+    middle = corners.mean(axis=0)
+    plane = np.linalg.lstsq(corners[:, :2] - middle[:2], corners[:, 2] - middle[2], rcond=None)[0]
+    return np.column_stack([places_m, middle[2] + (places_m - middle[:2]) @ plane])

@@ -1,0 +1,72 @@
+"""Signs in pictures: colour, shape, text and type of the plate from cut-outs of the best views."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.object_table import reference_point
+from roadscan.assets.pictures.colour_classes import colour_of
+from roadscan.assets.pictures.plate_outlines import on_plate, plate_axes, plate_outline
+from roadscan.assets.pictures.plate_shapes import shape_of
+from roadscan.assets.pictures.reader import CutOut, CutOutReader, Recognition, Sight
+
+Float64 = npt.NDArray[np.float64]
+
+_BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+
+
+class SignReader(CutOutReader):
+    """Signs: the outline of a plate follows from its middle, size, shape, facing and tilt."""
+
+    name = "sign"
+
+    def sight(self, one: AssetObject) -> Sight:
+        """The middle and the corners of the plate, from the front."""
+        middle, (facing_deg, tilt_deg) = np.array(reference_point(one.geometry)), _turn(one)
+        if one.attributes.get("facing_deg") is None:
+            return Sight(np.repeat(middle[None], 5, axis=0))
+        corners = on_plate(_BOX * _size(one), middle, facing_deg, tilt_deg)
+        return Sight(np.vstack([middle, corners]), plate_axes(facing_deg, tilt_deg)[2])
+
+    def outline_m(self, one: AssetObject) -> Float64 | None:
+        """Corners of the bounding box, then the outline of the shape; nothing of a plate whose facing is not known."""
+        if one.attributes.get("facing_deg") is None or not _size(one).all():
+            return None
+        middle, turn = np.array(reference_point(one.geometry)), _turn(one)
+        shape = plate_outline(one.attributes.get("shape") or "rectangle", *_size(one).tolist())
+        return np.vstack([on_plate(_BOX * _size(one), middle, *turn), on_plate(shape, middle, *turn)])
+
+    def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
+        """Columns colour, shape, message and type, each with its probability as far as it is told."""
+        told: dict[str, Any] = {}
+        shape, probability = shape_of(cut_outs, one.attributes.get("shape") or "other", *_size(one).tolist())
+        told |= {"shape": shape, "shape_probability": probability}
+        colour = colour_of([_within_shape(c) for c in cut_outs])
+        if colour is not None:
+            told |= {"colour": colour[0], "colour_probability": colour[1]}
+        for column, found in (("message", recognition.text), ("type", recognition.label)):
+            read = [r for r in map(found, cut_outs) if r is not None]
+            if read:
+                words, probability = max(read, key=lambda r: r[1])
+                told |= {column: words, f"{column}_probability": probability}
+        return told
+
+
+def _within_shape(one: CutOut) -> CutOut:
+    """A cut-out with the outline of the shape alone."""
+    return CutOut(one.pixels, one.outline_px[4:], one.resolution_m, one.is_grey)
+
+
+def _size(one: AssetObject) -> Float64:
+    """Width and height (m); 0 where they are not known."""
+    return np.array([one.attributes.get("width_m") or 0.0, one.attributes.get("plate_height_m") or 0.0])
+
+
+def _turn(one: AssetObject) -> tuple[float, float]:
+    """Facing and tilt (degrees)."""
+    return one.attributes.get("facing_deg") or 0.0, one.attributes.get("tilt_deg") or 0.0

@@ -17,6 +17,7 @@ from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.visibility import CELL_M, passes_in_sight
 from roadscan.code_reach import code_digest
 from roadscan.jobs.assets.load_returns import LoadedSquare, ReturnsTask, load_squares
 from roadscan.jobs.assets.plan import AssetPlan
@@ -32,14 +33,18 @@ from roadscan.products.assets.bare_earth import within, write_bare_earth
 from roadscan.products.assets.classified_points import classified_points, write_classified
 from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
+from roadscan.tables.writer import parquet_bytes
 from roadscan.tiles.blocks import Block
 
 EVIDENCE: Final = "asset_evidence"
 """Manifest name of the pieces of a kind in a square."""
 CLASSIFIED: Final = "classified_points"
 BARE_EARTH: Final = "bare_earth"
-OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH)
+VISIBILITY: Final = "asset_visibility"
+"""Cells of a square, and how many passes had them in sight."""
+OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, VISIBILITY)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
@@ -56,6 +61,7 @@ class SquareWork:
     """Names of the kinds whose evidence is due, with its key."""
     classified_key: str = ""
     bare_earth_key: str = ""
+    visibility_key: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,12 +102,14 @@ def due_squares(
         keys = {name: key_of(own, key) for name, own in kind_keys.items()}
         classified = key_of(code, key, sorted(keys.items()), plan.context.survey_id) if plan.config.classified else ""
         bare = key_of(code, key, plan.context.survey_id) if plan.config.bare_earth else ""
+        sight = key_of(code, key)
         if square not in anew:
             keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
             classified = "" if manifest.is_current(CLASSIFIED, unit, classified) else classified
             bare = "" if manifest.is_current(BARE_EARTH, unit, bare) else bare
-        if keys or classified or bare:
-            found.append(SquareWork(square, tuple(keys.items()), classified, bare))
+            sight = "" if manifest.is_current(VISIBILITY, unit, sight) else sight
+        if keys or classified or bare or sight:
+            found.append(SquareWork(square, tuple(keys.items()), classified, bare, sight))
     return found
 
 
@@ -183,6 +191,8 @@ class _Search:
                 self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
         if self._work.bare_earth_key:
             yield self._write_bare_earth(scene)
+        if self._work.visibility_key:
+            yield self._write_visibility(scene)
         if self._work.classified_key and not self.failures:
             yield self._write_classified(scene, marked)
 
@@ -191,7 +201,8 @@ class _Search:
         square, w = self._work.square, self._work
         for name, key in w.kinds:
             yield OutputRecord(EVIDENCE, evidence_unit(name, square), key, "", 0, "", _told(0))
-        for product, key in ((BARE_EARTH, w.bare_earth_key), (CLASSIFIED, w.classified_key)):
+        due = {BARE_EARTH: w.bare_earth_key, CLASSIFIED: w.classified_key, VISIBILITY: w.visibility_key}
+        for product, key in due.items():
             if key:
                 yield OutputRecord(product, str(square), key, "", 0, "", _told(0))
 
@@ -217,6 +228,16 @@ class _Search:
         target = f"products/{BARE_EARTH}/{square}.tif"
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
 
+    def _write_visibility(self, scene: Scene) -> OutputRecord:
+        unit, key, schema = str(self._work.square), self._work.visibility_key, table_schema(VISIBILITY)
+        rows = visibility_rows(scene)
+        if not rows.num_rows:
+            return OutputRecord(VISIBILITY, unit, key, "", 0, "", _told(0))
+        path = self._folder / "visibility.parquet"
+        path.write_bytes(parquet_bytes(rows, schema))
+        target = f"{schema.location}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, VISIBILITY, unit, key, _told(rows.num_rows))
+
     def _write_classified(self, scene: Scene, marked: Sequence[Marked]) -> OutputRecord:
         square, key = self._work.square, self._work.classified_key
         own = np.flatnonzero(scene.tile.holds(scene.returns.x_m, scene.returns.y_m))
@@ -228,6 +249,12 @@ class _Search:
         write_classified(path, points, self._task.load.grid.squares, self._task.context)
         target = f"products/{CLASSIFIED}/{square}.laz"
         return publish_file(self._task.store, path, target, CLASSIFIED, str(square), key, _told(len(points)))
+
+
+def visibility_rows(scene: Scene) -> pa.Table:
+    """Cells that passes had in sight, as the table `asset_visibility` has them; its metadata says their edge."""
+    schema = table_schema(VISIBILITY).arrow()
+    return passes_in_sight(scene).cast(schema).replace_schema_metadata({"edge_m": str(CELL_M)})
 
 
 def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uint8]:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from roadscan.jobs.assets.evidence import BARE_EARTH, CLASSIFIED, EVIDENCE, SquareWork, due_squares, evidence_unit
+from roadscan.jobs.assets.evidence import (
+    BARE_EARTH,
+    CLASSIFIED,
+    EVIDENCE,
+    VISIBILITY,
+    SquareWork,
+    due_squares,
+    evidence_unit,
+)
 from roadscan.jobs.assets.gains import GAINS, SAMPLES, GainsPlan, current_gains, plan_gains
 from roadscan.jobs.assets.objects import OBJECTS, Cluster, JoinTask, plan_joins
 from roadscan.jobs.assets.plan import AssetPlan, plan_assets
@@ -15,7 +23,7 @@ from roadscan.jobs.session import Session
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import Manifest, OutputRecord
 
-MADE = (SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, OBJECTS, TABLES, SECTIONS)
+MADE = (SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, VISIBILITY, OBJECTS, TABLES, SECTIONS)
 """Names of all outputs in the manifest."""
 
 
@@ -38,7 +46,8 @@ class AssetsWork:
     def evidence_due(self) -> int:
         """How many outputs of squares are due."""
         return len(self.samples) + sum(
-            len(one.kinds) + bool(one.classified_key) + bool(one.bare_earth_key) for one in self.squares
+            len(one.kinds) + bool(one.classified_key) + bool(one.bare_earth_key) + bool(one.visibility_key)
+            for one in self.squares
         )
 
 
@@ -73,6 +82,7 @@ def _gone(plan: AssetPlan, gains: GainsPlan, manifest: Manifest) -> list[OutputR
         *manifest.beside({EVIDENCE}, evidence),
         *manifest.beside({CLASSIFIED}, units if config.classified else ()),
         *manifest.beside({BARE_EARTH}, units if config.bare_earth else ()),
+        *manifest.beside({VISIBILITY}, units),
         *manifest.beside({OBJECTS}, objects),
         *manifest.beside({TABLES}, _files(plan)),
         *manifest.beside({SECTIONS} if config.cross_sections is None else set(), ()),

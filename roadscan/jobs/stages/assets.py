@@ -132,6 +132,7 @@ class Assets(Stage):
         """Evidence, objects, tables and files, classified points, bare earth."""
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
+            "tables/asset_visibility",
             ASSET_FOLDER, "products/classified_points", "products/ground_sections",
             "products/bare_earth",
         )  # fmt: skip

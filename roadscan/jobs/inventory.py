@@ -20,6 +20,7 @@ from roadscan.jobs.assets.plan import asset_grid
 from roadscan.jobs.session import Session
 from roadscan.model.crs import crs_from_text
 from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth
 from roadscan.tables.manifest import read_recorded
@@ -50,16 +51,26 @@ def truth_of(session: Session) -> Inventory:
 
 def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
-    url = survey.store_url
-    if settings.store is not None:
-        url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
     name = settings.name or survey.config.id
     frame = survey.config.map.frame()
     rules = Rules(_visibility(session), settings.matching, frame.horizontal_unit_m)
     return Inventory(
-        AssetTruth(Store(url, name)), home, name, rules, lambda: found_assets(session), frame.crs,
+        _truth(survey), home, name, rules, lambda: found_assets(session), frame.crs,
         lambda folder: _rasters(session, folder),
     )  # fmt: skip
+
+
+def _truth(survey: Survey) -> AssetTruth:
+    """The commits of the inventory that a survey belongs to."""
+    settings, url = survey.config.inventory, survey.store_url
+    if settings.store is not None:
+        url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
+    return AssetTruth(Store(url, settings.name or survey.config.id))
+
+
+def inventory_faults(survey: Survey) -> list[str]:
+    """What is wrong with the files of a survey's inventory, each of which is read and named."""
+    return _truth(survey).faults()
 
 
 def home_of(session: Session, given: str | None = None) -> Home:

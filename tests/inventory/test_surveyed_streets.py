@@ -1,4 +1,4 @@
-"""Two surveys of a street, simulated and processed: what the stage finds of poles and signs, compared by the inventory."""
+"""Two surveys of a street, simulated and processed: the inventory compares what the stage finds of poles and signs."""
 
 from __future__ import annotations
 
@@ -191,8 +191,7 @@ def test_what_was_added_removed_and_moved_is_found_and_what_is_hidden_is_never_g
         wanted = Counter((kind, n) for n in truth for kind in {"pole", town[n].kind})
         right = (wanted & told[change]).total()
         f1 = 2.0 * right / (wanted.total() + told[change].total())
-        print(f"{change}: F1 {f1:.3f} of {wanted.total()}; {wanted - told[change]} {told[change] - wanted}")
-        assert f1 >= 0.95, change
+        assert f1 >= 0.95, (change, f1, wanted - told[change], told[change] - wanted)
     hidden = {n for n, t in enumerate(town) if t.is_hidden}
     assert not hidden & {n for _, n in told["gone"]}
     assert len(hidden) >= 6 and changes.unseen >= len(hidden)

@@ -28,8 +28,8 @@ _REACH_M: Final = 30.0
 _HIT_M: Final = 0.5
 _LEAST_RAYS: Final = 50.0
 """A thin pole of 0.1 m gets a fifth of the rays of its cell."""
-_KNOWN_RAYS: Final = 20.0
-"""Of places with fewer rays it is not known whether something stood before them."""
+_STOPPED_RAYS: Final = 20.0
+"""Where fewer rays were stopped before a place, nothing stood before it."""
 _MOST_RAYS: Final = 60_000
 """Of more rays of a pass, each second, third … is followed."""
 
@@ -64,10 +64,10 @@ def passes_in_sight(scene: Scene) -> pa.Table:
     return pa.table(table)
 
 
-def in_sight(passed: npt.NDArray[np.float64], hidden: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def in_sight(passed: npt.NDArray[np.floating], hidden: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     """Whether a pass had places (rows, columns, bands) in sight, by how many rays reached them and how many did not."""
     seen: npt.NDArray[np.bool_] = (passed >= _LEAST_RAYS) & (passed >= hidden)
-    is_open = passed + hidden < _KNOWN_RAYS
+    is_open = (hidden < _STOPPED_RAYS) | (passed >= hidden)
     for band in range(1, seen.shape[2]):
         seen[:, :, band] |= is_open[:, :, band] & seen[:, :, band - 1]
     return seen

@@ -36,20 +36,20 @@ home = "../inventory.gpkg"
 def street(epoch: str) -> Scene:
     """30 m of a straight street with poles on its right and signs on its left, as a survey epoch finds it.
 
-    In autumn a pole is gone, another one stands 1.2 m farther on, a sign is new, and a van hides a third pole.
+    In autumn a pole is gone, another one stands 1.2 m farther on, a sign is new, and a hoarding hides a third pole.
     """
     is_autumn = epoch == AUTUMN
     stations = [4.0, 17.2, 22.0, 28.0] if is_autumn else [4.0, 10.0, 16.0, 22.0, 28.0]
     poles = [{"station_m": s, "offset_m": 7.5, "height_m": 3.0, "diameter_m": 0.12} for s in stations]
     signs = [{"station_m": s, "offset_m": -7.0} for s in ([7.0, 13.0, 19.0, 25.0] if is_autumn else [7.0, 13.0, 25.0])]
-    van = {"station_m": 22.0, "offset_m": 5.8, "length_m": 8.0, "width_m": 2.2, "height_m": 3.6}
+    hoarding = {"station_m": 22.0, "offset_m": 6.5, "length_m": 8.0, "width_m": 0.3, "height_m": 3.6}
     off = {key: {"on": False} for key in ("profilers", "sick", "imu", "gnss", "encoder", "camera")}
     return Scene.load("demo").changed(
         id="street", title="30 m of a street with poles and signs", start=_STARTS[epoch], length_m=30.0,
         seed=2 if is_autumn else 1, passes=[{"lane": 2, "direction": "forward"}],
         road={"alignment": [{"kind": "straight", "length_m": 200.0}], "waves": [], "ruts": [], "potholes": [],
               "cracks": [], "markings": [], "verge_width_m": 8.0},
-        roadside={"poles": poles, "signs": signs, "boxes": [van] if is_autumn else []},
+        roadside={"poles": poles, "signs": signs, "boxes": [hoarding] if is_autumn else []},
         lidar={"range_max_m": 25.0}, **off,
     )  # fmt: skip
 

@@ -90,7 +90,7 @@ def test_the_demos_street(tmp_path: Path) -> None:
         f"hand edit     {edit.asset_id}: asset_height_m 3.00, in force"
     )
     changes = inventory.changes()
-    assert changes is not None and changes.unseen == 1  # what the van hides
+    assert changes is not None and changes.unseen == 1  # what the hoarding hides
     told = Counter((c.kind, c.change) for c in changes.changes if c.change != "changed")
     # a new sign stands on a new pole
     assert told == {("pole", "appeared"): 1, ("sign", "appeared"): 1, ("pole", "gone"): 1, ("pole", "moved"): 1}
@@ -140,14 +140,14 @@ def scene(town: list[Thing], epoch: str) -> Scene:
         kind: [{"station_m": p[0], "offset_m": p[1], **sizes[kind]} for k, p in placed if k == kind and p is not None]
         for kind in sizes
     }
-    vans = [
-        {"station_m": t.autumn[0], "offset_m": float(np.sign(t.autumn[1])) * 5.6, "length_m": 7.5, "width_m": 2.2,
+    hoardings = [
+        {"station_m": t.autumn[0], "offset_m": float(np.sign(t.autumn[1])) * 6.0, "length_m": 7.5, "width_m": 0.3,
          "height_m": 3.8}
         for t in town if is_autumn and t.is_hidden and t.autumn is not None
     ]  # fmt: skip
     return street(epoch).changed(
         length_m=LENGTH_M, road={"alignment": [{"kind": "straight", "length_m": 600.0}]},
-        roadside={"poles": rows["pole"], "signs": rows["sign"], "boxes": vans},
+        roadside={"poles": rows["pole"], "signs": rows["sign"], "boxes": hoardings},
     )  # fmt: skip
 
 

@@ -21,8 +21,8 @@ CELL_M: Final = 0.5
 """Edge of the cells, whose corners are multiples of it."""
 BANDS_M: Final = (-0.3, 0.5, 1.5, 3.0, 5.0, 8.0)
 """Heights above the ground between which a cell's places lie."""
-PASSES: Final = ("passes_ground", "passes_0_5_m", "passes_1_5_m", "passes_3_m", "passes_5_m")
-"""Columns of the passes, by the lower height of the band."""
+PASSES: Final = ("passes_ground", "passes_low", "passes_middle", "passes_high", "passes_top")
+"""Columns of the passes, a band each, upwards."""
 _REACH_M: Final = 30.0
 """What is farther from the sensor does not count as seen."""
 _HIT_M: Final = 0.5

@@ -150,8 +150,8 @@ def test_passes_are_those_of_the_place_and_its_height() -> None:
     places[:, :2] += EAST, NORTH
     assert grid.expected_passes("pole", places).tolist() == [3, 3, 0, 2, 2]  # a pole reaches up to where it is seen
     assert grid.expected_passes("kerb", places).tolist() == [0, 3, 0, 2, 0]
-    with pytest.raises(SchemaError, match="has no column 'passes_3_m'"):
-        VisibilityGrid(in_sight((0.0, 0.0, 1)).drop_columns(["passes_3_m"]))
+    with pytest.raises(SchemaError, match="has no column 'passes_high'"):
+        VisibilityGrid(in_sight((0.0, 0.0, 1)).drop_columns(["passes_high"]))
     with pytest.raises(SchemaError, match="does not state the edge of its cells"):
         VisibilityGrid(in_sight((0.0, 0.0, 1)).replace_schema_metadata(None))
 

@@ -121,10 +121,15 @@ class OpenSurvey:
         """The faults of all files that the store should hold, each of which is read and compared with its record; and
         the ingested rows that are lost.
         """
+        from roadscan.jobs.inventory import inventory_faults
         from roadscan.jobs.status import verify_store
         from roadscan.tables.salvage import read_lost
 
-        return verify_store(self.store) + [f"lost: {one.told}" for one in read_lost(self.store)]
+        return (
+            verify_store(self.store)
+            + inventory_faults(self.survey)
+            + [f"lost: {one.told}" for one in read_lost(self.store)]
+        )
 
     def report(self) -> str:
         """The report page as HTML; it needs nothing beside it."""

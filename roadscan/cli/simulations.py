@@ -63,7 +63,20 @@ def demo(
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
     run_survey(survey_file, stages(), Where(workers))
-    compared = summarise(survey_file)
-    sum_up(survey_file, as_json, {"height_error_m": compared.height_error()})
-    for line in () if as_json else (*compared.lines(), f"look at it    roadscan view {survey_file}"):
+    compared, street = summarise(survey_file), _street_in_two_epochs(out / "street", workers, as_json)
+    sum_up(survey_file, as_json, {"height_error_m": compared.height_error(), "inventory": street})
+    for line in () if as_json else (*compared.lines(), *street, f"look at it    roadscan view {survey_file}"):
         typer.echo(line)
+
+
+def _street_in_two_epochs(folder: Path, workers: int | None, as_json: bool) -> list[str]:
+    """Survey the demo's street twice, with an edit by hand between; what its inventory says then."""
+    from roadscan.jobs.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
+    from roadscan.jobs.stage import stage_named
+
+    wanted = tuple(stage_named(name) for name in STAGES)
+    files = [prepare_street(folder, epoch, lambda text: typer.echo(text, err=as_json)) for epoch in (SPRING, AUTUMN)]
+    run_survey(files[0], wanted, Where(workers))
+    edit = edit_by_hand(files[0])
+    run_survey(files[1], wanted, Where(workers))
+    return compare_epochs(files[1], edit)

@@ -32,6 +32,7 @@ def verify(
     ] = False,
 ) -> None:
     """Read every file the store should hold, and say which are missing or damaged, and which rows are lost."""
+    from roadscan.jobs.inventory import inventory_faults
     from roadscan.jobs.repair import accept_losses as accept
     from roadscan.jobs.repair import repair_store
     from roadscan.jobs.session import Session
@@ -46,6 +47,7 @@ def verify(
         faults, told = mended.faults, mended.lines
     else:
         faults = verify_store(session.store, lambda d, t: reporter.progress("verify", d, t))
+    faults += inventory_faults(session.survey)
     reporter.close()
     if accept_losses:
         accept(session.store)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -118,11 +120,24 @@ def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
             place = shapely.to_wkb(shapely.Point(points[0]), flavor="iso")
         values = {name: _shown(one, name) for name in ("in_force", "other", "base")}
         layer = asset_schema(one.kind).table
-        rows.append(one._asdict() | values | {"layer": layer, "decision": None, GEOMETRY: place})
+        named = {"layer": layer, "pictures": pictures_of(row), "decision": None, GEOMETRY: place}
+        rows.append(one._asdict() | values | named)
     names = ["asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit"]
-    names += ["decision", GEOMETRY]
+    names += ["pictures", "decision", GEOMETRY]
     schema = pa.schema([pa.field(name, _TYPES.get(name, pa.string())) for name in names])
     return pa.Table.from_pylist([{name: row[name] for name in names} for row in rows], schema)
+
+
+def pictures_of(row: Mapping[str, Any]) -> str | None:
+    """Files of the pictures that show an asset best, a line each, the best first; None where no picture is named.
+
+    Parameters
+    ----------
+    row : the asset; its column `pictures`, where its kind has one, is a list in JSON whose entries name their `file`.
+    """
+    told = row.get("pictures")
+    files = [one["file"] for one in json.loads(told)] if told else []
+    return "\n".join(files) or None
 
 
 def _shown(conflict: Conflict, name: str) -> str | None:

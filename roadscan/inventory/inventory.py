@@ -17,7 +17,7 @@ from roadscan.inventory.changes import EpochChanges, epoch_changes
 from roadscan.inventory.checks import faults_of
 from roadscan.inventory.comparing import Changes, compared, published_rows, published_table
 from roadscan.inventory.conflicts import Conflict, conflict_rows, conflicts_of
-from roadscan.inventory.diff import Difference, differences
+from roadscan.inventory.diff import Differences, differences
 from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
 from roadscan.inventory.home import FID, Content, EditFault, Home, HomeError, Mark, Sheet
@@ -269,8 +269,8 @@ class Inventory:
         """Values on which people and evidence, or two persons, disagree."""
         return conflicts_of(self.state(as_of))
 
-    def diff(self, before: When, after: When = None) -> list[Difference]:
-        """What differs between two times: assets that came and went, and single values."""
+    def diff(self, before: When, after: When = None) -> Differences:
+        """What differs between two times: assets that came and went, and single values; a sequence of named tuples."""
         return differences(self.state(before), self.state(after))
 
     def changes(self, before: str | None = None, after: str | None = None) -> EpochChanges | None:

@@ -34,6 +34,17 @@ def encoded(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
+def encoded_column(values: list[Any]) -> list[str | None]:
+    """Values of a column as :func:`encoded` writes them, None where there is none."""
+    kinds = {type(v) for v in values} - {type(None)}
+    if kinds == {bytes}:
+        return [None if v is None else f'"{v.hex()}"' for v in values]
+    if kinds == {float}:  # as JSON has them: all but infinities, which repr writes otherwise
+        return [None if v is None else repr(v) if math.isfinite(v) else encoded(v) for v in values]
+    told: dict[Any, str | None] = {v: encoded(v) for v in set(values)} | {None: None}
+    return [told[v] for v in values]
+
+
 def decoded(kind: str, attribute: str, text: str | None) -> Any:
     """The value that :func:`encoded` wrote, as the column of the kind holds it."""
     value = None if text is None else json.loads(text)

@@ -38,6 +38,7 @@ _MADE_BY: Final = {
     ),
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
     "intensity_gains": "`roadscan assets` makes it, where the survey file has a section [assets]",
+    "asset_visibility": "`roadscan assets` makes it, where the survey file has a section [assets]",
     "innovations": "`roadscan navigate` makes it, for runs with GNSS and IMU",
     "navigation_states": "`roadscan navigate` makes it, for runs with GNSS and IMU",
     "regions": 'a run makes it with regions = "found" in [surface]',

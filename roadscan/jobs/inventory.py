@@ -14,18 +14,20 @@ from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
 from roadscan.inventory.recording import Found, Rules
-from roadscan.inventory.visibility import Unknown, Visibility, VisibilityGrid
+from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
+from roadscan.jobs.assets.evidence import VISIBILITY
+from roadscan.jobs.assets.plan import asset_grid
 from roadscan.jobs.session import Session
 from roadscan.model.crs import crs_from_text
-from roadscan.model.errors import SchemaError
+from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth
+from roadscan.tables.manifest import read_recorded
 from roadscan.tables.store import Store, bytes_digest
 
 FOUND: Final = "products/assets"
 """Folder of the tables of found assets, one a kind."""
-VISIBILITY: Final = f"{FOUND}/visibility.parquet"
-"""Passes by cell of the map; its schema metadata `edge_m` states the edge of a cell."""
 ADDRESS: Final = "ROADSCAN_POSTGIS"
 _BEHIND: Final = ("hillshade", "mosaic", "bare_earth")
 """Products that stand behind the assets in QGIS, the uppermost first."""
@@ -49,17 +51,26 @@ def truth_of(session: Session) -> Inventory:
 
 def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
-    url = survey.store_url
-    if settings.store is not None:
-        url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
     name = settings.name or survey.config.id
     frame = survey.config.map.frame()
-    own = session.store
-    rules = Rules(_visibility(own), settings.matching, frame.horizontal_unit_m)
+    rules = Rules(_visibility(session), settings.matching, frame.horizontal_unit_m)
     return Inventory(
-        AssetTruth(Store(url, name)), home, name, rules, lambda: found_assets(session), frame.crs,
+        _truth(survey), home, name, rules, lambda: found_assets(session), frame.crs,
         lambda folder: _rasters(session, folder),
     )  # fmt: skip
+
+
+def _truth(survey: Survey) -> AssetTruth:
+    """The commits of the inventory that a survey belongs to."""
+    settings, url = survey.config.inventory, survey.store_url
+    if settings.store is not None:
+        url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
+    return AssetTruth(Store(url, settings.name or survey.config.id))
+
+
+def inventory_faults(survey: Survey) -> list[str]:
+    """What is wrong with the files of a survey's inventory, each of which is read and named."""
+    return _truth(survey).faults()
 
 
 def home_of(session: Session, given: str | None = None) -> Home:
@@ -92,14 +103,18 @@ def found_assets(session: Session) -> Found | None:
     return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch)
 
 
-def _visibility(store: Store) -> Visibility:
-    if not store.exists(VISIBILITY):
+def _visibility(session: Session) -> Visibility:
+    """What the stage `assets` says of the places that passes had in sight, square by square."""
+    config, store = session.survey.config.assets, session.store
+    records = {} if config is None else session.manifest.of(VISIBILITY)
+    if config is None or not records:
         return Unknown()
-    cells = store.read_table(VISIBILITY)
-    edge = (cells.schema.metadata or {}).get(b"edge_m")
-    if edge is None:
-        raise SchemaError("the table of visibility does not state the edge of its cells", file=store.path(VISIBILITY))
-    return VisibilityGrid(cells, float(edge))
+
+    def cells(square: TileId) -> pa.Table | None:
+        record = records.get(str(square))
+        return store.parse_table(read_recorded(store, record), record.path) if record and record.path else None
+
+    return VisibilityOfSquares(asset_grid(session.survey, config).edge_m, cells)
 
 
 def _rasters(session: Session, folder: Path) -> Sequence[Raster]:

@@ -40,6 +40,7 @@ _ROWS: Final = {"found": "tables/assets_found", "edits": "tables/asset_edits"}
 _PUBLISHED: Final = "inventory/published"
 _LOCK: Final = "inventory/lock"
 _POLL_S: Final = 0.05
+_PUBLISH_ANEW: Final = "publish to a new home: what was changed in this one cannot be told"
 _RESTORE: Final = "restore it from a copy of the store: what people changed cannot be made again"
 
 
@@ -102,16 +103,22 @@ class AssetTruth:
 
     def _read_commits(self) -> Iterator[Commit]:
         for place, file in enumerate(self.store.files(COMMITS, ".parquet"), start=1):
-            rows = self.store.read_table(file, change=_RESTORE).to_pylist()
-            commit = Commit(**{f.name: rows[0][f.name] for f in fields(Commit)})
+            commit = self._read_commit(file)
             if commit.number != place:
                 raise DamagedError(
                     f"commit {place} of the inventory is missing", change=_RESTORE, file=self.store.path(file)
                 )
             yield commit
 
+    def _read_commit(self, file: str) -> Commit:
+        rows = self.store.read_table(file, change=_RESTORE).to_pylist()
+        names = [f.name for f in fields(Commit)]
+        if len(rows) != 1 or not rows[0].keys() >= set(names):
+            raise DamagedError("the file holds no commit of the inventory", change=_RESTORE, file=self.store.path(file))
+        return Commit(**{name: rows[0][name] for name in names})
+
     def rows(self, commit: Commit, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows of a commit.
+        """Rows of a commit, all columns or some; of all, one that was unknown when they were written is null.
 
         Raises
         ------
@@ -125,7 +132,33 @@ class AssetTruth:
                 change=_RESTORE,
                 file=self.store.path(commit.file),
             )
-        return self.store.parse_table(content, commit.file, columns, change=_RESTORE)
+        rows = self.store.parse_table(content, commit.file, columns, change=_RESTORE)
+        if columns is not None:
+            return rows
+        known, count = set(rows.column_names), rows.num_rows
+        fields = list(_schema_of(commit.kind))
+        return pa.table({f.name: rows[f.name] if f.name in known else pa.nulls(count, f.type) for f in fields})
+
+    def faults(self) -> list[str]:
+        """What is wrong with the files of the inventory, each with its name; reads all of them."""
+        found: list[str] = []
+        numbers: list[int] = []
+        for file in self.store.files(COMMITS, ".parquet"):
+            try:
+                commit = self._read_commit(file)
+                numbers.append(commit.number)
+                if commit.file:
+                    self.rows(commit)
+            except StoreError as error:
+                found.append(str(error))
+        gaps = sorted(set(range(1, max(numbers, default=0) + 1)) - set(numbers))
+        found += [f"{COMMITS}/{n:08d}.parquet: commit {n} of the inventory is missing; {_RESTORE}" for n in gaps]
+        for file in self.store.files(_PUBLISHED, ".parquet"):
+            try:
+                self.store.read_table(file, change=_PUBLISH_ANEW)
+            except StoreError as error:
+                found.append(str(error))
+        return found
 
     @contextlib.contextmanager
     def alone(self, wait_s: float = 30.0) -> Iterator[None]:
@@ -162,7 +195,7 @@ class AssetTruth:
         self._clear(number)
         file = digest = ""
         if rows is not None:
-            schema = evidence_table() if draft.kind == "found" else table_schema("asset_edits").arrow()
+            schema = _schema_of(draft.kind)
             stamped = rows.set_column(
                 rows.schema.get_field_index("commit"), "commit", pa.array([number] * rows.num_rows, pa.int32())
             )
@@ -205,7 +238,12 @@ class AssetTruth:
         file = f"{_PUBLISHED}/{token}.parquet"
         if "/" in token or not self.store.exists(file):
             return None
-        return self.store.read_table(file, change="publish to a new home: what was changed in this one cannot be told")
+        return self.store.read_table(file, change=_PUBLISH_ANEW)
+
+
+def _schema_of(kind: CommitKind) -> pa.Schema:
+    """Columns of the rows of a commit."""
+    return evidence_table() if kind == "found" else table_schema("asset_edits").arrow()
 
 
 def parquet_bytes(table: pa.Table) -> bytes:

@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,13 +20,15 @@ from typer.testing import CliRunner
 
 import roadscan
 from roadscan.cli import app
+from roadscan.inventory.conflicts import pictures_of
+from roadscan.inventory.state import state_at
 from roadscan.jobs.inventory import FOUND
 from roadscan.jobs.report.section import Material, sections
 from roadscan.model.errors import ConfigError, DamagedError, StoreError
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.asset_truth import AssetTruth
+from roadscan.tables.asset_truth import AssetTruth, parquet_bytes
 from roadscan.tables.inventory_schema import asset_columns
-from roadscan.tables.store import Store
+from roadscan.tables.store import Store, bytes_digest
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
@@ -201,6 +204,46 @@ def test_damage_of_the_truth_is_named(tmp_path: Path) -> None:
     next(Path(street.truth.store.path("tables/asset_commits")).glob("*1.parquet")).unlink()
     with pytest.raises(DamagedError, match="commit 1 of the inventory is missing"):
         inventory(tmp_path).state()
+
+
+def test_verify_names_each_damaged_file_of_the_inventory(survey_file: Path) -> None:
+    survey = roadscan.open_survey(survey_file)
+    survey.inventory.publish()
+    person.edit(
+        survey_file.parent / "inventory.gpkg", "poles", survey.inventory.assets("pole")["asset_id"][0], condition=3
+    )
+    survey.inventory.pull()
+    survey.inventory.undo(2)
+    assert not [one for one in survey.verify() if "inventory" in one]
+    truth = survey.inventory.truth
+    rows = Path(truth.store.path(truth.commits[0].file))
+    rows.write_bytes(rows.read_bytes()[:-9] + bytes(9))
+    second = next(Path(truth.store.path("tables/asset_commits")).glob("*2.parquet"))
+    second.unlink()
+    kept = min(Path(truth.store.path("inventory/published")).glob("*.parquet"))
+    kept.write_bytes(b"PAR1")
+    faults = "\n".join(roadscan.open_survey(survey_file).verify())
+    assert str(rows) in faults and "rows of commit 1 of the inventory are not those that were written" in faults
+    assert "asset_commits/00000002.parquet: commit 2 of the inventory is missing" in faults
+    assert str(kept) in faults
+    told = CliRunner().invoke(app, ["verify", str(survey_file)])
+    assert told.exit_code == 1 and "3 files are not whole" in told.output
+
+
+def test_rows_of_an_older_version_lack_columns_and_hold_for_all_that(tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(poles()))
+    commit = street.truth.commits[0]
+    content = parquet_bytes(street.truth.rows(commit).drop_columns(["probability", "message"]))
+    street.truth.store.write_bytes(commit.file, content)
+    street.truth._commits = (replace(commit, digest=bytes_digest(content)),)
+    assert state_at(street.truth).assets["pole"].rows["probability"].null_count == 6
+
+
+def test_a_conflict_names_the_pictures_of_its_asset() -> None:
+    told = [{"file": "front/0007.jpg", "camera": "front"}, {"file": "rear/0003.jpg", "camera": "rear"}]
+    assert pictures_of({"pictures": json.dumps(told)}) == "front/0007.jpg\nrear/0003.jpg"
+    assert pictures_of({"pictures": None}) is pictures_of({}) is None
 
 
 def test_two_surveys_share_an_inventory(tmp_path: Path) -> None:

@@ -12,10 +12,12 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
+from roadscan.assets.visibility import PASSES
 from roadscan.inventory.identity import new_ids
 from roadscan.inventory.recording import Found
-from roadscan.inventory.visibility import VisibilityGrid
+from roadscan.inventory.visibility import VisibilityGrid, VisibilityOfSquares
 from roadscan.model.errors import ConfigError, SchemaError
+from roadscan.model.ids import TileId
 from tests.inventory.streets import AUTUMN, EAST, NORTH, SPRING, Everywhere, asset, found, inventory, poles
 
 COUNT = 400
@@ -117,9 +119,8 @@ def test_a_sign_hangs_on_its_pole_and_a_pole_stands_on_its_sidewalk(tmp_path: Pa
 
 
 def test_what_is_not_seen_says_how_many_passes_should_have(tmp_path: Path) -> None:
-    column, row = int((EAST + 40.0) // 5.0), int((NORTH + 4.0) // 5.0)
-    cells = pa.table({"column": [column, column - 4], "row": [row, row], "passes": [3, 0]})
-    street = inventory(tmp_path, VisibilityGrid(cells, 5.0))
+    cells = in_sight((40.0, 4.0, 3), (20.0, 4.0, 0))
+    street = inventory(tmp_path, VisibilityGrid(cells))
     street.record(found(poles(), "spring"))
     ids = list(street.assets("pole").sort_values("station_m")["asset_id"])
     street.record(found(poles(1, when=AUTUMN), "autumn"))
@@ -128,6 +129,47 @@ def test_what_is_not_seen_says_how_many_passes_should_have(tmp_path: Path) -> No
     assert (shown.loc[ids[1], "status"], shown.loc[ids[4], "status"]) == ("found", "found")
     told = [(e.what, e.why) for e in street.history(ids[2])]
     assert told == [("found", "epoch spring"), ("not seen", "epoch autumn; 3 passes should have")]
+
+
+def in_sight(*places: tuple[float, float, int], ground_m: float = 100.0) -> pa.Table:
+    """Cells at places from the corner of the street that so many passes had in sight, above 0.5 m."""
+    cells = {
+        "column": [int((EAST + x) // 0.5) for x, _, _ in places],
+        "row": [int((NORTH + y) // 0.5) for _, y, _ in places],
+    }
+    values = {name: [0 if name == "passes_ground" else n for _, _, n in places] for name in PASSES}
+    table = pa.table({**cells, "ground_height_m": [ground_m] * len(places), **values})
+    return table.replace_schema_metadata({"edge_m": "0.5"})
+
+
+def test_passes_are_those_of_the_place_and_its_height() -> None:
+    grid = VisibilityGrid(in_sight((40.0, 4.0, 3), (20.0, 4.0, 2)))
+    places = np.array(
+        [[40.2, 4.4, 100.0], [40.2, 4.4, 102.0], [39.9, 4.4, 100.0], [20.0, 4.0, 130.0], [20.0, 4.0, 99.0]]
+    )
+    places[:, :2] += EAST, NORTH
+    assert grid.expected_passes("pole", places).tolist() == [3, 3, 0, 2, 2]  # a pole reaches up to where it is seen
+    assert grid.expected_passes("kerb", places).tolist() == [0, 3, 0, 2, 0]
+    with pytest.raises(SchemaError, match="has no column 'passes_high'"):
+        VisibilityGrid(in_sight((0.0, 0.0, 1)).drop_columns(["passes_high"]))
+    with pytest.raises(SchemaError, match="does not state the edge of its cells"):
+        VisibilityGrid(in_sight((0.0, 0.0, 1)).replace_schema_metadata(None))
+
+
+def test_squares_are_read_once_and_only_where_places_lie() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def read(square: TileId) -> pa.Table | None:
+        asked.append(square)
+        return in_sight((10.0, 4.0, 3), (50.0, 4.0, 2)) if square.column == int(EAST // 40) else None
+
+    town = VisibilityOfSquares(40.0, read)
+    places = np.array([[50.0, 4.0, 101.0], [EAST, NORTH, 0.0], [10.0, 4.0, 101.0]])
+    places[:, :2] += EAST, NORTH
+    first = town.expected_passes("pole", places)
+    assert first.tolist() == [0, 0, 3]  # the second square is none, though a table of the first names its cell
+    assert np.array_equal(town.expected_passes("pole", places[::-1]), first[::-1])
+    assert len(asked) == len(set(asked)) == 3
 
 
 def test_a_bad_run_is_undone_and_each_day_is_as_it_was(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,7 @@ from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.screens import screens_of
+from roadscan.assets.visibility import CELL_M, passes_in_sight
 from roadscan.code_reach import code_digest
 from roadscan.jobs.assets.load_returns import LoadedSquare, ReturnsTask, load_squares
 from roadscan.jobs.assets.plan import AssetPlan
@@ -33,7 +34,9 @@ from roadscan.products.assets.bare_earth import within, write_bare_earth
 from roadscan.products.assets.classified_points import classified_points, write_classified
 from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
+from roadscan.tables.writer import parquet_bytes
 from roadscan.tiles.blocks import Block
 
 EVIDENCE: Final = "asset_evidence"
@@ -42,7 +45,9 @@ CLASSIFIED: Final = "classified_points"
 BARE_EARTH: Final = "bare_earth"
 SCREENS: Final = "asset_screens"
 """Manifest name of what hides things from cameras."""
-OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS)
+VISIBILITY: Final = "asset_visibility"
+"""Cells of a square, and how many passes had them in sight."""
+OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
@@ -57,9 +62,8 @@ class SquareWork:
     square: TileId
     kinds: tuple[tuple[str, str], ...]
     """Names of the kinds whose evidence is due, with its key."""
-    classified_key: str = ""
-    bare_earth_key: str = ""
-    screens_key: str = ""
+    beside: Mapping[str, str]
+    """What else is due: the key of each of :data:`OF_SQUARES` by its name."""
 
 
 @dataclass(frozen=True)
@@ -98,16 +102,18 @@ def due_squares(
     for square, key in plan.keys.items():
         unit = str(square)
         keys = {name: key_of(own, key) for name, own in kind_keys.items()}
-        classified = key_of(code, key, sorted(keys.items()), plan.context.survey_id) if plan.config.classified else ""
-        bare = key_of(code, key, plan.context.survey_id) if plan.config.bare_earth else ""
-        screens = key_of(code, key, SCREENS) if plan.wants_pictures else ""
+        beside = {VISIBILITY: key_of(code, key)}
+        if plan.config.classified:
+            beside[CLASSIFIED] = key_of(code, key, sorted(keys.items()), plan.context.survey_id)
+        if plan.config.bare_earth:
+            beside[BARE_EARTH] = key_of(code, key, plan.context.survey_id)
+        if plan.wants_pictures:
+            beside[SCREENS] = key_of(code, key, SCREENS)
         if square not in anew:
             keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
-            classified = "" if manifest.is_current(CLASSIFIED, unit, classified) else classified
-            bare = "" if manifest.is_current(BARE_EARTH, unit, bare) else bare
-            screens = "" if manifest.is_current(SCREENS, unit, screens) else screens
-        if keys or classified or bare or screens:
-            found.append(SquareWork(square, tuple(keys.items()), classified, bare, screens))
+            beside = {name: k for name, k in beside.items() if not manifest.is_current(name, unit, k)}
+        if keys or beside:
+            found.append(SquareWork(square, tuple(keys.items()), beside))
     return found
 
 
@@ -177,7 +183,7 @@ class _Search:
         keys = dict(self._work.kinds)
         marked: list[Marked] = []
         for name, options in self._task.kinds:
-            if name not in keys and not self._work.classified_key:
+            if name not in keys and CLASSIFIED not in self._work.beside:
                 continue
             try:
                 kind = asset_kinds()[name]
@@ -187,21 +193,19 @@ class _Search:
                 marked += found.marked
             except Exception as error:  # noqa: BLE001  one kind's fault must not stop the others
                 self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
-        if self._work.bare_earth_key:
-            yield self._write_bare_earth(scene)
-        if self._work.screens_key:
-            yield self._write_screens(scene)
-        if self._work.classified_key and not self.failures:
-            yield self._write_classified(scene, marked)
+        writers = {BARE_EARTH: self._write_bare_earth, SCREENS: self._write_screens, VISIBILITY: self._write_visibility}
+        for product, write in writers.items():
+            if product in self._work.beside:
+                yield write(scene, self._work.beside[product])
+        if CLASSIFIED in self._work.beside and not self.failures:
+            yield self._write_classified(scene, marked, self._work.beside[CLASSIFIED])
 
     def _nothing(self) -> Iterator[OutputRecord]:
         """Records of a square without returns: finished, and no file."""
-        square, w = self._work.square, self._work
-        for name, key in w.kinds:
-            yield OutputRecord(EVIDENCE, evidence_unit(name, square), key, "", 0, "", _told(0))
-        for product, key in ((BARE_EARTH, w.bare_earth_key), (CLASSIFIED, w.classified_key), (SCREENS, w.screens_key)):
-            if key:
-                yield OutputRecord(product, str(square), key, "", 0, "", _told(0))
+        for name, key in self._work.kinds:
+            yield OutputRecord(EVIDENCE, evidence_unit(name, self._work.square), key, "", 0, "", _told(0))
+        for product, key in self._work.beside.items():
+            yield OutputRecord(product, str(self._work.square), key, "", 0, "", _told(0))
 
     def _write_pieces(self, kind: AssetKind, found: Evidence, key: str) -> OutputRecord:
         unit = evidence_unit(kind.name, self._work.square)
@@ -213,8 +217,8 @@ class _Search:
         target = f"tables/{EVIDENCE}/{unit}.parquet"
         return publish_file(self._task.store, path, target, EVIDENCE, unit, key, _told(pieces.num_rows))
 
-    def _write_bare_earth(self, scene: Scene) -> OutputRecord:
-        grid, square, key = self._task.load.grid, self._work.square, self._work.bare_earth_key
+    def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
+        grid, square = self._task.load.grid, self._work.square
         model = within(scene.ground, grid.own_box)
         known = 0 if model is None else int(np.count_nonzero(~np.isnan(model.height_m)))
         if model is None or not known:
@@ -225,8 +229,8 @@ class _Search:
         target = f"products/{BARE_EARTH}/{square}.tif"
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
 
-    def _write_screens(self, scene: Scene) -> OutputRecord:
-        square, key, screens = str(self._work.square), self._work.screens_key, screens_of(scene)
+    def _write_screens(self, scene: Scene, key: str) -> OutputRecord:
+        square, screens = str(self._work.square), screens_of(scene)
         if not screens.num_rows:
             return OutputRecord(SCREENS, square, key, "", 0, "", _told(0))
         path = self._folder / "screens.parquet"
@@ -234,8 +238,18 @@ class _Search:
         target = f"tables/{SCREENS}/{square}.parquet"
         return publish_file(self._task.store, path, target, SCREENS, square, key, _told(screens.num_rows))
 
-    def _write_classified(self, scene: Scene, marked: Sequence[Marked]) -> OutputRecord:
-        square, key = self._work.square, self._work.classified_key
+    def _write_visibility(self, scene: Scene, key: str) -> OutputRecord:
+        unit, schema = str(self._work.square), table_schema(VISIBILITY)
+        rows = visibility_rows(scene)
+        if not rows.num_rows:
+            return OutputRecord(VISIBILITY, unit, key, "", 0, "", _told(0))
+        path = self._folder / "visibility.parquet"
+        path.write_bytes(parquet_bytes(rows, schema))
+        target = f"{schema.location}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, VISIBILITY, unit, key, _told(rows.num_rows))
+
+    def _write_classified(self, scene: Scene, marked: Sequence[Marked], key: str) -> OutputRecord:
+        square = self._work.square
         own = np.flatnonzero(scene.tile.holds(scene.returns.x_m, scene.returns.y_m))
         if not own.size:
             return OutputRecord(CLASSIFIED, str(square), key, "", 0, "", _told(0))
@@ -245,6 +259,12 @@ class _Search:
         write_classified(path, points, self._task.load.grid.squares, self._task.context)
         target = f"products/{CLASSIFIED}/{square}.laz"
         return publish_file(self._task.store, path, target, CLASSIFIED, str(square), key, _told(len(points)))
+
+
+def visibility_rows(scene: Scene) -> pa.Table:
+    """Cells that passes had in sight, as the table `asset_visibility` has them; its metadata says their edge."""
+    schema = table_schema(VISIBILITY).arrow()
+    return passes_in_sight(scene).cast(schema).replace_schema_metadata({"edge_m": str(CELL_M)})
 
 
 def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uint8]:

@@ -10,6 +10,7 @@ from roadscan.jobs.assets.evidence import (
     CLASSIFIED,
     EVIDENCE,
     SCREENS,
+    VISIBILITY,
     SquareWork,
     due_squares,
     evidence_unit,
@@ -24,7 +25,9 @@ from roadscan.jobs.session import Session
 from roadscan.model.ids import TileId
 from roadscan.tables.manifest import Manifest, OutputRecord
 
-MADE = (SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS)
+MADE = (
+    SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS,
+)  # fmt: skip
 """Names of all outputs in the manifest."""
 
 
@@ -46,10 +49,7 @@ class AssetsWork:
     @property
     def evidence_due(self) -> int:
         """How many outputs of squares are due."""
-        return len(self.samples) + sum(
-            len(one.kinds) + bool(one.classified_key) + bool(one.bare_earth_key) + bool(one.screens_key)
-            for one in self.squares
-        )
+        return len(self.samples) + sum(len(one.kinds) + len(one.beside) for one in self.squares)
 
 
 def plan_evidence(session: Session) -> AssetsWork:
@@ -84,6 +84,7 @@ def _gone(plan: AssetPlan, gains: GainsPlan, manifest: Manifest) -> list[OutputR
         *manifest.beside({CLASSIFIED}, units if config.classified else ()),
         *manifest.beside({BARE_EARTH}, units if config.bare_earth else ()),
         *manifest.beside({SCREENS}, units if plan.wants_pictures else ()),
+        *manifest.beside({VISIBILITY}, units),
         *manifest.beside({OBJECTS}, objects),
         *manifest.beside({TABLES}, _files(plan)),
         *manifest.beside({SECTIONS} if config.cross_sections is None else set(), ()),

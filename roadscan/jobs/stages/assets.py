@@ -153,6 +153,6 @@ class Assets(Stage):
         """Evidence, objects, tables and files, classified points, bare earth."""
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
-            "tables/asset_screens", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
+            "tables/asset_screens", "tables/asset_visibility", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

@@ -1,0 +1,92 @@
+"""How many passes had a place in sight: the ground of each cell, and the air above it by height.
+
+Returns tell where a sensor looked. A return's ray passed all places on its way, saw what it hit, and did not see what
+lies behind. A pass had a place in sight where enough of its rays reached it, and no fewer than were stopped before.
+Where nothing came back, as from the sky, rays are not known; there a place counts as in sight that lies above one that
+is, unless something stood before it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.assets.scene import Scene
+from roadscan.kernels.assets.sight import Places, Rays, follow_rays
+
+CELL_M: Final = 0.5
+"""Edge of the cells, whose corners are multiples of it."""
+BANDS_M: Final = (-0.3, 0.5, 1.5, 3.0, 5.0, 8.0)
+"""Heights above the ground between which a cell's places lie."""
+PASSES: Final = ("passes_ground", "passes_low", "passes_middle", "passes_high", "passes_top")
+"""Columns of the passes, a band each, upwards."""
+_REACH_M: Final = 30.0
+"""What is farther from the sensor does not count as seen."""
+_HIT_M: Final = 0.5
+_LEAST_RAYS: Final = 50.0
+"""A thin pole of 0.1 m gets a fifth of the rays of its cell."""
+_STOPPED_RAYS: Final = 20.0
+"""Where fewer rays were stopped before a place, nothing stood before it."""
+_MOST_RAYS: Final = 60_000
+"""Of more rays of a pass, each second, third … is followed."""
+
+
+def passes_in_sight(scene: Scene) -> pa.Table:
+    """Cells of the scene's tile that any pass had in sight: column, row, ground height, passes by height.
+
+    Cells are those whose middles the tile holds; those of which the ground is not known are left out.
+    """
+    (east, north), box, ground = scene.returns.corner_m, scene.tile, scene.ground
+    least = np.array([_cells_before(east + box.x_min_m), _cells_before(north + box.y_min_m)])
+    most = np.array([_cells_before(east + box.x_max_m), _cells_before(north + box.y_max_m)])
+    columns, rows = np.maximum(most - least, 0).tolist()
+    corner = least * CELL_M - np.array([east, north])
+    x = corner[0] + (np.arange(columns) + 0.5) * CELL_M
+    y = corner[1] + (np.arange(rows) + 0.5) * CELL_M
+    height = ground.height_at(*np.meshgrid(x, y)).astype(np.float32)
+    counted = np.zeros((rows, columns, len(PASSES)), np.int32)
+    for rays, share in _rays_of_passes(scene):
+        passed, hidden = (np.zeros(counted.shape, np.uint32) for _ in range(2))
+        places = Places(np.ascontiguousarray(corner, np.float64), CELL_M, height, np.array(BANDS_M))
+        follow_rays(rays, places, _REACH_M, _HIT_M, passed, hidden)
+        counted += in_sight(passed * share, hidden * share)
+    at = np.flatnonzero(counted.any(axis=2))
+    table = {
+        "column": pa.array(least[0] + at % max(columns, 1), pa.int32()),
+        "row": pa.array(least[1] + at // max(columns, 1), pa.int32()),
+        "ground_height_m": pa.array(height.reshape(-1)[at], pa.float32()),
+    }
+    by_band = counted.reshape(-1, len(PASSES))[at]
+    table |= {name: pa.array(by_band[:, band], pa.int32()) for band, name in enumerate(PASSES)}
+    return pa.table(table)
+
+
+def in_sight(passed: npt.NDArray[np.floating], hidden: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    """Whether a pass had places (rows, columns, bands) in sight, by how many rays reached them and how many did not."""
+    seen: npt.NDArray[np.bool_] = (passed >= _LEAST_RAYS) & (passed >= hidden)
+    is_open = (hidden < _STOPPED_RAYS) | (passed >= hidden)
+    for band in range(1, seen.shape[2]):
+        seen[:, :, band] |= is_open[:, :, band] & seen[:, :, band - 1]
+    return seen
+
+
+def _cells_before(place_m: float) -> int:
+    """Number of the first cell whose middle does not lie before a place."""
+    return int(np.ceil(place_m / CELL_M - 0.5))
+
+
+def _rays_of_passes(scene: Scene) -> list[tuple[Rays, float]]:
+    """Rays of each pass, and how many returns each of them stands for."""
+    returns = scene.returns
+    is_known = np.isfinite(returns.sensor_x_m) & np.isfinite(returns.sensor_height_m)
+    found = []
+    for one in np.unique(returns.pass_id[is_known]):
+        rows = np.flatnonzero(is_known & (returns.pass_id == one))
+        share = 1 + rows.size // _MOST_RAYS
+        rows = rows[::share]
+        ends = returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m, returns.x_m, returns.y_m
+        found.append((Rays(*(v[rows] for v in (*ends, returns.height_m))), float(share)))
+    return found

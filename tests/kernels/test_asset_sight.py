@@ -1,0 +1,56 @@
+"""The kernel that follows rays, against NumPy and results known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.kernels.assets.sight import Places, Rays, follow_rays
+
+CELL_M = 0.5
+BANDS_M = np.array([-0.3, 0.5, 1.5, 3.0])
+
+
+def places(rows: int, columns: int, ground: float = 100.0) -> Places:
+    heights = np.full((rows, columns), ground, np.float32)
+    return Places(np.array([-3.0, 2.0]), CELL_M, heights, BANDS_M)
+
+
+def followed(rays: np.ndarray, of: Places, reach_m: float, hit_m: float) -> tuple[np.ndarray, np.ndarray]:
+    shape = (*of.ground.shape, BANDS_M.size - 1)
+    passed, hidden = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+    follow_rays(Rays(*np.ascontiguousarray(rays.T)), of, reach_m, hit_m, passed, hidden)
+    return passed, hidden
+
+
+def test_rays_count_where_they_pass_and_behind_what_they_hit() -> None:
+    random = np.random.default_rng(3)
+    of = places(24, 30)
+    of.ground[:] += random.normal(0, 0.2, of.ground.shape)
+    of.ground[3, 4] = np.nan
+    starts = np.column_stack([random.uniform(-8, 16, 500), random.uniform(-3, 18, 500), np.full(500, 102.0)])
+    ends = np.column_stack([random.uniform(-3, 12, 500), random.uniform(2, 14, 500), random.uniform(99.9, 104, 500)])
+    ends[7] = starts[7]
+    passed, hidden = followed(np.hstack([starts, ends]), of, 12.0, 0.4)
+
+    expected = np.zeros((2, *passed.shape), np.uint32)
+    for start, end in zip(np.delete(starts, 7, 0), np.delete(ends, 7, 0), strict=True):
+        length = float(np.linalg.norm(end - start))
+        along = (np.arange(24) + 0.5) * CELL_M  # 12 m
+        at = start + along[:, None] * (end - start) / length
+        column, row = (np.floor((at[:, :2] - of.corner) / CELL_M).astype(int)).T
+        inside = (column >= 0) & (row >= 0) & (column < 30) & (row < 24)
+        column, row, at, along = column[inside], row[inside], at[inside], along[inside]
+        above = at[:, 2] - of.ground[row, column].astype(float)
+        held = (above >= BANDS_M[0]) & (above < BANDS_M[-1])
+        band = np.searchsorted(BANDS_M, above[held], side="right") - 1
+        behind = (along[held] > length + 0.4).astype(int)
+        np.add.at(expected, (behind, row[held], column[held], band), 1)
+    assert expected.sum() > 5000 and expected[1].sum() > 500
+    # a sample on the edge of the raster may fall to either side of it
+    assert np.array_equal(passed, expected[0]) and np.array_equal(hidden, expected[1])
+
+
+def test_a_level_ray_passes_each_cell_of_a_row_once_until_it_hits() -> None:
+    passed, hidden = followed(np.array([[-3.0, 3.25, 101.0, 1.0, 3.25, 101.0]]), places(4, 20), 9.0, 0.0)
+    assert passed[2, :8, 1].tolist() == [1] * 8 and passed.sum() == 8
+    assert hidden[2, 8:18, 1].tolist() == [1] * 10 and hidden.sum() == 10

@@ -104,7 +104,10 @@ export class MapView {
 
   #listen(target: HTMLElement): void {
     const { desk, map } = this
+    const still = (drawn: boolean): void => void (this.element.dataset['drawn'] = String(drawn))
     map.on('moveend', () => this.look())
+    map.on('precompose', () => still(false))
+    map.on('rendercomplete', () => still(true))
     map.getView().on('change:resolution', () => this.#drawBar())
     map.on('singleclick', (event) => {
       if (!this.measuring.busy) void this.#click(event.pixel, event.coordinate)
@@ -133,6 +136,7 @@ export class MapView {
     desk.place.on((place) => this.#mark(this.#cross, place ? [place.easting_m, place.northing_m] : null))
     desk.target.on((goal) => {
       if (!goal) return
+      still(false)
       const size = map.getSize() ?? [400, 400]
       const resolution = goal.across_m ? goal.across_m / Math.max(100, Math.min(size[0]!, size[1]!)) : undefined
       map.getView().animate({ center: [goal.easting_m, goal.northing_m], ...(resolution ? { resolution } : {}), duration: 350 })
@@ -183,6 +187,17 @@ export class MapView {
       },
       hits,
     )
+  }
+
+  /** Show another state of some layers. */
+  replace(layers: readonly Layer[]): void {
+    const extent = this.map.getView().calculateExtent(this.map.getSize())
+    for (const document of layers) this.layers.find((one) => one.document.name === document.name)?.replace(document, extent)
+  }
+
+  /** Height of the surface at a place (m); null where no raster knows it. */
+  async heightAt(easting_m: number, northing_m: number): Promise<number | null> {
+    return (await this.valuesAt(easting_m, northing_m)).find(([name]) => name === 'height')?.[2] ?? null
   }
 
   /** Values of all rasters at a place: name, title, value, its text. */

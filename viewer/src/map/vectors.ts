@@ -54,7 +54,7 @@ export class FeatureLayer {
   readonly #outlines = new Map<Part, Feature>()
 
   constructor(
-    readonly document: Layer,
+    public document: Layer,
     private readonly files: Source,
     private readonly dark: Signal<boolean>,
     private readonly complain: (error: unknown) => void,
@@ -116,6 +116,7 @@ export class FeatureLayer {
 
   async #load(part: Part): Promise<void> {
     const { features } = await this.files.json<FeatureCollection>(part.url)
+    if (!this.document.parts.includes(part)) return // the layer was replaced meanwhile
     const outline = this.#outlines.get(part)
     if (outline) {
       this.source.removeFeature(outline)
@@ -131,6 +132,15 @@ export class FeatureLayer {
     const feature = new Feature({ geometry, row: document.properties, document, layer: this.document })
     feature.setId(document.id)
     return feature
+  }
+
+  /** Show another state of the layer. */
+  replace(document: Layer, extent: Extent): void {
+    this.document = document
+    this.#parts.clear()
+    this.#outlines.clear()
+    this.source.clear(true)
+    this.look(extent)
   }
 
   /** Load all parts: for the table of rows, and to find a row by its id. */

@@ -99,6 +99,8 @@ export interface Layer {
   columns: Column[]
   style: Style
   choices: Style[]
+  /** All features of a layer that lies in many parts, as they are seen from far away. */
+  overview?: string | null
   arrows: { east: string; north: string; up: string; exaggeration: number } | null
 }
 

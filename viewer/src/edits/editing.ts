@@ -118,6 +118,7 @@ export class Editing {
     this.#source.addFeature(feature)
     const modify = new Modify({ source: this.#source, style: measuring(this.desk.dark.value) })
     this.map.map.addInteraction(modify)
+    this.map.drawing = true
     const done = h('button', { type: 'button', onclick: () => {
       const geometry = feature.getGeometry()!
       this.#end()
@@ -127,6 +128,7 @@ export class Editing {
     fill(body, h('p', { class: 'hint' }, 'Drag it on the map to where it belongs.'), done)
     this.#stop = () => {
       this.map.map.removeInteraction(modify)
+      this.map.drawing = false
       this.#source.removeFeature(feature)
     }
   }
@@ -141,7 +143,11 @@ export class Editing {
       this.#addNew(layer, geometry.getType(), geometry.getCoordinates()).catch((error) => this.desk.complain(error))
     })
     this.map.map.addInteraction(draw)
-    this.#stop = () => this.map.map.removeInteraction(draw)
+    this.map.drawing = true
+    this.#stop = () => {
+      this.map.map.removeInteraction(draw)
+      this.map.drawing = false
+    }
   }
 
   /** A row that was drawn on the map gets the heights of the surface below it. */

@@ -22,6 +22,8 @@ import { crosshair, highlight, ring } from './styles'
 import { FeatureLayer, geometryOf } from './vectors'
 
 const TOUCH_PX = 7
+/** OpenLayers waits so long for a second click, and a little is added. */
+const SINGLE_CLICK_MS = 350
 
 export interface Hit {
   layer: Layer
@@ -43,6 +45,8 @@ export class MapView {
   readonly #ring = new Feature()
   readonly #selection = new VectorSource()
   readonly #tip = h('div', { class: 'map-tip', hidden: true })
+  #drawing = false
+  #drawn = 0
   readonly #bar = h('div', { class: 'scale-bar', 'aria-hidden': 'true' })
 
   constructor(readonly desk: Desk) {
@@ -110,7 +114,7 @@ export class MapView {
     map.on('rendercomplete', () => still(true))
     map.getView().on('change:resolution', () => this.#drawBar())
     map.on('singleclick', (event) => {
-      if (!this.measuring.busy) void this.#click(event.pixel, event.coordinate)
+      if (!this.measuring.busy && !this.#drawing) void this.#click(event.pixel, event.coordinate)
     })
     map.on('pointermove', (event) => {
       if (event.dragging) return
@@ -146,6 +150,13 @@ export class MapView {
       map.updateSize()
       this.#drawBar()
     }).observe(target)
+  }
+
+  /** While something is drawn, clicks select nothing; the last one comes as a single click only after a while. */
+  set drawing(drawing: boolean) {
+    window.clearTimeout(this.#drawn)
+    if (drawing) this.#drawing = true
+    else this.#drawn = window.setTimeout(() => (this.#drawing = false), SINGLE_CLICK_MS)
   }
 
   /** Load the features that the map shows now. */

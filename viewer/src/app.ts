@@ -170,6 +170,7 @@ export class App {
     if (!NARROW.matches && survey.strips) first.push('strips')
     this.#dock.hidden = !first.includes('strips')
     for (const [name, view] of this.#views) view.hidden = !first.includes(name)
+    if (first.includes('cloud')) this.parts.prepareCloud()
     requestAnimationFrame(() => {
       this.map.map.updateSize()
       this.map.fit(undefined, 0)

@@ -21,6 +21,7 @@ from roadscan.products.site_rasters import Place
 
 _GROUND: Final = (238, 240, 243)
 """Where nothing is known, as the page shows it."""
+_MARK: Final = (194, 24, 91)
 _SHIFT: Final = 4
 """Lines are placed to the sixteenth of a pixel."""
 _MOST_PICTURES: Final = 160
@@ -29,8 +30,15 @@ _MOST_PICTURES: Final = 160
 UInt8 = npt.NDArray[np.uint8]
 
 
-def thumbnail(material: Material, box_m: Box, width_px: int, height_px: int) -> bytes:
-    """A PNG of the map around the middle of a box (m), which it holds whole."""
+def thumbnail(material: Material, box_m: Box, size_px: tuple[int, int], marked: Any = None) -> bytes:
+    """A PNG of the map around the middle of a box (m), which it holds whole.
+
+    Parameters
+    ----------
+    size_px : its width and height.
+    marked : a shape of the map (m) that it marks, as the page marks a row that is selected.
+    """
+    width_px, height_px = size_px
     west, south, east, north = box_m
     pixel_m = max((east - west) / width_px, (north - south) / height_px, 1e-4)
     corner = (west + east - width_px * pixel_m) / 2, (south + north + height_px * pixel_m) / 2
@@ -39,8 +47,11 @@ def thumbnail(material: Material, box_m: Box, width_px: int, height_px: int) -> 
     for layer in site_layers(material)[0]:
         if layer.visible:
             _draw(picture, layer, seen, pixel_m)
+    for shape in () if marked is None else shapely.get_parts(shapely.force_2d(marked)):
+        outline = shape.exterior if shape.geom_type == "Polygon" else shape
+        _draw_shape(picture, picture, outline, _Pen(_MARK, Style("", 3), seen, pixel_m))
     stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, "PNG", optimize=True)
+    Image.fromarray(picture).save(stream, "PNG")
     return stream.getvalue()
 
 
@@ -139,7 +150,7 @@ def _draw_shape(picture: UInt8, over: UInt8, shape: Any, pen: _Pen) -> None:
         cv2.circle(picture, at, radius, pen.colour, -1, cv2.LINE_AA, _SHIFT)
     elif shape.geom_type == "Polygon":
         cv2.fillPoly(over, [pen.pixels(shapely.get_coordinates(shape.exterior))], pen.colour, cv2.LINE_AA, _SHIFT)
-    elif shape.geom_type == "LineString":
+    elif shape.geom_type in ("LineString", "LinearRing"):
         _line(picture, shapely.get_coordinates(shape), pen)
 
 

@@ -16,7 +16,7 @@ import OlStyle from 'ol/style/Style'
 import { Signal } from '../core/signal'
 import { type Bounds, type FeatureCollection, type FeatureDocument, type Layer, meets, type Part, type Style } from '../core/site'
 import type { Source } from '../core/source'
-import { colourOf, styleOf } from './styles'
+import { coarseStyleOf, colourOf, styleOf } from './styles'
 
 const MOST_FEATURES = 30_000
 /** Each part is a request: from far away, fewer are asked for. */
@@ -80,12 +80,14 @@ export class FeatureLayer {
 
   #restyle(): void {
     const features = styleOf(this.document, this.style.value, this.hidden.value, this.dark.value)
+    const coarse = coarseStyleOf(this.style.value, this.hidden.value)
     const colour = colourOf(this.style.value, {})
     const outline = new OlStyle({
       stroke: new OlStroke({ color: colour, width: 1, lineDash: [4, 3] }),
       fill: new OlFill({ color: 'rgba(128, 128, 128, 0.08)' }),
     })
     this.layer.setStyle((feature, resolution) => {
+      if (feature.get('coarse')) return coarse(feature)
       if (!feature.get('part')) return features(feature, resolution)
       const [west, , east] = feature.getGeometry()!.getExtent() as [number, number, number, number]
       return east - west > LEAST_OUTLINE_PX * resolution ? outline : []

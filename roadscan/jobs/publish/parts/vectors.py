@@ -16,7 +16,7 @@ from roadscan.jobs.publish.material import Material, box_of, sheet_name
 from roadscan.jobs.publish.part import SitePart
 from roadscan.model.errors import RoadscanError
 
-_MOST_VERTICES: Final = 50_000
+_MOST_VERTICES: Final = 10_000
 """A layer with more is cut into kilometre sheets."""
 _FROM_FAR: Final = ("survey", "control", "condition")
 """Groups whose layers are worth a look from far away; single cracks and poles are not seen there."""
@@ -114,11 +114,12 @@ def _has_overview(layer: SiteLayer, parts: Sequence[Any]) -> bool:
 def _overview(layer: SiteLayer) -> dict[str, Any]:
     """All features of a layer, as coarse as they are seen with the whole survey, with the values that colour them."""
     west, south, east, north = shapely.total_bounds(layer.shapes_m).tolist()
-    coarse = shapely.simplify(layer.shapes_m, max(east - west, north - south) / _SEEN_PX)
+    coarse = shapely.simplify(shapely.force_2d(layer.shapes_m), max(east - west, north - south) / _SEEN_PX)
+    coarse = shapely.transform(coarse, lambda places: np.round(places, 1))
     names = [style.by for style in layer.styles if style.by]
     features = [
         {"type": "Feature", "id": number, "geometry": geometry_of(shape), "properties": {n: row.get(n) for n in names}}
-        for number, (shape, row) in enumerate(zip(shapely.force_2d(coarse), layer.rows, strict=True))
+        for number, (shape, row) in enumerate(zip(coarse, layer.rows, strict=True))
     ]
     return {"type": "FeatureCollection", "coordinates": "map_m", "layer": layer.name, "features": features}
 

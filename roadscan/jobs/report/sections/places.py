@@ -43,7 +43,7 @@ class Places(Section):
             "The pictures show the map of the page at these places. In a published site, and where one lies beside "
             "this file, each of them leads there."
         )
-        whole = thumbnail(site, extent_m, *_WHOLE_PX)
+        whole = thumbnail(site, extent_m, _WHOLE_PX)
         yield Picture(whole, "The whole survey.", link="#views=map")
         for layer in site_layers(site)[0]:
             if layer.group in _LAYERS:
@@ -61,7 +61,8 @@ def _worst(site: Site, layer: SiteLayer) -> Iterator[Picture]:
         row = layer.rows[number]
         named = str(row[layer.key]) if layer.key else str(number)
         caption = f"{layer.title} {named}: {style.title} {_value(row, style):.4g}"
-        picture = thumbnail(site, _around(layer.shapes_m[number].bounds), *_PLACE_PX)
+        shape = layer.shapes_m[number]
+        picture = thumbnail(site, _around(shape.bounds), _PLACE_PX, shape)
         yield Picture(picture, caption, _WIDTH_MM, f"#row={layer.name}/{number}")
 
 

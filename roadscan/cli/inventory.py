@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 AsOf = Annotated[str | None, typer.Option("--as-of", help="A day (UTC), an instant with zone, or a commit's number.")]
 Who = Annotated[str | None, typer.Option(help="Who did it; the user of this computer where it is left out.")]
 Why = Annotated[str, typer.Option(help="Why it was done; kept with it.")]
-Home = Annotated[str | None, typer.Option(help="Another home: a copy of the GeoPackage, or an address of PostGIS.")]
+Home = Annotated[
+    str | None,
+    typer.Option(
+        help="Another home: a copy of the GeoPackage, an address of PostGIS, or the edits (.geojson) that a page saved."
+    ),
+]
+_PAGE_EDITS = (".geojson", ".json")
 _MOST_LINES = 200
 
 
@@ -40,12 +46,17 @@ def pull(
     sound: Annotated[bool, typer.Option("--sound", help="Take in sound rows where others are faulty.")] = False,
 ) -> None:
     """Take in what people changed in the home."""
-    from roadscan.jobs.inventory import home_of, open_inventory
+    from roadscan.jobs.inventory import edits_of_file, home_of, open_inventory, page_document
     from roadscan.jobs.session import Session
 
     session = Session.open(survey_file)
-    place = None if home is None else home_of(session, home)
-    done = open_inventory(session).pull(home=place, who=who, why=why, sound=sound)
+    inventory = open_inventory(session)
+    if home is not None and home.endswith(_PAGE_EDITS):
+        document = page_document(session, home, edits_of_file(Path(home)))
+        done, _ = inventory.pull_page(document, who=who, why=why, sound=sound)
+    else:
+        place = None if home is None else home_of(session, home)
+        done = inventory.pull(home=place, who=who, why=why, sound=sound)
     for fault in done.refused:
         typer.echo(f"refused: {fault}")
     assets = len({edit.asset_id for edit in done.edits})

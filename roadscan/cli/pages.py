@@ -24,6 +24,9 @@ def publish(
     finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0,
     clouds: Annotated[bool, typer.Option(help="With the points.")] = True,
     pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True,
+    edit: Annotated[
+        bool, typer.Option("--edit", help="With edits of the inventory; the page saves them as a file to be pulled.")
+    ] = False,
     largest: Annotated[float, typer.Option(help="--single: largest file (MB).")] = 200.0,
 ) -> None:
     """The survey as a page to look at: a folder for any web server with range requests, or one file."""
@@ -45,8 +48,10 @@ def publish(
         raise ConfigError("--box and --road are both given", expected="one of them")
     near = box_from_text(box) if box is not None else None
     near = near if road is None else box_of_road(Material(session), road)
-    wishes = Wishes(clouds, pictures, finest, near)
+    wishes = Wishes(clouds, pictures, finest, near, "file" if edit else "")
     material = Material(session, wishes, tuple(others))
+    if edit:
+        material.check_edits()
     reporter = new_reporter()
     if single is not None:
         page = write_single(material, single, largest, lambda d, t: reporter.progress("publish", d, t))
@@ -74,16 +79,24 @@ def view(
         list[Path] | None, typer.Option(help="Survey file of another survey of the roads, for strips over one another.")
     ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    edit: Annotated[
+        bool, typer.Option("--edit", help="Take edits from the page into the inventory, as `inventory pull` does.")
+    ] = False,
 ) -> None:
     """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
     import webbrowser
 
+    from roadscan.jobs.publish.edit_door import EditDoor
     from roadscan.jobs.publish.live import LiveSite, open_survey
     from roadscan.jobs.publish.server import SiteServer
     from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
+    from roadscan.jobs.session import Session
 
-    site = LiveSite(open_survey(survey_file, over or ()))
-    with SiteServer(site, port) as server:
+    site = LiveSite(open_survey(survey_file, over or (), edited=edit))
+    if edit:
+        site.material.check_edits()
+    door = EditDoor(lambda: Session.open(survey_file)) if edit else None
+    with SiteServer(site, port, None if door is None else door.take) as server:
         if web_folder() is None:
             typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")
         typer.echo(f"page: {server.address} (Ctrl-C ends it)")

@@ -12,9 +12,13 @@ from roadscan.cli.arguments import SurveyFile
 
 def report(
     survey_file: SurveyFile,
-    out: Annotated[Path | None, typer.Option(help="Write the page here as well.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write the page here as well; its pictures lead into a site beside it."),
+    ] = None,
 ) -> None:
     """One HTML page about the survey: what was recorded, made and found. It opens offline and prints on A4."""
+    from roadscan.jobs.publish.report_copy import linked_report, site_beside
     from roadscan.jobs.report.page import keep_report
     from roadscan.jobs.session import Session
 
@@ -23,7 +27,7 @@ def report(
     with session.store.lock():
         path = keep_report(session)
     if out is not None:
-        out.write_bytes(session.store.read_bytes(path))
+        out.write_bytes(linked_report(session.store.read_bytes(path), site_beside(out)))
     typer.echo(f"report: {out or session.store.path(path)}")
 
 

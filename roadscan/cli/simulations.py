@@ -59,13 +59,14 @@ def demo(
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
     from roadscan.jobs.demo import prepare_demo, summarise
+    from roadscan.jobs.publish.demo_page import page_lines
     from roadscan.jobs.stage import stages
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
     run_survey(survey_file, stages(), Where(workers))
     compared, street = summarise(survey_file), _street_in_two_epochs(out / "street", workers, as_json)
     sum_up(survey_file, as_json, {"height_error_m": compared.height_error(), "inventory": street})
-    for line in () if as_json else (*compared.lines(), *street, f"look at it    roadscan view {survey_file}"):
+    for line in () if as_json else (*compared.lines(), *street, *page_lines(survey_file)):
         typer.echo(line)
 
 

@@ -118,7 +118,7 @@ def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
         if row.get(GEOMETRY) is not None:
             points = reference_points(np.asarray(shapely.from_wkb([row[GEOMETRY]])))
             place = shapely.to_wkb(shapely.Point(points[0]), flavor="iso")
-        values = {name: _shown(one, name) for name in ("in_force", "other", "base")}
+        values = {name: value_shown(one, name) for name in ("in_force", "other", "base")}
         layer = asset_schema(one.kind).table
         named = {"layer": layer, "pictures": pictures_of(row), "decision": None, GEOMETRY: place}
         rows.append(one._asdict() | values | named)
@@ -140,8 +140,8 @@ def pictures_of(row: Mapping[str, Any]) -> str | None:
     return "\n".join(files) or None
 
 
-def _shown(conflict: Conflict, name: str) -> str | None:
-    """A value as people read it: geometries as WKT to the millimetre."""
+def value_shown(conflict: Conflict, name: str) -> str | None:
+    """A value of a conflict, `in_force`, `other` or `base`, as people read it: geometries as WKT to the millimetre."""
     value = decoded(conflict.kind, conflict.attribute, getattr(conflict, name))
     if isinstance(value, bytes):
         return str(shapely.to_wkt(shapely.from_wkb(value), rounding_precision=3))

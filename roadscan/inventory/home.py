@@ -51,10 +51,11 @@ class Mark(NamedTuple):
 
 
 class Author(NamedTuple):
-    """Who changed a row, and when (UTC)."""
+    """Who changed a row, when (UTC) and why, as far as the home tells; empty where it does not."""
 
     who: str
     at: str
+    why: str = ""
 
 
 class Decision(NamedTuple):
@@ -81,6 +82,8 @@ class Content:
     decisions: Sequence[Decision] = ()
     authors: Mapping[tuple[str, str], Author] = field(default_factory=dict)
     """Who changed rows last since they were read, by kind and id, or kind and `fid N`; empty where it is not told."""
+    faults: Sequence[EditFault] = ()
+    """What people wrote that no row can hold."""
 
 
 class Sheet(NamedTuple):
@@ -94,6 +97,9 @@ class Sheet(NamedTuple):
 
 class Home(ABC):
     """A place that people edit the inventory in."""
+
+    made_of: Mapping[str, pa.Table] | None = None
+    """Rows by kind that it was made of, where it has them itself; otherwise they are kept under its token."""
 
     @property
     @abstractmethod

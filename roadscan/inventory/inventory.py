@@ -21,6 +21,7 @@ from roadscan.inventory.diff import Differences, differences
 from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
 from roadscan.inventory.home import FID, Content, EditFault, Home, HomeError, Mark, Sheet
+from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument, PageEdits
 from roadscan.inventory.pulling import Pulling, new_edits, now_utc, refuse
 from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
@@ -125,7 +126,7 @@ class Inventory:
             recorded = None if given is None else record(self.truth, given, self.rules, getpass.getuser())
             state = state_at(self.truth)
             conflicts = conflicts_of(state)
-            content = _shown(state)
+            content = shown_content(state)
             at = self.truth.commits[-1].at if self.truth.commits else "1980-01-06T00:00:00Z"
             token = self._token(state.commit, mark)
             self.truth.keep_published(token, published_table(content))
@@ -166,7 +167,7 @@ class Inventory:
         with self.truth.alone():
             mark, changes, content = self._changes(place)
             now = state_at(self.truth)
-            faults = faults_of(changes, now, self.rules.unit_m)
+            faults = [*content.faults, *faults_of(changes, now, self.rules.unit_m)]
             if faults and not sound:
                 raise refuse(faults, place.name)
             taken = _without(changes, faults)
@@ -178,6 +179,35 @@ class Inventory:
         waiting = len(conflicts_of(state_at(self.truth))) if commit is not None else len(conflicts_of(now))
         return Pulled(place.name, commit, tuple(edits), tuple(faults), waiting)
 
+    def pull_page(
+        self, document: PageDocument, *, who: str | None = None, why: str = "", sound: bool = False
+    ) -> tuple[Pulled, list[EditOutcome]]:
+        """Take in edits that people made in the page of a survey; beside it, what became of each of them.
+
+        Parameters
+        ----------
+        who, why : of edits of which the document does not tell; sound : as :meth:`pull`.
+
+        Raises
+        ------
+        FaultyEditsError
+            where edits are faulty; it lists all of them.
+        HomeError
+            where the page showed another inventory, or a commit that this one does not have.
+        """
+        commit = document.edits.commit
+        self._check_own(document.mark, document)
+        self.truth.renew()
+        if commit > len(self.truth.commits):
+            raise HomeError(
+                f"the page showed commit {commit}, and the inventory has {len(self.truth.commits)}",
+                change="publish the page again, and make the edits there",
+                file=document.name,
+            )
+        home = PageEdits(document, shown_content(self.state(commit)).rows)
+        pulled = self.pull(home=home, who=who, why=why, sound=sound)
+        return pulled, home.outcomes(pulled.edits, pulled.refused, self.conflicts())
+
     def _append(self, place: Home, mark: Mark, edits: list[Edit], rows: Content, why: str) -> int | None:
         """Commit edits and let the home say so, in steps of which any may be the last one that is done.
 
@@ -188,7 +218,8 @@ class Inventory:
         number = len(self.truth.commits) + 1
         token = self._token(number, mark)
         place.note(mark._replace(pending=token))
-        self.truth.keep_published(token, published_table(rows))
+        if place.made_of is None:
+            self.truth.keep_published(token, published_table(rows))
         who = edits[0].who if len({e.who for e in edits}) == 1 else "several"
         stamped = [edit._replace(commit=number) for edit in edits]
         commit = self.truth.append(Draft("edits", who, why, place.name, run=token), edit_rows(stamped))
@@ -203,15 +234,16 @@ class Inventory:
         self._check_own(mark, place)
         if mark.pending and any(c.run == mark.pending for c in self.truth.commits):
             mark = mark._replace(token=mark.pending, pending="")
-        base = self.truth.published(mark.token)
-        if base is None or mark.commit > len(self.truth.commits):
+        base = None if place.made_of is not None else self.truth.published(mark.token)
+        if (base is None and place.made_of is None) or mark.commit > len(self.truth.commits):
             raise HomeError(
                 "it was published from another store, or from one that was lost",
                 change="publish to a new file, and bring over what was edited by hand",
                 file=place.name,
             )
         content = place.read()
-        return mark, compared(content, published_rows(base), mark.token), content
+        rows = place.made_of if place.made_of is not None else published_rows(base)
+        return mark, compared(content, rows, mark.token or f"commit {mark.commit}"), content
 
     def _write_project(self) -> None:
         """Write the project file of QGIS, where there is none yet: people arrange it to their liking."""
@@ -228,7 +260,7 @@ class Inventory:
         except OSError as error:
             raise HomeError(f"the project file cannot be written: {error.strerror}", file=file) from error
 
-    def _check_own(self, mark: Mark | None, place: Home | None = None) -> None:
+    def _check_own(self, mark: Mark | None, place: Home | PageDocument | None = None) -> None:
         if mark is not None and mark.inventory != self.name:
             raise HomeError(
                 f"it is the home of the inventory '{mark.inventory}'",
@@ -346,7 +378,7 @@ def _undoing(commits: Sequence[Commit]) -> list[Commit]:
     return counted
 
 
-def _shown(state: State) -> Content:
+def shown_content(state: State) -> Content:
     """A state as homes show it: without rejected assets, numbered."""
     rows = {}
     for kind, assets in state.assets.items():

@@ -64,11 +64,12 @@ def _edit(
 ) -> Edit:
     action, old, new = change
     author = pulling.authors.get((kind, asset_id)) or pulling.authors.get((kind, f"fid {fid}"))
-    who, at = author if author is not None else (pulling.who, pulling.at)
+    who, at, why = author if author is not None else ("", "", "")
     evidence = (pulling.base.row(asset_id, evidence=True) or {}).get(attribute)
     return Edit(
         "", 0, asset_id, kind, attribute, action, None if old is None else encoded(old), encoded(new),
-        None if evidence is None else encoded(evidence), pulling.base.commit, who, at, pulling.why, pulling.source,
+        None if evidence is None else encoded(evidence), pulling.base.commit, who or pulling.who, at or pulling.at,
+        why or pulling.why, pulling.source,
     )  # fmt: skip
 
 

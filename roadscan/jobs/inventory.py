@@ -9,8 +9,9 @@ from typing import Final
 
 import pyarrow as pa
 
-from roadscan.inventory.home import Home
+from roadscan.inventory.home import Home, HomeError
 from roadscan.inventory.homes.geopackage import GeoPackage
+from roadscan.inventory.homes.page_edits import PageDocument
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
 from roadscan.inventory.recording import Found, Rules
@@ -84,6 +85,33 @@ def home_of(session: Session, given: str | None = None) -> Home:
         srid = None if crs is None else crs_from_text(crs).to_epsg()
         return PostGis(address, settings.schema_name, srid)
     return GeoPackage(Path(given) if given is not None else survey.resolve(settings.home), crs)
+
+
+def page_document(session: Session, name: str, content: bytes) -> PageDocument:
+    """Edits of the page of a survey.
+
+    Raises
+    ------
+    HomeError
+        where `content` is no such document.
+    """
+    frame = session.survey.config.map.frame()
+    units_m = frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m
+    return PageDocument.parse(name, content, units_m)
+
+
+def edits_of_file(file: Path) -> bytes:
+    """What a file holds that the page of a survey saved.
+
+    Raises
+    ------
+    HomeError
+        where it cannot be read.
+    """
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise HomeError(f"the edits cannot be read: {error.strerror}", file=file) from error
 
 
 def found_assets(session: Session) -> Found | None:

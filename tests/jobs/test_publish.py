@@ -7,30 +7,41 @@ import io
 import json
 import random
 import re
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import geopandas
 import laspy
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pyproj
 import pytest
+import shapely
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.inventory import truth_of
 from roadscan.jobs.publish import web_part
 from roadscan.jobs.publish.document import json_bytes
+from roadscan.jobs.publish.edit_door import EditDoor
+from roadscan.jobs.publish.live import LiveSite, open_survey
 from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.jobs.publish.parts import vectors
+from roadscan.jobs.publish.parts.edits import Edits
+from roadscan.jobs.publish.parts.rasters import images_of
 from roadscan.jobs.publish.parts.strips import Strips
 from roadscan.jobs.publish.single import write_single
 from roadscan.jobs.publish.site import KEYS, Published, publish
+from roadscan.jobs.publish.thumbnail import thumbnail
 from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stages
@@ -38,8 +49,12 @@ from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import ConfigError
 from roadscan.model.survey import Survey
+from roadscan.products.geo_table import write_geo_table
 from roadscan.products.site_rasters import Place, Raster, coarser_picture
 from roadscan.simulate import simulate, truth
+from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.store import bytes_digest
+from tests.inventory.streets import EAST, NORTH, asset, found
 from tests.jobs.conftest import Lines, Simulated, small_scene
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewer.md"
@@ -374,8 +389,8 @@ def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
     items = list(collection.get_items())
     assert collection.id == "demo" and len(items) == len(read(published, "clouds/index.json")["sheets"])
     for item in items:
-        for asset in item.assets.values():
-            assert Path(asset.get_absolute_href()).is_file()
+        for one in item.assets.values():
+            assert Path(one.get_absolute_href()).is_file()
         assert item.get_collection() is collection
         item.stac_extensions.clear()  # their schemas lie on the network, those of the core in the library
         item.validate()
@@ -447,7 +462,8 @@ def test_a_single_file_holds_all(survey_file: Path, published: Published, with_p
             assert content == ({**true, "report": None} if path == "survey.json" else true)
         else:
             assert base64.b64decode(text, validate=True) == file.read_bytes()
-    assert set(read(published, KEYS)["keys"]) - set(page.held) <= {
+    known = {path for path in read(published, KEYS)["keys"] if not path.startswith("app/")}  # the page, where it is built
+    assert known - set(page.held) <= {
         f.relative_to(published.folder).as_posix()
         for f in published.folder.rglob("*")
         if f.suffix in (".parquet", ".vpc", ".tif", ".vrt", ".html")
@@ -530,13 +546,115 @@ def test_what_json_has_no_word_for_is_null_and_long_numbers_are_text() -> None:
     assert told == {"a": None, "b": [None, 1.5], "c": str(2**60), "d": [0, 1], "e": None}
 
 
-def test_a_large_layer_is_cut_into_sheets(
-    survey_file: Path, monkeypatch: pytest.MonkeyPatch, published: Published
-) -> None:
+def test_a_large_layer_is_cut_into_sheets(survey_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(vectors, "_MOST_VERTICES", 10)
     material = Material(opened(survey_file))
     documents = {d.path: d for d in vectors.Vectors().documents(material) if d.path.startswith("layers/tiles/")}
     layer = next(one for one in vectors.Vectors().members(material)["layers"] if one["name"] == "tiles")
+    coarse = documents.pop(layer["overview"])
     assert {part["url"] for part in layer["parts"]} == set(documents)
     assert "whole" not in "".join(documents)
     assert sum(part["features"] for part in layer["parts"]) == layer["features"]
+    # Who looks from far away gets all features with what colours them, and nothing else.
+    coarse.write(tmp_path / "coarse.json", Path)
+    features = json.loads((tmp_path / "coarse.json").read_text())["features"]
+    assert [one["properties"] for one in features] == [{"state": "done"}] * layer["features"]
+
+
+def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) -> None:
+    """What `roadscan view --edit` does: the page's edits are in the site at once, and the page's layers in metres."""
+    copy = tmp_path / "survey"
+    shutil.copytree(survey_file.parent, copy)
+    edited = copy / survey_file.name
+    with pytest.raises(ConfigError, match="inventory is empty"):
+        Material(opened(edited), Wishes(edits="post")).check_edits()
+    session = opened(edited)
+    west, south, _, _ = Material(session).extent_m or (0.0,) * 4
+    held = truth_of(session)
+    held.record(found([asset("pole", (west - EAST + 3.0, south - NORTH + 2.0, 50.0), asset_height_m=5.0)]))
+    site = LiveSite(open_survey(edited, edited=True))
+    served = site.document("survey.json")
+    assert served is not None
+    survey = json.loads(served.file.read_bytes())
+    (layer,) = (one for one in survey["layers"] if one["name"] == "asset_poles")
+    assert survey["edits"] == {
+        "layers": ["asset_poles"], "post": "edits", "inventory": session.survey.config.id, "commit": 1,
+    }  # fmt: skip
+    columns = {one["name"]: one.get("edited") for one in layer["columns"]}
+    assert columns["condition"] == {"type": "int32", "values": []} and columns["returns"] is None
+    assert "rejected" in columns["status"]["values"]
+    (pole,) = features_of(site, layer)
+    assert pole["geometry"]["coordinates"] == [west + 3.0, south + 2.0, 50.0]
+    properties = {"layer": "asset_poles", "action": "change", "asset_id": pole["properties"]["asset_id"]}
+    document = {
+        "type": "FeatureCollection", "coordinates": "map_m", "survey": "s", "inventory": session.survey.config.id,
+        "commit": 1,
+        "features": [
+            {"type": "Feature", "geometry": None, "properties": properties | {"attributes": {"condition": 3}}}
+        ],
+    }  # fmt: skip
+    told = EditDoor(lambda: opened(edited)).take(json.dumps(document).encode())
+    assert (told["commit"], told["edits"]) == (2, [{"outcome": "accepted", "reason": ""}])
+    assert served != site.document("survey.json")  # a page that begins anew sees it
+    (pole,) = features_of(site, layer)
+    assert pole["properties"]["condition"] == 3
+    # The same from a file that a published site saved, by the command line; and without edits a site offers none.
+    file = tmp_path / "edits.geojson"
+    file.write_text(
+        json.dumps(document).replace('"condition": 3', '"condition": 5').replace('"commit": 1', '"commit": 2')
+    )
+    done = CliRunner().invoke(app, ["inventory", "pull", str(edited), "--home", str(file), "--who", "max"])
+    assert done.exit_code == 0 and "commit 3: 1 values of 1 assets" in done.output
+    assert Material(opened(edited)).inventory is not None
+    assert entry_of(Material(opened(edited)))["edits"] is None
+    assert entry_of(Material(opened(edited), Wishes(edits="file")))["edits"]["post"] is None
+
+
+def features_of(site: LiveSite, layer: dict[str, Any]) -> list[dict[str, Any]]:
+    served = site.document(layer["parts"][0]["url"])
+    assert served is not None
+    features: list[dict[str, Any]] = json.loads(served.file.read_bytes())["features"]
+    return features
+
+
+def entry_of(material: Material) -> dict[str, Any]:
+    """What the parts of a site tell of it."""
+    return dict(Edits().members(material))
+
+
+def test_heights_of_a_table_are_metres_once(survey_file: Path, tmp_path: Path) -> None:
+    """GeoParquet is in the CRS's own units: feet of a map in feet become metres, and no further."""
+    copy = tmp_path / "survey"
+    shutil.copytree(survey_file.parent, copy)
+    material: Any = Material(opened(copy / survey_file.name))
+    feet: Any = SimpleNamespace(map=SimpleNamespace(crs=None, horizontal_unit_m=0.3, vertical_unit_m=0.3))
+    place = np.array([shapely.Point(30.0, 60.0, 90.0)], object)
+    write_geo_table(tmp_path / "t.parquet", pa.table({"a": [1]}), "geometry", place, ["Point Z"], feet)
+    content = (tmp_path / "t.parquet").read_bytes()
+    material.store.write_bytes("products/t.parquet", content)
+    material.__dict__["context"] = feet
+    held = material.rows_of([OutputRecord("t", "t", "k", "products/t.parquet", len(content), bytes_digest(content))])
+    assert shapely.get_coordinates(held.shapes_m, include_z=True) == pytest.approx(np.array([[30.0, 60.0, 90.0]]))
+
+
+def test_a_thumbnail_shows_the_map(survey_file: Path, tmp_path: Path) -> None:
+    material = Material(opened(survey_file))
+    west, south, east, north = material.extent_m or (0.0,) * 4
+    wide = np.asarray(Image.open(io.BytesIO(thumbnail(material, (west, south, east, north), (300, 200)))))
+    assert wide.shape == (200, 300, 3)
+    colours = {tuple(one) for one in wide.reshape(-1, 3).tolist()}
+    assert (213, 94, 0) in colours or (0, 114, 178) in colours  # a run of the layer of passes
+    # The hillshade lies where the finest picture has it: its middle, pixel by pixel.
+    images = images_of(material)
+    pixel_m = images.pyramid.pixel_m(0)
+    place = Place(0, *images.pyramid.places(0)[len(images.pyramid.places(0)) // 2].tolist())
+    tile_m = pixel_m * images.pyramid.tile_px
+    made = tmp_path / "finest.png"
+    images.document("hillshade", place).write(made, Path)
+    finest = np.asarray(Image.open(made))
+    shade = thumbnail(
+        replace(material, wishes=Wishes(near=None)), (place.column * tile_m, place.row * tile_m,
+        (place.column + 1) * tile_m, (place.row + 1) * tile_m), (images.pyramid.tile_px,) * 2,
+    )  # fmt: skip
+    same = np.asarray(Image.open(io.BytesIO(shade)))[..., 0] == finest[..., 0]
+    assert same[finest[..., 1] > 0].mean() > 0.8  # the others lie under lines

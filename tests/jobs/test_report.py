@@ -17,6 +17,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from roadscan.cli import app
+from roadscan.jobs.publish.report_copy import linked_report
 from roadscan.jobs.report.page import PATH, keep_report, report_page
 from roadscan.jobs.report.section import sections
 from roadscan.jobs.session import Session
@@ -63,7 +64,7 @@ def test_a_run_writes_a_page_that_needs_nothing_else(finished: Simulated) -> Non
     read = Reader(page)
     assert not read.of("script") and not read.of("link") and not read.of("iframe")
     assert all((image["src"] or "").startswith("data:image/") for image in read.of("img"))
-    anchors = {(link["href"] or "")[1:] for link in read.of("a")}
+    anchors = {(link["href"] or "")[1:] for link in read.of("a") if "data-place" not in link}
     assert anchors == {section["id"] for section in read.of("section")}
     assert {"overview", "recorded", "coverage", "products"} <= anchors
     assert "http" not in page.replace("http-equiv", "")
@@ -107,6 +108,21 @@ def test_small_pictures_show_the_products(finished: Simulated) -> None:
     assert sum(max(picture.size) <= 900 for picture in pictures) >= 2  # others are shown whole: of the adjustment
     for picture in pictures:
         assert np.asarray(picture.convert("L")).std() > 5.0  # something is to be seen
+
+
+def test_pictures_of_places_lead_into_a_site_beside_the_report(finished: Simulated, tmp_path: Path) -> None:
+    copy, out = finished.copy_with_store_to(tmp_path / "survey"), tmp_path / "page.html"
+    links = []
+    for folder in ("none", "site"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "survey.json").write_text("{}")
+        outcome = CliRunner().invoke(app, ["report", str(copy.survey_file), "--out", str(out)])
+        assert outcome.exit_code == 0, outcome.output
+        links.append([one.get("href") or "" for one in Reader(out.read_text()).of("a")])
+    assert not any("index.html" in one for one in links[0])
+    into = [one for one in links[1] if one.startswith("site/index.html#")]
+    assert "site/index.html#views=map" in into
+    assert out.read_bytes() == linked_report(copy.store().read_bytes(PATH), "site/")
 
 
 def test_every_section_has_a_place_of_its_own() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from roadscan.jobs.publish.live import LiveSite, Served, open_survey
 from roadscan.jobs.publish.server import SiteServer, range_of
+from roadscan.model.errors import StoreError
 from tests.jobs.conftest import Simulated
 
 CONTENT = bytes(range(256)) * 40
@@ -71,6 +72,74 @@ def test_a_document_is_given_whole_and_by_range(server: SiteServer) -> None:
         assert answer.getheader("Content-Range") == f"bytes {span[0]}-{span[1] - 1}/10240"
     answer, _ = ask(server, "/clouds/a.laz", headers={"Range": "bytes=10240-"})
     assert (answer.status, answer.getheader("Content-Range")) == (416, "bytes */10240")
+
+
+@pytest.fixture
+def editable(held: Held) -> Iterator[SiteServer]:
+    """A server that takes edits; what it took stands in `held.asked`."""
+
+    def take(content: bytes) -> dict[str, str]:
+        if content == b"bad":
+            raise StoreError("the edits <b>are</b> bad")
+        held.asked.append(content.decode())
+        return {"took": content.decode()}
+
+    with SiteServer(held, take=take) as one:
+        thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield one
+        one.shutdown()
+        thread.join()
+
+
+def post(
+    server: SiteServer, content: bytes = b"<edits>", path: str = "/edits", **headers: str | None
+) -> tuple[int, bytes]:
+    """Status and body of an answer to a post as the page sends it, but for some headers; None leaves one out."""
+    own = {
+        "Host": f"127.0.0.1:{server.server_port}", "Origin": f"http://127.0.0.1:{server.server_port}",
+        "Content-Type": "application/geo+json", "X-Roadscan-Edit": server.token, "Content-Length": str(len(content)),
+    }  # fmt: skip
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.putrequest("POST", path, skip_host=True, skip_accept_encoding=True)
+    for name, value in (own | {name.replace("_", "-"): value for name, value in headers.items()}).items():
+        if value is not None:
+            connection.putheader(name, value)
+    connection.endheaders(content)
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, body
+
+
+def test_edits_of_its_own_page_are_taken(editable: SiteServer, held: Held) -> None:
+    assert editable.address.endswith(f"/#edit={editable.token}") and len(editable.token) >= 32
+    status, body = post(editable)
+    assert (status, json.loads(body), held.asked) == (200, {"took": "<edits>"}, ["<edits>"])
+    assert b"<" not in body
+    assert post(editable, b"bad") == (422, b"the edits <b>are</b> bad\n")
+    assert ask(editable, "/clouds/a.laz")[0].status == 200
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Origin": None}, 403), ({"Origin": "null"}, 403), ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "http://127.0.0.1:1"}, 403), ({"Host": "evil.example"}, 403), ({"Host": None}, 403),
+        ({"X_Roadscan_Edit": None}, 403), ({"X_Roadscan_Edit": ""}, 403), ({"X_Roadscan_Edit": "\xe9"}, 403),
+        ({"X_Roadscan_Edit": "0" * 32}, 403), ({"Content_Type": "text/plain"}, 415),
+        ({"Content_Type": None}, 415), ({"Content_Length": None}, 411), ({"Content_Length": "-1"}, 411),
+        ({"Content_Length": "999999999999"}, 413), ({"path": "/"}, 405), ({"path": "/clouds/a.laz"}, 405),
+    ],
+)  # fmt: skip
+def test_other_edits_are_refused(editable: SiteServer, held: Held, headers: dict[str, str | None], status: int) -> None:
+    assert post(editable, **headers)[0] == status  # type: ignore[arg-type]
+    assert held.asked == []
+
+
+def test_without_being_asked_to_it_takes_no_edits(server: SiteServer, held: Held) -> None:
+    assert post(server)[0] == 405
+    assert "#" not in server.address and held.asked == []
 
 
 def test_a_head_has_no_body(server: SiteServer) -> None:

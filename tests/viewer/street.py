@@ -79,7 +79,7 @@ def write_site(folder: Path) -> None:
         "catalog": None,
         "report": None,
         "left_out": [],
-        "edits": {"layers": ["asset_poles"], "post": None},
+        "edits": {"layers": ["asset_poles"], "post": None, "inventory": "street", "commit": 3},
     }
     _write_mesh(folder)
     _write_strips(folder)
@@ -107,7 +107,7 @@ def _layers() -> list[tuple[dict[str, Any], list[dict[str, Any]]]]:
                 "columns": [
                     _column("pole", "number"),
                     _column("name", "text"),
-                    _column("height_m", "m") | {"sigma": "sigma_height_m"},
+                    _column("height_m", "m") | {"sigma": "sigma_height_m", "edited": {"type": "float64", "values": []}},
                     _column("sigma_height_m", "m"),
                 ]
             },

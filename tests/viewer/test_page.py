@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -11,10 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
+from roadscan.inventory.homes.page_edits import EditDocument
+from tests.viewer.conftest import go_to
 from tests.viewer.street import CURB, EAST_M, HOSTILE, NORTH_M, TARGET, height_m, perspective_pixel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 AXE = REPOSITORY / "viewer/node_modules/axe-core/axe.min.js"
+STILL = '.map-view[data-drawn="true"]'
+_TURNS = itertools.count()
 NUMBERS = re.compile(r"-?\d+(?:\.\d+)?")
 
 
@@ -42,8 +47,7 @@ def _click_cloud(page: Any, place: tuple[float, float, float]) -> None:
 
 
 def _look(page: Any, place: tuple[float, float, float], across_m: float) -> None:
-    page.evaluate(f"location.hash = 'at={place[0]},{place[1]},{place[2]}&zoom={across_m}&t=' + Math.random()")
-    page.wait_for_timeout(700)
+    go_to(page, f"at={place[0]},{place[1]},{place[2]}&zoom={across_m}&t={next(_TURNS)}")
     page.wait_for_selector('.cloud-view[data-loading="0"]')
 
 
@@ -71,11 +75,11 @@ def test_a_click_on_the_map_reads_place_and_height(watched: Any, address: str) -
     page = watched.open(address)
     page.locator("#search").fill(f"{EAST_M + 10.5} {NORTH_M + 2.5}")
     page.locator("#search").press("Enter")
-    page.wait_for_timeout(600)
     box = page.locator(".map-target").bounding_box()
     for _ in range(8):
+        page.wait_for_selector(STILL)
         page.locator(".map-view .view-buttons button").first.click()
-        page.wait_for_timeout(200)
+    page.wait_for_selector(STILL)
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.locator('.place:has-text("from the map")').wait_for()
     east, north, height = _read(page)
@@ -134,9 +138,9 @@ def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: s
     read = _read(page)
     page.locator('.place button:has-text("Pictures of it")').click()
     page.locator(".picture-frame[data-mark]:not([data-mark=''])").wait_for()
-    page.locator(".picture-list button").first.wait_for()
+    page.locator(".picture-list button").nth(1).wait_for()
     assert page.locator(".picture-list button").count() == 2
-    page.wait_for_timeout(800)
+    page.wait_for_selector('.picture-frame[data-state="shown"]')
     mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
     assert np.hypot(*(mark - perspective_pixel(read))) <= 0.05
     # Back from the pixel: the frame shows the whole picture, as large as it fits.
@@ -170,8 +174,8 @@ def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
     _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=6)
     before = page.locator(".cloud-canvas").screenshot()
     page.locator(".cloud-settings label", has_text="Mesh of the surface").click()
-    page.wait_for_function("() => performance.getEntriesByType('resource').some((one) => one.name.endsWith('.glb'))")
-    page.wait_for_timeout(1500)
+    page.wait_for_selector('.cloud-view[data-meshes="1"]')
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     shown = cv2.imdecode(np.frombuffer(page.locator(".cloud-canvas").screenshot(), np.uint8), cv2.IMREAD_COLOR)
     points = cv2.imdecode(np.frombuffer(before, np.uint8), cv2.IMREAD_COLOR)
     # The mesh is red, and no colour of the points' scale is.
@@ -192,18 +196,19 @@ def test_edits_become_a_document(watched: Any, address: str) -> None:
     (edit,) = document["features"]
     assert document["survey"] == "street"
     assert document["crs"] == "EPSG:25832"
+    assert (document["inventory"], document["commit"]) == ("street", 3)
     assert edit["geometry"] is None
     assert edit["properties"]["attributes"] == {"height_m": 4.5}
-    assert (
-        edit["properties"] | {"layer": "asset_poles", "action": "change", "id": 1, "comment": HOSTILE}
-        == edit["properties"]
-    )
+    said = {"layer": "asset_poles", "action": "change", "asset_id": "1", "comment": HOSTILE}
+    assert edit["properties"] | said == edit["properties"]
+    assert EditDocument.parse(document).features[0].properties.asset_id == "1"
 
 
 def test_the_page_goes_on_without_the_host(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=4)
-    page.wait_for_timeout(2000)
+    page.wait_for_selector('.app[data-code="all"]')
+    page.wait_for_selector(STILL)
     page.context.set_offline(True)
     _middle(page)
     read = _read(page)
@@ -258,7 +263,7 @@ def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
 
 def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#at={CURB[0]},{CURB[1]}&zoom=2&views=map")
-    page.wait_for_timeout(700)
+    page.wait_for_selector(STILL)
     page.locator(".map-target").focus()
     page.keyboard.press("Enter")
     page.locator(".details h2", has_text="<script>").wait_for()

@@ -5,7 +5,7 @@ import type { Desk, ViewName } from './core/desk'
 import { fill, h, icon, iconButton } from './core/dom'
 import * as format from './core/format'
 import { MapView } from './map/map'
-import { Editing } from './edits/editing'
+import { Editing, editToken } from './edits/editing'
 import { helpDialog } from './panels/help'
 import { layersPanel } from './panels/layers'
 import { Measurements } from './panels/measurements'
@@ -47,7 +47,8 @@ export class App {
     this.map = new MapView(desk)
     this.#measurements = new Measurements(desk)
     this.parts = new ModelParts(desk, this.map, this.#measurements, () => this.#openDock('section'))
-    this.#editing = survey.edits ? new Editing(desk, this.map, survey.edits) : null
+    const token = survey.edits?.post ? editToken() : null
+    this.#editing = survey.edits && (token || !survey.edits.post) ? new Editing(desk, this.map, survey.edits, token) : null
     this.#rows = new RowPanel(desk, {
       openPicture: (url) => void this.parts.openPicture(url),
       openPictures: (place) => void this.parts.picturesOf(place),
@@ -169,6 +170,7 @@ export class App {
     if (!NARROW.matches && survey.strips) first.push('strips')
     this.#dock.hidden = !first.includes('strips')
     for (const [name, view] of this.#views) view.hidden = !first.includes(name)
+    if (first.includes('cloud')) this.parts.prepareCloud()
     requestAnimationFrame(() => {
       this.map.map.updateSize()
       this.map.fit(undefined, 0)
@@ -179,7 +181,7 @@ export class App {
         this.desk.views.value = new Set(first)
         this.parts.startPictures()
         void this.#followHash()
-        window.setTimeout(() => void this.parts.fetchCode(), 1500)
+        window.setTimeout(() => void this.parts.fetchCode().then(() => (this.element.dataset['code'] = 'all')), 1500)
       })
       this.map.map.render()
     })
@@ -264,10 +266,13 @@ export class App {
     if (Number.isFinite(column) && Number.isFinite(row)) this.desk.goTo({ easting_m: (column + 0.5) * size, northing_m: (row + 0.5) * size, across_m: size * 1.5 })
   }
 
-  async #goToRow(name: string, id: number): Promise<boolean> {
+  /** Go to a row by the column that tells rows apart, or by its number in the layer. */
+  async #goToRow(name: string, id: string): Promise<boolean> {
     const layer = this.map.layers.find((one) => one.document.name === name)
     if (!layer) return false
-    const feature = (await layer.loadAll()).find((one) => one.id === id)
+    const rows = await layer.loadAll()
+    const { key } = layer.document
+    const feature = rows.find((one) => key !== null && String(one.properties[key]) === id) ?? rows.find((one) => String(one.id) === id)
     if (!feature) return false
     layer.setVisible(true)
     this.desk.selected.value = { layer: layer.document, feature }
@@ -287,14 +292,19 @@ export class App {
   }
 
   async #followHash(): Promise<void> {
-    const asked = new URLSearchParams(location.hash.slice(1))
+    const { hash } = location
+    await this.#goToHash(new URLSearchParams(hash.slice(1)))
+    this.element.dataset['at'] = hash
+  }
+
+  async #goToHash(asked: URLSearchParams): Promise<void> {
     const views = (asked.get('views') ?? '').split(',').filter((one): one is ViewName => this.#available.includes(one as ViewName))
     if (views.length) this.desk.views.value = new Set(views)
     const at = (asked.get('at') ?? '').split(',').map(Number)
     const across_m = Number(asked.get('zoom')) || 30
     if (at.length >= 2 && at.every(Number.isFinite)) this.desk.goTo({ easting_m: at[0]!, northing_m: at[1]!, height_m: at[2] ?? null, across_m })
     const [layer, id] = (asked.get('row') ?? '').split('/')
-    if (layer && id) await this.#goToRow(layer, Number(id))
+    if (layer && id) await this.#goToRow(layer, id)
     const station = asked.get('station')
     if (station && this.desk.survey.strips) await this.parts.goToStation(Number(station), asked.has('lane') ? Number(asked.get('lane')) : null)
   }

@@ -144,6 +144,12 @@ export class ModelParts {
     return this.#store
   }
 
+  /** Fetch the code and the coarsest points before the view is there: its graphics take a while to begin. */
+  prepareCloud(): void {
+    void import('./cloud/view').catch(() => {})
+    void this.#openStore().then((store) => store?.begin(), () => {})
+  }
+
   async openCloud(into: HTMLElement): Promise<void> {
     if (this.#cloud) return
     fill(into, h('p', { class: 'waiting', role: 'status' }, 'Opening the cloud …'))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,12 +42,15 @@ class SiteColumn:
     title: str = ""
     sigma: str = ""
     """Column that holds its 1 σ."""
+    edited: tuple[str, tuple[str, ...]] | None = None
+    """Type of its values, and those that there are (all where there are none), where people may change it."""
 
     def stated(self) -> dict[str, Any]:
         """As the page reads it."""
         title = self.title or self.name.replace("_", " ")
-        told = {"name": self.name, "title": title, "unit": self.unit, "meaning": self.meaning}
-        return told | ({"sigma": self.sigma} if self.sigma else {})
+        told: dict[str, Any] = {"name": self.name, "title": title, "unit": self.unit, "meaning": self.meaning}
+        told |= {"sigma": self.sigma} if self.sigma else {}
+        return told if self.edited is None else told | {"edited": {"type": self.edited[0], "values": self.edited[1]}}
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,19 @@ class Style:
         if self.values:
             return told | {"values": [{"value": v, "colour": c, "label": v} for v, c in self.values.items()]}
         return told | {"classes": list(_classes(self.limits))}
+
+    def colour_of(self, row: Mapping[str, Any]) -> str:
+        """Colour of a row, as the page finds it."""
+        if not self.by:
+            return self.colour
+        value = row.get(self.by)
+        if self.values:
+            return self.values.get(str(value), GREY)
+        if not isinstance(value, int | float) or math.isnan(value):
+            return GREY
+        kinds = list(_classes(self.limits))
+        colour: str = kinds[bisect.bisect_right(self.limits, value)]["colour"]
+        return colour
 
 
 def _classes(limits: Sequence[float]) -> Iterator[dict[str, Any]]:

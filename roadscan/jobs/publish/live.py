@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from roadscan.jobs.inventory import truth_of
 from roadscan.jobs.publish.document import Document
-from roadscan.jobs.publish.material import Material
+from roadscan.jobs.publish.material import Material, Wishes
 from roadscan.jobs.publish.part import site_parts
 from roadscan.jobs.publish.site import ENTRY, first_documents
 from roadscan.jobs.session import Session
+from roadscan.tables.asset_truth import COMMITS
 from roadscan.tables.store import Store
 
 FOLDER: Final = "site"
@@ -36,7 +38,7 @@ class LiveSite:
         self._open = open_material
         self._listing = threading.Lock()
         self._making: dict[str, threading.RLock] = defaultdict(threading.RLock)
-        self._seen: list[str] = []
+        self._seen: list[list[str]] = []
         self._listed: dict[str, Document] = {}
         self.material = self._renewed()
         self._cache = _cache_folder(self.material.store)
@@ -48,7 +50,7 @@ class LiveSite:
         """
         if path == ENTRY:
             with self._listing:
-                if self.material.store.files(_OUTPUTS) != self._seen:
+                if _stamp(self.material) != self._seen:
                     self.material = self._renewed()
         found = self._listed.get(path) or self._unlisted(path)
         if found is None:
@@ -80,7 +82,7 @@ class LiveSite:
 
     def _renewed(self) -> Material:
         material = self._open()
-        self._seen = material.store.files(_OUTPUTS)
+        self._seen = _stamp(material)
         listed = {one.path: one for one in first_documents(material)}
         for part in site_parts():
             listed |= {one.path: one for one in part.listed(material)}
@@ -88,18 +90,30 @@ class LiveSite:
         return material
 
 
-def open_survey(survey_file: str | Path, over: Sequence[str | Path] = ()) -> Callable[[], Material]:
+def open_survey(
+    survey_file: str | Path, over: Sequence[str | Path] = (), *, edited: bool = False
+) -> Callable[[], Material]:
     """Function that looks at a survey anew, and at others over it; damaged records are no hindrance, what is sound is
     shown.
+
+    Parameters
+    ----------
+    over : surveys that are shown over it; edited : whether people may edit the survey's inventory.
     """
+    wishes = Wishes(edits="post" if edited else "")
 
     def opened() -> Material:
         sessions = [Session.open(file) for file in (survey_file, *over)]
         for session in sessions:
             session.hear_of_damage()
-        return Material(sessions[0], over=tuple(sessions[1:]))
+        return Material(sessions[0], wishes, tuple(sessions[1:]))
 
     return opened
+
+
+def _stamp(material: Material) -> list[list[str]]:
+    """What differs where a survey has changed: its records, and the commits of its inventory."""
+    return [material.store.files(_OUTPUTS), truth_of(material.session).truth.store.files(COMMITS)]
 
 
 def _cache_folder(store: Store) -> Path:

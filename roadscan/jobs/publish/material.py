@@ -6,14 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.inventory.state import State
 from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.inventory import truth_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.products import StoredTiles, product_context
 from roadscan.jobs.session import Session
@@ -49,6 +51,8 @@ class Wishes:
     """Rasters with finer pixels are left out."""
     near: Box | None = None
     """Only what lies in this box of the map; all where it is None."""
+    edits: Literal["", "file", "post"] = ""
+    """Whether people may edit assets, and where their edits go: into a file, or to the server."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,27 @@ class Material:
             max(b.easting_max_m for b in boxes), max(b.northing_max_m for b in boxes),
         )  # fmt: skip
 
+    @cached_property
+    def inventory(self) -> tuple[str, State] | None:
+        """Name of the survey's inventory and its state today; None where nothing was taken into it yet.
+
+        Raises
+        ------
+        DamagedError
+            where the inventory is damaged.
+        """
+        held = truth_of(self.session)
+        return (held.name, held.state()) if held.truth.commits else None
+
+    def check_edits(self) -> None:
+        """Raise :class:`ConfigError` where the survey has no inventory that could be edited."""
+        if self.inventory is None:
+            raise ConfigError(
+                "there is nothing to be edited: the survey's inventory is empty",
+                expected="an inventory, which `roadscan inventory publish` makes of what the stage assets found",
+                change="run that first, or go without --edit",
+            )
+
     def cells(self, tiles: Sequence[TileId] | None = None) -> StoredTiles:
         """Cells and overviews of tiles, all of them unless some are named."""
         chosen = self.tiles if tiles is None else {t: self.tiles[t] for t in tiles if t in self.tiles}
@@ -162,7 +187,7 @@ class Material:
             rows = self.store.parse_table(content, record.path)
             if b"geo" in (rows.schema.metadata or {}):
                 rows, own = read_geo_table(content, self.context)
-                shapes.append(self._in_metres(own))
+                shapes.append(own)
             parts.append(rows.replace_schema_metadata(None))
         if not parts:
             return None
@@ -172,14 +197,6 @@ class Material:
     def key(self, records: Sequence[OutputRecord], *parts: Any) -> str:
         """Hash of the content of files, and of what else shapes a document."""
         return key_of([(r.unit, r.digest) for r in records], *parts)
-
-    def _in_metres(self, shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Shapes whose heights, too, are in metres; :func:`read_geo_table` turns easting and northing alone."""
-        unit_m = self.context.map.vertical_unit_m
-        if unit_m == 1.0 or not shapely.has_z(shapes).any():
-            return shapes
-        turned: npt.NDArray[Any] = shapely.transform(shapes, lambda p: p * [1.0, 1.0, unit_m], include_z=True)
-        return turned
 
     def _is_near(self, tile: TileId) -> bool:
         near, box = self.wishes.near, self.context.grid.bounds(tile)

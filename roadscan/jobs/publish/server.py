@@ -2,21 +2,27 @@
 
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
-reads the survey by a name that resolves to this machine.
+reads the survey by a name that resolves to this machine. Where it is asked to, it takes edits: by POST from its own
+page, with a token that stands in no document.
 """
 
 from __future__ import annotations
 
+import hmac
 import re
+import secrets
 import sys
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol
+from typing import Any, BinaryIO, Final, Protocol
 from urllib.parse import unquote, urlsplit
 
 from roadscan import __version__
+from roadscan.jobs.publish.document import json_bytes
 from roadscan.jobs.publish.live import Served
+from roadscan.jobs.publish.parts.edits import POST
 from roadscan.jobs.publish.site import REPORT_PAGE
 from roadscan.jobs.publish.web_part import HOW_TO_BUILD, PAGE
 from roadscan.model.errors import RoadscanError
@@ -48,6 +54,9 @@ _TYPES: Final = {
 _PATH: Final = re.compile(r"/([A-Za-z0-9_-][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*)?")
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _LONGEST_HEAD: Final = 8192
+TOKEN_HEADER: Final = "X-Roadscan-Edit"
+"""Carries the token; a page of another origin can send no such header without asking this server first."""
+_MOST_EDITS_BYTES: Final = 16_000_000
 
 
 class Documents(Protocol):
@@ -58,14 +67,18 @@ class Documents(Protocol):
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves a site on a loopback port; use it as a context, `serve_forever` answers until `shutdown`."""
+    """Serves a site on a loopback port; use it as a context, `serve_forever` answers until `shutdown`.
+
+    With `take`, a function that takes in a document of edits and answers, it takes edits.
+    """
 
     daemon_threads = True
     allow_reuse_address = False
 
-    def __init__(self, documents: Documents, port: int = 0) -> None:
+    def __init__(self, documents: Documents, port: int = 0, take: Callable[[bytes], Any] | None = None) -> None:
         """Listen; port 0 takes one that is free."""
-        self.documents = documents
+        self.documents, self.take = documents, take
+        self.token = secrets.token_urlsafe(24) if take is not None else ""
         super().__init__((LOOPBACK, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
@@ -75,8 +88,8 @@ class SiteServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Address of the page."""
-        return f"http://{LOOPBACK}:{self.server_port}/"
+        """Address of the page; it carries the token of edits behind `#`, which browsers send to no server."""
+        return f"http://{LOOPBACK}:{self.server_port}/" + (f"#edit={self.token}" if self.token else "")
 
     @property
     def hosts(self) -> frozenset[str]:
@@ -99,6 +112,42 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the head alone."""
         self._answer(with_body=False)
 
+    def do_POST(self) -> None:
+        """Take in edits."""
+        self.close_connection = True  # a body may follow that nobody reads
+        if self.server.take is None or urlsplit(self.path).path != f"/{POST}":
+            self._refuse_method()
+            return
+        refused = self._refused()
+        if refused is not None:
+            self._text(*refused)
+            return
+        try:
+            answer = self.server.take(self.rfile.read(int(self.headers["Content-Length"])))
+        except RoadscanError as error:
+            self._text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return
+        content = json_bytes(answer)
+        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(content))})
+        self.wfile.write(content)
+
+    def _refused(self) -> tuple[HTTPStatus, str] | None:
+        """Why edits are not taken; None where they come from this server's own page."""
+        host, origin = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        if host not in [[one] for one in self.server.hosts] or origin != [f"http://{host[0]}"]:
+            return HTTPStatus.FORBIDDEN, "edits are taken from this server's own page alone"
+        token = self.headers.get(TOKEN_HEADER, "").encode("utf-8", "replace")
+        if not hmac.compare_digest(token, self.server.token.encode()):
+            return HTTPStatus.FORBIDDEN, "open the page by the address that roadscan printed: it allows edits"
+        if self.headers.get_content_type() != "application/geo+json":
+            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "edits come as application/geo+json"
+        length = self.headers.get("Content-Length", "")
+        if not length.isascii() or not length.isdigit():
+            return HTTPStatus.LENGTH_REQUIRED, "edits come with their length"
+        if int(length) > _MOST_EDITS_BYTES:
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"edits hold {_MOST_EDITS_BYTES} bytes at most"
+        return None
+
     def __getattr__(self, name: str) -> object:
         if name.startswith("do_"):
             return self._refuse_method
@@ -109,7 +158,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse_method(self) -> None:
         self.close_connection = True  # a body may follow that nobody reads
-        self._text(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only", {"Allow": "GET, HEAD"})
+        told = "this server is read-only" if self.server.take is None else "only edits are taken, at their address"
+        self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
 
     def _answer(self, *, with_body: bool) -> None:
         if self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:

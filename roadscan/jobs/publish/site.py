@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from roadscan.code_reach import code_digest
 from roadscan.codecs import SOFTWARE
+from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.publish.document import Ask, Document, json_document
 from roadscan.jobs.publish.material import SHEET_M, Box, Material
 from roadscan.jobs.publish.part import site_parts
 from roadscan.jobs.publish.parts.catalog import to_longitude_latitude
+from roadscan.jobs.publish.report_copy import REPORT, linked_report
 from roadscan.jobs.publish.web_part import web_documents
-from roadscan.jobs.report.page import REPORT
 from roadscan.model.crs import MapFrame, crs_from_text
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.tables.manifest import read_recorded
@@ -27,6 +29,7 @@ from roadscan.tables.manifest import read_recorded
 LAYOUT: Final = 1
 ENTRY: Final = "survey.json"
 REPORT_PAGE: Final = "report.html"
+_LINKED: Final = "roadscan.jobs.publish.report_copy:linked_report"
 KEYS: Final = "keys.json"
 """Which documents the folder holds, with the key of each."""
 
@@ -63,9 +66,9 @@ def first_documents(material: Material) -> Iterator[Document]:
     if record is not None:
 
         def write(path: Path, _ask: Ask) -> None:
-            path.write_bytes(read_recorded(material.store, record))
+            path.write_bytes(linked_report(read_recorded(material.store, record), ""))
 
-        yield Document(REPORT_PAGE, record.digest, write)
+        yield Document(REPORT_PAGE, key_of(record.digest, code_digest(_LINKED)), write)
 
 
 @dataclass(frozen=True)

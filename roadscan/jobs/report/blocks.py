@@ -56,6 +56,8 @@ class Picture:
     caption: str
     width_mm: float = 170.0
     """Width on paper, at most."""
+    link: str = ""
+    """Where it leads in the page of a published site: what stands behind the page's name, from ``#`` on."""
 
     @property
     def address(self) -> str:

@@ -11,13 +11,12 @@ from jinja2 import Environment, StrictUndefined
 from roadscan import __version__
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import keep_file
+from roadscan.jobs.publish.report_copy import REPORT
 from roadscan.jobs.report.blocks import Paragraph, Part
 from roadscan.jobs.report.section import Material, Section, sections
 from roadscan.jobs.session import Session
 from roadscan.model.errors import RoadscanError
 
-REPORT: Final = "report"
-"""Product of the report's record."""
 PATH: Final = "report/report.html"
 """Where it lies, relative to the survey's root."""
 

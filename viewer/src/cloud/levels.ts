@@ -33,6 +33,7 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
     if (root) add(root)
     else if (!sheet.copc) void store.open(sheet)
   }
+  // Finer nodes are asked for together with coarser ones, which come first: the file says where all of them lie.
   const nodes = new Map<CloudNode, Float32Array>()
   let points = 0
   while (waiting.length) {
@@ -46,7 +47,6 @@ export function chooseNodes(store: CloudStore, camera: Camera, eye: Vector3, foc
     node.used = store.turn
     if (node.points) nodes.set(node, new Float32Array(8).fill(node.spacing_m))
     else if (node.count) void store.load(node)
-    if (node.count && !node.points) continue
     const distance = Math.max(0.5, local(node.box).distanceToPoint(eye))
     if ((node.spacing_m * focal_px) / distance > ENOUGH_PX) for (const child of store.children(node)) add(child)
   }

@@ -8,6 +8,8 @@ import { Decoders } from './decoders'
 
 const KEPT_POINTS = 12_000_000
 const AT_ONCE = 6
+/** Clouds of more sheets are opened as they come into sight. */
+const MOST_AT_FIRST = 12
 
 export interface Box {
   /** Least and greatest easting, northing, height (m). */
@@ -89,6 +91,16 @@ export class CloudStore {
 
   get loading(): number {
     return this.#running + this.#queue.length
+  }
+
+  /** Open the sheets of a small cloud, and load the coarsest points of each. */
+  async begin(): Promise<void> {
+    if (this.sheets.length > MOST_AT_FIRST) return
+    await Promise.all(this.sheets.map(async (sheet) => {
+      await this.open(sheet)
+      const root = sheet.nodes.get('0-0-0-0')
+      if (root) await this.load(root, true)
+    }))
   }
 
   /** Read a sheet's header and its first page of nodes, once. */

@@ -26,6 +26,8 @@ export interface CloudMeasure {
 const FIRST_BUDGET = 700_000
 const BUDGET = 3_000_000
 const REACH_PX = 6
+/** While points come, a picture is drawn no more often than so. */
+const BETWEEN_PICTURES_MS = 300
 
 export class CloudView {
   readonly element: HTMLElement
@@ -62,6 +64,7 @@ export class CloudView {
   /** True once people have moved the eye. */
   #touched = false
   #hover = 0
+  #pause = 0
 
   constructor(
     readonly desk: Desk,
@@ -177,6 +180,7 @@ export class CloudView {
 
   #redraw(choose = false): void {
     this.#stale ||= choose
+    if (choose && this.#active) this.element.dataset['loading'] = 'waiting'
     if (this.#asked || !this.#active) return
     this.#asked = true
     requestAnimationFrame(() => {
@@ -236,12 +240,17 @@ export class CloudView {
     drawOverlay(this.#overlay, this.#size, this.eye.camera, this.#origin, drawings, this.desk.dark.value)
   }
 
+  /** Something came: many nodes come at once, and not each is worth a picture of its own. */
   #arrived(): void {
     if (!this.#coloured && this.store.coloured) {
       this.#coloured = true
       this.#drawSettings()
     }
-    this.#redraw(true)
+    if (!this.store.loading) this.#redraw(true)
+    else this.#pause ||= window.setTimeout(() => {
+      this.#pause = 0
+      this.#redraw(true)
+    }, BETWEEN_PICTURES_MS)
   }
 
   /** Show the meshes of the detailed surface, or the points alone. */
@@ -249,7 +258,11 @@ export class CloudView {
     const { survey, source } = this.desk
     this.#meshes ??= (async () => {
       const [{ SurfaceMeshes }, index] = await Promise.all([import('./meshes'), source.json<MeshIndex>(survey.meshes!.url)])
-      return new SurfaceMeshes(index, source, this.#scene.meshes, this.#origin, () => this.#redraw(), (error) => this.desk.complain(error))
+      const arrived = (): void => {
+        this.element.dataset['meshes'] = String(this.#scene.meshes.children.length)
+        this.#redraw()
+      }
+      return new SurfaceMeshes(index, source, this.#scene.meshes, this.#origin, arrived, (error) => this.desk.complain(error))
     })()
     const meshes = await this.#meshes
     meshes.shown = shown

@@ -39,7 +39,15 @@ export interface Survey {
   left_out?: string[]
   cogs?: string[]
   catalog?: { collection: string; items: string; points: string | null } | null
-  edits?: { layers: string[]; post: string | null } | null
+  edits?: EditRules | null
+}
+
+/** Which layers are edited, where edits are sent (null: into a file), and what they are made on. */
+export interface EditRules {
+  layers: string[]
+  post: string | null
+  inventory: string
+  commit: number
 }
 
 export interface Column {
@@ -48,6 +56,8 @@ export interface Column {
   unit: string | null
   meaning: string | null
   sigma?: string | null
+  /** Where people may change it: the type of its values, and those that there are; all where none is named. */
+  edited?: { type: 'bool' | 'date' | 'float64' | 'int32' | 'int64' | 'string'; values: string[] } | null
 }
 
 export interface Class {
@@ -89,6 +99,8 @@ export interface Layer {
   columns: Column[]
   style: Style
   choices: Style[]
+  /** All features of a layer that lies in many parts, as they are seen from far away. */
+  overview?: string | null
   arrows: { east: string; north: string; up: string; exaggeration: number } | null
 }
 

@@ -22,6 +22,8 @@ import { crosshair, highlight, ring } from './styles'
 import { FeatureLayer, geometryOf } from './vectors'
 
 const TOUCH_PX = 7
+/** OpenLayers waits so long for a second click, and a little is added. */
+const SINGLE_CLICK_MS = 350
 
 export interface Hit {
   layer: Layer
@@ -43,6 +45,8 @@ export class MapView {
   readonly #ring = new Feature()
   readonly #selection = new VectorSource()
   readonly #tip = h('div', { class: 'map-tip', hidden: true })
+  #drawing = false
+  #drawn = 0
   readonly #bar = h('div', { class: 'scale-bar', 'aria-hidden': 'true' })
 
   constructor(readonly desk: Desk) {
@@ -104,10 +108,13 @@ export class MapView {
 
   #listen(target: HTMLElement): void {
     const { desk, map } = this
+    const still = (drawn: boolean): void => void (this.element.dataset['drawn'] = String(drawn))
     map.on('moveend', () => this.look())
+    map.on('precompose', () => still(false))
+    map.on('rendercomplete', () => still(true))
     map.getView().on('change:resolution', () => this.#drawBar())
     map.on('singleclick', (event) => {
-      if (!this.measuring.busy) void this.#click(event.pixel, event.coordinate)
+      if (!this.measuring.busy && !this.#drawing) void this.#click(event.pixel, event.coordinate)
     })
     map.on('pointermove', (event) => {
       if (event.dragging) return
@@ -133,6 +140,7 @@ export class MapView {
     desk.place.on((place) => this.#mark(this.#cross, place ? [place.easting_m, place.northing_m] : null))
     desk.target.on((goal) => {
       if (!goal) return
+      still(false)
       const size = map.getSize() ?? [400, 400]
       const resolution = goal.across_m ? goal.across_m / Math.max(100, Math.min(size[0]!, size[1]!)) : undefined
       map.getView().animate({ center: [goal.easting_m, goal.northing_m], ...(resolution ? { resolution } : {}), duration: 350 })
@@ -142,6 +150,13 @@ export class MapView {
       map.updateSize()
       this.#drawBar()
     }).observe(target)
+  }
+
+  /** While something is drawn, clicks select nothing; the last one comes as a single click only after a while. */
+  set drawing(drawing: boolean) {
+    window.clearTimeout(this.#drawn)
+    if (drawing) this.#drawing = true
+    else this.#drawn = window.setTimeout(() => (this.#drawing = false), SINGLE_CLICK_MS)
   }
 
   /** Load the features that the map shows now. */
@@ -183,6 +198,17 @@ export class MapView {
       },
       hits,
     )
+  }
+
+  /** Show another state of some layers. */
+  replace(layers: readonly Layer[]): void {
+    const extent = this.map.getView().calculateExtent(this.map.getSize())
+    for (const document of layers) this.layers.find((one) => one.document.name === document.name)?.replace(document, extent)
+  }
+
+  /** Height of the surface at a place (m); null where no raster knows it. */
+  async heightAt(easting_m: number, northing_m: number): Promise<number | null> {
+    return (await this.valuesAt(easting_m, northing_m)).find(([name]) => name === 'height')?.[2] ?? null
   }
 
   /** Values of all rasters at a place: name, title, value, its text. */

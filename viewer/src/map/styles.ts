@@ -50,6 +50,19 @@ export function styleOf(layer: Layer, style: Style, hidden: ReadonlySet<number>,
   }
 }
 
+/** The same from far away, where there are many features: a thin line of one colour. */
+export function coarseStyleOf(style: Style, hidden: ReadonlySet<number>) {
+  const made = new Map<string, OlStyle>()
+  return (feature: FeatureLike): OlStyle[] => {
+    const row = feature.get('row') as Row
+    if (hidden.size && hidden.has(entryOf(style, row))) return []
+    const colour = colourOf(style, row)
+    let drawn = made.get(colour)
+    if (!drawn) made.set(colour, (drawn = new OlStyle({ stroke: new Stroke({ color: css(colour), width: Math.min(3, style.width_px ?? 2), lineCap: 'butt' }) })))
+    return [drawn]
+  }
+}
+
 function drawn(layer: Layer, colour: string, width_px: number, dark: boolean): OlStyle[] {
   const edge = dark ? 'rgba(16, 18, 22, 0.9)' : 'rgba(255, 255, 255, 0.9)'
   if (layer.geometry === 'point') {

@@ -16,9 +16,13 @@ import OlStyle from 'ol/style/Style'
 import { Signal } from '../core/signal'
 import { type Bounds, type FeatureCollection, type FeatureDocument, type Layer, meets, type Part, type Style } from '../core/site'
 import type { Source } from '../core/source'
-import { colourOf, styleOf } from './styles'
+import { coarseStyleOf, colourOf, styleOf } from './styles'
 
 const MOST_FEATURES = 30_000
+/** Each part is a request: from far away, fewer are asked for. */
+const MOST_PARTS = 48
+/** Outlines of smaller parts would hide the map. */
+const LEAST_OUTLINE_PX = 60
 
 /** The geometry of a document; null where there is none or its kind is unknown. */
 export function geometryOf(document: FeatureDocument['geometry']) {
@@ -52,9 +56,12 @@ export class FeatureLayer {
   readonly loaded = new Signal<{ count: number; whole: boolean }>({ count: 0, whole: false })
   readonly #parts = new Map<Part, Promise<void>>()
   readonly #outlines = new Map<Part, Feature>()
+  /** What is shown from far away; null until it is first wanted. */
+  #overview: Promise<Feature[]> | null = null
+  #far = false
 
   constructor(
-    readonly document: Layer,
+    public document: Layer,
     private readonly files: Source,
     private readonly dark: Signal<boolean>,
     private readonly complain: (error: unknown) => void,
@@ -73,12 +80,18 @@ export class FeatureLayer {
 
   #restyle(): void {
     const features = styleOf(this.document, this.style.value, this.hidden.value, this.dark.value)
+    const coarse = coarseStyleOf(this.style.value, this.hidden.value)
     const colour = colourOf(this.style.value, {})
     const outline = new OlStyle({
       stroke: new OlStroke({ color: colour, width: 1, lineDash: [4, 3] }),
       fill: new OlFill({ color: 'rgba(128, 128, 128, 0.08)' }),
     })
-    this.layer.setStyle((feature, resolution) => (feature.get('part') ? outline : features(feature, resolution)))
+    this.layer.setStyle((feature, resolution) => {
+      if (feature.get('coarse')) return coarse(feature)
+      if (!feature.get('part')) return features(feature, resolution)
+      const [west, , east] = feature.getGeometry()!.getExtent() as [number, number, number, number]
+      return east - west > LEAST_OUTLINE_PX * resolution ? outline : []
+    })
   }
 
   /** Load what the map shows; called after each move. */
@@ -86,12 +99,31 @@ export class FeatureLayer {
     if (!this.layer.getVisible()) return
     const wanted = this.document.parts.filter((part) => meets(part.bounds_m, extent as Bounds))
     const features = wanted.reduce((sum, part) => sum + part.features, 0)
-    if (features > MOST_FEATURES) {
-      for (const part of wanted) if (!this.#parts.has(part)) this.#outline(part)
-    } else {
-      for (const part of wanted) void this.load(part)
-    }
-    this.loaded.value = { count: this.source.getFeatures().length - this.#outlines.size, whole: features <= MOST_FEATURES }
+    const far = features > MOST_FEATURES || wanted.length > MOST_PARTS
+    if (this.document.overview) this.#lookFromFar(far)
+    else if (far) for (const part of wanted) if (!this.#parts.has(part)) this.#outline(part)
+    if (!far) for (const part of wanted) void this.load(part)
+    this.loaded.value = { count: this.source.getFeatures().length - this.#outlines.size, whole: !far }
+  }
+
+  /** Show the coarse features, or none of them. */
+  #lookFromFar(far: boolean): void {
+    if (far === this.#far) return
+    this.#far = far
+    this.#overview ??= this.files.json<FeatureCollection>(this.document.overview!).then(
+      ({ features }) => features.flatMap((one) => {
+        const geometry = geometryOf(one.geometry)
+        return geometry ? new Feature({ geometry, row: one.properties, coarse: true }) : []
+      }),
+    )
+    this.#overview.then(
+      (features) => {
+        const shown = features.length > 0 && this.source.hasFeature(features[0]!)
+        if (this.#far && !shown) this.source.addFeatures(features)
+        if (!this.#far && shown) this.source.removeFeatures(features)
+      },
+      (error) => this.complain(error),
+    )
   }
 
   #outline(part: Part): void {
@@ -116,6 +148,7 @@ export class FeatureLayer {
 
   async #load(part: Part): Promise<void> {
     const { features } = await this.files.json<FeatureCollection>(part.url)
+    if (!this.document.parts.includes(part)) return // the layer was replaced meanwhile
     const outline = this.#outlines.get(part)
     if (outline) {
       this.source.removeFeature(outline)
@@ -131,6 +164,17 @@ export class FeatureLayer {
     const feature = new Feature({ geometry, row: document.properties, document, layer: this.document })
     feature.setId(document.id)
     return feature
+  }
+
+  /** Show another state of the layer. */
+  replace(document: Layer, extent: Extent): void {
+    this.document = document
+    this.#parts.clear()
+    this.#outlines.clear()
+    this.#overview = null
+    this.#far = false
+    this.source.clear(true)
+    this.look(extent)
   }
 
   /** Load all parts: for the table of rows, and to find a row by its id. */

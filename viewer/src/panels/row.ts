@@ -97,7 +97,7 @@ export class RowPanel {
       .map((column) => {
         const raw = row[column.name]
         const sigma = column.sigma ? row[column.sigma] : null
-        const unit = column.unit && !['text', 'number', '1'].includes(column.unit) ? `\u202f${column.unit}` : ''
+        const unit = column.unit && !['text', 'number', '1', 'date'].includes(column.unit) ? `\u202f${column.unit}` : ''
         const text = /_gps_ns$/.test(column.name) ? format.gpsTime(raw) : format.value(raw)
         return h(
           'div',

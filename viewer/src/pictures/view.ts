@@ -127,6 +127,7 @@ export class PictureView {
   /** The pictures that see a place; the best is opened. */
   async showPlace(place: Place): Promise<void> {
     this.#place = place
+    this.#frame.dataset['state'] = 'loading'
     const at = [place.easting_m, place.northing_m, place.height_m ?? this.desk.survey.height_extent_m?.[0] ?? 0] as const
     this.#views = (await this.pictures.seeing(at)).slice(0, OFFERED)
     this.#drawList()
@@ -135,7 +136,9 @@ export class PictureView {
       return
     }
     await this.open(this.#views[0]!.picture)
+    this.#frame.dataset['state'] = 'loading'
     await this.#findHidden(at)
+    this.#frame.dataset['state'] = 'shown'
   }
 
   /** Ask the cloud whether something stands before the place; a picture in which it is hidden comes last. */
@@ -188,6 +191,7 @@ export class PictureView {
 
   async open(picture: Picture): Promise<void> {
     this.#picture = picture
+    this.#frame.dataset['state'] = 'loading'
     this.#caption.textContent = `Loading ${picture.camera.title} …`
     this.#drawList()
     const bitmap = await this.#load(picture.url)
@@ -201,6 +205,7 @@ export class PictureView {
     const sigma = picture.sigma_m === null ? '' : `  σ ${format.length(picture.sigma_m)}`
     this.#caption.textContent = [picture.camera.run, picture.camera.title, picture.name, format.gpsTime(picture.epoch_gps_ns)].filter(Boolean).join(' · ') + sigma
     this.desk.picture.value = picture.id
+    this.#frame.dataset['state'] = 'shown'
   }
 
   #openBall(bitmap: ImageBitmap): void {

@@ -13,7 +13,7 @@ const CLOSE_M = 8
 interface Chart {
   plot: uPlot
   read: HTMLElement
-  series: { name: string; quantity: Quantity; dashed: boolean }[]
+  series: { found: StripSeries; quantity: Quantity; colour: string; other: string | null }[]
 }
 
 export class Strips {
@@ -74,6 +74,12 @@ export class Strips {
 
   #others: Strip[] = []
 
+  /** What the survey of a strip is called. */
+  #surveyOf(strip: Strip): string {
+    const lane = this.index.lanes.find((one) => one.lane_id === strip.lane_id)
+    return lane?.survey_title ?? lane?.survey ?? ''
+  }
+
   // ---- drawing ----
 
   #draw(): void {
@@ -101,19 +107,20 @@ export class Strips {
     const tables: uPlot.AlignedData[] = []
     const series: Chart['series'] = []
     const options: uPlot.Series[] = [{}]
-    const all: [Strip, boolean][] = [[this.#strip!, false], ...this.#others.map((one) => [one, true] as [Strip, boolean])]
-    for (const [strip, dashed] of all) {
+    for (const strip of [this.#strip!, ...this.#others]) {
+      const other = strip === this.#strip ? null : this.#surveyOf(strip)
       for (const [index, quantity] of quantities.entries()) {
         const found = strip.series.find((one) => one.quantity === quantity.name)
         if (!found) continue
         tables.push(curve(found))
-        series.push({ name: found.quantity, quantity, dashed })
+        const colour = colours[index % colours.length]!
+        series.push({ found, quantity, colour, other })
         const stepped = found.extent === 'section'
         options.push({
           label: quantity.title,
-          stroke: colours[index % colours.length]!,
-          width: dashed ? 1.2 : 1.6,
-          ...(dashed ? { dash: [4, 3] } : {}),
+          stroke: colour,
+          width: other ? 1.2 : 1.6,
+          ...(other ? { dash: [4, 3] } : {}),
           ...(stepped ? { paths: uPlot.paths.stepped!({ align: 1 }) } : {}),
           points: { show: false },
         })
@@ -183,17 +190,12 @@ export class Strips {
   }
 
   #readings(chart: Chart, station_m: number | null): void {
-    const strips = [this.#strip!, ...this.#others]
-    const dark = this.desk.dark.value
     fill(
       chart.read,
-      ...chart.series.map((one, index) => {
-        const strip = one.dashed ? strips[1] : strips[0]
-        const found = strip?.series.find((series) => series.quantity === one.name)
-        const at = found && station_m !== null ? valueAt(found, station_m) : null
-        const colour = (dark ? COLOURS.dark : COLOURS.light)[index % 6]!
-        const name = h('span', { class: 'read-name' }, one.quantity.title)
-        name.style.setProperty('--line', colour)
+      ...chart.series.map((one) => {
+        const at = station_m !== null ? valueAt(one.found, station_m) : null
+        const name = h('span', { class: one.other ? 'read-name dashed' : 'read-name' }, one.other ? `${one.quantity.title}, ${one.other}` : one.quantity.title)
+        name.style.setProperty('--line', one.colour)
         const text = at === null ? '' : at.value === null ? (at.reason ?? 'not measured') : `${format.number(at.value)}${at.sigma === null ? '' : ` ± ${format.number(Number(at.sigma.toPrecision(2)))}`}`
         return h('span', { class: 'read', title: one.quantity.meaning }, name, text && h('span', { class: 'number' }, ` ${text}`))
       }),

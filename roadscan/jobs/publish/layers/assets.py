@@ -1,14 +1,21 @@
-"""Layers of the assets, one a kind."""
+"""Layers of the assets, one a kind: those of the inventory, or what the newest run found where there is none."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import cycle
-from typing import Final
+from typing import Any, Final
 
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from roadscan.inventory.homes.page_edits import LAYER
 from roadscan.jobs.publish.layer import (
     BLUE,
     GREEN,
+    GREY,
     ORANGE,
     PURPLE,
     RED,
@@ -20,39 +27,73 @@ from roadscan.jobs.publish.layer import (
     Style,
 )
 from roadscan.jobs.publish.material import Material
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
+from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 FOLDER: Final = "products/assets"
 _GEOMETRY: Final[dict[str, Geometry]] = {"PointZ": "point", "LineStringZ": "line", "PolygonZ": "polygon"}
 _WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}
+_COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+_STATES: Final = {"found": BLUE, "confirmed": GREEN, "missing": RED, "rejected": GREY}
+
+_Rows = tuple[pa.Table, npt.NDArray[Any]]
 
 
 class Assets(LayerKind):
-    """What was found beside and on the road; the tables lie below `products/assets`."""
+    """What stands beside, on and over the road."""
 
     name = "assets"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """A layer a kind of which something was found."""
-        files = [r for r in material.session.manifest.all() if r.path.startswith(f"{FOLDER}/")]
+        """A layer a kind of which there is anything."""
+        is_inventory = material.inventory is not None
         for place, (kind, colour) in enumerate(zip(asset_kind_names(), cycle(_COLOURS), strict=False)):
-            schema = asset_schema(kind)
-            own = [r for r in files if r.path == f"{FOLDER}/{schema.table}.parquet"]
-            held = material.rows_of(own)
-            if held is None or held.shapes_m is None or not held.rows.num_rows:
-                continue
-            known = {c.name: c for c in schema.columns}
-            names = [n for n in held.rows.column_names if n in known]
-            sigmas = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}
-            wanted = {n: sigmas.get(n, f"sigma_{n}") for n in names}
-            told = {n: wanted[n] if wanted[n] in names else "" for n in names}
-            geometry = _GEOMETRY[schema.geometry]
-            yield SiteLayer(
-                f"asset_{schema.table}", schema.title, "assets", geometry, 600 + place, held.shapes_m,
-                held.rows.select(names).to_pylist(),
-                [SiteColumn(n, known[n].unit, known[n].meaning, known[n].title, told[n]) for n in names],
-                [Style("one colour", _WIDTH_PX[geometry], colour)], key="object",
-            )  # fmt: skip
+            held = _of_inventory(material, kind) if is_inventory else _found(material, kind)
+            if held is not None and held[0].num_rows:
+                yield _layer(material, kind, held, 600 + place, colour)
 
 
-_COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+def _found(material: Material, kind: str) -> _Rows | None:
+    """What the newest run found; its tables lie below `products/assets`."""
+    path = f"{FOLDER}/{asset_schema(kind).table}.parquet"
+    held = material.rows_of([r for r in material.session.manifest.all() if r.path == path])
+    return None if held is None or held.shapes_m is None else (held.rows, held.shapes_m)
+
+
+def _of_inventory(material: Material, kind: str) -> _Rows | None:
+    """What the inventory holds today, without what people rejected; shapes in metres."""
+    shown = material.inventory
+    own = None if shown is None else shown[1].assets.get(kind)
+    if own is None:
+        return None
+    keep = pc.not_equal(own.rows["status"], "rejected")
+    frame = material.context.map
+    units_m = [frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m]
+    shapes = own.shapes[keep.to_numpy()]
+    if units_m != [1.0, 1.0, 1.0]:
+        shapes = shapely.transform(shapes, lambda places: places * units_m, include_z=True)
+    return own.rows.filter(keep).drop_columns([GEOMETRY]), shapes
+
+
+def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) -> SiteLayer:
+    schema, (rows, shapes_m) = asset_schema(kind), held
+    is_inventory, geometry = "asset_id" in rows.column_names, _GEOMETRY[schema.geometry]
+    columns = {c.name: c for c in (asset_columns(kind) if is_inventory else schema.columns)}
+    names = [n for n in rows.column_names if n in columns]
+    edited = editable_columns(kind) if is_inventory and material.wishes.edits else frozenset()
+    styles = [Style("one colour", _WIDTH_PX[geometry], colour)]
+    if is_inventory:
+        styles.append(Style("Status", _WIDTH_PX[geometry], by="status", values=_STATES))
+    return SiteLayer(
+        f"{LAYER}{schema.table}", schema.title, "assets", geometry, order, shapes_m, rows.select(names).to_pylist(),
+        [_column(columns[n], names, is_edited=n in edited) for n in names], styles,
+        key="asset_id" if is_inventory else "object",
+    )  # fmt: skip
+
+
+def _column(column: AssetColumn, names: list[str], *, is_edited: bool) -> SiteColumn:
+    sigma = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}.get(
+        column.name, f"sigma_{column.name}"
+    )
+    edited = (column.type, column.values) if is_edited else None
+    return SiteColumn(column.name, column.unit, column.meaning, column.title, sigma if sigma in names else "", edited)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -16,8 +16,15 @@ from roadscan.jobs.publish.material import Material, box_of, sheet_name
 from roadscan.jobs.publish.part import SitePart
 from roadscan.model.errors import RoadscanError
 
-_MOST_VERTICES: Final = 50_000
+_MOST_VERTICES: Final = 10_000
 """A layer with more is cut into kilometre sheets."""
+_FROM_FAR: Final = ("survey", "control", "condition")
+"""Groups whose layers are worth a look from far away; single cracks and poles are not seen there."""
+_MOST_FROM_FAR: Final = 30_000
+"""A layer in sheets with more features has no file for who looks from far away."""
+_SEEN_PX: Final = 4000
+"""Pixels across which a whole survey may be seen."""
+_OVERVIEW: Final = "overview"
 _DECIMALS: Final = 5
 """Coordinates are told to 10 µm."""
 
@@ -31,13 +38,22 @@ class Vectors(SitePart):
     def members(self, material: Material) -> Mapping[str, Any]:
         """What the layers are and where their files lie."""
         found, left_out = site_layers(material)
-        return {"layers": [_about(layer) for layer in found], "left_out": list(left_out)}
+        return {"layers": [about(layer) for layer in found], "left_out": list(left_out)}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """A file a layer, or a sheet of it."""
+        """A file a layer, or a sheet of it; for a layer in sheets one more, for who looks from far away."""
         for layer in site_layers(material)[0]:
-            for name, numbers in parts_of(layer):
-                yield json_document(_url(layer, name), _features(layer, numbers))
+            for path, content in files_of(layer):
+                yield json_document(path, content())
+
+
+def files_of(layer: SiteLayer) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Paths of a layer's files, each with a function that gives its content."""
+    parts = parts_of(layer)
+    for name, numbers in parts:
+        yield _url(layer, name), functools.partial(_features, layer, numbers)
+    if _has_overview(layer, parts):
+        yield _url(layer, _OVERVIEW), functools.partial(_overview, layer)
 
 
 @functools.lru_cache(maxsize=2)
@@ -75,18 +91,37 @@ def parts_of(layer: SiteLayer) -> list[tuple[str, list[int]]]:
     return sorted(found.items())
 
 
-def _about(layer: SiteLayer) -> dict[str, Any]:
+def about(layer: SiteLayer) -> dict[str, Any]:
+    """A layer as the page reads it in the entry."""
+    held = parts_of(layer)
     parts = [
         {"url": _url(layer, name), "bounds_m": box_of(layer.shapes_m[numbers]), "features": len(numbers)}
-        for name, numbers in parts_of(layer)
+        for name, numbers in held
     ]
     return {
         "name": layer.name, "title": layer.title, "group": layer.group, "geometry": layer.geometry,
         "order": layer.order, "visible": layer.visible, "features": len(layer.rows), "parts": parts,
         "key": layer.key or None, "label": layer.label or None, "columns": [c.stated() for c in layer.columns],
         "style": layer.styles[0].stated(), "choices": [style.stated() for style in layer.styles],
-        "arrows": layer.arrows,
+        "arrows": layer.arrows, "overview": _url(layer, _OVERVIEW) if _has_overview(layer, held) else None,
     }  # fmt: skip
+
+
+def _has_overview(layer: SiteLayer, parts: Sequence[Any]) -> bool:
+    return layer.group in _FROM_FAR and len(parts) > 1 and len(layer.rows) <= _MOST_FROM_FAR
+
+
+def _overview(layer: SiteLayer) -> dict[str, Any]:
+    """All features of a layer, as coarse as they are seen with the whole survey, with the values that colour them."""
+    west, south, east, north = shapely.total_bounds(layer.shapes_m).tolist()
+    coarse = shapely.simplify(shapely.force_2d(layer.shapes_m), max(east - west, north - south) / _SEEN_PX)
+    coarse = shapely.transform(coarse, lambda places: np.round(places, 1))
+    names = [style.by for style in layer.styles if style.by]
+    features = [
+        {"type": "Feature", "id": number, "geometry": geometry_of(shape), "properties": {n: row.get(n) for n in names}}
+        for number, (shape, row) in enumerate(zip(coarse, layer.rows, strict=True))
+    ]
+    return {"type": "FeatureCollection", "coordinates": "map_m", "layer": layer.name, "features": features}
 
 
 def _url(layer: SiteLayer, part: str) -> str:

@@ -1,0 +1,82 @@
+"""The street with an inventory that people edit: its layers come from it as those of a survey do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from roadscan.inventory.homes.page_edits import PageDocument
+from roadscan.jobs.publish.document import json_bytes
+from roadscan.jobs.publish.layer import SiteLayer
+from roadscan.jobs.publish.layers.assets import Assets
+from roadscan.jobs.publish.live import Served
+from roadscan.jobs.publish.material import Wishes
+from roadscan.jobs.publish.parts import vectors
+from roadscan.model.crs import MapFrame
+from tests.inventory.streets import EAST, NORTH, asset, found, inventory
+from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
+
+POLES = ((10.0, 3.0), (20.0, 3.0), (30.0, 3.0))
+"""Metres from the street's beginning, and to the left of its middle."""
+
+
+class EditedSite:
+    """Documents of the street, those of the poles from an inventory."""
+
+    def __init__(self, street: Path, folder: Path) -> None:
+        self._street, self._folder = street, folder
+        self.inventory = inventory(folder)
+        shift = EAST_M - EAST, NORTH_M - NORTH
+        rows = [asset("pole", (shift[0] + x, shift[1] + y, 40.0), object=f"p{n}") for n, (x, y) in enumerate(POLES)]
+        self.inventory.record(found(rows))
+        self.taken = 0
+
+    def document(self, path: str) -> Served | None:
+        """A document as it is now."""
+        if path == "survey.json":
+            layer = vectors.about(self._layer())
+            survey = json.loads((self._street / path).read_text())
+            survey["layers"] = [layer, *(one for one in survey["layers"] if one["name"] != "asset_poles")]
+            commit = self.inventory.state().commit
+            survey["edits"] = {"layers": ["asset_poles"], "post": "edits", "inventory": "street", "commit": commit}
+            return self._made(path, survey)
+        if path == "layers/asset_poles/whole.json":
+            return self._made(path, dict(vectors.files_of(self._layer()))[path]())
+        file = self._street / path
+        return Served(file, path) if file.is_file() else None
+
+    def take(self, content: bytes) -> dict[str, Any]:
+        """Take in edits as `roadscan view --edit` does."""
+        document = PageDocument.parse("the page", content, (1.0, 1.0, 1.0))
+        pulled, outcomes = self.inventory.pull_page(document, sound=True)
+        self.taken += 1
+        return {"commit": pulled.commit, "edits": [one._asdict() for one in outcomes]}
+
+    def another(self, number: int, **attributes: Any) -> None:
+        """What somebody else writes meanwhile, who saw commit 1."""
+        given = {"layer": "asset_poles", "action": "change", "asset_id": self.id_of(number), "attributes": attributes}
+        head = {"type": "FeatureCollection", "coordinates": "map_m", "survey": "s", "inventory": "street", "commit": 1}
+        feature = {"type": "Feature", "geometry": None, "properties": given | {"author": HOSTILE}}
+        self.take(json.dumps({**head, "features": [feature]}).encode())
+
+    def id_of(self, number: int) -> str:
+        """Id of a pole."""
+        ids = {row["easting_m"]: row["asset_id"] for row in self.inventory.state().assets["pole"].rows.to_pylist()}
+        return str(ids[sorted(ids)[number]])
+
+    def _layer(self) -> SiteLayer:
+        state = self.inventory.state()
+        material: Any = SimpleNamespace(
+            inventory=("street", state), wishes=Wishes(edits="post"),
+            context=SimpleNamespace(map=MapFrame(crs="EPSG:32632")),
+        )  # fmt: skip
+        (layer,) = Assets().layers(material)
+        return layer
+
+    def _made(self, path: str, value: Any) -> Served:
+        content = json_bytes(value)
+        file = self._folder / f"{abs(hash(content))}.json"
+        file.write_bytes(content)
+        return Served(file, file.stem)

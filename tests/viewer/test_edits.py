@@ -1,0 +1,128 @@
+"""Edits in the page go into an inventory, and the page says what became of each."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import shapely
+
+from roadscan.jobs.publish.server import SiteServer
+from tests.viewer.conftest import go_to
+from tests.viewer.inventory_site import POLES, EditedSite
+from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
+
+STILL = '.map-view[data-drawn="true"]'
+
+
+class Opened(NamedTuple):
+    site: EditedSite
+    page: Any
+    server: SiteServer
+
+
+@pytest.fixture
+def opened(open_page: Any, street: Path, tmp_path: Path) -> Iterator[Opened]:
+    """The page by the address that allows edits."""
+    site = EditedSite(street, tmp_path)
+    with SiteServer(site, take=site.take) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        origin = server.address.partition("#")[0]
+        with open_page(origin) as watched:
+            watched.page.on("dialog", lambda one: one.accept())
+            yield Opened(site, watched.open(f"{server.address}&views=map"), server)
+        server.shutdown()
+        thread.join()
+
+
+def choose(opened: Opened, number: int) -> None:
+    """Select a pole as a link does."""
+    go_to(opened.page, f"row=asset_poles/{opened.site.id_of(number)}&views=map")
+    opened.page.locator(".details h2", has_text=opened.site.id_of(number)).wait_for()
+
+
+def correct(opened: Opened, number: int, **fields: str) -> None:
+    choose(opened, number)
+    opened.page.locator(".edit button", has_text="Correct").click()
+    for title, value in fields.items():
+        opened.page.locator(f'.edit-form [aria-label="{title}"]').fill(value)
+    opened.page.locator('.edit-form button:has-text("Keep")').click()
+
+
+def send(opened: Opened) -> list[tuple[str, str]]:
+    """Outcome and text of each edit."""
+    opened.page.locator(".edits button", has_text="Send the edits").click()
+    told = opened.page.locator(".edit-told li")
+    told.first.wait_for()
+    return [(one.get_attribute("data-outcome"), one.inner_text()) for one in told.all()]
+
+
+def test_edits_go_into_the_inventory(opened: Opened) -> None:
+    page, site = opened.page, opened.site
+    assert opened.server.token not in page.url  # a link that is passed on allows nobody to edit
+    one, two, three = (site.id_of(number) for number in range(3))
+    correct(opened, 0, Condition="4", Comments=HOSTILE)
+    choose(opened, 1)
+    page.locator(".edit button", has_text="Confirm").click()
+    correct(opened, 2, Condition="77")
+    page.locator('.edits [aria-label="Your name"]').fill("eva")
+    site.another(0, condition=9)  # while this page still shows commit 1
+
+    told = send(opened)
+
+    assert [outcome for outcome, _ in told] == ["conflict", "accepted", "refused"]
+    assert "9" in told[0][1] and "77, above 10" in told[2][1]
+    rows = {row["asset_id"]: row for row in site.inventory.state().assets["pole"].rows.to_pylist()}
+    assert (rows[one]["condition"], rows[one]["comments"]) == (9, HOSTILE)
+    assert (rows[two]["status"], rows[three]["condition"]) == ("confirmed", None)
+    assert {e.who for e in site.inventory.history(two) if e.what != "found"} >= {"eva"}
+    # What was refused stays to be mended; the page shows what the others have become.
+    assert page.locator(".edit-list li").count() == 1
+    choose(opened, 0)
+    assert page.locator('.details dt:text-is("Condition") + dd').inner_text() == "9"
+    assert page.locator('.details dt:text-is("Comments") + dd').inner_text() == HOSTILE
+    assert page.evaluate("window.hit") is None
+
+
+def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
+    page, site = opened.page, opened.site
+    go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 1.0}&zoom=2&views=map")
+    page.wait_for_selector(STILL)
+    page.locator(".edits button", has_text="Add: Pole").click()
+    box = page.locator(".map-target").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.click(*middle)
+    page.locator(".edit-list li", has_text="added").wait_for()
+    choose(opened, 1)
+    page.wait_for_selector(STILL)
+    page.locator(".edit button", has_text="Move").click()
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 60, middle[1], steps=4)
+    page.mouse.up()
+    page.locator("button", has_text="Keep the new place").click()
+    assert [outcome for outcome, _ in send(opened)] == ["accepted", "accepted"]
+    state = site.inventory.state()
+    shapes = [shapely.from_wkb(row["geometry"]) for row in state.assets["pole"].rows.to_pylist()]
+    drawn, moved = sorted((s for s in shapes if min(abs(s.x - EAST_M - x) for x, _ in POLES) > 1e-3), key=lambda s: s.x)
+    assert abs(drawn.x - EAST_M - 15.0) <= 0.01
+    assert abs(drawn.y - NORTH_M - 1.0) <= 0.01
+    assert abs(drawn.z - 40.0) <= 0.1  # the surface's height there
+    assert 0.2 <= moved.x - EAST_M - POLES[1][0] <= 3.0
+    assert abs(moved.y - NORTH_M - POLES[1][1]) <= 0.05
+    assert moved.z == 40.0
+    assert len(shapes) == len(POLES) + 1
+
+
+def test_an_address_without_the_token_is_read_only(open_page: Any, opened: Opened) -> None:
+    origin = opened.server.address.partition("#")[0]
+    with open_page(origin) as other:
+        page = other.open(f"{origin}#row=asset_poles/{opened.site.id_of(0)}&views=map")
+        page.locator(".details h2").wait_for()
+        assert page.locator(".edit").count() == 0
+        assert page.locator(".edits").count() == 0
+    assert opened.site.taken == 0

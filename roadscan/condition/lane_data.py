@@ -93,5 +93,7 @@ class LaneData:
     """Cracks near the lane; None where the survey has no table of cracks."""
     sigma_roll_rad: float = 0.0
     """Standard deviation of the vehicle's roll as the poses state it."""
+    sigma_pose_height_m: float = 0.0
+    """The same of its height."""
     edges: EdgesOnLane | None = None
     """Edges of the road beside the lane; None where none are sought."""

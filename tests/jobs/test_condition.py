@@ -77,6 +77,16 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert error.size > 200
         assert abs(error.mean()) <= 0.3
         assert error.std() <= 1.0
+    for name in ("rut_area_left_m2", "rut_area_right_m2", "rut_width_left_m", "rut_width_right_m"):
+        found, true, sigma = held["cross_section", name].T
+        known = np.isfinite(found)
+        # Widths end where a depth crosses a tenth of the greatest: some jump from one place to another.
+        assert 0.2 < np.median(np.abs(found - true)[known] / sigma[known]) / 0.6745 < 1.7
+    for name in ("hri_m_per_km", "iri_local_max_m_per_km", "grade_percent"):
+        found, true, sigma = held["section", name].T
+        known = np.isfinite(found)
+        assert known.sum() >= 3
+        assert (np.abs(found - true)[known] <= 4.0 * sigma[known]).all()
     slope = held["section", "cross_slope_mean_percent"]
     assert np.nanmax(np.abs(slope[:, 0] - slope[:, 1])) <= 0.05
     assert held["section", "grade_percent"][:, 0] == pytest.approx(held["section", "grade_percent"][:, 1], abs=0.02)

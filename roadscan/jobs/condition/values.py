@@ -110,6 +110,7 @@ def plan_groups(
                 lane.sign,
                 lane.width_m,
                 lane.sigma_roll_deg,
+                lane.sigma_height_m,
                 own,
                 [(r.unit, r.digest) for r in (*read, *read_cross)],
                 cell_m,
@@ -235,6 +236,7 @@ def load_lane(task: GroupTask) -> LaneData:
         cracks=_cracks(task),
         edges=edges,
         sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
+        sigma_pose_height_m=group.lane.sigma_height_m,
     )
 
 

@@ -77,11 +77,13 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert error.size > 200
         assert abs(error.mean()) <= 0.3
         assert error.std() <= 1.0
-    for name in ("rut_area_left_m2", "rut_area_right_m2", "rut_width_left_m", "rut_width_right_m"):
-        found, true, sigma = held["cross_section", name].T
+    for side in ("left", "right"):
+        found, true, sigma = held["cross_section", f"rut_area_{side}_m2"].T
         known = np.isfinite(found)
-        # Widths end where a depth crosses a tenth of the greatest: some jump from one place to another.
-        assert 0.2 < np.median(np.abs(found - true)[known] / sigma[known]) / 0.6745 < 1.7
+        assert 0.3 < np.median(np.abs(found - true)[known] / sigma[known]) / 0.6745 < 1.3
+        found, true, sigma = held["cross_section", f"rut_width_{side}_m"].T
+        # Some end elsewhere: a depth beside the rut crosses a tenth of the greatest, or does not.
+        assert np.mean(np.abs(found - true)[known] <= 2.0 * sigma[known]) >= 0.7
     for name in ("hri_m_per_km", "iri_local_max_m_per_km", "grade_percent"):
         found, true, sigma = held["section", name].T
         known = np.isfinite(found)

@@ -94,7 +94,8 @@ def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -
     stepped = scipy.ndimage.maximum_filter(np.nan_to_num(np.abs(step)), (1, 2 * round(DEFAULT.across_m / OFFSET_M) + 1))
     bend = np.where(stepped >= _STEP, 0.0, bend)
     up, down = np.where(step > 0.0, step, 0.0), np.where(step < 0.0, step, 0.0)
-    kinds = np.stack([counted(e) for e in (up, down, bend, change)])
+    change = _lasting(change, surface)
+    kinds = np.stack([trust * counted(e) for e, trust in zip((up, down, bend, change), _TRUST, strict=True)])
     begin = int(np.searchsorted(raster.away_m, first_m(lane_width_m) - 1e-9))
     kinds = kinds[:, :, begin:]
     path = path_along(kinds.max(axis=0), spacing)
@@ -133,6 +134,21 @@ def _opened(grey: Float64) -> Float64:
     return np.where(np.isnan(grey) | np.isinf(opened), np.nan, opened)
 
 
+def _lasting(change: Float64, surface: Float64) -> Float64:
+    """Changes of intensity (σ), no more of each than the mean intensities of both sides differ by."""
+    size = (2 * round(DEFAULT.along_m / STATION_M) + 1, round(DEFAULT.across_m / OFFSET_M))
+    size = (size[0], size[1] + 1 - size[1] % 2)
+    known = np.isfinite(surface)
+    share = scipy.ndimage.uniform_filter(known.astype(np.float64), size, mode="constant")
+    total = scipy.ndimage.uniform_filter(np.where(known, surface, 0.0), size, mode="constant")
+    mean = np.where(share > 0.2, total / np.maximum(share, 1e-9), np.nan)
+    away = size[1] // 2 + 1
+    padded = np.pad(mean, ((0, 0), (away, away)), constant_values=np.nan)
+    levels = (padded[:, 2 * away :] - padded[:, : -2 * away]) / _SIGMA_GREY
+    alike = np.sign(change) == np.sign(levels)
+    return np.where(alike, np.sign(change) * np.minimum(np.abs(change), np.abs(levels)), np.nan)
+
+
 def _edge_line(bright: Float64, raster: SideRaster, lane_width_m: float) -> tuple[Bool, Float64, Float64]:
     """Where a line is painted along the border of the lane: whether, its distance, and its evidence, (s,) each."""
     border = 0.5 * lane_width_m
@@ -163,7 +179,7 @@ def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64
     near = np.clip(cell[:, None] + np.arange(-_AROUND, _AROUND + 1), 0, kinds.shape[2] - 1)
     beside = np.take_along_axis(kinds, np.broadcast_to(near, (len(kinds), *near.shape)), axis=2).max(axis=2)
     around = scipy.ndimage.uniform_filter1d(beside, _cells(_KIND_M), axis=1, mode="nearest")
-    strongest: npt.NDArray[np.int64] = np.argmax(around * np.array(_TRUST)[:, None], axis=0)
+    strongest: npt.NDArray[np.int64] = np.argmax(around, axis=0)
     return strongest
 
 

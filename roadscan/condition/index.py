@@ -95,8 +95,12 @@ class PerCrossSection:
             yield Value(self.quantity, "cross_section", station, station, value, sigma, share, reason)
 
 
-def by_section(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str, How]]) -> Iterable[Value]:
+def by_section(
+    held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str, How]], spacing_m: float | None = None
+) -> Iterable[Value]:
     """Mean or greatest value of the cross-sections of each section, under names of their own.
+
+    `spacing_m` is their distance, that of the lane's cross-sections by default.
 
     A section of which too few cross-sections have a value has none. The standard deviation of a mean takes the
     cross-sections' errors as alike, since neighbours share the vehicle's motion: it is their root mean square. That of
@@ -107,7 +111,7 @@ def by_section(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str
         own = (held.station_m >= from_m - 1e-6) & (held.station_m < to_m - 1e-6)
         value, sigma = held.value[own], held.sigma[own]
         known = ~np.isnan(value)
-        due = max(1.0, (to_m - from_m) / config.cross_section_spacing_m)
+        due = max(1.0, (to_m - from_m) / (spacing_m or config.cross_section_spacing_m))
         share = min(1.0, float(known.sum()) / due)
         for name, how in wanted:
             if share < config.least_share or not known.any():

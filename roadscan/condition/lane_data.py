@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.cracks_on_lane import CrackOnLane
+from roadscan.condition.road_edges.on_lane import EdgesOnLane
 from roadscan.model.settings.condition import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
@@ -92,3 +93,7 @@ class LaneData:
     """Cracks near the lane; None where the survey has no table of cracks."""
     sigma_roll_rad: float = 0.0
     """Standard deviation of the vehicle's roll as the poses state it."""
+    sigma_pose_height_m: float = 0.0
+    """The same of its height."""
+    edges: EdgesOnLane | None = None
+    """Edges of the road beside the lane; None where none are sought."""

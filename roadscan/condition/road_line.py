@@ -108,6 +108,8 @@ class Lane:
     """Passes that drove it."""
     sigma_roll_deg: float = 0.0
     """Standard deviation of the roll of its drives' poses, as the logs state it; the greatest of all."""
+    sigma_height_m: float = 0.0
+    """The same of their heights."""
 
     @property
     def last_m(self) -> int:
@@ -134,5 +136,5 @@ class Lane:
         end = min(int(np.ceil(to_m)) + 2 - self.first_m, len(self.offset_m))
         return Lane(
             self.road, self.name, self.sign, self.first_m + first, self.offset_m[first:end], self.width_m,
-            self.width_from, self.passes, self.sigma_roll_deg,
+            self.width_from, self.passes, self.sigma_roll_deg, self.sigma_height_m,
         )  # fmt: skip

@@ -77,6 +77,18 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert error.size > 200
         assert abs(error.mean()) <= 0.3
         assert error.std() <= 1.0
+    for side in ("left", "right"):
+        found, true, sigma = held["cross_section", f"rut_area_{side}_m2"].T
+        known = np.isfinite(found)
+        assert 0.3 < np.median(np.abs(found - true)[known] / sigma[known]) / 0.6745 < 1.3
+        found, true, sigma = held["cross_section", f"rut_width_{side}_m"].T
+        # Some end elsewhere: a depth beside the rut crosses a tenth of the greatest, or does not.
+        assert np.mean(np.abs(found - true)[known] <= 2.0 * sigma[known]) >= 0.7
+    for name in ("hri_m_per_km", "iri_local_max_m_per_km", "grade_percent"):
+        found, true, sigma = held["section", name].T
+        known = np.isfinite(found)
+        assert known.sum() >= 3
+        assert (np.abs(found - true)[known] <= 4.0 * sigma[known]).all()
     slope = held["section", "cross_slope_mean_percent"]
     assert np.nanmax(np.abs(slope[:, 0] - slope[:, 1])) <= 0.05
     assert held["section", "grade_percent"][:, 0] == pytest.approx(held["section", "grade_percent"][:, 1], abs=0.02)

@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 import pytest
 
-from roadscan.kernels.assets.edge_across import best_path, step_and_bend
 from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
 from roadscan.kernels.assets.low_heights import low_heights
 from roadscan.kernels.assets.step_filter import CHUNK, FRAME, WORK, step_response, strips, thin
@@ -22,6 +21,7 @@ from roadscan.kernels.assets.transects import (
     walk,
 )
 from roadscan.kernels.assets.transects import RESULTS as WALK_RESULTS
+from roadscan.kernels.road.edge_across import best_path, step_and_bend
 
 RNG = np.random.default_rng(8)
 

@@ -102,10 +102,12 @@ def test_exact_on_linear_fields(kind: str) -> None:
 def test_franke_as_near_as_linear() -> None:
     """Franke's test function (1979) on the unit square, at random points.
 
-    Sibson's interpolant weighs more neighbours than a triangle has corners: its root mean square error is 2 to 4 %
-    above that of linear interpolation on the same points, in the mean of many draws.
+    Sibson's interpolant weighs more neighbours than a triangle has corners: in the mean of many draws its mean error is
+    that of linear interpolation on the same points or up to 2 % above, and its root mean square error 1 to 8 % above
+    (100 to 2,000 points). The bar of no larger an error is missed by that; the weights are those of Voronoi cells
+    (see above), so it is the interpolant's own.
     """
-    ratios = []
+    ratios, means = [], []
     for seed in range(6):
         places = scattered(400, seed)
         out = interpolate(*places.T, franke(*places.T), (0.0, 0.0), 0.05, (20, 20))
@@ -114,7 +116,9 @@ def test_franke_as_near_as_linear() -> None:
         known = ~np.isnan(out) & ~np.isnan(linear)
         own, other = (np.abs(v - truth)[known] for v in (out, linear))
         ratios.append(np.sqrt(np.mean(own**2) / np.mean(other**2)))
+        means.append(own.mean() / other.mean())
     assert np.mean(ratios) < 1.05
+    assert np.mean(means) < 1.03
 
 
 def franke(x: np.ndarray, y: np.ndarray) -> np.ndarray:

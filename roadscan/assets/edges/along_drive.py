@@ -10,7 +10,6 @@ import numpy.typing as npt
 import scipy.ndimage
 import scipy.spatial
 
-from roadscan.assets.edges.across import edge_along
 from roadscan.assets.edges.beside import Beside, beside_of
 from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, CutEdge, columns_of, cut_at, dense
@@ -18,6 +17,7 @@ from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.edges.across import edge_along
 
 Float64 = npt.NDArray[np.float64]
 

@@ -2,7 +2,8 @@
 
 Severity goes by the mean width of a crack: low up to 6 mm, moderate up to 19 mm, high above (classes of the LTPP
 distress identification manual, FHWA-HRT-13-092, as published). The wheel paths are strips of 0.75 m, cut each 0.5 m
-along the lane; the share of the pieces that a crack touches is the cracked share.
+along the lane; the share of the pieces that a crack touches is the cracked share. What lies beyond the road's edges,
+where these are known, is no crack of it.
 """
 
 from __future__ import annotations
@@ -55,6 +56,8 @@ class Cracking(ConditionIndex):
         for crack in lane.cracks or ():
             inside = (crack.station_m >= from_m) & (crack.station_m < to_m)
             own = inside & (np.abs(crack.own_m) <= lane.width_m / 2)
+            if lane.edges is not None:
+                own &= lane.edges.inside(crack.station_m, crack.own_m)
             length = float(crack.length_m[own].sum())
             found["crack_length_m"] += length
             found[f"crack_{crack.kind if crack.kind in _TYPES else 'unknown'}_m"] += length

@@ -2,7 +2,8 @@
 
 Cross-slope is that of the straight line that fits a cross-section best; crown is how far the middle of the parabola
 that fits it best lies above the line through its ends. The standard deviation of the cross-slope holds the noise of the
-readings and the roll of the poses, as their logs state it.
+readings and the roll of the poses, that of the grade the heights of the poses at both ends of the section, taken as
+independent, as their logs state them. The curvature of the reference line has none.
 """
 
 from __future__ import annotations
@@ -84,4 +85,5 @@ class CrossSlope(ConditionIndex):
         if len(slopes) < len(lane.profiles) or share < lane.config.least_share:
             reason = f"{100 * share:.0f} % of the wheel paths were measured"
             return Value("grade_percent", "section", from_m, to_m, np.nan, np.nan, share, reason)
-        return Value("grade_percent", "section", from_m, to_m, 100.0 * float(np.mean(slopes)), np.nan, share)
+        sigma = 100.0 * np.sqrt(2.0) * lane.sigma_pose_height_m / max(to_m - from_m, 1.0)
+        return Value("grade_percent", "section", from_m, to_m, 100.0 * float(np.mean(slopes)), float(sigma), share)

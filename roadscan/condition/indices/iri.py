@@ -7,7 +7,7 @@ sources: :mod:`roadscan.condition.iri`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
@@ -52,11 +52,11 @@ class Iri(ConditionIndex):
     def _section(self, lane: LaneData, from_m: float, to_m: float) -> Iterator[Value]:
         before, after = (LEAD_M, 10.0) if lane.sign > 0 else (10.0, LEAD_M)
         found: dict[str, _Told] = {}
-        heights: dict[str, tuple[Float64, Float64]] = {}
+        parts: list[Profile] = []
         for side, profile in lane.profiles.items():
             part = bridged(profile.between(from_m - before, to_m + after), lane.config.largest_gap_m)
             found[side] = _judged(part, from_m, to_m, lane)
-            heights[side] = part.distance_m, part.height_m
+            parts.append(part)
             told = found[side]
             yield Value(f"iri_{side}_m_per_km", "section", from_m, to_m, told.iri, told.sigma, told.share, told.reason)
         left, right = found["left"], found["right"]
@@ -64,22 +64,19 @@ class Iri(ConditionIndex):
         mean = float(mean_roughness_index(np.array(left.iri), np.array(right.iri)))
         spread = 0.5 * float(np.hypot(left.sigma, right.sigma))
         yield Value("mri_m_per_km", "section", from_m, to_m, mean, spread, share, reason)
-        half = np.nan
-        if np.isfinite(mean):
-            x = 0.5 * (heights["left"][0] + heights["right"][0])
-            on = ride(x, 0.5 * (heights["left"][1] + heights["right"][1]))
-            ends = _ends(x, lane.profiles["left"].between(from_m - before, to_m + after).station_m, from_m, to_m)
-            half = float(iri_of(on, ends).iri_m_per_km[0, 0])
-        yield Value("hri_m_per_km", "section", from_m, to_m, half, np.nan, share, reason)
-        local = max(left.local, right.local)
-        yield Value("iri_local_max_m_per_km", "section", from_m, to_m, local, np.nan, share, reason)
+        half, spread = _half_car(parts, (from_m, to_m), lane) if np.isfinite(mean) else (np.nan, np.nan)
+        yield Value("hri_m_per_km", "section", from_m, to_m, half, spread, share, reason)
+        local = max(left, right, key=lambda told: told.local)
+        known = np.isfinite(left.local) and np.isfinite(right.local)
+        worst, spread = (local.local, local.sigma_local) if known else (np.nan, np.nan)
+        yield Value("iri_local_max_m_per_km", "section", from_m, to_m, worst, spread, share, reason)
 
 
 class _Told:
     """What the golden car says of a wheel path in a section."""
 
     def __init__(self, share: float, reason: str) -> None:
-        self.iri = self.sigma = self.local = np.nan
+        self.iri = self.sigma = self.local = self.sigma_local = np.nan
         self.share, self.reason = share, reason
 
 
@@ -122,13 +119,27 @@ def _judged(part: Profile, from_m: float, to_m: float, lane: LaneData) -> _Told:
     told = _Told(share, "")
     told.iri = float(rough[0])
     told.sigma = float(np.sqrt(np.mean((rough[1:] - rough[0]) ** 2)))
-    rolling = rolling_iri(on)[0][inside]
-    told.local = float(np.nanmax(rolling)) if not np.isnan(rolling).all() else np.nan
+    rolling = rolling_iri(on)[:, inside]
+    if not np.isnan(rolling).all(axis=1).any():
+        most = np.nanmax(rolling, axis=1)
+        told.local = float(most[0])
+        told.sigma_local = float(np.sqrt(np.mean((most[1:] - most[0]) ** 2)))
     if "start" in on.notes(ends)[0][0]:
         told.reason = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
     elif on.notes(ends)[0][0]:
         told.reason = f"{on.notes(ends)[0][0]}"
     return told
+
+
+def _half_car(parts: Sequence[Profile], between_m: tuple[float, float], lane: LaneData) -> tuple[float, float]:
+    """IRI of the mean of two wheel paths, and its standard deviation; the noises of both are independent."""
+    left, right = parts
+    x, mean = 0.5 * (left.distance_m + right.distance_m), 0.5 * (left.height_m + right.height_m)
+    spacing = lane.config.profile_spacing_m
+    noise = _noise(left, spacing, lane.cell_m) + _noise(right, spacing, lane.cell_m, _NOISES)
+    on = ride(x, np.concatenate([mean[None], mean + 0.5 * noise]))
+    rough = iri_of(on, _ends(x, left.station_m, *between_m)).iri_m_per_km[:, 0]
+    return float(rough[0]), float(np.sqrt(np.mean((rough[1:] - rough[0]) ** 2)))
 
 
 def _ends(distance_m: Float64, station_m: Float64, from_m: float, to_m: float) -> Segments:
@@ -138,7 +149,7 @@ def _ends(distance_m: Float64, station_m: Float64, from_m: float, to_m: float) -
     return Segments(ends[:1], ends[1:])
 
 
-def _noise(part: Profile, spacing_m: float, cell_m: float) -> Float64:
+def _noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0) -> Float64:
     """(k, n) errors as the noise of the readings makes them: those of neighbours are alike, for they share cells.
 
     They are drawn from counters of the place, so a section has the same ones in every run.
@@ -151,7 +162,7 @@ def _noise(part: Profile, spacing_m: float, cell_m: float) -> Float64:
     sigma = np.where(np.isnan(part.sigma_m), 0.0, part.sigma_m)
     out = np.empty((_NOISES, number.size))
     for k in range(_NOISES):
-        drawn = np.concatenate([_normal(k, block) for block in range(low // 1024, high // 1024 + 1)])
+        drawn = np.concatenate([_normal(first_stream + k, block) for block in range(low // 1024, high // 1024 + 1)])
         alike = np.convolve(drawn, window, mode="same")
         out[k] = sigma * alike[number - low // 1024 * 1024]
     return out

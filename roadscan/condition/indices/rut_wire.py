@@ -3,6 +3,11 @@
 The wire is stretched over the cross-section from edge to edge of the lane, the upper convex hull of its heights. Left
 and right are the halves of the lane in the direction of travel. Source: the wire method as public descriptions of
 AASHTO R 48 and PP 69 have it (the texts were not at hand, no compliance is claimed).
+
+Standard deviations follow from those of the heights, of which one in three is a measurement of its own, since
+neighbours share cells. That of an area holds the heights' and those of the two places that carry the wire. That of a
+width holds those of wire and height over the slope at the rut's ends, for which the depth over the width is taken (half
+of the mean slope of its sides), and the step of the heights.
 """
 
 from __future__ import annotations
@@ -52,7 +57,8 @@ class RutWire(ConditionIndex):
         found = np.zeros((whole.rows.size, 2, 5))
         stretched_wire(c.offset_m, whole.height_m, found)
         n = c.station_m.size
-        unknown = np.full(n, np.nan)
+        step, half_m = lane.config.cross_section_step_m, 0.5 * lane.width_m
+        sigma_area = whole.sigma_m * np.sqrt(3.0 * half_m * step + 0.5 * half_m**2)
 
         def held(name: str, values: Float64, sigma: Float64) -> PerCrossSection:
             return PerCrossSection(name, c.station_m, whole.spread(values, n), sigma, c.share)
@@ -66,8 +72,11 @@ class RutWire(ConditionIndex):
                 (f"rut_depth_max_{side}_mm", "max"),
             )
             yield from by_section(depth, lane, wanted)
-            yield from held(f"rut_width_{side}_m", found[:, half, 1], unknown).values()
-            yield from held(f"rut_area_{side}_m2", found[:, half, 2], unknown).values()
+            steep = found[:, half, 0] / np.maximum(found[:, half, 1], step)
+            sigma = whole.sigma_m * np.sqrt(2.0 * found[:, half, 4]) / np.maximum(steep, 1e-6)
+            sigma_width = np.minimum(np.hypot(sigma, step / np.sqrt(6.0)), half_m)
+            yield from held(f"rut_width_{side}_m", found[:, half, 1], whole.spread(sigma_width, n)).values()
+            yield from held(f"rut_area_{side}_m2", found[:, half, 2], whole.spread(sigma_area, n)).values()
         standing = np.zeros_like(whole.height_m)
         water(whole.height_m, standing)
         sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(2.0), n)

@@ -119,15 +119,17 @@ def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[Out
 
 
 def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
-    """The lanes with the standard deviation of the roll of their drives."""
+    """The lanes with the standard deviations of roll and height of their drives."""
     settings = plan.survey.config.navigation.calibration
-    roll_deg = {
-        one.pass_id: math.degrees(float(usual_pose_sigma(plan.store, plan.records, source, settings)[3]))
-        for one, source in _driven(plan)
-    }
-    most = max(roll_deg.values(), default=0.0)
+    known = {one.pass_id: usual_pose_sigma(plan.store, plan.records, source, settings) for one, source in _driven(plan)}
+
+    def greatest(lane: Lane, number: int) -> float:
+        own = [known[PassId(p)] for p in lane.passes] or list(known.values())
+        return max((float(sigma[number]) for sigma in own), default=0.0)
+
     return [
-        replace(lane, sigma_roll_deg=max((roll_deg[PassId(p)] for p in lane.passes), default=most)) for lane in lanes
+        replace(lane, sigma_roll_deg=math.degrees(greatest(lane, 3)), sigma_height_m=greatest(lane, 2))
+        for lane in lanes
     ]
 
 
@@ -232,6 +234,7 @@ def _write_lanes(
         "width_from": [lane.width_from for lane in lanes],
         "offset_mean_m": [float(np.mean(lane.offset_m)) for lane in lanes],
         "sigma_roll_deg": [lane.sigma_roll_deg for lane in lanes],
+        "sigma_height_m": [lane.sigma_height_m for lane in lanes],
         "passes": [" ".join(map(str, lane.passes)) for lane in lanes],
         "offset_m": [lane.offset_m for lane in lanes],
     }
@@ -285,7 +288,7 @@ def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roa
         Lane(
             row["road"], row["lane"], 1 if row["direction"] == "forward" else -1, row["station_from_m"],
             np.array(row["offset_m"]), row["width_m"], row["width_from"], tuple(map(int, row["passes"].split())),
-            row["sigma_roll_deg"],
+            row["sigma_roll_deg"], row["sigma_height_m"],
         )
         for row in held.to_pylist()
     )  # fmt: skip

@@ -10,13 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import shapely
 
 from roadscan.code_reach import code_digest
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.on_road import Stretch, points_of, section_regions, station_and_offset
 from roadscan.condition.roughness_regions.regions import Region, SectionRegions
 from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.tiles_beside import tiles_beside
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.cell_files import read_cells
@@ -30,7 +30,7 @@ from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest, file_digest
 from roadscan.tables.writer import parquet_bytes
-from roadscan.tiles.grid import Bounds, TileGrid
+from roadscan.tiles.grid import TileGrid
 
 REGIONS: Final = "roughness_regions"
 REGION_SECTIONS: Final = "roughness_sections"
@@ -98,23 +98,14 @@ def plan_pieces(
                 for lane in roads.lanes
                 if lane.road == road and lane.last_m > sections[0][0] and lane.first_m < sections[-1][1]
             )
-            own = tuple(tiles[t] for t in _on_the_way(part, sections, grid, settings) if t in tiles)
+            beside = tiles_beside(part, sections[0][0], sections[-1][1], settings.width_m / 2 + 1.0, grid)
+            own = tuple(tiles[t] for t in beside if t in tiles)
             if own and lanes:
                 shape = [part.road, part.first_m, part.nodes_m.tolist(), sections]
                 shape += [[v.sign, v.width_m, v.first_m, v.offset_m.tolist()] for v in lanes]
                 key = key_of(common, shape, [(r.unit, r.digest) for r in own])
                 found.append(Piece(part, lanes, number, sections, own, key))
     return found
-
-
-def _on_the_way(
-    line: RoadLine, sections: Sequence[tuple[float, float]], grid: TileGrid, settings: RoughnessRegionsConfig
-) -> list[TileId]:
-    station = np.arange(sections[0][0], sections[-1][1] + 1.0)
-    strip = shapely.LineString(line.places(station, 0.0)[:, :2]).buffer(settings.width_m / 2 + 1.0)
-    boxes = [(t, grid.bounds(t)) for t in grid.tiles_in(Bounds(*strip.bounds))]
-    shapes = [shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m) for _, b in boxes]
-    return [t for (t, _), shape in zip(boxes, shapes, strict=True) if strip.intersects(shape)]
 
 
 def due_pieces(pieces: Sequence[Piece], manifest: Manifest) -> list[Piece]:

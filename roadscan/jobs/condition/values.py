@@ -17,8 +17,10 @@ from roadscan.code_reach import code_digest, name_of
 from roadscan.condition.cracks_on_lane import PIECE_M, CrackOnLane, located
 from roadscan.condition.index import ConditionIndex, Value, condition_indices
 from roadscan.condition.lane_data import CrossSections, LaneData, Profile
+from roadscan.condition.road_edges.on_lane import EdgeRows, EdgesOnLane, edges_on_lane
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.road_edges import EDGE_PIECE_M, EDGES, edge_unit
 from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, STRETCH_M, unit_of
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
@@ -49,6 +51,10 @@ class Group:
     cross_sections: tuple[OutputRecord, ...]
     cracks: OutputRecord | None
     """Record of the table of cracks, where there is one."""
+    edges: tuple[OutputRecord, ...] | None
+    """Records of the road's edges on its way; None where none are sought."""
+    beside: Mapping[str, bool]
+    """Whether no other lane lies between this one and the edge, by side in the direction of travel."""
     indices: tuple[tuple[str, str], ...]
     """Names of the indices to compute, with the keys of their values."""
 
@@ -77,13 +83,16 @@ class GroupTask:
         return [replace(self, group=replace(self.group, indices=(one,))) for one in self.group.indices]
 
 
-def plan_groups(roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float) -> list[Group]:
-    """All groups of sections, with all indices."""
+def plan_groups(
+    roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float, *, with_edges: bool
+) -> list[Group]:
+    """All groups of sections, with all indices; `with_edges` says whether the road's edges are sought."""
     profiles, crossings = manifest.of(PROFILES), manifest.of(CROSS_SECTIONS)
     indices, cracks = condition_indices(), manifest.get("cracks", "cracks.parquet")
     of_cracks = None if cracks is None else cracks.digest
     entry = "roadscan.jobs.condition.values:values_of_group"
     codes = {name: code_digest(entry, name_of(type(one))) for name, one in indices.items()}
+    found_edges = dict(manifest.of(EDGES)) if with_edges else {}
     lead = max((one.lead_m for one in indices.values()), default=0.0)
     settings = config.model_dump(mode="json")
     many = max(1, round(_GROUP_M / config.section_m))
@@ -101,16 +110,38 @@ def plan_groups(roads: Roads, manifest: Manifest, config: SectionConfig, cell_m:
                 lane.sign,
                 lane.width_m,
                 lane.sigma_roll_deg,
+                lane.sigma_height_m,
                 own,
                 [(r.unit, r.digest) for r in (*read, *read_cross)],
                 cell_m,
             ]
+            edges: tuple[OutputRecord, ...] | None = None
+            beside = _beside(lane, roads.lanes)
+            if with_edges:
+                pieces = range(int(own[0][0]) // EDGE_PIECE_M, int(own[-1][1]) // EDGE_PIECE_M + 1)
+                units = [edge_unit(lane.road, piece) for piece in pieces]
+                edges = tuple(found_edges[u] for u in units if u in found_edges)
+                shape += [[(r.unit, r.digest) for r in edges], sorted(beside.items())]
             keys = tuple(
                 (name, key_of(codes[name], settings, shape, of_cracks if indices[name].needs_cracks else None))
                 for name in sorted(indices)
             )
             line = roads.lines[lane.road].stretch(own[0][0] - 20.0, own[-1][1] + 20.0)
-            found.append(Group(line, lane, number, own, read, read_cross, cracks, keys))
+            found.append(Group(line, lane, number, own, read, read_cross, cracks, edges, beside, keys))
+    return found
+
+
+def _beside(lane: Lane, lanes: Sequence[Lane]) -> dict[str, bool]:
+    """Whether no other lane lies on a side of a lane, by side in the direction of travel."""
+    found = {"left": True, "right": True}
+    for other in lanes:
+        first, last = max(lane.first_m, other.first_m), min(lane.last_m, other.last_m)
+        if other.road != lane.road or other is lane or last <= first:
+            continue
+        station = np.arange(first, last + 1, dtype=np.float64)
+        away = lane.sign * float(np.median(other.offsets(station) - lane.offsets(station)))
+        if abs(away) > 0.5 * min(lane.width_m, other.width_m):
+            found["right" if away > 0.0 else "left"] = False
     return found
 
 
@@ -190,6 +221,9 @@ def load_lane(task: GroupTask) -> LaneData:
     profiles = _tables(task.store, group.profiles, table_schema(PROFILES).arrow())
     crossings = _tables(task.store, group.cross_sections, table_schema(CROSS_SECTIONS).arrow())
     cross = _cross_sections(crossings, task.config, group.lane.width_m)
+    edges = _edges(task)
+    if edges is not None:
+        cross = _on_road(cross, edges)
     return LaneData(
         sign=group.lane.sign,
         width_m=group.lane.width_m,
@@ -200,8 +234,32 @@ def load_lane(task: GroupTask) -> LaneData:
         config=task.config,
         curvature_per_m=group.line.curvature_per_m(_within(cross, group.sections_m).station_m),
         cracks=_cracks(task),
+        edges=edges,
         sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
+        sigma_pose_height_m=group.lane.sigma_height_m,
     )
+
+
+def _edges(task: GroupTask) -> EdgesOnLane | None:
+    """The road's edges beside the lane along the group; None where none are sought."""
+    group = task.group
+    if group.edges is None:
+        return None
+    table = _tables(task.store, group.edges, table_schema(EDGES).arrow())
+    names = ("station_m", "offset_m", "sigma_offset_m", "drop_m", "sigma_drop_m")
+    rows = {}
+    for side in ("left", "right"):
+        own = table.filter(pc.equal(table["side"], side))
+        rows[side] = EdgeRows(*(own[name].to_numpy().astype(np.float64) for name in names))
+    return edges_on_lane(rows, group.lane, (group.sections_m[0][0], group.sections_m[-1][1]), group.beside)
+
+
+def _on_road(cross: CrossSections, edges: EdgesOnLane) -> CrossSections:
+    """Cross-sections without heights beyond the road's edges."""
+    inside = np.array([edges.inside(np.full(cross.offset_m.size, s), cross.offset_m) for s in cross.station_m])
+    inside = inside.reshape(cross.height_m.shape)
+    height, sigma = (np.where(inside, values, np.nan) for values in (cross.height_m, cross.sigma_m))
+    return replace(cross, height_m=height, sigma_m=sigma)
 
 
 def _cracks(task: GroupTask) -> tuple[CrackOnLane, ...] | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
 from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
+from roadscan.jobs.condition.road_edges import EDGES, SURFACES, EdgePiece, due_edges, plan_edges, stated_surface
 from roadscan.jobs.condition.roughness_regions import (
     REGION_PICTURES,
     REGION_SECTIONS,
@@ -32,7 +33,10 @@ from roadscan.model.ids import TileId
 from roadscan.model.settings.condition import ConditionConfig
 from roadscan.tables.manifest import OutputRecord
 
-MADE = (LINES, LANES, PROFILES, CROSS_SECTIONS, VALUES, SECTIONS, PICTURES, REGIONS, REGION_SECTIONS, REGION_PICTURES)
+MADE = (
+    LINES, LANES, PROFILES, CROSS_SECTIONS, EDGES, SURFACES, VALUES, SECTIONS, PICTURES, REGIONS, REGION_SECTIONS,
+    REGION_PICTURES,
+)  # fmt: skip
 """Names of all outputs in the manifest."""
 
 
@@ -49,6 +53,9 @@ class ConditionWork:
     files: SectionFiles | None = None
     due_files: Sequence[str] = ()
     due_pictures: Sequence[PictureTask] = ()
+    edges: Sequence[EdgePiece] = ()
+    """Pieces of roads whose edges are sought."""
+    due_edges: Sequence[EdgePiece] = ()
     pieces: Sequence[Piece] = ()
     """Of roads, to be looked through for roughness regions."""
     due_pieces: Sequence[Piece] = ()
@@ -80,21 +87,25 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     tiles = {TileId.parse(unit): r for unit, r in made.items() if r.path}
     settings, grid = config.sections(), plan.ground.grid
     stretches = plan_stretches(roads, tiles, grid, settings)
-    groups = plan_groups(roads, manifest, settings, grid.cell_m)
+    measured = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    stated = stated_surface(plan, config.road_edges)
+    edges = plan_edges(roads, measured, grid, config.road_edges, stated)
+    groups = plan_groups(roads, manifest, settings, grid.cell_m, with_edges=config.road_edges is not None)
     units = [one.unit(name) for one in groups for name, _ in one.indices]
     tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
     pictures = plan_pictures(tasks, manifest)
     files = plan_sections(session.store, manifest, roads, units, context)
-    measured = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
     pieces = plan_pieces(roads, measured, grid, config.roughness_regions)
     gone = [
         *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
+        *manifest.beside({EDGES, SURFACES}, {one.unit for one in edges}),
         *manifest.beside({VALUES}, set(units)),
         *manifest.beside({PICTURES}, {one.unit for one in pictures}),
         *manifest.beside({REGIONS, REGION_SECTIONS, REGION_PICTURES}, {one.unit for one in pieces}),
     ]
     return ConditionWork(
         key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
-        due_files(files, manifest), due_pictures(pictures, manifest), pieces, due_pieces(pieces, manifest),
+        due_files(files, manifest), due_pictures(pictures, manifest), edges, due_edges(edges, manifest), pieces,
+        due_pieces(pieces, manifest),
         gone,
     )  # fmt: skip

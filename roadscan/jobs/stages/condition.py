@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
+from roadscan.jobs.condition.road_edges import EdgeTask, check_edge_polygons, edges_of_pieces
 from roadscan.jobs.condition.roughness_regions import PieceTask, regions_of_pieces
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
@@ -49,7 +50,8 @@ class Condition(Stage):
         tasks = stretch_tasks(work.due_stretches, session.store, context, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
-        work = plan_condition(session) if tasks else work
+        self._seek_edges(session, work)
+        work = plan_condition(session) if tasks or work.due_edges else work
         self._look_for_regions(session, work)
         values = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in work.due_groups]
         bar = session.bar("values of condition")
@@ -62,6 +64,15 @@ class Condition(Stage):
         failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
         session.failed(self.name, [(one.unit, reason) for one, reason in failed])
 
+    def _seek_edges(self, session: Session, work: ConditionWork) -> None:
+        config = session.survey.config.condition
+        if config is None or config.road_edges is None:
+            return
+        grid, context = session.plan.ground.grid, product_context(session.plan)
+        tasks = [EdgeTask(session.store, grid, context, config.road_edges, (one,)) for one in work.due_edges]
+        bar = session.bar("edges of roads")
+        session.failed(self.name, run_units(edges_of_pieces, tasks, session.manifest, session.compute, bar))
+
     def _look_for_regions(self, session: Session, work: ConditionWork) -> None:
         config = session.survey.config.condition
         if config is None or config.roughness_regions is None:
@@ -72,10 +83,11 @@ class Condition(Stage):
         session.failed(self.name, run_units(regions_of_pieces, tasks, session.manifest, session.compute, bar))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """The layer of reference lines can be opened as stated; there is a surface where its heights are asked for."""
+        """Layers of lines and polygons can be opened as stated; there is a surface where its heights are asked for."""
         try:
             check_layer(survey)
             check_surface_cells(survey)
+            check_edge_polygons(survey)
         except RoadscanError as error:
             return [error]
         return []
@@ -86,13 +98,15 @@ class Condition(Stage):
             return StageState()
         work = plan_condition(session)
         stale = self._stale(work)
-        current = len(work.stretches) + len(work.pieces) + sum(len(g.indices) for g in work.groups) - stale
+        units = len(work.stretches) + len(work.edges) + len(work.pieces) + sum(len(g.indices) for g in work.groups)
+        current = units - stale
         return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
 
     def _stale(self, work: ConditionWork) -> int:
         return (
             int(work.lines_due)
             + len(work.due_stretches)
+            + len(work.due_edges)
             + work.values_due
             + len(work.due_files)
             + len(work.due_pictures)
@@ -100,9 +114,10 @@ class Condition(Stage):
         )
 
     def folders(self) -> Sequence[str]:
-        """Tables of lines, lanes, profiles, cross-sections, values and roughness regions, and the section table."""
+        """Tables of lines, lanes, profiles, cross-sections, edges, values and regions, and the section table."""
         return (
             "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
-            "tables/condition_values", "products/condition_sections", "products/condition_pictures",
-            "tables/roughness_sections", "products/roughness_regions", "products/roughness_pictures",
+            "tables/road_edge_offsets", "products/road_surface", "tables/condition_values",
+            "products/condition_sections", "products/condition_pictures", "tables/roughness_sections",
+            "products/roughness_regions", "products/roughness_pictures",
         )  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.model.settings.road_edges import RoadEdgesConfig
 from roadscan.model.settings.roughness_regions import RoughnessRegionsConfig
 from roadscan.model.strict import NAME_PATTERN, Strict
 
@@ -76,6 +77,8 @@ class ConditionConfig(SectionConfig):
     lane_smoothing_m: float = Field(default=100.0, ge=2.0, le=1000.0)
     """Length over which the middle of a driven lane is smoothed (m)."""
 
+    road_edges: RoadEdgesConfig | None = None
+    """Edges of the road's surface, by the readings or by polygons; left out, none are sought."""
     roughness_regions: RoughnessRegionsConfig | None = None
     """Dim regions of the road's surface (utility cuts, patches, worn places), section by section; left out, none."""
 

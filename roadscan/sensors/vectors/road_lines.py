@@ -283,7 +283,7 @@ class LineLayer:
             "measure_from": _attribute(options.measure_from_column, (), names, path),
             "measure_to": _attribute(options.measure_to_column, (), names, path),
         }
-        crs = _layer_crs(info["crs"], stated_crs or (None if info["crs"] else default_crs), path)
+        crs = layer_crs(info["crs"], stated_crs or (None if info["crs"] else default_crs), path)
         return cls(path, name, crs, str(info.get("geometry_name") or ""), columns, options)
 
     @property
@@ -304,7 +304,7 @@ def _attribute(stated: str | None, known: tuple[str, ...], names: tuple[str, ...
     return stated
 
 
-def _layer_crs(found: str | None, stated: str | None, path: Path) -> str:
+def layer_crs(found: str | None, stated: str | None, path: Path) -> str:
     """CRS of a layer: its own, or the stated one; the two have to agree."""
     if found is None:
         if stated is None:

@@ -1,4 +1,4 @@
-"""Layers of the roads: reference lines, lanes, sections in colours of their condition, roughness regions."""
+"""Layers of the roads: reference lines, lanes, surfaces, sections in colours of their condition, roughness regions."""
 
 from __future__ import annotations
 
@@ -42,6 +42,8 @@ class Condition(LayerKind):
             ("lanes", described("lanes", "Lanes", "survey", "line", 220, [Style("one colour", 2, SKY)], visible=False)),
             ("condition_sections", described("condition_sections", "Condition by section", "condition", "line", 300,
                 _STYLES)),
+            ("road_surface", described("road_surface", "Road surface inside its edges", "survey", "polygon", 205,
+                [Style("one colour", 1, SKY)], visible=False)),
             ("roughness_regions", described("roughness_regions", "Roughness regions", "condition", "polygon", 310,
                 [Style("one colour", 1, BLUE)], visible=False)),
         ):  # fmt: skip

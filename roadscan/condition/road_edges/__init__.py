@@ -1,0 +1,1 @@
+"""Edges of the road's surface on both sides of its lanes."""

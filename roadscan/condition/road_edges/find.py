@@ -1,0 +1,260 @@
+"""Edges of a road's surface on one side of its lanes, from heights and intensities beside them.
+
+After P. Kumar, C. P. McElhinney, P. Lewis and T. McCarthy, *An automated algorithm for extracting road edges from
+terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road tells its edge, and intensity and
+pulse width where the slope does not. They let a snake find its way over rasters of the three; here each change across
+the road is measured in standard deviations, and the best path is found by dynamic programming
+(:mod:`roadscan.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities tell an
+edge, the line painted along the border of the lane stands for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+
+from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, SideRaster
+from roadscan.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
+
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+KINDS: Final = ("kerb", "drop", "slope", "intensity", "marking", "polygon")
+"""What an edge is told by: a step up, a step down, a change of slope, one of intensity, a painted line, a polygon."""
+INNER_M: Final = 1.2
+"""The raster begins this far inside the first place where an edge may be."""
+NEAREST_M: Final = 0.8
+"""An edge lies at least this far from a lane's middle."""
+_INSIDE_LANE_M: Final = 0.5
+"""How far inside a lane's border its road's edge may be."""
+_SIGMA_HEIGHT_M: Final = 0.005
+_SIGMA_GREY: Final = 0.08
+"""Standard deviation of an intensity (share of that of the road), before what its neighbours say of it."""
+_GREY: Final = AcrossSettings(floor_step_m=0.08, floor_bend=1e6)
+"""A change of the intensity by less than 8 % is none, and its slope tells nothing."""
+_STEP: Final = 4.0
+"""Evidence (σ) of a step beside which a change of slope tells nothing."""
+_TRUST: Final = (1.0, 1.0, 0.95, 0.7)
+"""How much the evidence of a step up or down, of a slope and of the intensity counts where several tell an edge."""
+_AROUND: Final = 3
+_ROUNDS: Final = 3
+_LEAST_EVIDENCE: Final = 0.6
+_LINE_M: Final = 0.6
+"""Painted lines are narrower than this."""
+_PAINT: Final = 0.25
+"""A painted line is so much brighter than the road (share of its intensity)."""
+_LINE_INSIDE_M: Final = 0.8
+_LINE_OUTSIDE_M: Final = 0.8
+"""How far inside and outside the lane's border its edge line may be."""
+_SMOOTHED_M: Final = 3.5
+_SPREAD_M: Final = 10.0
+_KIND_M: Final = 10.0
+"""What an edge is told by is judged over this length."""
+_STEP_NEAR_M: Final = 0.15
+_STEP_FAR_M: Final = 0.65
+"""Heights between these distances from an edge tell its step."""
+
+
+@dataclass(frozen=True, eq=False)
+class SideEdge:
+    """The edge of the road on one side, station by station."""
+
+    away_m: Float64
+    """(s,) its distance from the line that the raster counts from; NaN where it is not known."""
+    sigma_m: Float64
+    """(s,) standard deviation of that."""
+    kind: npt.NDArray[np.int8]
+    """(s,) what tells it: places in :data:`KINDS`; −1 where it is not known."""
+    evidence: Float64
+    """(s,) mean evidence (σ) around the station."""
+    drop_m: Float64
+    """(s,) height of the road's surface at the edge above the ground beside it; negative where that is higher."""
+    sigma_drop_m: Float64
+    """(s,)"""
+
+
+def first_m(lane_width_m: float) -> float:
+    """Least distance of an edge from the middle of a lane (m)."""
+    return max(NEAREST_M, 0.5 * lane_width_m - _INSIDE_LANE_M)
+
+
+def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -> SideEdge:
+    """The edge on one side; distances count from the middle of the outermost lane."""
+    spacing = (STATION_M, OFFSET_M)
+    step, bend = evidence_across(raster.height_m, np.full(raster.height_m.shape, _SIGMA_HEIGHT_M), spacing)
+    grey = _relative(raster)
+    surface = _opened(grey)
+    change, _ = evidence_across(surface, np.full(grey.shape, _SIGMA_GREY), spacing, _GREY)
+    # Beside a step the slopes of both sides differ as well.
+    stepped = scipy.ndimage.maximum_filter(np.nan_to_num(np.abs(step)), (1, 2 * round(DEFAULT.across_m / OFFSET_M) + 1))
+    bend = np.where(stepped >= _STEP, 0.0, bend)
+    up, down = np.where(step > 0.0, step, 0.0), np.where(step < 0.0, step, 0.0)
+    change = _lasting(change, surface)
+    kinds = np.stack([trust * counted(e) for e, trust in zip((up, down, bend, change), _TRUST, strict=True)])
+    begin = int(np.searchsorted(raster.away_m, first_m(lane_width_m) - 1e-9))
+    kinds = kinds[:, :, begin:]
+    path = path_along(kinds.max(axis=0), spacing)
+    told = _judged(kinds, path.cell)
+    away = _places(kinds[told, np.arange(told.size)], path.cell, raster.away_m[begin:])
+    good = path.evidence >= _LEAST_EVIDENCE
+    painted, paint_away, paint_evidence = _edge_line(grey - surface, raster, lane_width_m)
+    instead = ~good & painted
+    away = np.where(instead, paint_away, away)
+    kind = np.where(instead, KINDS.index("marking"), told).astype(np.int8)
+    evidence = np.where(instead, paint_evidence, path.evidence)
+    away, sigma = smoothed(away, good | painted, kind)
+    known = (good | painted) & (sigma <= largest_sigma_m)
+    drop, sigma_drop = drops(raster, np.where(known, away, np.nan))
+    nan = np.nan
+    return SideEdge(
+        np.where(known, away, nan), np.where(known, sigma, nan), np.where(known, kind, -1).astype(np.int8),
+        np.where(known, evidence, nan), drop, sigma_drop,
+    )  # fmt: skip
+
+
+def _relative(raster: SideRaster) -> Float64:
+    """Intensities (s, o) as shares of the lane's; NaN where there are none."""
+    inner = raster.intensity[raster.away_m[None, :].repeat(len(raster.intensity), 0) <= NEAREST_M + INNER_M]
+    inner = inner[np.isfinite(inner)]
+    level = float(np.median(inner)) if inner.size else 0.0
+    return raster.intensity / level if level > 0.0 else np.full(raster.intensity.shape, np.nan)
+
+
+def _opened(grey: Float64) -> Float64:
+    """Intensities without what is brighter than its surroundings and narrower than a painted line may be."""
+    cells = round(_LINE_M / OFFSET_M)
+    cells += 1 - cells % 2
+    low = scipy.ndimage.minimum_filter(np.where(np.isnan(grey), np.inf, grey), (1, cells), mode="nearest")
+    opened = scipy.ndimage.maximum_filter(np.where(np.isinf(low), -np.inf, low), (1, cells), mode="nearest")
+    return np.where(np.isnan(grey) | np.isinf(opened), np.nan, opened)
+
+
+def _lasting(change: Float64, surface: Float64) -> Float64:
+    """Changes of intensity (σ), no more of each than the mean intensities of both sides differ by."""
+    size = (2 * round(DEFAULT.along_m / STATION_M) + 1, round(DEFAULT.across_m / OFFSET_M))
+    size = (size[0], size[1] + 1 - size[1] % 2)
+    known = np.isfinite(surface)
+    share = scipy.ndimage.uniform_filter(known.astype(np.float64), size, mode="constant")
+    total = scipy.ndimage.uniform_filter(np.where(known, surface, 0.0), size, mode="constant")
+    mean = np.where(share > 0.2, total / np.maximum(share, 1e-9), np.nan)
+    away = size[1] // 2 + 1
+    padded = np.pad(mean, ((0, 0), (away, away)), constant_values=np.nan)
+    levels = (padded[:, 2 * away :] - padded[:, : -2 * away]) / _SIGMA_GREY
+    alike = np.sign(change) == np.sign(levels)
+    return np.where(alike, np.sign(change) * np.minimum(np.abs(change), np.abs(levels)), np.nan)
+
+
+def _edge_line(bright: Float64, raster: SideRaster, lane_width_m: float) -> tuple[Bool, Float64, Float64]:
+    """Where a line is painted along the border of the lane: whether, its distance, and its evidence, (s,) each."""
+    border = 0.5 * lane_width_m
+    near = (raster.away_m >= max(border - _LINE_INSIDE_M, NEAREST_M)) & (raster.away_m <= border + _LINE_OUTSIDE_M)
+    columns = np.flatnonzero(near)
+    strength = counted(np.maximum(np.nan_to_num(bright[:, columns]), 0.0) * DEFAULT.chance / _PAINT)
+    path = path_along(strength, (STATION_M, OFFSET_M), DEFAULT)
+    away = _places(strength, path.cell, raster.away_m[columns])
+    return path.evidence >= _LEAST_EVIDENCE, away, path.evidence
+
+
+def _places(found: Float64, cell: npt.NDArray[np.int64], away_m: Float64) -> Float64:
+    """Distances (s,) of evidence (s, o) beside the cells of a path: its middle over three cells to each side."""
+    at = away_m[cell]
+    for _ in range(_ROUNDS):
+        near = np.rint((at - away_m[0]) / OFFSET_M).astype(np.int64)[:, None] + np.arange(-_AROUND, _AROUND + 1)
+        inside = (near >= 0) & (near < found.shape[1])
+        near = np.clip(near, 0, found.shape[1] - 1)
+        weight = np.where(inside, np.maximum(np.take_along_axis(found, near, axis=1), 0.0), 0.0)
+        total = weight.sum(axis=1)
+        mean = (weight * away_m[near]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        at = np.where(total > 0.0, mean, at)
+    return at
+
+
+def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(s,) the kind of evidence (kinds, s, o) that is strongest beside a path around each station."""
+    near = np.clip(cell[:, None] + np.arange(-_AROUND, _AROUND + 1), 0, kinds.shape[2] - 1)
+    beside = np.take_along_axis(kinds, np.broadcast_to(near, (len(kinds), *near.shape)), axis=2).max(axis=2)
+    around = scipy.ndimage.uniform_filter1d(beside, _cells(_KIND_M), axis=1, mode="nearest")
+    strongest: npt.NDArray[np.int64] = np.argmax(around, axis=0)
+    return strongest
+
+
+def smoothed(away_m: Float64, known: Bool, kind: npt.NDArray[np.int8]) -> tuple[Float64, Float64]:
+    """Distances (s,) smoothed along the road within runs of known ones of one kind, and their standard deviations.
+
+    The standard deviation is that of the single places about the smooth line, as their median difference within 10 m
+    tells it, and that of a cell's width.
+    """
+    out, sigma = np.array(away_m), np.full(away_m.size, np.nan)
+    group = np.where(known, kind.astype(np.int64) + 1, 0)
+    ends = np.flatnonzero(np.diff(group, prepend=-1, append=-1))
+    for first, end in itertools.pairwise(ends):
+        if group[first] == 0:
+            continue
+        own = away_m[first:end]
+        middle = scipy.ndimage.median_filter(own, min(_cells(_SMOOTHED_M), _odd(own.size)), mode="nearest")
+        smooth = scipy.ndimage.uniform_filter1d(middle, min(_cells(_SMOOTHED_M), _odd(own.size)), mode="nearest")
+        width = min(_cells(_SPREAD_M), _odd(own.size))
+        spread = 1.4826 * scipy.ndimage.median_filter(np.abs(own - smooth), width, mode="nearest")
+        out[first:end], sigma[first:end] = smooth, np.hypot(spread, OFFSET_M / np.sqrt(12.0))
+    return out, sigma
+
+
+def _cells(length_m: float) -> int:
+    return _odd(round(length_m / STATION_M))
+
+
+def _odd(count: int) -> int:
+    return max(count - 1 + count % 2, 1)
+
+
+def drops(raster: SideRaster, away_m: Float64) -> tuple[Float64, Float64]:
+    """Height (s,) of the road's surface above the ground beside it at its edge (m), and its standard deviation.
+
+    Straight lines are fitted to the heights from 0.15 to 0.65 m inside and outside the edge; NaN where either side has
+    fewer than three. The median of five stations is taken, so that single things beside the road do not count.
+    """
+    reach = np.arange(-round(_STEP_FAR_M / OFFSET_M) - 1, round(_STEP_FAR_M / OFFSET_M) + 2)
+    known = np.isfinite(away_m)
+    cell = np.round((np.where(known, away_m, 0.0) - raster.away_m[0]) / OFFSET_M).astype(np.int64)
+    near = cell[:, None] + reach
+    inside = (near >= 0) & (near < raster.away_m.size) & known[:, None]
+    near = np.clip(near, 0, raster.away_m.size - 1)
+    height = np.where(inside, np.take_along_axis(raster.height_m, near, axis=1), np.nan)
+    beyond = raster.away_m[near] - away_m[:, None]
+    wanted = (np.abs(beyond) >= _STEP_NEAR_M) & (np.abs(beyond) <= _STEP_FAR_M)
+    height = np.where(wanted, height, np.nan)
+    ends = [_line_at_edge(np.where(side * beyond > 0.0, height, np.nan), beyond) for side in (-1.0, 1.0)]
+    drop, variance = ends[0][0] - ends[1][0], ends[0][1] + ends[1][1]
+    return _median_of_five(drop), _median_of_five(np.sqrt(variance))
+
+
+def _line_at_edge(height: Float64, beyond: Float64) -> tuple[Float64, Float64]:
+    """Heights (s,) at the edge of straight lines through some heights (s, k) beside it, and their variances."""
+    good = np.isfinite(height)
+    n = good.sum(axis=1)
+    enough = n >= 3
+    count = np.where(enough, n, 1)
+    x, h = np.where(good, beyond, 0.0), np.where(good, height, 0.0)
+    mean_x, mean_h = x.sum(axis=1) / count, h.sum(axis=1) / count
+    dx, dh = np.where(good, x - mean_x[:, None], 0.0), np.where(good, h - mean_h[:, None], 0.0)
+    square = np.where(enough, (dx * dx).sum(axis=1), 1.0)
+    slope = (dx * dh).sum(axis=1) / square
+    rest = ((dh - slope[:, None] * dx) ** 2).sum(axis=1) / np.maximum(count - 2, 1)
+    variance = np.maximum(rest, 1e-6) * (1.0 / count + mean_x**2 / square)
+    return np.where(enough, mean_h - slope * mean_x, np.nan), np.where(enough, variance, np.nan)
+
+
+def _median_of_five(value: Float64) -> Float64:
+    """(s,) medians of known values of five stations; NaN where the middle one is not known."""
+    padded = np.pad(value, 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
+    known = np.isfinite(value)
+    out = np.full(value.size, np.nan)
+    if known.any():
+        out[known] = np.nanmedian(windows[known], axis=1)
+    return out

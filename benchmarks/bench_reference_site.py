@@ -33,15 +33,42 @@ CHECK_ROW = derivatives(DOWN, 0.0)
 BARS = {300.0: (2.6, 1.5), 825.0: (4.0, 1.9)}
 """Mean absolute height error (mm), each run alone and all together, by spacing of the control."""
 REPEATABILITY_MM = 0.5
+CURVE_M = (150.0, 300.0, 825.0, 1650.0)
+"""Spacings of the control that the error is drawn against."""
 
 
 def figures(_: Path) -> Iterator[Figure]:
-    """By spacing of the control and mode: errors, repeatability, best estimate, honesty of σ."""
+    """By spacing of the control and mode: errors, repeatability, best estimate, honesty of σ; then the curve."""
     seeds = Settings.current().adjustment_seeds
     for spacing, (alone, together) in BARS.items():
         road = replace(SITE, control_spacing_m=spacing)
         for mode, bar in (("each_pass", alone), ("joint", together)):
             yield from of_mode(road, mode, bar, seeds)
+    for mode in ("each_pass", "joint"):
+        for spacing in CURVE_M:
+            yield curve_point(replace(SITE, control_spacing_m=spacing), mode, seeds)
+
+
+def curve_point(road: Road, mode: str, seeds: int) -> Figure:
+    """Mean absolute height error at the check points for a spacing of the control, beside the expected best."""
+    checks = np.linspace(0.0, road.length_m, CHECKS + 2)[1:-1]
+    best = 1e3 * BestEstimate.of(road, checks, joint=mode == "joint").expected
+    settings = AdjustmentSettings.model_validate({"mode": mode})
+    found = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(1000 + seed)
+        drawn = drawn_errors(road, np.concatenate([road.ties_m, road.control_m, checks]), rng)
+        solved = adjust(observed(road, mode, drawn, rng), road.priors(), settings)
+        found.append(np.abs(errors(solved, road, drawn, checks)[0]).mean())
+    runs = "all runs" if mode == "joint" else "each run alone"
+    name = f"control each {road.control_spacing_m:,.0f} m, {runs}: mean absolute height error"
+    return Figure(name, 1e3 * float(np.mean(found)), "mm", best, "best, expected")
+
+
+def observed(road: Road, mode: str, drawn: Drawn, rng: np.random.Generator) -> Observations:
+    """Control, and where runs are adjusted together, ties."""
+    tied = [ties(road, drawn, rng)] if mode == "joint" else []
+    return Observations.joined([*tied, control(road, drawn, rng)])
 
 
 def of_mode(road: Road, mode: str, bar: float, seeds: int) -> Iterator[Figure]:

@@ -154,14 +154,11 @@ class BestEstimate:
         is_control = (observations.run == FIXED).any(axis=1)
         used = (observations.partials[:, 0, 2] != 0.0) & (joint | is_control)
         chosen = observations.chosen(used)
-        own = cls._covariance(road, chosen, chosen)
+        own = pose_covariance(road, chosen, chosen)
         survey = chosen.survey_sigma_m
-        shared = (chosen.place[:, None] == chosen.place) & (survey[:, None] > 0.0)
-        if not joint:
-            shared &= chosen.run[:, None, 0] == chosen.run[:, 0]
-        own += np.diag(chosen.sigma_m**2) + np.where(shared, survey[:, None] * survey, 0.0)
+        own += np.diag(chosen.sigma_m**2) + survey_covariance(chosen, joint=joint)
         wanted = cls._wanted(road, checks)
-        across = cls._covariance(road, wanted, chosen)
+        across = pose_covariance(road, wanted, chosen)
         factor = cho_factor(own, overwrite_a=True, lower=True)
         some = across[:: max(1, checks.size // 50)]
         prior = sum(p.sigma**2 * d**2 for p, d in zip(road.processes, CHECK_ROW, strict=True))
@@ -193,15 +190,24 @@ class BestEstimate:
             zeros.astype(np.uint8), run.astype(np.int32), epochs, rows, np.zeros(size), np.ones(size), zeros, zeros
         )
 
-    @staticmethod
-    def _covariance(road: Road, one: Observations, two: Observations) -> Float64:
-        """Of what the errors of the poses make of two sets of observations."""
-        total = np.zeros((one.size, two.size))
-        for run, a, b in itertools.product(range(road.runs), (0, 1), (0, 1)):
-            i, j = np.flatnonzero(one.run[:, a] == run), np.flatnonzero(two.run[:, b] == run)
-            apart = np.abs(one.epoch_gps_ns[i, a, None] - two.epoch_gps_ns[j, b]) / 1e9
-            for c, p in enumerate(road.processes):
-                first, second = one.partials[i, a, c], two.partials[j, b, c]
-                if first.any() and second.any():
-                    total[np.ix_(i, j)] += first[:, None] * second * p.sigma**2 * np.exp(-apart / p.tau_s)
-        return total
+
+def pose_covariance(road: Road, one: Observations, two: Observations) -> Float64:
+    """Of what the errors of the poses make of two sets of observations."""
+    total = np.zeros((one.size, two.size))
+    for run, a, b in itertools.product(range(road.runs), (0, 1), (0, 1)):
+        i, j = np.flatnonzero(one.run[:, a] == run), np.flatnonzero(two.run[:, b] == run)
+        apart = np.abs(one.epoch_gps_ns[i, a, None] - two.epoch_gps_ns[j, b]) / 1e9
+        for c, p in enumerate(road.processes):
+            first, second = one.partials[i, a, c], two.partials[j, b, c]
+            if first.any() and second.any():
+                total[np.ix_(i, j)] += first[:, None] * second * p.sigma**2 * np.exp(-apart / p.tau_s)
+    return total
+
+
+def survey_covariance(observations: Observations, *, joint: bool) -> Float64:
+    """Of what the errors of the survey of the control make of them: one error a point, or a point and run."""
+    survey = observations.survey_sigma_m
+    shared = (observations.place[:, None] == observations.place) & (survey[:, None] > 0.0)
+    if not joint:
+        shared &= observations.run[:, None, 0] == observations.run[:, 0]
+    return np.where(shared, survey[:, None] * survey, 0.0)

@@ -71,7 +71,7 @@ def _station_m(track: Track, epochs_gps_ns: Int64) -> Float64:
     moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
     station = np.concatenate([[0.0], np.cumsum(moved)])
     since = (epochs_gps_ns - track.epoch_gps_ns[0]).astype(np.float64)
-    return np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station)
+    return np.asarray(np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station))
 
 
 def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Sequence[Track]) -> Rows:

@@ -45,8 +45,8 @@ def draw_seams(shown: Sequence[ShownSeam], path: Path) -> None:
     Equal input gives equal bytes.
     """
     figure = empty_figure(13.0, 3.4 * len(shown), 120)
-    parts = np.atleast_1d(figure.subfigures(len(shown), 1))
-    for part, one in zip(parts, shown, strict=True):
+    parts = figure.subfigures(len(shown), 1, squeeze=False)
+    for part, one in zip(parts.ravel(), shown, strict=True):
         part.suptitle(one.title, fontsize="medium")
         axes = part.subplots(1, 4)
         limit = max(1e3 * float(np.nanpercentile(np.abs(one.difference_m[0]), 90)), _LEAST_MM)

@@ -204,14 +204,16 @@ def of_evidence(one: Adjusted, what: str) -> Iterator[Figure]:
     own = ties.chosen((ties.kind == KINDS.index("height_tie")) & (solution.tie_weight > 0.0))
     error = own.observed_m - explained(one, own)
     stated = 1e3 * rms(own.sigma_m)
-    yield Figure(f"{what}: error of {own.size} height ties, mean", 1e3 * float(error.mean()), "mm")
+    yield Figure(f"{what}: error of {own.size} height ties, absolute mean", 1e3 * abs(float(error.mean())), "mm")
     yield Figure(f"{what}: the same, RMS", 1e3 * rms(error), "mm", stated, "stated")
     control = solution.control.chosen(solution.control.kind == KINDS.index("control_height"))
     sightings = [s for s in evidence.sightings if np.isfinite(s.height_m)]
     surveyed = np.array([s.point.height_m for s in evidence.sightings]) - one.true_heights_m()
     surveyed = surveyed[[np.isfinite(s.height_m) for s in evidence.sightings]]
     read = control.observed_m - explained(one, control) - surveyed
-    yield Figure(f"{what}: error of {len(sightings)} heights read at points, mean", 1e3 * float(read.mean()), "mm")
+    yield Figure(
+        f"{what}: error of {len(sightings)} heights read at points, absolute mean", 1e3 * abs(float(read.mean())), "mm"
+    )
     yield Figure(f"{what}: the same, RMS", 1e3 * rms(read), "mm", 1e3 * rms(control.sigma_m), "stated")
     gcp = np.array([s.point.role == "gcp" for s in sightings])
     once = np.unique([s.point.number for s in sightings if s.point.role == "gcp"], return_index=True)[1]

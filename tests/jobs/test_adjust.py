@@ -12,6 +12,7 @@ import pytest
 import rasterio
 
 from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.engine.embedded import embedded
 from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.report.blocks import Picture, Table
 from roadscan.jobs.report.section import Material
@@ -204,6 +205,30 @@ def test_workers_order_and_a_killed_run_change_no_bit(adjusted: Simulated, tmp_p
     assert not store.exists(held_path("corrections"))
     adjust(copy, Shuffled())
     assert corrections(store) == before
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_cluster_of_workers_gives_the_same_bits(adjusted: Simulated, tmp_path: Path, workers: int) -> None:
+    """Evidence, corrections, tables and pictures of the adjustment, against those of this process alone."""
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    store, manifest = copy.store(), Manifest(copy.store())
+    before = adjustment_files(store)
+    store.remove(held_path("corrections"))
+    made = ("ties", "control_sightings", "adjustment_picture", "tie_residuals", "control_residuals")
+    manifest.remove([r for name in made for r in manifest.of(name).values()])
+    with embedded(workers) as cluster:
+        adjust(copy, cluster)
+    assert adjustment_files(store) == before
+
+
+def adjustment_files(store: Store) -> dict[str, bytes]:
+    """All that the stage writes, by path."""
+    tables = ("ties", "control_sightings", "tie_residuals", "control_residuals", "relative_accuracy")
+    folders = ["products/adjustment", *(f"tables/{name}" for name in tables)]
+    paths = [path for folder in folders for path in store.files(folder)]
+    assert len(paths) > len(folders)
+    return {path: store.read_bytes(path) for path in [*paths, held_path("corrections")]}
 
 
 def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(

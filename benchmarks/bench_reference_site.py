@@ -33,15 +33,42 @@ CHECK_ROW = derivatives(DOWN, 0.0)
 BARS = {300.0: (2.6, 1.5), 825.0: (4.0, 1.9)}
 """Mean absolute height error (mm), each run alone and all together, by spacing of the control."""
 REPEATABILITY_MM = 0.5
+CURVE_M = (150.0, 300.0, 825.0, 1650.0)
+"""Spacings of the control that the error is drawn against."""
 
 
 def figures(_: Path) -> Iterator[Figure]:
-    """By spacing of the control and mode: errors, repeatability, best estimate, honesty of σ."""
+    """By spacing of the control and mode: errors, repeatability, best estimate, honesty of σ; then the curve."""
     seeds = Settings.current().adjustment_seeds
     for spacing, (alone, together) in BARS.items():
         road = replace(SITE, control_spacing_m=spacing)
         for mode, bar in (("each_pass", alone), ("joint", together)):
             yield from of_mode(road, mode, bar, seeds)
+    for mode in ("each_pass", "joint"):
+        for spacing in CURVE_M:
+            yield curve_point(replace(SITE, control_spacing_m=spacing), mode, seeds)
+
+
+def curve_point(road: Road, mode: str, seeds: int) -> Figure:
+    """Mean absolute height error at the check points for a spacing of the control, beside the expected best."""
+    checks = np.linspace(0.0, road.length_m, CHECKS + 2)[1:-1]
+    best = 1e3 * BestEstimate.of(road, checks, joint=mode == "joint").expected
+    settings = AdjustmentSettings.model_validate({"mode": mode})
+    found = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(1000 + seed)
+        drawn = drawn_errors(road, np.concatenate([road.ties_m, road.control_m, checks]), rng)
+        solved = adjust(observed(road, mode, drawn, rng), road.priors(), settings)
+        found.append(np.abs(errors(solved, road, drawn, checks)[0]).mean())
+    runs = "all runs" if mode == "joint" else "each run alone"
+    name = f"control each {road.control_spacing_m:,.0f} m, {runs}: mean absolute height error"
+    return Figure(name, 1e3 * float(np.mean(found)), "mm", best, "best, expected")
+
+
+def observed(road: Road, mode: str, drawn: Drawn, rng: np.random.Generator) -> Observations:
+    """Control, and where runs are adjusted together, ties."""
+    tied = [ties(road, drawn, rng)] if mode == "joint" else []
+    return Observations.joined([*tied, control(road, drawn, rng)])
 
 
 def of_mode(road: Road, mode: str, bar: float, seeds: int) -> Iterator[Figure]:
@@ -127,14 +154,11 @@ class BestEstimate:
         is_control = (observations.run == FIXED).any(axis=1)
         used = (observations.partials[:, 0, 2] != 0.0) & (joint | is_control)
         chosen = observations.chosen(used)
-        own = cls._covariance(road, chosen, chosen)
+        own = pose_covariance(road, chosen, chosen)
         survey = chosen.survey_sigma_m
-        shared = (chosen.place[:, None] == chosen.place) & (survey[:, None] > 0.0)
-        if not joint:
-            shared &= chosen.run[:, None, 0] == chosen.run[:, 0]
-        own += np.diag(chosen.sigma_m**2) + np.where(shared, survey[:, None] * survey, 0.0)
+        own += np.diag(chosen.sigma_m**2) + survey_covariance(chosen, joint=joint)
         wanted = cls._wanted(road, checks)
-        across = cls._covariance(road, wanted, chosen)
+        across = pose_covariance(road, wanted, chosen)
         factor = cho_factor(own, overwrite_a=True, lower=True)
         some = across[:: max(1, checks.size // 50)]
         prior = sum(p.sigma**2 * d**2 for p, d in zip(road.processes, CHECK_ROW, strict=True))
@@ -166,15 +190,24 @@ class BestEstimate:
             zeros.astype(np.uint8), run.astype(np.int32), epochs, rows, np.zeros(size), np.ones(size), zeros, zeros
         )
 
-    @staticmethod
-    def _covariance(road: Road, one: Observations, two: Observations) -> Float64:
-        """Of what the errors of the poses make of two sets of observations."""
-        total = np.zeros((one.size, two.size))
-        for run, a, b in itertools.product(range(road.runs), (0, 1), (0, 1)):
-            i, j = np.flatnonzero(one.run[:, a] == run), np.flatnonzero(two.run[:, b] == run)
-            apart = np.abs(one.epoch_gps_ns[i, a, None] - two.epoch_gps_ns[j, b]) / 1e9
-            for c, p in enumerate(road.processes):
-                first, second = one.partials[i, a, c], two.partials[j, b, c]
-                if first.any() and second.any():
-                    total[np.ix_(i, j)] += first[:, None] * second * p.sigma**2 * np.exp(-apart / p.tau_s)
-        return total
+
+def pose_covariance(road: Road, one: Observations, two: Observations) -> Float64:
+    """Of what the errors of the poses make of two sets of observations."""
+    total = np.zeros((one.size, two.size))
+    for run, a, b in itertools.product(range(road.runs), (0, 1), (0, 1)):
+        i, j = np.flatnonzero(one.run[:, a] == run), np.flatnonzero(two.run[:, b] == run)
+        apart = np.abs(one.epoch_gps_ns[i, a, None] - two.epoch_gps_ns[j, b]) / 1e9
+        for c, p in enumerate(road.processes):
+            first, second = one.partials[i, a, c], two.partials[j, b, c]
+            if first.any() and second.any():
+                total[np.ix_(i, j)] += first[:, None] * second * p.sigma**2 * np.exp(-apart / p.tau_s)
+    return total
+
+
+def survey_covariance(observations: Observations, *, joint: bool) -> Float64:
+    """Of what the errors of the survey of the control make of them: one error a point, or a point and run."""
+    survey = observations.survey_sigma_m
+    shared = (observations.place[:, None] == observations.place) & (survey[:, None] > 0.0)
+    if not joint:
+        shared &= observations.run[:, None, 0] == observations.run[:, 0]
+    return np.where(shared, survey[:, None] * survey, 0.0)

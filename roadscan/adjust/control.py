@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import FIXED, KINDS, Observations, partials
-from roadscan.adjust.patches import PassReadings, level_from_map
+from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.targets.find import find_target
 from roadscan.adjust.targets.heights import height_at
@@ -207,9 +207,8 @@ def moved_m(one: Sighting, corrections: Corrections | None) -> Float64:
     if corrections is None or not np.isfinite(one.arm_body_m).all():
         return np.zeros(3)
     shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
-    north, east, down = shift[0] + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
-    c, s = np.cos(one.convergence_rad), np.sin(one.convergence_rad)
-    easting, northing, height = c * east - s * north, c * north + s * east, -down
+    level = shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    easting, northing, height = map_from_level(level, one.convergence_rad)[0]
     if not one.is_placed and np.isfinite(one.slope_east):
         height -= one.slope_east * easting + one.slope_north * northing
     return np.array([easting, northing, height])

@@ -77,6 +77,13 @@ def level_from_map(vector_m: Float64, convergence_rad: float) -> Float64:
     return np.stack([c * n - s * e, s * n + c * e, -h], axis=-1)
 
 
+def map_from_level(vector_m: Float64, convergence_rad: float) -> Float64:
+    """Vectors (n, 3) of the local level (north, east, down) as easting, northing, height of the map."""
+    n, e, d = np.asarray(vector_m).T
+    c, s = math.cos(convergence_rad), math.sin(convergence_rad)
+    return np.stack([c * e - s * n, c * n + s * e, -d], axis=-1)
+
+
 @dataclass(frozen=True)
 class Inside:
     """The readings of a traverse that lie inside a patch."""

@@ -21,6 +21,8 @@ NSSDA_HORIZONTAL: Final = 1.7308
 """The same of a length in the plane whose two components are equally accurate (ibid.)."""
 ASPRS_CHECK_POINTS: Final = 30
 """Fewer check points do not make a statement after ASPRS (2023, 7.12); the figures are computed all the same."""
+DISTANCES_M: Final = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, float("inf"))
+"""Bounds of the classes of distance to the nearest ground control."""
 _DOWN: Final = 2
 
 
@@ -207,6 +209,45 @@ def relative_accuracy(station_m: Float64, before_m: Float64, after_m: Float64, l
     before, after = (np.sqrt(np.bincount(own, v**2, minlength=sections.size) / count) for v in (before_m, after_m))
     first = sections.astype(np.float64) * length_m
     return Sections(first, count.astype(np.int64), before.astype(np.float64), after.astype(np.float64))
+
+
+@dataclass(frozen=True)
+class DistanceClass:
+    """Accuracy of heights at points that lie about as far from ground control."""
+
+    from_m: float
+    to_m: float
+    """Infinite in the last class."""
+    mean_distance_m: float
+    accuracy: VerticalAccuracy
+
+
+def accuracy_by_distance(distance_m: Float64, error_m: Float64) -> list[DistanceClass]:
+    """How the error of heights grows with the distance to ground control, by class that holds a point.
+
+    Parameters
+    ----------
+    distance_m : (n,) along the road to the nearest ground control that counts; NaN where there is none.
+    error_m : (n,) surface minus survey; NaN where there is none.
+    """
+    known = np.isfinite(distance_m) & np.isfinite(error_m)
+    number = np.searchsorted(np.array(DISTANCES_M), distance_m, side="right") - 1
+    found = []
+    for k in np.unique(number[known]).tolist():
+        own = known & (number == k)
+        mean = float(distance_m[own].mean())
+        found.append(DistanceClass(DISTANCES_M[k], DISTANCES_M[k + 1], mean, vertical_accuracy(error_m[own])))
+    return found
+
+
+def nearest_m(station_m: Float64, point: Int64, control_m: Float64, control: Int64) -> Float64:
+    """Distance (n,) of points at stations to the nearest of other control points, all of one run (m); NaN without any.
+
+    point : (n,) number of each; control_m, control : stations and numbers (c,) of the control; no point is its own.
+    """
+    away = np.abs(station_m[:, None] - control_m)
+    away = np.where(point[:, None] == control, np.inf, away).min(axis=1, initial=np.inf)
+    return np.where(np.isfinite(away), away, np.nan)
 
 
 def _there(error_m: Float64, there: npt.NDArray[np.bool_]) -> Float64:

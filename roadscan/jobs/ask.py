@@ -33,6 +33,7 @@ _MADE_BY: Final = {
             "control_residuals",
             "relative_accuracy",
             "absolute_accuracy",
+            "accuracy_by_distance",
         ),
         "`roadscan adjust` makes it, where passes overlap or come by ground control",
     ),

@@ -67,6 +67,10 @@ class Tile:
     cells: TileCells
     marked: TilePoints | None = None
     """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
+    sigma_horizontal_m: float | None = None
+    """Largest horizontal 1 σ of the poses that placed the readings, √(σ_north² + σ_east²); None where not stated."""
+    sigma_height_m: float | None = None
+    """The same of the height."""
 
     @functools.cached_property
     def overviews(self) -> list[Level]:

@@ -49,12 +49,16 @@ class GeoTiff(TileProduct):
     intensity of all points, the mean number of points a cell that holds one.
 
     Images are DEFLATE in blocks of up to 512 pixels, those without a cell left out.
+
+    The metadata items `ROADSCAN_SIGMA_HEIGHT_M` and `ROADSCAN_SIGMA_HORIZONTAL_M` state the largest 1 σ (metres) of the
+    poses that placed the tile's readings, after the adjustment, as the table `tiles` does; they are left out where a
+    trajectory states no σ. They say nothing of the noise of single readings, which the band height_std shows.
     """
 
     name: ClassVar[str] = "geotiff"
     title: ClassVar[str] = "cells of a tile as a GeoTIFF (height, intensity, count) with overviews, for GIS"
     suffix: ClassVar[str] = ".tif"
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     options: ClassVar[type[Strict]] = GeoTiffOptions
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
@@ -62,11 +66,18 @@ class GeoTiff(TileProduct):
         bands = cast(GeoTiffOptions, options).bands
         images = [_image(tile, bands, context), *_overviews(tile, bands, context)]
         place = CellBox.around([tile.cells.tile], context.grid).transform(context)
-        write_cog(path, images, about(place, [band_of(b, context) for b in bands], context, tile.cells.tile))
+        of_bands = [band_of(b, context) for b in bands]
+        write_cog(path, images, about(place, of_bands, context, tile.cells.tile, _sigmas(tile)))
 
     def check(self, path: Path) -> None:
         """Compare every byte with the stored digest."""
         check_cog(path)
+
+
+def _sigmas(tile: Tile) -> list[tuple[str, str]]:
+    """Metadata items of the σ that are known."""
+    known = (("HEIGHT", tile.sigma_height_m), ("HORIZONTAL", tile.sigma_horizontal_m))
+    return [(f"ROADSCAN_SIGMA_{name}_M", f"{sigma_m:.6f}") for name, sigma_m in known if sigma_m is not None]
 
 
 def _image(tile: Tile, bands: tuple[Quantity, ...], context: ProductContext) -> Image:

@@ -184,10 +184,16 @@ class SparseRaster:
                 yield block
 
 
-def about(transform: Affine, bands: Sequence[Band], context: ProductContext, tile: TileId | None = None) -> About:
-    """What a raster says of itself."""
+def about(
+    transform: Affine,
+    bands: Sequence[Band],
+    context: ProductContext,
+    tile: TileId | None = None,
+    more: Sequence[tuple[str, str]] = (),
+) -> About:
+    """What a raster says of itself; `more` : names and values of further metadata."""
     height = "local" if context.map.is_local else context.map.height
     items = [("ROADSCAN_SURVEY", context.survey_id), ("ROADSCAN_HEIGHT", height)]
     if tile is not None:
         items.append(("ROADSCAN_TILE", str(tile)))
-    return About(context.map, transform, tuple(bands), context.date, tuple(items))
+    return About(context.map, transform, tuple(bands), context.date, (*items, *more))

@@ -11,10 +11,12 @@ from roadscan.adjust.adjustment import AdjustmentSettings, ControlErrors, adjust
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import GaussMarkov, RunPrior
 from roadscan.adjust.quality import (
+    accuracy_by_distance,
     asprs_three_dimensional,
     horizontal_accuracy,
     leave_one_out,
     mean_corrections,
+    nearest_m,
     relative_accuracy,
     vertical_accuracy,
 )
@@ -95,3 +97,22 @@ def test_passes_agree_by_section() -> None:
     assert found.count.tolist() == [1, 2, 1, 1]
     np.testing.assert_allclose(found.rms_before_m, [0.02, np.sqrt(0.0025 / 2), 0.01, 0.05])
     np.testing.assert_allclose(found.rms_after_m, 0.001)
+
+
+def test_errors_are_told_by_the_distance_to_control() -> None:
+    distance = np.array([0.0, 24.9, 25.0, 150.0, 2000.0, np.nan, 30.0])
+    error = np.array([0.001, -0.003, 0.004, -0.005, 0.02, 0.5, np.nan])
+    found = accuracy_by_distance(distance, error)
+    assert [(one.from_m, one.to_m, one.accuracy.count) for one in found] == [
+        (0.0, 25.0, 2), (25.0, 50.0, 1), (100.0, 200.0, 1), (1600.0, np.inf, 1),
+    ]  # fmt: skip
+    assert found[0].mean_distance_m == pytest.approx(12.45)
+    assert found[0].accuracy.mean_absolute == pytest.approx(0.002)
+    assert found[0].accuracy.rmse == pytest.approx(np.sqrt(5.0) * 1e-3)
+
+
+def test_a_point_is_not_its_own_control() -> None:
+    control, numbers = np.array([0.0, 300.0, 310.0]), np.array([4, 5, 6])
+    away = nearest_m(np.array([0.0, 300.0, 120.0]), np.array([4, 5, 9]), control, numbers)
+    assert away.tolist() == [300.0, 10.0, 120.0]
+    assert np.isnan(nearest_m(np.array([7.0]), np.array([4]), control[:1], numbers[:1])).all()

@@ -9,9 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 
 from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.engine.embedded import embedded
 from roadscan.jobs.plan.plan import plan_survey
+from roadscan.jobs.report.blocks import Picture, Table
+from roadscan.jobs.report.section import Material
+from roadscan.jobs.report.sections.adjustment import Adjustment
 from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
@@ -112,7 +117,51 @@ def test_surface_and_check_points_come_to_the_truth(adjusted: Simulated) -> None
     sigma = rows(store, "SELECT max(sigma_down_m) AS s FROM tiles")[0]["s"]
     assert 0.0003 < sigma < 0.005  # a fifth of the 0.02 m that the logs state
     pictures = store.files("products/adjustment", ".png")
-    assert len(pictures) == 1 + len(residuals)
+    assert {"adjustment.png", "seams.png"} < {path.rsplit("/", 1)[-1] for path in pictures}
+    assert len(pictures) == 2 + len(residuals)
+
+
+def test_accuracy_is_told_by_distance_to_control_and_the_report_shows_seams(adjusted: Simulated) -> None:
+    store = adjusted.store()
+    by_distance = {(row["points"], row["from_m"]): row for row in rows(store, "FROM accuracy_by_distance")}
+    # GCPs lie 4 m (the last two) to 8 m from one another, check points 4 m from the next of them.
+    assert {points: one["count"] for (points, _), one in by_distance.items()} == {"check": 3 * 2, "left_out": 4}
+    assert by_distance["check", 0.0]["mean_distance_m"] == pytest.approx(4.0, abs=0.1)
+    assert by_distance["left_out", 0.0]["mean_distance_m"] == pytest.approx((8 + 8 + 4 + 4) / 4, abs=0.1)
+    whole = rows(store, "FROM absolute_accuracy WHERE component = 'height' AND poses = 'adjusted'")
+    for row in whole:  # all lie in one class
+        assert by_distance[row["points"], 0.0]["rmse_m"] == pytest.approx(row["rmse_m"])
+    survey = changed(Survey.load(adjusted.survey_file), {**CIRCLES, **NO_FILES})
+    blocks = list(Adjustment().blocks(Material(Session(survey, store))))
+    pictures = [one.content for one in blocks if isinstance(one, Picture)]
+    assert store.read_bytes("products/adjustment/seams.png") in pictures
+    assert "accuracy_by_distance" in [one.full_table for one in blocks if isinstance(one, Table)]
+
+
+def test_a_raster_states_the_sigma_of_its_tile_and_a_change_of_sigma_alone_makes_no_tile_anew(
+    adjusted: Simulated, tmp_path: Path
+) -> None:
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    whole = {**CIRCLES, "products__make": ["tile_table", "geotiff"]}
+    survey = changed(Survey.load(copy.survey_file), whole)
+    run_stages(Session(survey, store, Inline(), None, Lines()), [stage_named(name) for name in ("tiles", "products")])
+    told = {row["tile"]: row for row in rows(store, "FROM tiles")}
+    files = store.files("tiles/geotiff", ".tif")
+    assert len(files) == len(told) > 3
+    for path in files:
+        with rasterio.MemoryFile(store.read_bytes(path)) as held, held.open() as raster:
+            tags = raster.tags()
+        row = told[tags["ROADSCAN_TILE"]]
+        assert float(tags["ROADSCAN_SIGMA_HEIGHT_M"]) == pytest.approx(row["sigma_down_m"], abs=5e-7)
+        assert float(tags["ROADSCAN_SIGMA_HORIZONTAL_M"]) == pytest.approx(row["sigma_horizontal_m"], abs=5e-7)
+    manifest = Manifest(store)
+    before = plan_tiles(load_ranges(plan_survey(survey, store), manifest), plan_survey(survey, store))
+    table = read_held(store, "corrections")
+    assert table is not None
+    write_held(store, "corrections", [{**row, "sigma_down_m": 2 * row["sigma_down_m"]} for row in table.to_pylist()])
+    after = plan_tiles(load_ranges(plan_survey(survey, store), manifest), plan_survey(survey, store))
+    assert list(after.keys) == list(before.keys)
 
 
 def test_a_second_run_does_nothing_and_status_says_what_it_is_worth(adjusted: Simulated) -> None:
@@ -156,6 +205,30 @@ def test_workers_order_and_a_killed_run_change_no_bit(adjusted: Simulated, tmp_p
     assert not store.exists(held_path("corrections"))
     adjust(copy, Shuffled())
     assert corrections(store) == before
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_cluster_of_workers_gives_the_same_bits(adjusted: Simulated, tmp_path: Path, workers: int) -> None:
+    """Evidence, corrections, tables and pictures of the adjustment, against those of this process alone."""
+    copy = adjusted.copy_with_store_to(tmp_path / "survey")
+    store, manifest = copy.store(), Manifest(copy.store())
+    before = adjustment_files(store)
+    store.remove(held_path("corrections"))
+    made = ("ties", "control_sightings", "adjustment_picture", "tie_residuals", "control_residuals")
+    manifest.remove([r for name in made for r in manifest.of(name).values()])
+    with embedded(workers) as cluster:
+        adjust(copy, cluster)
+    assert adjustment_files(store) == before
+
+
+def adjustment_files(store: Store) -> dict[str, bytes]:
+    """All that the stage writes, by path."""
+    tables = ("ties", "control_sightings", "tie_residuals", "control_residuals", "relative_accuracy")
+    folders = ["products/adjustment", *(f"tables/{name}" for name in tables)]
+    paths = [path for folder in folders for path in store.files(folder)]
+    assert len(paths) > len(folders)
+    return {path: store.read_bytes(path) for path in [*paths, held_path("corrections")]}
 
 
 def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(

@@ -85,6 +85,20 @@ def test_bands_units_and_crs_are_stated(geotiff, workshop, place, tmp_path):
     assert ("VERT_CS" in text) == (place.map.vertical_crs is not None)
 
 
+def test_the_sigma_of_the_poses_is_stated_where_it_is_known(geotiff, workshop, places, tmp_path):
+    context = workshop.context(places["utm_north"].map, 0.5)
+    tile = workshop.tile(places["utm_north"].tile, context.grid)
+    names = ("ROADSCAN_SIGMA_HEIGHT_M", "ROADSCAN_SIGMA_HORIZONTAL_M")
+    for sigma_height_m, sigma_horizontal_m in ((0.0123456789, 0.02), (None, 0.02), (None, None)):
+        known = dataclasses.replace(tile, sigma_height_m=sigma_height_m, sigma_horizontal_m=sigma_horizontal_m)
+        geotiff.write(known, THREE, context, tmp_path / "tile")
+        geotiff.check(tmp_path / "tile")
+        with rasterio.open(tmp_path / "tile") as file:
+            stated = [file.tags().get(name) for name in names]
+        for text, value in zip(stated, (sigma_height_m, sigma_horizontal_m), strict=True):
+            assert text is None if value is None else float(text) == pytest.approx(value, abs=5e-7)
+
+
 def test_georeference_is_what_rasterio_writes(geotiff, workshop, place, tmp_path):
     write(geotiff, workshop, place, tmp_path / "tile", cell_m=0.01)
     context = workshop.context(place.map, 0.01)

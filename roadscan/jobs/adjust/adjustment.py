@@ -21,10 +21,11 @@ from roadscan.jobs.adjust.control_work import (
     load_sightings,
     sight_control,
 )
-from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
 from roadscan.jobs.adjust.publication import digest_of, foreign_runs, publish
+from roadscan.jobs.adjust.seams import shown_seams
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
 from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.jobs.adjust.tracks import adjusted_sources, runs_of, tracks_of
@@ -114,6 +115,7 @@ def adjust_survey(session: Session) -> None:
     if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
+        manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
         _keep(session, key, {}, (lines, notes + _of_points(work, sightings)), failed)
         return
     solution = solve(plan, evidence)
@@ -124,11 +126,14 @@ def adjust_survey(session: Session) -> None:
         "control_residuals": points,
         "relative_accuracy": relative_rows(evidence, work.tracks, held),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
+        "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
-    keep_pictures(session.store, manifest, key, _picture(plan, work, tables), pictures)
+    seams, not_drawn = shown_seams(work.ties, evidence, solution, held, session.compute)
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
     lines = _lines(work, evidence, solution, held, tables)
-    _keep(session, key, held, (lines, [*notes, *solution.notes, *_of_points(work, sightings)]), failed)
+    notes += [*solution.notes, *_of_points(work, sightings), *not_drawn]
+    _keep(session, key, held, (lines, notes), failed)
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float]) -> Work:

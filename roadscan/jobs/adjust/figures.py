@@ -14,7 +14,9 @@ from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
     HorizontalAccuracy,
     VerticalAccuracy,
+    accuracy_by_distance,
     horizontal_accuracy,
+    nearest_m,
     relative_accuracy,
     vertical_accuracy,
 )
@@ -22,6 +24,7 @@ from roadscan.jobs.adjust.solution import Evidence, Solution
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 Rows = list[dict[str, Any]]
 Held = Mapping[str, Corrections]
 
@@ -47,10 +50,7 @@ def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held) -> Ro
     rows: Rows = []
     for number in np.unique(observations.run[:, 0]).tolist():
         track = next(t for t in tracks if t.run == number)
-        moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
-        station = np.concatenate([[0.0], np.cumsum(moved)])
-        since = (observations.epoch_gps_ns[:, 0] - track.epoch_gps_ns[0]).astype(np.float64)
-        at = np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station)
+        at = _station_m(track, observations.epoch_gps_ns[:, 0])
         for kind in sorted(set(kinds.tolist())):
             here = (observations.run[:, 0] == number) & (kinds == kind)
             if not here.any():
@@ -64,6 +64,51 @@ def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held) -> Ro
             }
             rows += [{"run": evidence.runs[number], "kind": kind, **row} for row in _rows(columns)]
     return rows
+
+
+def _station_m(track: Track, epochs_gps_ns: Int64) -> Float64:
+    """How far (n,) along its way a run was at some epochs."""
+    moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
+    station = np.concatenate([[0.0], np.cumsum(moved)])
+    since = (epochs_gps_ns - track.epoch_gps_ns[0]).astype(np.float64)
+    return np.asarray(np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station))
+
+
+def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Sequence[Track]) -> Rows:
+    """Of the table `accuracy_by_distance`, from rows of `control_residuals`.
+
+    Where all runs are adjusted together, a control point that is left out counts once, in the first run that saw it.
+    """
+    seen = [row for row in rows if row["height_before_m"] is not None]
+    tracked = {track.run: track for track in reversed(tracks)}
+    found: dict[str, list[tuple[float, float]]] = {"check": [], "left_out": []}
+    counted: set[tuple[int, int]] = set()
+    for number, run in enumerate(evidence.runs):
+        own = [row for row in seen if row["run"] == run]
+        if not own or number not in tracked:
+            continue
+        points = np.array([row["point"] for row in own], np.int64)
+        station = _station_m(tracked[number], np.array([row["epoch_gps_ns"] for row in own], np.int64))
+        control = np.array([(row.get("weight_height") or 0.0) > 0.0 for row in own], bool)
+        away = nearest_m(station, points, station[control], points[control]).tolist()
+        for row, distance_m in zip(own, away, strict=True):
+            if row["role"] == "check":
+                found["check"].append((distance_m, -row["height_after_m"]))
+                continue
+            key = (row["point"], -1 if (row["point"], -1) in solution.points else number)
+            left = row.get("left_out_height_m")
+            if left is not None and (row.get("weight_height") or 0.0) > 0.0 and key not in counted:
+                counted.add(key)
+                found["left_out"].append((distance_m, -left))
+    return [
+        {
+            "points": points, "from_m": one.from_m, "to_m": one.to_m if np.isfinite(one.to_m) else None,
+            "count": one.accuracy.count, "mean_distance_m": one.mean_distance_m, "mean_m": one.accuracy.mean,
+            "mean_absolute_m": one.accuracy.mean_absolute, "rmse_m": one.accuracy.rmse,
+        }
+        for points, pairs in found.items()
+        for one in accuracy_by_distance(*np.array(pairs).reshape(-1, 2).T)
+    ]  # fmt: skip
 
 
 def control_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:

@@ -15,6 +15,7 @@ from roadscan.jobs.adjust.figures import Rows
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import keep_file
 from roadscan.products.pictures.adjustment import AdjustmentPicture, draw_adjustment
+from roadscan.products.pictures.seams import ShownSeam, draw_seams
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
@@ -23,11 +24,15 @@ from roadscan.tables.writer import parquet_bytes
 ADJUSTMENT: Final = "adjustment"
 SOLUTION: Final = "solution"
 """Name and unit in the manifest of the solution; it has no file of its own."""
-TABLES: Final = ("tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy")
+TABLES: Final = (
+    "tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy", "accuracy_by_distance",
+)  # fmt: skip
 """Tables of the outcome; each is a product of the manifest with one unit."""
 PICTURES: Final = "adjustment_picture"
 FOLDER: Final = "products/adjustment"
 _WHOLE: Final = "all"
+SEAMS: Final = "seams"
+"""Unit of the picture of seams."""
 
 
 def known_lines(manifest: Manifest) -> list[str]:
@@ -56,14 +61,21 @@ def keep_tables(store: Store, manifest: Manifest, key: str, tables: Mapping[str,
 
 
 def keep_pictures(
-    store: Store, manifest: Manifest, key: str, shown: AdjustmentPicture, sightings: Sequence[Mapping[str, Any]]
+    store: Store,
+    manifest: Manifest,
+    key: str,
+    shown: tuple[AdjustmentPicture, Sequence[ShownSeam]],
+    sightings: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Draw the outcome, and write the picture of each target as each pass saw it; remove those of no target."""
+    """Draw the outcome and seams, and the picture of each target as each pass saw it; remove those of no target."""
+    outcome, seams = shown
     targets = {_target_name(row): row for row in sightings if row["picture"]}
-    manifest.remove(manifest.beside([PICTURES], {_WHOLE, *targets}))
+    manifest.remove(manifest.beside([PICTURES], {_WHOLE, *targets, *([SEAMS] if seams else [])}))
     if not manifest.is_current(PICTURES, _WHOLE, key):
-        draw = partial(draw_adjustment, shown)
+        draw = partial(draw_adjustment, outcome)
         keep_file(store, manifest, (PICTURES, _WHOLE), key, f"{FOLDER}/adjustment.png", draw)
+    if seams and not manifest.is_current(PICTURES, SEAMS, key):
+        keep_file(store, manifest, (PICTURES, SEAMS), key, f"{FOLDER}/seams.png", partial(draw_seams, seams))
     for name, row in targets.items():
         own = key_of(row["picture"], row["picture_columns"], row["status"])
         if not manifest.is_current(PICTURES, name, own):

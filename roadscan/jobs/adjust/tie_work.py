@@ -30,7 +30,7 @@ TIES: Final = "ties"
 
 _PLACES: Final = 50
 """Places of a task: half a kilometre of one road at the usual spacing."""
-_DIAGONAL: Final = 1.5
+DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _TURNS: Final = tuple(
     f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
@@ -80,7 +80,7 @@ def collect_ties(task: TieTask) -> OutputRecord:
     parts = [
         ties_at(place, [reader.of(t, circle) for t in place.traverses], task.settings)
         for place in task.places
-        for circle in [Circle(place.easting_m, place.northing_m, _DIAGONAL * place.radius_m)]
+        for circle in [Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)]
     ]
     found = Ties.joined(parts)
     if not found.observations.size:

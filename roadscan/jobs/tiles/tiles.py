@@ -168,6 +168,8 @@ def summary_of(record: OutputRecord) -> TileSummary | None:
 def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence, folder: Path) -> list[OutputRecord]:
     cells, unit = content.cells, str(content.cells.tile)
     context = dataclasses.replace(task.context, date=utc_from_gps_ns(evidence.first_epoch_gps_ns).date())
+    horizontal, upright = _known(evidence.sigma_horizontal_m), _known(evidence.sigma_down_m)
+    content = dataclasses.replace(content, sigma_horizontal_m=horizontal, sigma_height_m=upright)
     records: list[OutputRecord] = []
     for wanted in task.products:
         records += write_product(wanted, content, context, key, task.store, folder)

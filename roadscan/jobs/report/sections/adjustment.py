@@ -15,6 +15,8 @@ from roadscan.tables.store import Store
 _MOST_TARGETS: Final = 24
 _TARGET_MM: Final = 25.0
 
+_NAMES: Final = {"check": "check points", "left_out": "each GCP left out"}
+
 Rows = Sequence[dict[str, Any]]
 
 
@@ -34,7 +36,10 @@ class Adjustment(Section):
         for line in known_lines(manifest):
             yield Paragraph(line)
         yield from _pictures(store, [f"{FOLDER}/adjustment.png"], "Control residuals on the map and as histograms")
+        seams = "Two passes at the place where they differed most, and at a typical one, before and after"
+        yield from _pictures(store, [f"{FOLDER}/seams.png"], seams)
         yield from _accuracy(_rows(session, "absolute_accuracy"))
+        yield from _by_distance(_rows(session, "accuracy_by_distance"))
         yield from _seams(_rows(session, "relative_accuracy"))
         yield from _control(_rows(session, "control_residuals"))
         targets = sorted(r.path for r in manifest.of(PICTURES).values() if "/targets/" in r.path)
@@ -56,17 +61,33 @@ def _pictures(store: Store, paths: Sequence[str], caption: str, width_mm: float 
 
 def _accuracy(rows: Rows) -> Iterator[Table]:
     if rows:
-        names = {"check": "check points", "left_out": "each GCP left out"}
         yield Table(
             ("points", "component", "poses", "count", "mean", "mean absolute", "RMSE", "95 % (NSSDA)", "largest"),
             [
                 (
-                    names[r["points"]], r["component"], r["poses"], f"{r['count']:,}",
+                    _NAMES[r["points"]], r["component"], r["poses"], f"{r['count']:,}",
                     *(_mm(r[name]) for name in ("mean_m", "mean_absolute_m", "rmse_m", "nssda_95_m", "largest_m")),
                 )
                 for r in rows
             ],
             "Absolute accuracy in mm: surface minus survey", "absolute_accuracy",
+        )  # fmt: skip
+
+
+def _by_distance(rows: Rows) -> Iterator[Table]:
+    if rows:
+        yield Table(
+            ("points", "nearest control", "mean distance", "count", "mean", "mean absolute", "RMSE"),
+            [
+                (
+                    _NAMES[r["points"]],
+                    f"from {r['from_m']:,.0f} m" + ("" if r["to_m"] is None else f" to {r['to_m']:,.0f} m"),
+                    f"{r['mean_distance_m']:,.0f} m", f"{r['count']:,}",
+                    *(_mm(r[name]) for name in ("mean_m", "mean_absolute_m", "rmse_m")),
+                )
+                for r in rows
+            ],
+            "Error of heights by distance along the road to the nearest ground control, in mm", "accuracy_by_distance",
         )  # fmt: skip
 
 

@@ -1,0 +1,93 @@
+"""A seam to look at: the surfaces of two passes at one place, as they were recorded and as they are corrected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
+from roadscan.adjust.places import Place
+from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.navigation.trajectory import Corrections
+
+Float64 = npt.NDArray[np.float64]
+
+_SECTION: Final = 0.2
+"""Share of the patch, about its middle, whose rows are averaged to a cross-section."""
+
+
+@dataclass(frozen=True)
+class SeamView:
+    """Two passes at a place, before and after."""
+
+    cell_m: float
+    difference_m: Float64
+    """(2, k, k) height of the second pass minus that of the first, before and after; rows along, columns across, NaN in
+    cells that one of them did not see."""
+    across_m: Float64
+    """(k,) middles of the columns, positive to the right."""
+    section_m: Float64
+    """(2, 2, k) cross-sections, before and after, of the first and the second pass, above one plane; NaN as above."""
+
+    @property
+    def median_m(self) -> tuple[float, float]:
+        """Median difference before and after."""
+        before, after = (float(np.nanmedian(d)) for d in self.difference_m)
+        return before, after
+
+
+def seam_view(
+    place: Place,
+    readings: tuple[PassReadings, PassReadings],
+    corrections: tuple[Corrections | None, Corrections | None],
+    settings: TieSettings,
+) -> SeamView | None:
+    """Both passes at a place, without and with their corrections; None where they have no cell in common."""
+    states = [readings, tuple(moved(r, c) for r, c in zip(readings, corrections, strict=True))]
+    patches = [[patch_of(place, r, settings.cell_m, settings.least_readings) for r in pair] for pair in states]
+    known = [[p for p in pair if p is not None] for pair in patches]
+    if any(len(pair) < 2 for pair in known):
+        return None
+    difference = np.stack([second.height_m - first.height_m for first, second in known])
+    if not np.isfinite(difference).any(axis=(1, 2)).all():
+        return None
+    plane = _plane(known[1])
+    sections = np.array([[_section(p.height_m - plane) for p in pair] for pair in known])
+    return SeamView(settings.cell_m, difference, known[0][0].middle_m, sections)
+
+
+def moved(readings: PassReadings, corrections: Corrections | None) -> PassReadings:
+    """The readings of a traverse, placed with corrected poses; corrections are small, so turns are linear."""
+    if corrections is None or not readings.pose.size:
+        return readings
+    shift, turn = corrections.at(readings.epoch_gps_ns)
+    points = np.stack([readings.easting_m, readings.northing_m, readings.height_m], axis=-1)
+    pose = readings.pose.astype(np.int64)
+    swung = np.cross(turn[pose], readings.arm_body_m(points, pose))
+    level = shift[pose] + np.einsum("nij,nj->ni", readings.level_from_body[pose], swung)
+    there = points + map_from_level(level, readings.convergence_rad)
+    easting, northing, height = (np.ascontiguousarray(there[:, k]) for k in range(3))
+    return replace(readings, easting_m=easting, northing_m=northing, height_m=height)
+
+
+def _plane(pair: list[Patch]) -> Float64:
+    """(k, k) plane through the cells of two passes."""
+    middle = pair[0].middle_m
+    row, column = np.nonzero(np.isfinite(np.stack([p.height_m for p in pair])).any(axis=0))
+    height = np.nanmean(np.stack([p.height_m[row, column] for p in pair]), axis=0)
+    design = np.stack([np.ones(row.size), middle[row], middle[column]], axis=-1)
+    level = float(height.mean())
+    plane, *_ = np.linalg.lstsq(design, height - level, rcond=None)
+    return np.asarray(level + plane[0] + plane[1] * middle[:, None] + plane[2] * middle)
+
+
+def _section(height_m: Float64) -> Float64:
+    """(k,) mean over the rows about the middle; NaN in columns that were not seen there."""
+    edge = len(height_m)
+    half = max(round(0.5 * _SECTION * edge), 1)
+    rows = height_m[edge // 2 - half : edge // 2 + half]
+    count = np.isfinite(rows).sum(axis=0)
+    return np.where(count > 0, np.nansum(rows, axis=0) / np.maximum(count, 1), np.nan)

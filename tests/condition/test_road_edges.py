@@ -17,6 +17,7 @@ from roadscan.model.ids import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.tiles.cells import TileCells
+from tests.assets.scenes import semantic_kitti_returns
 
 LENGTH_M = 20.0
 KERBS = [{"side": "left", "height_m": 0.12}, {"side": "right", "height_m": 0.08}]
@@ -180,3 +181,34 @@ def test_a_lane_sees_its_edges_in_the_direction_of_travel(sign: int) -> None:
     own = np.array([1.9, 2.1, -4.9, -5.1]) * sign
     assert edges.inside(np.full(4, 2.6), own).tolist() == [True, False, True, False]
     assert edges.inside(np.full(4, 8.0), own).all()
+
+
+@pytest.mark.nightly
+def test_edges_of_a_labelled_street() -> None:
+    """SemanticKITTI 00, 20 m beside parked cars: where the returns that hand labels call road end."""
+    returns, labels, drive = semantic_kitti_returns()
+    place = np.column_stack([returns.x_m, returns.y_m])
+    ahead = (drive[-1, :2] - drive[0, :2]) / np.hypot(*(drive[-1, :2] - drive[0, :2]))
+    line = RoadLine("A", drive[0, :2] + np.arange(-40.0, 41.0)[:, None] * ahead)
+    cell, inverse = np.unique(np.floor(place / 0.05), axis=0, return_inverse=True)
+    count = np.bincount(inverse.ravel()).astype(np.float64)
+    height, grey = (np.bincount(inverse.ravel(), v) / count for v in (returns.height_m, returns.intensity))
+    points = TilePoints(0.05 * (cell + 0.5), height, grey, count)
+    lane = Lane("A", "1", 1, 0, np.zeros(81), 3.0, "stated", ())
+    found = road_edges([points], RoadStretch(line, (lane,), 38.0, 58.0), 8.0, 0.3)
+    station, offset = line.along(place, 40.0 + (place - drive[0, :2]) @ ahead)
+    road = np.isin(labels, (40, 60))
+    away, known = [], 0
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        for at, edge in zip(found.station_m, found.sides[side].offset_m, strict=True):
+            own = np.abs(station - at) <= 1.0
+            bins = np.floor(sign * offset[own] / 0.2).astype(int)
+            inside = (bins >= 0) & (bins < 50)
+            on, off = (np.bincount(bins[inside & one], minlength=50) for one in (road[own], ~road[own]))
+            # The first place from the lane outward that holds other things than road.
+            ends = [b for b in range(6, 49) if off[b] > on[b] and off[b] >= 3]
+            if ends and np.isfinite(edge):
+                away.append(sign * edge - 0.2 * ends[0])
+            known += bool(ends)
+    assert len(away) >= 0.8 * known  # 0.98
+    assert np.mean(np.abs(np.array(away)) <= 0.5) >= 0.8  # 0.85; within 0.3 m 0.53

@@ -115,7 +115,7 @@ def scene(spacing_m: float, length_m: float, runs: int) -> Scene:
     points = [("gcp", float(s)) for s in np.arange(0.0, length_m + 0.1, spacing_m)]
     points += [("check", float(s)) for s in np.arange(CHECK_SPACING_M / 2, length_m, CHECK_SPACING_M)]
     targets = [
-        {"station_m": min(max(s, 1.0), length_m - 1.0), "offset_m": OFFSET_M, "role": role}
+        {"station_m": min(max(s, 1.0), length_m - 4.0), "offset_m": OFFSET_M, "role": role}
         for role, s in sorted(points)
     ]
     bare: dict[str, Any] = {

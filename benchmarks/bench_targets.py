@@ -108,6 +108,8 @@ def _of(name: str, make: Callable[[np.random.Generator], Sample], count: int, ba
     yield Figure(f"{name}: found of {count}", outcome.found, "", bar, "bar" if bar else "")
     yield Figure(f"{name}: found elsewhere", outcome.wrong, "", 0, "bar")
     yield Figure(f"{name}: RMS distance from the truth", rms, "mm", PLACE_BAR_MM, "bar")
+    beyond = int((outcome.errors_mm > PLACE_BAR_MM).sum())
+    yield Figure(f"{name}: farther than {PLACE_BAR_MM:g} mm from the truth", beyond, "", 0, "bar")
     yield Figure(f"{name}: largest distance from the truth", float(outcome.errors_mm.max()), "mm")
     yield Figure(f"{name}: normalised squared error of the place", float(outcome.squared.mean()) / 2, "", 1.0, "honest")
     yield Figure(f"{name}: of the height", float(outcome.height_squared.mean()), "", 1.0, "honest")

@@ -43,6 +43,12 @@ _LEAST_CHANCE: Final = 0.02
 _MOST_LOST: Final = 0.6
 _MOST_STRAY: Final = 0.2
 _SIGMA_LOG_SIZE: Final = 0.05
+"""1 σ of a target's size as a share of that stated."""
+_SAME_SIZE: Final = 0.03
+"""A target that differs from the stated size by less is of that size, and all of its outline tells of its centre."""
+_SIGMA_SAME_SIZE: Final = 0.003
+"""1 σ of such a size: 1 %, where ten labels say as much as one, since paint wears off in patches. Without it, a patch
+that is lost at the edge makes the target smaller and moves its centre."""
 _MAD_TO_SIGMA: Final = 1.4826
 
 
@@ -55,7 +61,7 @@ class ShapeFit:
     covariance_m2: Float64
     """(2, 2) of the centre."""
     scale: float
-    """Size over the stated size."""
+    """Size over the stated size, as the labels alone tell it."""
     turn_rad: float
     """Of a chequered target, east to north."""
     levels: Levels
@@ -124,11 +130,15 @@ def fit_shape(cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, sp
         if levels.contrast <= 0.0:
             return None
         state = fit.likeliest(state, float(blur))
+    free_scale = float(np.exp(state[SIZE]))
+    if abs(state[SIZE]) < _SAME_SIZE:
+        fit.sigma_log_size = _SIGMA_SAME_SIZE
+        state = fit.likeliest(state, last)
     covariance = fit.covariance(state, _CURVATURE_BLUR * spacing_m)
     if covariance is None or not np.all(np.isfinite(covariance)):
         return None
-    scale, turn = float(np.exp(state[SIZE])), float(state[TURN])
-    return ShapeFit(state[[EAST, NORTH]], covariance, scale, turn, levels, int(near.count.sum()))
+    turn = float(state[TURN])
+    return ShapeFit(state[[EAST, NORTH]], covariance, free_scale, turn, levels, int(near.count.sum()))
 
 
 class _Fit:
@@ -145,6 +155,7 @@ class _Fit:
         self.group = np.minimum(((azimuth / np.pi + 1.0) / 2.0 * _SECTORS).astype(np.int64), _SECTORS - 1)
         self.active = np.array([True, True, True, not isinstance(shape, Disc)])
         self.label = np.zeros(cells.value.size)
+        self.sigma_log_size = _SIGMA_LOG_SIZE
         self.chances = (_LEAST_CHANCE, _LEAST_CHANCE)
         self.out = kernels.Fitted(np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((_SECTORS, UNKNOWNS)))
 
@@ -191,13 +202,13 @@ class _Fit:
             self.cells.place_m, self.label, self.group, self.drawn, state, paint, self.out
         )
         right: Float64 = self.out.scores.sum(axis=0)
-        right[SIZE] -= state[SIZE] / _SIGMA_LOG_SIZE**2
-        return float(likelihood) - 0.5 * (state[SIZE] / _SIGMA_LOG_SIZE) ** 2, right
+        right[SIZE] -= state[SIZE] / self.sigma_log_size**2
+        return float(likelihood) - 0.5 * (state[SIZE] / self.sigma_log_size) ** 2, right
 
     def _step(self, state: Float64, blur_m: float) -> tuple[float, Float64]:
         likelihood, right = self._score(state, blur_m)
         normal = self.out.normal[np.ix_(self.active, self.active)].copy()
-        normal[SIZE, SIZE] += _SIGMA_LOG_SIZE**-2
+        normal[SIZE, SIZE] += self.sigma_log_size**-2
         step = np.zeros(UNKNOWNS)
         step[self.active] = np.linalg.lstsq(normal, right[self.active], rcond=None)[0]
         reach = 0.1 * self.shape.half_m

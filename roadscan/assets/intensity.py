@@ -206,6 +206,16 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
 
 def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
     """Range (n,) of each return (m), and the angle of incidence of those that are wanted (deg); 0 of all others."""
+    range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
+    place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
+    sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
+    grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
+    meet_ground(place, sensor, grid, *_slopes(ground), wanted, range_m, cosine)
+    return range_m, np.degrees(np.arccos(cosine))
+
+
+def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:
+    """Slopes (rows, columns) of the ground to the east and to the north (m/m); 0 where it is not known."""
     from scipy import ndimage
 
     height = ground.height_m.astype(np.float64)
@@ -218,12 +228,7 @@ def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_])
         share = ndimage.uniform_filter(known.astype(np.float64), size, mode="nearest")
         mean = ndimage.uniform_filter(np.where(known, slope, 0.0), size, mode="nearest")
         slopes.append(np.where(share > 0.0, mean / np.maximum(share, 1e-9), 0.0))
-    range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
-    place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
-    sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
-    grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
-    meet_ground(place, sensor, grid, slopes[0], slopes[1], wanted, range_m, cosine)
-    return range_m, np.degrees(np.arccos(cosine))
+    return slopes[0], slopes[1]
 
 
 # --- the places of a sample ------------------------------------------------------------------------

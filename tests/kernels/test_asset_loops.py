@@ -8,8 +8,8 @@ import scipy.ndimage
 
 from roadscan.kernels.assets.beams import ground_heights, log_gains, meet_ground
 from roadscan.kernels.assets.buckets import by_number, raster_cells, rows_within
-from roadscan.kernels.assets.paint_levels import contrasts, distinct_in_groups, paint_sums
 from roadscan.kernels.assets.corridors import mark_strip
+from roadscan.kernels.assets.paint_levels import contrasts, distinct_in_groups, paint_sums
 from roadscan.kernels.assets.smoothing import convolve, window_means
 from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
 from roadscan.kernels.assets.step_filter import sizes_of, take_excess

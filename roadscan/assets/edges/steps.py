@@ -84,6 +84,7 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
     """
     whole, part = raster, _part(raster, settings)
     raster = replace(raster, **{name: getattr(raster, name)[part] for name in ("count", "height_m", "sigma_m")})
+    first = part[0].start, part[1].start
     best = np.zeros((4, *raster.count.shape))
     ground = [slope[part] for slope in whole.slopes]
     field = _framed(raster, whole.level_m, ground)
@@ -108,8 +109,8 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
         across = _across(v, settings, raster.cell_m)
         step_response(strip, freedom, active, slope, across, constants, work, step, evidence)
         surroundings.take_excess(evidence, still)
-        thin(step, evidence, float(k), v, limits, best)
-    return _places(raster, best, (part[0].start, part[1].start), settings)
+        thin(step, evidence, float(k), v, limits, first, best)
+    return _places(raster, best, first, settings)
 
 
 def _part(raster: HeightRaster, settings: StepSettings) -> tuple[slice, slice]:
@@ -164,7 +165,8 @@ class _Surroundings(NamedTuple):
         looked_at = np.flatnonzero(active.any(axis=1))
         wanted = (int(looked_at[0]), int(looked_at[-1]) + 1) if looked_at.size else (0, 0)
         between, line = np.zeros((rows + 2, columns)), np.zeros(columns + size)
-        return cls(size, wanted, *np.empty((2, rows, columns)), np.empty((2, rows, columns)), between, line)
+        counted, sizes = np.empty(active.shape), np.empty(active.shape)
+        return cls(size, wanted, counted, sizes, np.empty((2, rows, columns)), between, line)
 
     def take_excess(self, evidence: Float64, still: npt.NDArray[np.bool_]) -> None:
         """Divide steps over their σ by how much more than by chance steps of one direction scatter around each cell.

@@ -92,7 +92,7 @@ def _not_zero(counts: npt.NDArray[np.uint16]) -> Int64:
     some = counts[: counts.size // 4 * 4].view(np.uint64)
     cells = (4 * np.flatnonzero(some)[:, None] + np.arange(4)).reshape(-1)
     cells = np.concatenate([cells, np.arange(4 * some.size, counts.size)])
-    return cells[counts[cells] > 0]
+    return np.asarray(cells[counts[cells] > 0], np.int64)
 
 
 def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArray[Any]:

@@ -76,8 +76,9 @@ def divided(total, size, out):
 def window_means(value, size, wanted, between, line, out):
     """Fill `out` (rows, columns) with the means of squares of `size` by `size` cells, zeros beyond the raster.
 
-    wanted : (first, end) rows that are filled. The square reaches from size // 2 cells before a cell. between : (rows + 2, columns), its last row zeros, and line :
-    (columns + size,), zeros, are working space. Sums run along columns, then along rows.
+    wanted : (first, end) rows that are filled. The square reaches from size // 2 cells before a cell. between : (rows +
+    2, columns), its last row zeros, and line : (columns + size,), zeros, are working space. Sums run along columns,
+    then along rows.
     """
     rows, columns = value.shape
     before = size // 2

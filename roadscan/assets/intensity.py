@@ -214,12 +214,11 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
 
 def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
     """Range (n,) of each return (m), and the angle of incidence of those that are wanted (deg); 0 of all others."""
-    east, north = _slopes(ground)
     range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
     place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
     sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
     grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
-    meet_ground(place, sensor, grid, east, north, wanted, range_m, cosine)
+    meet_ground(place, sensor, grid, *_slopes(ground), wanted, range_m, cosine)
     return range_m, np.degrees(np.arccos(cosine))
 
 

@@ -68,7 +68,7 @@ def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
     assert evidence[12, 9:11].min() > 8.0
     assert np.abs(evidence[12, 4]) < 3.0
     best = np.zeros((4, *height.shape))
-    thin(step, evidence, 3.0, (1.0, 0.0), (4.0, 0.015, 0.3), best)
+    thin(step, evidence, 3.0, (1.0, 0.0), (4.0, 0.015, 0.3), (0, 0), best)
     assert set(np.argmax(best[0, 5:-5], axis=1).tolist()) <= {9, 10}
     assert best[2, 12].max() == 3.0
 

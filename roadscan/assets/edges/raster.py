@@ -106,8 +106,9 @@ def raster_of(scene: Scene) -> HeightRaster:
     count = np.zeros(rows * columns, np.int32)
     mean, variance = np.zeros(rows * columns), np.zeros(rows * columns)
     low_heights(cell, returns.height_m, used, DEPTH_M, count, mean, variance)
-    cells = (count, mean, np.sqrt(variance))
-    raster = of_cells(x_min, y_min, CELL_M, *(column.reshape(rows, columns) for column in cells))
+    shape = (rows, columns)
+    spread = np.sqrt(variance).reshape(shape)
+    raster = of_cells(x_min, y_min, CELL_M, count.reshape(shape), mean.reshape(shape), spread)
     return replace(raster, used=used, cell=cell)
 
 

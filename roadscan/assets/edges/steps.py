@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple, Self
 
 import cv2
@@ -80,18 +82,22 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
     the difference of both lines at the edge, and its evidence the step over its σ, which grows with the scatter of the
     cells about the lines. A place is kept for the direction that tells most, where no neighbour across tells more.
     """
+    whole, part = raster, _part(raster, settings)
+    raster = replace(raster, **{name: getattr(raster, name)[part] for name in ("count", "height_m", "sigma_m")})
+    first = part[0].start, part[1].start
     best = np.zeros((4, *raster.count.shape))
-    field = _framed(raster)
+    ground = [slope[part] for slope in whole.slopes]
+    field = _framed(raster, whole.level_m, ground)
     active = _active(raster, settings)
     still = field.inner((raster.count > 0) & ~active)
     freedom, active = field.inner(_freedom(raster, settings)), field.inner(active)
-    slopes = [field.inner(slope) for slope in raster.slopes]
+    slopes = [field.inner(slope) for slope in ground]
     reach = round(settings.across_m / raster.cell_m)
     wanted = cv2.dilate(active.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     wanted = wanted.reshape(len(wanted), -1, CHUNK).max(axis=2) > 0
     strip, work = np.zeros((3, *field.weight.shape)), np.empty((WORK, CHUNK))
     step, evidence = np.empty(active.shape), np.empty(active.shape)
-    surroundings = _Surroundings.of(active.shape, round(settings.around_m / raster.cell_m))
+    surroundings = _Surroundings.of(active, round(settings.around_m / raster.cell_m))
     constants = (settings.slope_sigma**-2, settings.floor_m)
     limits = (settings.least_evidence, settings.least_m, settings.greatest_m)
     for k in range(settings.directions):
@@ -103,8 +109,19 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
         across = _across(v, settings, raster.cell_m)
         step_response(strip, freedom, active, slope, across, constants, work, step, evidence)
         surroundings.take_excess(evidence, still)
-        thin(step, evidence, float(k), v, limits, best)
-    return _places(raster, best, settings)
+        thin(step, evidence, float(k), v, limits, first, best)
+    return _places(raster, best, first, settings)
+
+
+def _part(raster: HeightRaster, settings: StepSettings) -> tuple[slice, slice]:
+    """Rows and columns of the raster around which, as far as a step's surroundings reach, no cell has a height."""
+    margin, known = round(settings.around_m / raster.cell_m) + 1, raster.count > 0
+    parts = []
+    for axis, size in enumerate(known.shape):
+        held = np.flatnonzero(known.any(axis=1 - axis))
+        first, last = (int(held[0]), int(held[-1])) if held.size else (0, 0)
+        parts.append(slice(max(first - margin, 0), min(last + margin + 1, size)))
+    return parts[0], parts[1]
 
 
 class _Field(NamedTuple):
@@ -121,11 +138,11 @@ class _Field(NamedTuple):
         return np.pad(raster, ((0, 0), (0, columns - raster.shape[1])))
 
 
-def _framed(raster: HeightRaster) -> _Field:
+def _framed(raster: HeightRaster, level_m: float, slopes: Sequence[Float64]) -> _Field:
     more = -raster.count.shape[1] % CHUNK
-    height = np.where(raster.count > 0, raster.height_m - raster.level_m, 0.0)
+    height = np.where(raster.count > 0, raster.height_m - level_m, 0.0)
     frame = ((FRAME, FRAME), (FRAME, FRAME + more))
-    return _Field(*(np.pad(one, frame) for one in (raster.weight, height, *raster.slopes)))
+    return _Field(*(np.pad(one, frame) for one in (raster.weight, height, *slopes)))
 
 
 class _Surroundings(NamedTuple):
@@ -133,6 +150,8 @@ class _Surroundings(NamedTuple):
 
     size: int
     """Width of the surroundings (cells)."""
+    wanted: tuple[int, int]
+    """First of the rows in which steps are looked for, and the one after the last."""
     counted: Float64
     sizes: Float64
     means: Float64
@@ -140,11 +159,14 @@ class _Surroundings(NamedTuple):
     line: Float64
 
     @classmethod
-    def of(cls, shape: tuple[int, ...], size: int) -> Self:
-        """For rasters of a shape."""
-        rows, columns = shape
+    def of(cls, active: npt.NDArray[np.bool_], size: int) -> Self:
+        """For steps that are looked for in some cells (rows, columns)."""
+        rows, columns = active.shape
+        looked_at = np.flatnonzero(active.any(axis=1))
+        wanted = (int(looked_at[0]), int(looked_at[-1]) + 1) if looked_at.size else (0, 0)
         between, line = np.zeros((rows + 2, columns)), np.zeros(columns + size)
-        return cls(size, np.empty(shape), np.empty(shape), np.empty((2, *shape)), between, line)
+        counted, sizes = np.empty(active.shape), np.empty(active.shape)
+        return cls(size, wanted, counted, sizes, np.empty((2, rows, columns)), between, line)
 
     def take_excess(self, evidence: Float64, still: npt.NDArray[np.bool_]) -> None:
         """Divide steps over their σ by how much more than by chance steps of one direction scatter around each cell.
@@ -154,7 +176,7 @@ class _Surroundings(NamedTuple):
         """
         sizes_of(evidence, still, (_STILL, _CLIPPED), self.counted, self.sizes)
         for value, mean in ((self.counted, self.means[0]), (self.sizes, self.means[1])):
-            window_means(value, self.size, self.between, self.line, mean)
+            window_means(value, self.size, self.wanted, self.between, self.line, mean)
         take_excess(evidence, *self.means, (_PRIOR, _PRIOR * _STILL), _MEAN_SIZE)
 
 
@@ -188,9 +210,11 @@ def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool
     return np.asarray(np.isfinite(top) & (top - bottom >= settings.least_m))
 
 
-def _places(raster: HeightRaster, best: Float64, settings: StepSettings) -> Places:
+def _places(raster: HeightRaster, best: Float64, first: tuple[int, int], settings: StepSettings) -> Places:
+    """Places of the cells with a step; first : row and column of the raster that `best` begins at."""
     row, column = np.nonzero(best[0] > 0.0)
     evidence, step, direction, offset = best[:, row, column]
+    row, column = row + first[0], column + first[1]
     angle = math.pi * direction / settings.directions
     ux, uy = np.cos(angle), np.sin(angle)
     x = raster.x_min_m + (column + 0.5 + offset * uy) * raster.cell_m

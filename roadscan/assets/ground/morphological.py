@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 

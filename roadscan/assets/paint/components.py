@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
 from roadscan.assets.paint.contrast import CELL_M, Contrast
-from roadscan.kernels.assets.contrasts import distinct_in_groups
+from roadscan.kernels.assets.paint_levels import distinct_in_groups
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

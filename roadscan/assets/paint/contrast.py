@@ -12,8 +12,7 @@ from roadscan.assets.bins import in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
-from roadscan.kernels.assets.contrasts import contrasts, paint_sums
-from roadscan.kernels.assets.paint_levels import paint_levels
+from roadscan.kernels.assets.paint_levels import contrasts, paint_levels, paint_sums
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -94,9 +93,7 @@ def contrast_of(scene: Scene) -> Contrast:
     row = np.clip(((y - window.y_min_m) / CELL_M).astype(np.int64), 0, shape[0] - 1)
     cell = row * shape[1] + column
     mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows].astype(np.float64), (shape[0], shape[1]))
-    return Contrast(
-        rows, x, y, found.height_m[rows], contrast, noise, _lines(found, rows), cell, window, mean, sigma
-    )
+    return Contrast(rows, x, y, found.height_m[rows], contrast, noise, _lines(found, rows), cell, window, mean, sigma)
 
 
 def _seen_flat(found: Returns, rows: Int64) -> npt.NDArray[np.bool_]:

@@ -95,9 +95,7 @@ def regions_of(scene: Scene) -> list[Region]:
     for number, group in enumerate(joined):
         group_of[group] = number
     first, order = in_bins(group_of[voxel], len(joined))  # voxel −1 is the last one, which belongs to none
-    regions = (
-        _region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined)
-    )
+    regions = (_region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined))
     return [one for one in regions if one is not None]
 
 

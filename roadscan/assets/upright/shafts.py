@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import Axis, fit_axis
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
@@ -143,32 +145,31 @@ def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]
     ax, ay, bx, by = float(slices.x_m[seed]), float(slices.y_m[seed]), 0.0, 0.0
     kept = np.ones(near.size, np.bool_)
     for reach in (0.3, 0.2, 0.15):
-        middle = float(np.mean(level[kept])) if kept.any() else 0.0
-        if np.unique(level[kept]).size >= 4:
-            bx, by = (_slope(level[kept] - middle, v[kept]) for v in (x, y))
-            bx, by = (float(np.clip(b, -_MOST_LEAN * SLICE_M, _MOST_LEAN * SLICE_M)) for b in (bx, by))
-        ax, ay = (
-            float(np.median((x - bx * (level - middle))[kept])),
-            float(np.median((y - by * (level - middle))[kept])),
-        )
+        own = level[kept]
+        middle = float(np.add.reduce(own) / own.size) if own.size else 0.0
+        if len(set(own.tolist())) >= 4:
+            bx, by = (_slope(own - middle, v[kept]) for v in (x, y))
+            bx, by = (min(max(b, -_MOST_LEAN * SLICE_M), _MOST_LEAN * SLICE_M) for b in (bx, by))
+        ax, ay = median(x[kept] - bx * (own - middle)), median(y[kept] - by * (own - middle))
         kept = np.hypot(x - ax - bx * (level - middle), y - ay - by * (level - middle)) <= reach
         if not kept.any():
             return near[:0]
     members = near[kept]
     members = members[_longest_run(slices.level[members])]
-    return members if np.unique(slices.level[members]).size >= _LEAST_SLICES else members[:0]
+    return members if len(set(slices.level[members].tolist())) >= _LEAST_SLICES else members[:0]
 
 
 def _slope(t: Float64, v: Float64) -> float:
-    return float(np.sum(t * (v - np.mean(v))) / max(float(np.sum(t * t)), 1e-9))
+    return float(np.add.reduce(t * (v - np.add.reduce(v) / v.size)) / max(float(np.add.reduce(t * t)), 1e-9))
 
 
 def _longest_run(level: Int64) -> npt.NDArray[np.bool_]:
     """Which belong to the run of levels with the most of them, gaps within limits; the lower run where equal."""
-    distinct, counts = np.unique(level, return_counts=True)
-    run = np.concatenate([[0], np.cumsum(np.diff(distinct) > _GAP_SLICES + 1)])
-    best = int(np.argmax(np.bincount(run, np.minimum(counts, 1))))
-    return np.isin(level, distinct[run == best])
+    distinct = sorted(set(level.tolist()))
+    breaks = [k for k in range(1, len(distinct)) if distinct[k] - distinct[k - 1] > _GAP_SLICES + 1]
+    runs = [(first, end) for first, end in pairwise([0, *breaks, len(distinct)])]
+    first, end = max(runs, key=lambda run: run[1] - run[0])
+    return np.asarray((level >= distinct[first]) & (level <= distinct[end - 1]))
 
 
 def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: float) -> Shaft | None:

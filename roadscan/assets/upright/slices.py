@@ -73,7 +73,7 @@ def slices_of(scene: Scene) -> Slices:
     cell = np.empty(len(returns), np.int64)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
     fill_slices(returns.x_m, returns.y_m, above, corner, CELL_M, SLICE_M, counts, cell)
-    cells = np.flatnonzero(counts)
+    cells = _not_zero(counts.reshape(-1))
     labels, boxes = np.zeros(counts.shape, np.int32), np.empty((cells.size, 5), np.int32)
     found = label_slices(counts, cells, labels, boxes, np.empty(max(cells.size, 1), np.int64))
     boxes = boxes[:found]
@@ -85,6 +85,14 @@ def slices_of(scene: Scene) -> Slices:
     owners(returns.x_m, returns.y_m, cell, labels.reshape(-1), number, owner, sums)
     x, y = sums[:, 1] / sums[:, 0], sums[:, 2] / sums[:, 0]
     return Slices((window.x_min_m, window.y_min_m), counts, boxes[compact, 0].astype(np.int64), x, y, owner)
+
+
+def _not_zero(counts: npt.NDArray[np.uint16]) -> Int64:
+    """Numbers of the cells with returns, ascending: most are empty, so four are looked at together."""
+    some = counts[: counts.size // 4 * 4].view(np.uint64)
+    cells = (4 * np.flatnonzero(some)[:, None] + np.arange(4)).reshape(-1)
+    cells = np.concatenate([cells, np.arange(4 * some.size, counts.size)])
+    return np.asarray(cells[counts[cells] > 0], np.int64)
 
 
 def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArray[Any]:

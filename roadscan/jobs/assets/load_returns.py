@@ -113,9 +113,9 @@ class _Block:
         west, south = ((n * grid.per_edge - first) * size for n, first in zip(square, self._corner, strict=True))
         halo, edge = round(grid.halo_m * QUANTA_PER_M), grid.per_edge * size
         c = self._columns
-        box = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
+        ends = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
         rows = np.empty(c.x.size, np.int64)
-        own = c.at(rows[: rows_within(c.x, c.y, box, rows)])
+        own = c.at(rows[: rows_within(c.x, c.y, ends, rows)])
         corner = grid.corner_m(square)
         x, y = _metres(own.x - np.int64(west)), _metres(own.y - np.int64(south))
         if self._centre is not None:

@@ -37,8 +37,8 @@ def mark_corridor(x, y, reach_m, corner, cell_m, inside):
 def mark_strip(x, y, rows, middle, axes, box, marked):
     """Mark the returns of a rectangle seen from above: `marked` (n,) bool at their numbers.
 
-    x, y : (k,) places (m) and rows : (k,) numbers of returns. middle : (2,) where axes (2, 2) begin, unit vectors. box :
-    (4,) least and greatest place along the first axis, then along the second (m).
+    x, y : (k,) places (m) and rows : (k,) numbers of returns. middle : (2,) where axes (2, 2) begin, unit vectors. box
+    : (4,) least and greatest place along the first axis, then along the second (m).
     """
     for i in range(x.size):
         dx, dy = x[i] - middle[0], y[i] - middle[1]

@@ -131,8 +131,9 @@ def trace(place, total, following, preceding, ranked, order, starts, bins, limit
 
     total : (n,) evidence of the best path through each place. ranked : places, strongest first. order, starts, bins :
     places sorted by bin, as in :func:`find_links`. limits : (least evidence to begin, least evidence to go on,
-    distances within which a chain leaves no second one and no other side of a gutter (m)). chain : (n, 2) filled, in chains one after another: the chain's number and the place. owner : (n,)
-    −1 at first; then the chain that holds the place or lies beside it.
+    distances within which a chain leaves no second one and no other side of a gutter (m)). chain : (n, 2) filled, in
+    chains one after another: the chain's number and the place. owner : (n,) −1 at first; then the chain that holds the
+    place or lies beside it.
     """
     n = total.size
     length, chains = 0, 0

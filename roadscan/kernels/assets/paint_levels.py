@@ -1,10 +1,12 @@
-"""The brightness of the surface around each place, whatever is painted on it."""
+"""The brightness of the surface around each place, whatever is painted on it, and the contrast of returns to it."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inlined, kernel
 
 MOST_OF_A_CELL = 16
 """Readings of a cell that are looked at; of more, every so-manieth."""
@@ -52,3 +54,64 @@ def paint_levels(value, first, half, level, upper):
             kept = np.searchsorted(found, most, side="right")
             level[i, j] = found[kept // 2]
             upper[i, j] = found[int(0.84 * kept)]
+
+
+@inlined
+def _sampled(value, row, column, fu, fv):
+    """Value between the middles of cells: row and column of the lower one, and how far the place lies past it."""
+    rows, columns = value.shape
+    i, j = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+    north, east = min(max(row + 1, 0), rows - 1), min(max(column + 1, 0), columns - 1)
+    u, v = 1.0 - fu, 1.0 - fv
+    return (
+        (value[i, j] * u * v + value[i, east] * u * (1.0 - v))
+        + (value[north, j] * (1.0 - u) * v)
+        + value[north, east] * (1.0 - u) * (1.0 - v)
+    )
+
+
+@kernel
+def contrasts(x, y, intensity, grid, level, upper, bounds, contrast, noise):
+    """Fill `contrast` (n,), intensity over that of the surface less 1, and `noise`, its 1 σ on a bare surface.
+
+    x, y : (n,) places (m). grid : (x_min_m, y_min_m, cell_m) of both rasters. level, upper : (rows, columns) brightness
+    of the surface, and what 84 % of its returns do not reach; linear between the middles of cells. bounds : (least and
+    greatest contrast, least noise).
+    """
+    for k in range(x.size):
+        u, v = (y[k] - grid[1]) / grid[2] - 0.5, (x[k] - grid[0]) / grid[2] - 0.5
+        i, j = math.floor(u), math.floor(v)
+        fu, fv = u - i, v - j
+        here = _sampled(level, i, j, fu, fv)
+        most = _sampled(upper, i, j, fu, fv)
+        contrast[k] = min(max(intensity[k] / here - 1.0, bounds[0]), bounds[1])
+        noise[k] = max(most / here - 1.0, bounds[2])
+
+
+@kernel
+def paint_sums(cell, contrast, noise, height_m, sums):
+    """Add returns to their cells: sums (cells, 5), number, contrast, noise², height (m), height².
+
+    cell : (n,) number of each return's cell; contrast, noise, height_m : (n,).
+    """
+    for k in range(cell.size):
+        at = cell[k]
+        sums[at, 0] += 1.0
+        sums[at, 1] += contrast[k]
+        sums[at, 2] += noise[k] * noise[k]
+        sums[at, 3] += height_m[k]
+        sums[at, 4] += height_m[k] * height_m[k]
+
+
+@kernel
+def distinct_in_groups(starts, order, value, out):
+    """How many different values each group has: out (groups,) int64.
+
+    starts : (groups + 1,) where the things of each group begin in `order`. value : (n,) int64 of each thing.
+    """
+    for group in range(out.size):
+        own = np.sort(value[order[starts[group] : starts[group + 1]]])
+        found = 0
+        for k in range(own.size):
+            found += 1 if k == 0 or own[k] != own[k - 1] else 0
+        out[group] = found

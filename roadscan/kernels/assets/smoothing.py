@@ -73,11 +73,12 @@ def divided(total, size, out):
 
 
 @bare
-def window_means(value, size, between, line, out):
+def window_means(value, size, wanted, between, line, out):
     """Fill `out` (rows, columns) with the means of squares of `size` by `size` cells, zeros beyond the raster.
 
-    The square reaches from size // 2 cells before a cell. between : (rows + 2, columns), its last row zeros, and line :
-    (columns + size,), zeros, are working space. Sums run along columns, then along rows.
+    wanted : (first, end) rows that are filled. The square reaches from size // 2 cells before a cell. between : (rows +
+    2, columns), its last row zeros, and line : (columns + size,), zeros, are working space. Sums run along columns,
+    then along rows.
     """
     rows, columns = value.shape
     before = size // 2
@@ -87,13 +88,15 @@ def window_means(value, size, between, line, out):
         total[i] = 0.0
     for row in range(min(after + 1, rows)):
         add_row(value[row], total)
-    divided(total, float(size), between[0])
-    for row in range(1, rows):
+    if wanted[0] == 0:
+        divided(total, float(size), between[0])
+    for row in range(1, wanted[1]):
         entering = value[row + after] if row + after < rows else nothing
         leaving = value[row - before - 1] if row - before - 1 >= 0 else nothing
         moved(entering, leaving, total)
-        divided(total, float(size), between[row])
-    for row in range(rows):
+        if row >= wanted[0]:
+            divided(total, float(size), between[row])
+    for row in range(wanted[0], wanted[1]):
         for i in range(columns):
             line[before + i] = between[row, i]
         here = 0.0

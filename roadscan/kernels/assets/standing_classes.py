@@ -14,10 +14,11 @@ LEAFY, WALL, WIRE, ALONE = 1, 2, 4, 8
 def standing_classes(above, number, cubes, place, sensor, limits, codes, out):
     """Give returns that have no class yet the class of what stands there.
 
-    above : (n,) float32, heights above the ground (m). number : (n,) int32 cube of each return, −1 of none. cubes : (k,)
-    uint8 bits of each cube. place, sensor : three (n,) arrays, x, y and height (m). limits : (height of what lies on
-    the ground, heights from which vegetation is medium and high, how near a lone return is noise (m)). codes : classes:
-    none, low, medium and high vegetation, building, wire, noise. out : (n,) uint8, changed where it holds none.
+    above : (n,) float32, heights above the ground (m). number : (n,) int32 cube of each return, −1 of none. cubes :
+    (k,) uint8 bits of each cube. place, sensor : three (n,) arrays, x, y and height (m). limits : (height of what lies
+    on the ground, heights from which vegetation is medium and high, how near a lone return is noise (m)). codes :
+    classes: none, low, medium and high vegetation, building, wire, noise. out : (n,) uint8, changed where it holds
+    none.
     """
     for k in range(out.size):
         if out[k] != codes[0]:

@@ -274,12 +274,13 @@ def take_excess(evidence, counted, size, prior, usual):
 
 
 @kernel
-def thin(step_m, evidence, direction, across_unit, limits, best):
+def thin(step_m, evidence, direction, across_unit, limits, first, best):
     """Keep in `best` (4, rows, columns) the strongest step of all directions, where it is the greatest across the edge.
 
     `best` holds evidence, step (m), direction (number), offset across (cells, to the right) and is filled direction by
-    direction. `step_m` and `evidence` may have more columns, which are left out. across_unit : (column, row) unit vector to the right, in cells. limits : (least evidence, least and
-    greatest height of a step (m)).
+    direction. `step_m` and `evidence` may have more columns, which are left out. across_unit : (column, row) unit
+    vector to the right, in cells. limits : (least evidence, least and greatest height of a step (m)). first : row and
+    column that cells count from.
     """
     rows, columns = best.shape[1:]
     for row in range(2, rows - 2):
@@ -288,8 +289,9 @@ def thin(step_m, evidence, direction, across_unit, limits, best):
             if e < limits[0] or h < limits[1] or h > limits[2] or e <= best[0, row, column]:
                 continue
             sign = 1.0 if evidence[row, column] > 0.0 else -1.0
-            before = sign * sample(evidence, column - across_unit[0], row - across_unit[1])
-            after = sign * sample(evidence, column + across_unit[0], row + across_unit[1])
+            x, y = column + first[1], row + first[0]
+            before = sign * sample(evidence, x - across_unit[0], y - across_unit[1], first)
+            after = sign * sample(evidence, x + across_unit[0], y + across_unit[1], first)
             if before > e or after > e:
                 continue
             curve = before - 2.0 * e + after
@@ -300,10 +302,11 @@ def thin(step_m, evidence, direction, across_unit, limits, best):
 
 
 @inlined
-def sample(field, column, row):
-    """Bilinear value of a field (rows, columns) at a place inside it."""
+def sample(field, column, row, first):
+    """Bilinear value of a field (rows, columns) at a place inside it; first : row and column that it begins at."""
     c, r = int(np.floor(column)), int(np.floor(row))
     u, v = column - c, row - r
+    c, r = c - first[1], r - first[0]
     return (field[r, c] * (1.0 - u) + field[r, c + 1] * u) * (1.0 - v) + (
         field[r + 1, c] * (1.0 - u) + field[r + 1, c + 1] * u
     ) * v

@@ -23,12 +23,12 @@ def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
 
     node : (n, 7) x, y (m), unit vector along the edge (higher side to its right), height (m) and the ground's slope at
     large along and across it (to the right). x_m, y_m, z_m : (m,) heights of the ground, sorted by bin. starts : the
-    first of each bin. bins : (x_min_m, y_min_m, size_m, rows, columns). along_m : half the length of the window along the edge. search : (farthest offset
-    (m), least and greatest face (m), depth of a side (m)). prior : (σ of a side's slope (m/m), σ of a height (m)).
-    OFFSET : from the node to the upper edge, to the right. SCATTER : of strips of 0.1 m about their side's line.
-    SEEN_LOW : share of strips of 0.1 m with heights on the lower side, up to the farthest of at most 1.2 m; 0 of fewer
-    than four. SEEN_HIGH : width with heights on the higher side, of at most 1.2 m. COVERED : share of the window along
-    the edge with heights near it on both sides.
+    first of each bin. bins : (x_min_m, y_min_m, size_m, rows, columns). along_m : half the length of the window along
+    the edge. search : (farthest offset (m), least and greatest face (m), depth of a side (m)). prior : (σ of a side's
+    slope (m/m), σ of a height (m)). OFFSET : from the node to the upper edge, to the right. SCATTER : of strips of 0.1
+    m about their side's line. SEEN_LOW : share of strips of 0.1 m with heights on the lower side, up to the farthest of
+    at most 1.2 m; 0 of fewer than four. SEEN_HIGH : width with heights on the higher side, of at most 1.2 m. COVERED :
+    share of the window along the edge with heights near it on both sides.
     """
     columns = int(bins[4])
     profile, near = np.empty((4, 2 * HALF_BINS)), np.empty((2, QUARTERS))

@@ -23,7 +23,7 @@ class Weights(NamedTuple):
     low: float = 3.0
     """Of the share of the lower side that was seen, less 0.9."""
     behind: float = 12.0
-    """Of the width of the surface behind it, up to 0.5 m, less that (m): where less is seen, a wall or a hedge stands."""
+    """Of the width of the surface behind it, up to 0.5 m, less that (m): where less is seen, a wall or hedge stands."""
 
 
 WEIGHTS: Final = Weights()

@@ -96,4 +96,4 @@ def test_cars_end_in_no_upright_asset() -> None:
         one = asset_kinds()[kind]
         for part in one.evidence(scene, one.options()).marked:
             marked[part.rows] = True
-    assert marked[labels == 10].mean() <= 0.03
+    assert marked[labels == 10].mean() <= 0.002  # 0.0003; the bar is 0.03

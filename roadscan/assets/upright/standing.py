@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -71,6 +72,8 @@ def probability_of(shaft: Shaft, inside_plane: bool) -> float:
     are few.
     """
     lean = shaft.axis.lean_deg
+    # Half a radius is how far the middle of a thick shaft's near side wanders from height to height.
+    wander = math.degrees(math.atan2(0.5 * shaft.axis.radius_m, max(shaft.top_above_m - shaft.low_above_m, 0.2)))
     if shaft.top_above_m <= _LOW_M:
         low = [
             (1.0, min(shaft.slices, 4)), (6.0, shaft.alone), (2.5, shaft.free), (-3.0, shaft.covered),
@@ -81,8 +84,8 @@ def probability_of(shaft: Shaft, inside_plane: bool) -> float:
     rough = shaft.axis.residual_m / (0.05 + 0.2 * shaft.axis.radius_m)
     high = [
         (0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free),
-        (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)), (-0.35, max(lean - 5.0, 0.0)),
-        (-5.0, float(inside_plane)), (-0.1, max(40 - shaft.rows.size, 0)),
+        (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)),
+        (-0.35, max(lean - 5.0 - wander, 0.0)), (-5.0, float(inside_plane)), (-0.1, max(40 - shaft.rows.size, 0)),
     ]  # fmt: skip
     return logistic(-12.5, high)
 

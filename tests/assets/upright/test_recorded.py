@@ -48,7 +48,7 @@ def test_poles_and_trunks_are_found_where_they_stand() -> None:
         expected = surface + np.pi / 4 * best.shaft.axis.radius_m * sight / np.hypot(*sight)
         errors.append(float(np.hypot(*(axis - expected))))
     assert len(truth) >= 24
-    assert found / len(truth) >= 0.83  # 20 of 24; the bar is 0.85
+    assert found / len(truth) >= 0.85  # 21 of 24
     assert np.quantile(errors, 0.95) <= 0.12
 
 
@@ -64,7 +64,7 @@ def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
             right += 1
         elif np.isin(seen, NOT_JUDGED).mean() <= 0.4:
             wrong += 1
-    assert right / (right + wrong) >= 0.80
+    assert right / (right + wrong) >= 0.80  # 0.875
 
 
 def test_the_two_strong_signs_are_found_and_no_other() -> None:
@@ -96,4 +96,4 @@ def test_cars_end_in_no_upright_asset() -> None:
         one = asset_kinds()[kind]
         for part in one.evidence(scene, one.options()).marked:
             marked[part.rows] = True
-    assert marked[labels == 10].mean() <= 0.03
+    assert marked[labels == 10].mean() <= 0.002  # 0.0003; the bar is 0.03

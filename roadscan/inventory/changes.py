@@ -213,6 +213,8 @@ def _compare_places(pair: _Pair, unit_m: float, compared: _Compared) -> None:
 
 def _compare_values(pair: _Pair, compared: _Compared) -> None:
     for column in asset_schema(pair.kind).own:
+        if column.is_evidence:
+            continue
         was, now = pair.then[column.name], pair.now[column.name]
         sigma = sigma_of(pair.kind, column.name)
         both = np.asarray(pc.and_(pc.is_valid(was), pc.is_valid(now)))

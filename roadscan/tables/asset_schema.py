@@ -44,6 +44,8 @@ class AssetColumn:
     min: float | None = None
     max: float | None = None
     values: tuple[str, ...] = ()
+    is_evidence: bool = False
+    """It tells of what was seen, not of the asset: people do not change it, and its changes are none of the asset."""
 
     def field(self) -> pa.Field:
         """The column as Arrow has it, with unit, frame and meaning as metadata."""

@@ -33,8 +33,8 @@ def asset_columns(kind: str) -> tuple[AssetColumn, ...]:
 
 @functools.cache
 def editable_columns(kind: str) -> frozenset[str]:
-    """Columns of a kind that people may change, without the geometry."""
-    return EDITED_BY_PEOPLE | {c.name for c in asset_schema(kind).own}
+    """Columns of a kind that people may change, without the geometry and what tells of its evidence."""
+    return EDITED_BY_PEOPLE | {c.name for c in asset_schema(kind).own if not c.is_evidence}
 
 
 @functools.cache

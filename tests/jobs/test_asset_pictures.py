@@ -28,6 +28,7 @@ from roadscan.jobs.stage import stage_named
 from roadscan.model.errors import ConfigError
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
+from roadscan.tables.inventory_schema import editable_columns
 from roadscan.tables.store import Store
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.known_assets import KnownLines, KnownSigns, true_lines, true_signs
@@ -60,12 +61,18 @@ SCENE = (
 )  # fmt: skip
 
 
-def session(street: Simulated, name: str = "store", **pictures: object) -> Session:
-    assets = {"tile_m": 10.0, "halo_m": 2.0, "intensity": "raw", "pictures": pictures}
+def session(street: Simulated, block_returns: int = 6_000_000, **pictures: object) -> Session:
+    assets = {
+        "tile_m": 10.0,
+        "halo_m": 2.0,
+        "intensity": "raw",
+        "max_block_returns": block_returns,
+        "pictures": pictures,
+    }
     survey = changed(
         roadscan.open_survey(street.survey_file).survey, {"assets": assets, "tiles__size_m": 10.0, "adjust__on": False}
     )
-    return Session(survey, Store(str(street.survey_file.parent / name), survey.config.id), Inline(), None, Lines())
+    return Session(survey, Store(str(street.survey_file.parent / "store"), survey.config.id), Inline(), None, Lines())
 
 
 def run(of: Session, *stages: str) -> Session:
@@ -182,6 +189,13 @@ def test_a_second_run_does_nothing_and_what_is_gone_is_made_again(street: Simula
     off = run(session(Simulated(folder / street.survey_file.name), on=False), "assets")
     assert not off.store.files("products/asset_pictures")
     assert signs_of(off)["pictures"].isna().all() and signs_of(off)["colour"].isna().all()
+    singly = run(session(Simulated(folder / street.survey_file.name), 1), "assets")
+    assert {p: singly.store.read_bytes(p) for p in singly.store.files("products/asset_pictures")} == before
+
+
+def test_people_do_not_edit_what_tells_of_the_evidence() -> None:
+    assert {"colour", "message", "type", "shape"} <= editable_columns("sign")
+    assert not {"cut_out", "colour_probability", "pictures"} & editable_columns("sign")
 
 
 def test_a_picture_that_cannot_be_read_is_named_and_the_next_is_taken(street: Simulated, tmp_path: Path) -> None:

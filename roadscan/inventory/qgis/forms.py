@@ -75,7 +75,7 @@ def _widget(column: AssetColumn, *, is_editable: bool) -> Element:
     if column.type.startswith("int") and column.min is not None and column.max is not None:
         limits = {"Min": int(column.min), "Max": int(column.max), "Step": 1, "AllowNull": True, "Style": "SpinBox"}
         return _configured("Range", limits)
-    return _configured("TextEdit", {"IsMultiline": column.name == "comments", "UseHtml": False})
+    return _configured("TextEdit", {"IsMultiline": column.name in ("comments", "pictures"), "UseHtml": False})
 
 
 def _value_map(column: AssetColumn) -> Element:

@@ -21,7 +21,7 @@ Float32 = npt.NDArray[np.float32]
 _LEAST_TEXT_PX: Final = 24
 _TEXT_PX: Final = 320
 """Cut-outs are enlarged to this height before text is sought."""
-_LEAST_TEXT: Final = 0.5
+_LEAST_TEXT: Final = 0.75
 _SQUARE_PX: Final = 64
 _ONE_THREAD: Final = {
     "EngineConfig.onnxruntime.intra_op_num_threads": 1, "EngineConfig.onnxruntime.inter_op_num_threads": 1,

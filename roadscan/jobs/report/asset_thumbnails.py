@@ -44,10 +44,12 @@ class Thumbnails:
         self._read: OrderedDict[str, tuple[Any, Any, Any]] = OrderedDict()
 
     def of(self, layer: Layer) -> bytes | None:
-        """A sheet of a kind's most probable assets; None where nothing shows them."""
+        """A sheet of a kind's most probable assets, cut-outs before returns; None where nothing shows them."""
         rows = layer.rows
-        order = np.lexsort((rows["object"].to_numpy(), -rows["probability"].to_numpy()))[:_TRIED]
-        near = sorted(order.tolist(), key=lambda n: (self._square(rows, n), n))
+        cut = [name is not None for name in rows["cut_out"].to_pylist()] if "cut_out" in rows.schema.names else []
+        has_cut = np.array(cut or [False] * rows.num_rows)
+        order = np.lexsort((rows["object"].to_numpy(), -rows["probability"].to_numpy(), ~has_cut))[:_TRIED]
+        near = sorted(order.tolist(), key=lambda n: (not has_cut[n], self._square(rows, n), n))
         found: list[npt.NDArray[np.uint8]] = []
         for number in near:
             one = self._one(layer, number)

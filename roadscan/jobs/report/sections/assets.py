@@ -50,7 +50,7 @@ class Assets(Section):
             some = thumbnails.of(layer)
             if some is not None:
                 yield Picture(some, f"{schema.title}: {_SEEN}")
-            shown = ["road", "station_m", "offset_m", *(c.name for c in schema.own), "probability"]
+            shown = ["road", "station_m", "offset_m", *(c.name for c in schema.own if not c.is_evidence), "probability"]
             head = [next(c.title for c in schema.columns if c.name == name) for name in shown]
             rows = [[_words(row[name]) for name in shown] for row in layer.rows.select(shown).to_pylist()]
             yield Table(head, rows, schema.meaning, schema.table)

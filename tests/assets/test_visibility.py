@@ -93,5 +93,5 @@ def test_cells_belong_to_the_tile_that_holds_their_middle(cells: pa.Table) -> No
 
 def test_a_pass_counts_by_its_rays() -> None:
     passed = np.array([[[200.0, 60.0, 5.0], [200.0, 100.0, 5.0], [30.0, 80.0, 0.0]]])
-    hidden = np.array([[[0.0, 90.0, 5.0], [0.0, 90.0, 30.0], [0.0, 0.0, 0.0]]])
+    hidden = np.array([[[0.0, 90.0, 5.0], [0.0, 90.0, 60.0], [0.0, 0.0, 0.0]]])
     assert in_sight(passed, hidden).tolist() == [[[True, False, False], [True, True, False], [False, True, True]]]

@@ -3,7 +3,7 @@
 Returns tell where a sensor looked. A return's ray passed all places on its way, saw what it hit, and did not see what
 lies behind. A pass had a place in sight where enough of its rays reached it, and no fewer than were stopped before.
 Where nothing came back, as from the sky, rays are not known; there a place counts as in sight that lies above one that
-is, unless something stood before it.
+is, unless half of the rays that lower places let expect were stopped before it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ _REACH_M: Final = 30.0
 """What is farther from the sensor does not count as seen."""
 _HIT_M: Final = 0.5
 _LEAST_RAYS: Final = 50.0
-"""A thin pole of 0.1 m gets a fifth of the rays of its cell."""
-_STOPPED_RAYS: Final = 20.0
-"""Where fewer rays were stopped before a place, nothing stood before it."""
-_MOST_RAYS: Final = 60_000
+"""Fewer rays do not tell that a place was seen, nor that something stood before it. A pole of 0.1 m gets a fifth of
+the rays of its cell."""
+_MOST_RAYS: Final = 120_000
 """Of more rays of a pass, each second, third … is followed."""
 
 
@@ -67,9 +66,12 @@ def passes_in_sight(scene: Scene) -> pa.Table:
 def in_sight(passed: npt.NDArray[np.floating], hidden: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     """Whether a pass had places (rows, columns, bands) in sight, by how many rays reached them and how many did not."""
     seen: npt.NDArray[np.bool_] = (passed >= _LEAST_RAYS) & (passed >= hidden)
-    is_open = (hidden < _STOPPED_RAYS) | (passed >= hidden)
+    per_m = (passed + hidden) / np.diff(BANDS_M)
     for band in range(1, seen.shape[2]):
-        seen[:, :, band] |= is_open[:, :, band] & seen[:, :, band - 1]
+        # rays that passed may not have come back, so those that were stopped are held against the bands below
+        expected = per_m[:, :, 1:band].max(axis=2, initial=0.0) * (BANDS_M[band + 1] - BANDS_M[band])
+        is_open = hidden[:, :, band] < np.maximum(_LEAST_RAYS, 0.5 * expected)
+        seen[:, :, band] |= is_open & seen[:, :, band - 1]
     return seen
 
 

@@ -92,6 +92,14 @@ def test_cells_belong_to_the_tile_that_holds_their_middle(cells: pa.Table) -> No
 
 
 def test_a_pass_counts_by_its_rays() -> None:
-    passed = np.array([[[200.0, 60.0, 5.0], [200.0, 100.0, 5.0], [30.0, 80.0, 0.0]]])
-    hidden = np.array([[[0.0, 90.0, 5.0], [0.0, 90.0, 30.0], [0.0, 0.0, 0.0]]])
-    assert in_sight(passed, hidden).tolist() == [[[True, False, False], [True, True, False], [False, True, True]]]
+    """Bands of five cells: rays that reached them, and rays that were stopped before."""
+    cells = {
+        (200, 60, 5, 0, 0): ((0, 90, 5, 0, 0), (1, 0, 0, 0, 0)),  # the second band is hidden, and with it the sky
+        (200, 100, 5, 0, 0): ((0, 90, 140, 0, 0), (1, 1, 1, 1, 1)),  # less than half of 1.5 x 190 is stopped
+        (201, 100, 5, 0, 0): ((0, 90, 150, 0, 0), (1, 1, 0, 0, 0)),
+        (30, 80, 0, 0, 0): ((0, 0, 0, 0, 0), (0, 1, 1, 1, 1)),
+        (49, 49, 49, 49, 49): ((0, 0, 0, 0, 0), (0, 0, 0, 0, 0)),
+    }
+    passed = np.array([list(cells)], float)
+    hidden = np.array([[stopped for stopped, _ in cells.values()]], float)
+    assert in_sight(passed, hidden)[0].astype(int).tolist() == [list(seen) for _, seen in cells.values()]

@@ -27,6 +27,7 @@ from roadscan.jobs.assets.evidence import EVIDENCE
 from roadscan.jobs.assets.objects import OBJECTS
 from roadscan.jobs.assets.work import MADE, due_joins, plan_evidence
 from roadscan.jobs.engine.compute import Done, Inline
+from roadscan.jobs.inventory import truth_of
 from roadscan.jobs.report.blocks import Drawing, Picture, Table
 from roadscan.jobs.report.page import report_page
 from roadscan.jobs.report.section import Material
@@ -97,6 +98,18 @@ def again(street: Simulated, folder: Path, **assets: object) -> Session:
 
 def true_posts(street: Simulated) -> pd.DataFrame:
     return pd.read_parquet(street.survey_file.parent / "truth" / "objects.parquet")
+
+
+def test_the_inventory_learns_which_places_the_pass_had_in_sight(street: Simulated) -> None:
+    own = session(street)
+    sight = truth_of(own).rules.visibility
+    true = true_posts(street)[["easting_m", "northing_m", "height_m"]].to_numpy(float)
+    assert sight.expected_passes("pole", true).tolist() == [1, 1, 1]
+    assert sight.expected_passes("pole", true + np.array([0.0, 40.0, 0.0])).tolist() == [0, 0, 0]
+    cells = query(own.store, "SELECT max(passes_low) AS most FROM asset_visibility")
+    assert cells.to_pylist() == [{"most": 1}]
+    unasked = Session(changed(own.survey, {"assets": None}), own.store)
+    assert truth_of(unasked).rules.visibility.expected_passes("pole", true).tolist() == [-1, -1, -1]
 
 
 def test_posts_stand_where_the_truth_has_them(street: Simulated) -> None:

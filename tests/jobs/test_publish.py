@@ -462,7 +462,7 @@ def test_a_single_file_holds_all(survey_file: Path, published: Published, with_p
             assert content == ({**true, "report": None} if path == "survey.json" else true)
         else:
             assert base64.b64decode(text, validate=True) == file.read_bytes()
-    known = {path for path in read(published, KEYS)["keys"] if not path.startswith("app/")}  # the page, where it is built
+    known = {path for path in read(published, KEYS)["keys"] if not path.startswith("app/")}  # without a built page
     assert known - set(page.held) <= {
         f.relative_to(published.folder).as_posix()
         for f in published.folder.rglob("*")

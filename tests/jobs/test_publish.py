@@ -40,7 +40,7 @@ from roadscan.jobs.publish.parts.edits import Edits
 from roadscan.jobs.publish.parts.rasters import images_of
 from roadscan.jobs.publish.parts.strips import Strips
 from roadscan.jobs.publish.single import write_single
-from roadscan.jobs.publish.site import KEYS, Published, publish
+from roadscan.jobs.publish.site import KEYS, Published, entry, publish
 from roadscan.jobs.publish.thumbnail import thumbnail
 from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
@@ -462,7 +462,7 @@ def test_a_single_file_holds_all(survey_file: Path, published: Published, with_p
             assert content == ({**true, "report": None} if path == "survey.json" else true)
         else:
             assert base64.b64decode(text, validate=True) == file.read_bytes()
-    known = {path for path in read(published, KEYS)["keys"] if not path.startswith("app/")}  # the page, where it is built
+    known = {path for path in read(published, KEYS)["keys"] if not path.startswith("app/")}  # without a built page
     assert known - set(page.held) <= {
         f.relative_to(published.folder).as_posix()
         for f in published.folder.rglob("*")
@@ -658,3 +658,21 @@ def test_a_thumbnail_shows_the_map(survey_file: Path, tmp_path: Path) -> None:
     )  # fmt: skip
     same = np.asarray(Image.open(io.BytesIO(shade)))[..., 0] == finest[..., 0]
     assert same[finest[..., 1] > 0].mean() > 0.8  # the others lie under lines
+
+
+def test_a_survey_without_tiles_is_shown_where_its_layers_are(survey_file: Path) -> None:
+    material = Material(opened(survey_file))
+    material.__dict__["tiles"] = {}
+    entry_of_all: dict[str, Any] = {}
+
+    class Kept:
+        def write_bytes(self, content: bytes) -> None:
+            entry_of_all.update(json.loads(content))
+
+    kept: Any = Kept()
+    entry(material).write(kept, Path)
+    west, south, east, north = entry_of_all["extent_m"]
+    places = [p["bounds_m"] for layer in entry_of_all["layers"] for p in layer["parts"]]
+    assert places and entry_of_all["clouds"] is None and entry_of_all["lon_lat"] is not None
+    for box in places:
+        assert west <= box[0] and south <= box[1] and box[2] <= east and box[3] <= north

@@ -17,6 +17,7 @@ from roadscan.jobs.publish.server import SiteServer
 from roadscan.jobs.publish.web_part import DATA_MARK, single_page, web_folder
 from tests.viewer.street import write_site
 
+AXE = Path(__file__).resolve().parents[2] / "viewer/node_modules/axe-core/axe.min.js"
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser")) if path), None)
 FLAGS = (
     "--headless",
@@ -86,6 +87,15 @@ def go_to(page: Any, place: str) -> None:
     """Go where a link says, and wait until the page has followed it."""
     page.evaluate("place => { location.hash = place }", place)
     page.wait_for_function("() => document.querySelector('.app').dataset.at === location.hash")
+
+
+def serious(page: Any) -> list[tuple[str, str]]:
+    """What axe-core finds that keeps people out."""
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed: make viewer")
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("axe.run().then((answer) => answer.violations)")
+    return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
 
 
 def _own(url: str, origin: str) -> bool:

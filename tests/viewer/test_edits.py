@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from roadscan.jobs.publish.server import SiteServer
-from tests.viewer.conftest import go_to
+from tests.viewer.conftest import go_to, serious
 from tests.viewer.inventory_site import POLES, EditedSite
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
 
@@ -86,6 +86,8 @@ def test_edits_go_into_the_inventory(opened: Opened) -> None:
     assert page.locator('.details dt:text-is("Condition") + dd').inner_text() == "9"
     assert page.locator('.details dt:text-is("Comments") + dd').inner_text() == HOSTILE
     assert page.evaluate("window.hit") is None
+    page.locator(".edit button", has_text="Correct").click()
+    assert serious(page) == []
 
 
 def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:

@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 
 from roadscan.inventory.homes.page_edits import EditDocument
-from tests.viewer.conftest import go_to
+from tests.viewer.conftest import go_to, serious
 from tests.viewer.street import CURB, EAST_M, HOSTILE, NORTH_M, TARGET, height_m, perspective_pixel
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-AXE = REPOSITORY / "viewer/node_modules/axe-core/axe.min.js"
 STILL = '.map-view[data-drawn="true"]'
 _TURNS = itertools.count()
 NUMBERS = re.compile(r"-?\d+(?:\.\d+)?")
@@ -230,23 +228,14 @@ def test_one_file_opens_by_itself(open_page: Any, single: Path) -> None:
         page.locator(".picture-caption", has_text="run_a").wait_for()
 
 
-def _serious(page: Any) -> list[tuple[str, str]]:
-    """What axe-core finds that keeps people out."""
-    if not AXE.is_file():
-        pytest.skip("axe-core is not installed: make viewer")
-    page.evaluate(AXE.read_text())
-    found = page.evaluate("axe.run().then((answer) => answer.violations)")
-    return [(one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in ("serious", "critical")]
-
-
-def test_axe_finds_nothing_serious(watched: Any, address: str) -> None:
+def test_axe_finds_nothingserious(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#row=asset_poles/1&views=map,cloud,strips")
     page.locator(".details h2").wait_for()
     page.locator('[role="tab"]:has-text("Strips")').click()
     page.locator(".strips .panel").first.wait_for()
-    assert _serious(page) == []
+    assert serious(page) == []
     page.locator('[aria-label="Light or dark"]').click()
-    assert _serious(page) == []
+    assert serious(page) == []
 
 
 def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
@@ -258,7 +247,7 @@ def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         page.locator('[aria-label="Layers (L)"]').click()
         assert page.locator(".side.left").is_visible()
-        assert _serious(page) == []
+        assert serious(page) == []
 
 
 def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:

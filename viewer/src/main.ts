@@ -17,6 +17,7 @@ async function start(): Promise<void> {
     if (survey.layout !== LAYOUT) {
       throw new Error(`survey.json has the layout ${survey.layout}, and this page reads layout ${LAYOUT}: publish the survey again with the roadscan that this page is from`)
     }
+    if (!survey.extent_m) throw new Error('nothing of this survey can be shown yet: run it first (roadscan run)')
     const app = new App(new Desk(survey, source))
     fill(root, app.element)
     app.begin()

@@ -16,6 +16,7 @@ from roadscan.jobs.publish.material import Material, Wishes
 from roadscan.jobs.publish.part import site_parts
 from roadscan.jobs.publish.site import ENTRY, first_documents
 from roadscan.jobs.session import Session
+from roadscan.model.errors import RoadscanError
 from roadscan.tables.asset_truth import COMMITS
 from roadscan.tables.store import Store
 
@@ -112,8 +113,12 @@ def open_survey(
 
 
 def _stamp(material: Material) -> list[list[str]]:
-    """What differs where a survey has changed: its records, and the commits of its inventory."""
-    return [material.store.files(_OUTPUTS), truth_of(material.session).truth.store.files(COMMITS)]
+    """What differs where a survey has changed: its records, and commits of its inventory, which may lie elsewhere."""
+    try:
+        commits = truth_of(material.session).truth.store.files(COMMITS)
+    except RoadscanError:
+        commits = []
+    return [material.store.files(_OUTPUTS), commits]
 
 
 def _cache_folder(store: Store) -> Path:

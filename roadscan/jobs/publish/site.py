@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -48,6 +48,9 @@ def entry(material: Material) -> Document:
     }  # fmt: skip
     for part in site_parts():
         told |= part.members(material)
+    if extent_m is None:
+        told["extent_m"] = box = _box_of(told["layers"])
+        told["lon_lat"] = _longitude_latitude(context.map, box)
     return json_document(ENTRY, told)
 
 
@@ -217,6 +220,15 @@ def _origin(material: Material) -> list[float]:
         return [0.0, 0.0, 0.0]
     low = (extent_m[0], extent_m[1], 0.0 if heights is None else heights[0])
     return [float(v // 10 * 10) for v in low]
+
+
+def _box_of(layers: Sequence[Mapping[str, Any]]) -> Box | None:
+    """Box of all layers, for a survey without tiles; None without any."""
+    boxes = [part["bounds_m"] for layer in layers for part in layer["parts"]]
+    if not boxes:
+        return None
+    west, south, east, north = zip(*boxes, strict=True)
+    return min(west), min(south), max(east), max(north)
 
 
 def _heights(material: Material) -> list[float] | None:

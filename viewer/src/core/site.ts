@@ -22,6 +22,7 @@ export interface Survey {
     geoid: string | null
   }
   origin_m: [number, number, number]
+  /** Null where there is nothing to be shown; the page opens no such survey. */
   extent_m: Bounds
   height_extent_m: [number, number] | null
   lon_lat: [number, number] | null

@@ -10,6 +10,7 @@ from typing import Any, Final
 from roadscan.inventory.changes import Change
 from roadscan.jobs.inventory import open_inventory
 from roadscan.jobs.session import Session
+from roadscan.model.counted import counted
 from roadscan.simulate import Scene, simulate
 
 SPRING: Final = "2026-spring"
@@ -112,7 +113,8 @@ def compare_epochs(survey_file: Path, edit: HandEdit) -> list[str]:
     lines = [f"inventory     {shown.home}: {shown.assets} assets of {SPRING} and {AUTUMN}"]
     if changes is not None:
         lines += [f"on the street {line}" for line in _told(changes.changes)]
-        lines.append(f"not in sight  {changes.unseen} asset was not found, but something hid it: it counts as there")
+        unseen = counted(changes.unseen, "asset")
+        lines.append(f"not in sight  {unseen}: the second survey says nothing of it, so it counts as there")
     lines.append(
         f"hand edit     {edit.asset_id}: {edit.attribute} {row.get(edit.attribute):.2f}, "
         f"{'in force' if is_in_force else 'not in force'}; found {edit.found:.2f} before it and "

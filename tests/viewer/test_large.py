@@ -93,7 +93,7 @@ def strings_address(street: Path, tmp_path: Path) -> Iterator[str]:
     site = tmp_path / "site"
     shutil.copytree(street, site, ignore=shutil.ignore_patterns("clouds", "pictures", "strips", "meshes"))
     survey = json.loads((site / "survey.json").read_text())
-    survey |= dict.fromkeys(("clouds", "pictures", "strips", "meshes", "edits"))
+    survey |= dict.fromkeys(("clouds", "pictures", "strips", "meshes", "edits", "raster_grid")) | {"rasters": []}
     names = [f"c{k}" for k in range(ACROSS)]
     rows = [dict(zip(names, texts[at : at + ACROSS], strict=True)) for at in range(0, STRINGS, ACROSS)]
     layer = next(one for one in survey["layers"] if one["name"] == "asset_poles")

@@ -109,6 +109,10 @@ def strings_address(street: Path, tmp_path: Path) -> Iterator[str]:
 def test_ten_thousand_strings_are_shown_as_text(open_page: Any, strings_address: str) -> None:
     with open_page(strings_address) as watched:
         page = watched.open(strings_address)
+        # The map shows its layers where there is no raster, too.
+        page.wait_for_function(
+            "() => performance.getEntriesByType('resource').some((one) => one.name.includes('layers/cracks'))"
+        )
         page.locator('[aria-label="Rows of Poles"]').click()
         page.locator("td").nth(STRINGS - 1).wait_for()
         shown = page.evaluate("() => [...document.querySelectorAll('td')].map((one) => one.textContent)")

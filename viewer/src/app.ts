@@ -177,6 +177,7 @@ export class App {
       this.map.map.once('rendercomplete', () => {
         performance.mark('roadscan-map')
         this.element.dataset['ready'] = 'map'
+        this.map.look() // without rasters, no further picture tells that the map has moved
         // The rest waits until the map is there.
         this.desk.views.value = new Set(first)
         this.parts.startPictures()

@@ -32,7 +32,7 @@ def test_shape_place_and_size_of_a_plate(shape: str) -> None:
     assert found.shape == shape
     np.testing.assert_allclose(found.middle, [0.3, -0.2], atol=0.02)
     assert abs(found.width_m - 0.8) < 0.04
-    assert abs(found.height_m - {"rectangle": 0.6}.get(shape, 0.8)) < 0.04
+    assert abs(found.height_m - {"rectangle": 0.6, "triangle": 0.4 * np.sqrt(3.0)}.get(shape, 0.8)) < 0.04
 
 
 def test_areas_are_cells_that_share_a_side() -> None:

@@ -119,12 +119,13 @@ export class Editing {
     const modify = new Modify({ source: this.#source, style: measuring(this.desk.dark.value) })
     this.map.map.addInteraction(modify)
     this.map.drawing = true
-    const done = h('button', { type: 'button', onclick: () => {
+    const done = h('button', { type: 'button', disabled: true, onclick: () => {
       const geometry = feature.getGeometry()!
       this.#end()
       fill(body)
       this.#add(selected, 'change', {}, { type: geometry.getType(), coordinates: geometry.getCoordinates() })
     } }, 'Keep the new place')
+    modify.on('modifyend', () => { done.disabled = false })
     fill(body, h('p', { class: 'hint' }, 'Drag it on the map to where it belongs.'), done)
     this.#stop = () => {
       this.map.map.removeInteraction(modify)

@@ -111,7 +111,7 @@ export class MapView {
     const still = (drawn: boolean): void => void (this.element.dataset['drawn'] = String(drawn))
     map.on('moveend', () => this.look())
     map.on('precompose', () => still(false))
-    map.on('rendercomplete', () => still(true))
+    map.on('rendercomplete', () => still(!map.getView().getAnimating())) // a picture from before the map set out tells nothing
     map.getView().on('change:resolution', () => this.#drawBar())
     map.on('singleclick', (event) => {
       if (!this.measuring.busy && !this.#drawing) void this.#click(event.pixel, event.coordinate)

@@ -8,6 +8,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.pictures.reader import ColourReader
+
 UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
 
@@ -17,6 +19,14 @@ _BRIGHTER: Final = 1.15
 _BETWEEN: Final = 0.82
 """Blue over the mean of red and green, of paint relative to the surface: white paint is near 1, yellow below 0.65."""
 _SPREAD: Final = 0.10
+
+
+class PaintReader(ColourReader):
+    """A reader of the colour of paint; where its places lie, each kind says."""
+
+    def read(self, own: UInt8, beside: UInt8) -> Mapping[str, Any]:
+        """Columns colour and colour_probability."""
+        return paint_colour(own, beside)
 
 
 def paint_colour(own: UInt8, beside: UInt8) -> Mapping[str, Any]:

@@ -209,13 +209,16 @@ class _Search:
 
     def _write_pieces(self, kind: AssetKind, found: Evidence, key: str) -> OutputRecord:
         unit = evidence_unit(kind.name, self._work.square)
-        pieces = conformed(found.pieces, kind)
-        if not pieces.num_rows:
-            return OutputRecord(EVIDENCE, unit, key, "", 0, "", _told(0))
-        path = self._folder / "pieces.parquet"
-        pq.write_table(pieces, path, compression="zstd", write_page_checksum=True, version="2.6")
-        target = f"tables/{EVIDENCE}/{unit}.parquet"
-        return publish_file(self._task.store, path, target, EVIDENCE, unit, key, _told(pieces.num_rows))
+        return self._write_rows(EVIDENCE, unit, key, conformed(found.pieces, kind))
+
+    def _write_rows(self, product: str, unit: str, key: str, rows: pa.Table) -> OutputRecord:
+        """Keep rows as the table of that name; without any there is no file."""
+        if not rows.num_rows:
+            return OutputRecord(product, unit, key, "", 0, "", _told(0))
+        path = self._folder / f"{product}.parquet"
+        pq.write_table(rows, path, compression="zstd", write_page_checksum=True, version="2.6")
+        target = f"tables/{product}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, product, unit, key, _told(rows.num_rows))
 
     def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
         grid, square = self._task.load.grid, self._work.square
@@ -230,13 +233,7 @@ class _Search:
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
 
     def _write_screens(self, scene: Scene, key: str) -> OutputRecord:
-        square, screens = str(self._work.square), screens_of(scene)
-        if not screens.num_rows:
-            return OutputRecord(SCREENS, square, key, "", 0, "", _told(0))
-        path = self._folder / "screens.parquet"
-        pq.write_table(screens, path, compression="zstd", write_page_checksum=True, version="2.6")
-        target = f"tables/{SCREENS}/{square}.parquet"
-        return publish_file(self._task.store, path, target, SCREENS, square, key, _told(screens.num_rows))
+        return self._write_rows(SCREENS, str(self._work.square), key, screens_of(scene))
 
     def _write_visibility(self, scene: Scene, key: str) -> OutputRecord:
         unit, schema = str(self._work.square), table_schema(VISIBILITY)

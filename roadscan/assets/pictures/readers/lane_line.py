@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from roadscan.assets.kind import AssetObject
-from roadscan.assets.pictures.paint_colours import paint_colour
-from roadscan.assets.pictures.reader import ColourPlaces, ColourReader
+from roadscan.assets.pictures.paint_colours import PaintReader
+from roadscan.assets.pictures.reader import ColourPlaces
 
 Float64 = npt.NDArray[np.float64]
 
@@ -21,7 +20,7 @@ _BESIDE_M: Final = 0.35
 """From the edge of the paint to the places on the surface."""
 
 
-class LaneLineReader(ColourReader):
+class LaneLineReader(PaintReader):
     """Lane lines: places along the line, and beside it on both sides."""
 
     name = "lane_line"
@@ -41,10 +40,6 @@ class LaneLineReader(ColourReader):
             apart = np.column_stack([across * width, np.zeros(count)])  # the line is midway between two
             return ColourPlaces(np.vstack([own + apart, own - apart]), np.vstack([own + 2 * aside, own - 2 * aside]))
         return ColourPlaces(own, np.vstack([own + aside, own - aside]))
-
-    def read(self, own: npt.NDArray[np.uint8], beside: npt.NDArray[np.uint8]) -> Mapping[str, Any]:
-        """Columns colour and colour_probability."""
-        return paint_colour(own, beside)
 
 
 def _along(line: shapely.LineString, at_m: Float64) -> Float64:

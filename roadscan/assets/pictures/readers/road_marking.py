@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from roadscan.assets.kind import AssetObject
-from roadscan.assets.pictures.paint_colours import paint_colour
-from roadscan.assets.pictures.reader import ColourPlaces, ColourReader
+from roadscan.assets.pictures.paint_colours import PaintReader
+from roadscan.assets.pictures.reader import ColourPlaces
 
 Float64 = npt.NDArray[np.float64]
 
@@ -20,7 +19,7 @@ _BESIDE_M: Final = 0.3
 _MOST_PLACES: Final = 200
 
 
-class RoadMarkingReader(ColourReader):
+class RoadMarkingReader(PaintReader):
     """Road markings: places within the outline, and around it."""
 
     name = "road_marking"
@@ -41,10 +40,6 @@ class RoadMarkingReader(ColourReader):
             shapely.line_interpolate_point(ring, np.arange(count) / count, normalized=True)
         )
         return ColourPlaces(_with_heights(own, one), _with_heights(around, one))
-
-    def read(self, own: npt.NDArray[np.uint8], beside: npt.NDArray[np.uint8]) -> Mapping[str, Any]:
-        """Columns colour and colour_probability."""
-        return paint_colour(own, beside)
 
 
 def _with_heights(places_m: Float64, one: AssetObject) -> Float64:

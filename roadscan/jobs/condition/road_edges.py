@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +24,8 @@ from roadscan.condition.road_edges.on_road import (
     road_surfaces,
 )
 from roadscan.condition.road_edges.raster import tile_points
-from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.tasks import PieceTask
 from roadscan.jobs.condition.tiles_beside import tiles_beside
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
@@ -35,13 +35,12 @@ from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.ids import TileId
 from roadscan.model.settings.road_edges import RoadEdgesConfig
 from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import write_geo_table
 from roadscan.sensors.vectors.polygons import check_polygons, read_polygons
 from roadscan.sensors.vectors.road_lines import sidecars
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store, bytes_digest, file_digest
+from roadscan.tables.store import bytes_digest, file_digest
 from roadscan.tables.writer import parquet_bytes
 from roadscan.tiles.grid import TileGrid
 
@@ -56,10 +55,7 @@ EDGE_PIECE_M: Final = 100
 class EdgePiece:
     """A piece of a road; it holds no heights."""
 
-    line: RoadLine
-    lanes: tuple[Lane, ...]
-    from_m: float
-    to_m: float
+    stretch: RoadStretch
     cells: tuple[OutputRecord, ...]
     """Records of the tiles beside it that hold cells."""
     polygons: bytes
@@ -69,7 +65,7 @@ class EdgePiece:
     @property
     def unit(self) -> str:
         """Its name in the manifest."""
-        return edge_unit(self.line.road, int(self.from_m) // EDGE_PIECE_M)
+        return edge_unit(self.stretch.line.road, int(self.stretch.from_m) // EDGE_PIECE_M)
 
 
 def edge_unit(road: str, number: int) -> str:
@@ -77,24 +73,7 @@ def edge_unit(road: str, number: int) -> str:
     return f"{road}/{number:06d}"
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeTask:
-    """Pieces whose edges are sought. Sent to workers: it holds no data."""
-
-    store: Store
-    grid: TileGrid
-    context: ProductContext
-    settings: RoadEdgesConfig
-    pieces: tuple[EdgePiece, ...]
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Names of the pieces."""
-        return tuple(p.unit for p in self.pieces)
-
-    def singly(self) -> list[EdgeTask]:
-        """A task for each piece."""
-        return [replace(self, pieces=(one,)) for one in self.pieces]
+EdgeTask: TypeAlias = PieceTask[EdgePiece, RoadEdgesConfig]
 
 
 def check_edge_polygons(survey: Survey) -> None:
@@ -164,7 +143,7 @@ def plan_edges(
             shape = [part.road, part.first_m, part.nodes_m.tolist(), from_m, to_m, bytes_digest(polygons)]
             shape += [[v.sign, v.width_m, v.first_m, v.offset_m.tolist()] for v in lanes]
             key = key_of(common, shape, [(r.unit, r.digest) for r in own])
-            found.append(EdgePiece(part, lanes, from_m, to_m, own, polygons, key))
+            found.append(EdgePiece(RoadStretch(part, lanes, from_m, to_m), own, polygons, key))
     return found
 
 
@@ -194,23 +173,22 @@ def _edges(task: EdgeTask, piece: EdgePiece) -> RoadEdges:
         bounds = task.grid.bounds(TileId.parse(record.unit))
         cells = read_cells(task.store, record, task.grid.cells_per_edge)
         points.append(tile_points(cells, (bounds.easting_min_m, bounds.northing_min_m), task.grid.cell_m))
-    stretch = RoadStretch(piece.line, piece.lanes, piece.from_m, piece.to_m)
     polygons = shapely.from_wkb(piece.polygons) if piece.polygons else None
-    return road_edges(points, stretch, task.settings.reach_m, task.settings.largest_sigma_m, polygons)
+    return road_edges(points, piece.stretch, task.settings.reach_m, task.settings.largest_sigma_m, polygons)
 
 
 def _write_edges(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> OutputRecord:
     schema = table_schema(EDGES)
     tables = []
     for side, edge in found.sides.items():
-        rows = np.flatnonzero(np.isfinite(edge.offset_m) & (found.station_m < piece.to_m - 1e-6))
-        place = piece.line.places(found.station_m[rows], edge.offset_m[rows])
+        rows = np.flatnonzero(np.isfinite(edge.offset_m) & (found.station_m < piece.stretch.to_m - 1e-6))
+        place = piece.stretch.line.places(found.station_m[rows], edge.offset_m[rows])
 
         def known(values: npt.NDArray[np.float64], rows: npt.NDArray[np.int64] = rows) -> pa.Array:
             return pa.array(values[rows], pa.float64(), from_pandas=True)
 
         columns = {
-            "road": pa.array([piece.line.road] * rows.size, pa.string()),
+            "road": pa.array([piece.stretch.line.road] * rows.size, pa.string()),
             "side": pa.array([side] * rows.size, pa.string()),
             "station_m": known(found.station_m),
             "offset_m": known(edge.offset_m),
@@ -232,7 +210,7 @@ def _write_edges(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> OutputRe
 def _write_surface(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> OutputRecord:
     """GeoParquet of the road's surface; no file where nowhere both edges are known."""
     schema = table_schema(SURFACES)
-    parts = list(road_surfaces(found, piece.line))
+    parts = list(road_surfaces(found, piece.stretch.line))
     if not parts:
         return OutputRecord(SURFACES, piece.unit, piece.key, "", 0, "")
     table = pa.Table.from_pylist([_row(piece, one) for one in parts], schema.arrow())
@@ -249,7 +227,7 @@ def _write_surface(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> Output
 def _row(piece: EdgePiece, one: RoadSurface) -> dict[str, Any]:
     known = math.isfinite(one.sigma_width_m)
     return {
-        "road": piece.line.road,
+        "road": piece.stretch.line.road,
         "station_from_m": one.from_m,
         "station_to_m": one.to_m,
         "width_mean_m": one.width_m,

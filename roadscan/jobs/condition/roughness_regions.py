@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +16,7 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.on_road import Stretch, points_of, section_regions, station_and_offset
 from roadscan.condition.roughness_regions.regions import Region, SectionRegions
 from roadscan.jobs.condition.lines import Roads
+from roadscan.jobs.condition.tasks import PieceTask
 from roadscan.jobs.condition.tiles_beside import tiles_beside
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
@@ -23,12 +24,11 @@ from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.ids import TileId
 from roadscan.model.settings.roughness_regions import RoughnessRegionsConfig
-from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import write_geo_table
 from roadscan.products.pictures.roughness_regions import DrawnSection, draw_regions
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store, bytes_digest, file_digest
+from roadscan.tables.store import bytes_digest, file_digest
 from roadscan.tables.writer import parquet_bytes
 from roadscan.tiles.grid import TileGrid
 
@@ -58,24 +58,7 @@ class Piece:
         return f"{self.line.road}/{self.number:06d}"
 
 
-@dataclass(frozen=True, eq=False)
-class PieceTask:
-    """A piece to be looked through. Sent to workers."""
-
-    store: Store
-    grid: TileGrid
-    context: ProductContext
-    settings: RoughnessRegionsConfig
-    pieces: tuple[Piece, ...]
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Names of the pieces."""
-        return tuple(p.unit for p in self.pieces)
-
-    def singly(self) -> list[PieceTask]:
-        """A task for each piece."""
-        return [replace(self, pieces=(one,)) for one in self.pieces]
+RegionTask: TypeAlias = PieceTask[Piece, RoughnessRegionsConfig]
 
 
 def plan_pieces(
@@ -113,7 +96,7 @@ def due_pieces(pieces: Sequence[Piece], manifest: Manifest) -> list[Piece]:
     return [p for p in pieces if not all(manifest.is_current(n, p.unit, p.key) for n in _OUTPUTS)]
 
 
-def regions_of_pieces(task: PieceTask) -> TaskResult:
+def regions_of_pieces(task: RegionTask) -> TaskResult:
     """Write regions, sections and picture of the pieces of a task (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
@@ -128,7 +111,7 @@ def regions_of_pieces(task: PieceTask) -> TaskResult:
     return TaskResult.of(records, failures, damaged)
 
 
-def _sections(task: PieceTask, piece: Piece) -> Iterator[SectionRegions]:
+def _sections(task: RegionTask, piece: Piece) -> Iterator[SectionRegions]:
     points = []
     for record in sorted(piece.cells, key=lambda r: r.unit):
         bounds = task.grid.bounds(TileId.parse(record.unit))
@@ -139,7 +122,7 @@ def _sections(task: PieceTask, piece: Piece) -> Iterator[SectionRegions]:
         yield section_regions(points, Stretch(piece.line, piece.lanes, from_m, to_m), task.settings)
 
 
-def _write_sections(task: PieceTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
+def _write_sections(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
     schema, settings = table_schema(REGION_SECTIONS), task.settings
     rows = []
     for (from_m, to_m), one in zip(piece.sections_m, found, strict=True):
@@ -169,7 +152,7 @@ def _write_sections(task: PieceTask, piece: Piece, found: Sequence[SectionRegion
     return OutputRecord(REGION_SECTIONS, piece.unit, piece.key, target, len(content), bytes_digest(content))
 
 
-def _write_regions(task: PieceTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
+def _write_regions(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
     """GeoParquet of the regions; no file without any."""
     schema = table_schema(REGIONS)
     both = [(ends, r) for ends, one in zip(piece.sections_m, found, strict=True) for r in one.regions]
@@ -216,7 +199,7 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _draw(task: PieceTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
+def _draw(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
     """Picture of the sections with regions; no file without any."""
     drawn = [
         DrawnSection(f"{piece.line.road}, station {a:g} to {b:g} m", one.raster.values, one.raster.measured,

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, Self, TypeVar
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, Self, TypeVar
 
 from roadscan.jobs.engine.compute import Compute, reason_of
 from roadscan.jobs.tiles.tiles import TaskResult
+from roadscan.model.strict import Strict
+from roadscan.products.base import ProductContext
 from roadscan.tables.manifest import Manifest
+from roadscan.tables.store import Store
+from roadscan.tiles.grid import TileGrid
 
 
 class Splittable(Protocol):
@@ -22,6 +27,38 @@ class Splittable(Protocol):
 
 
 T = TypeVar("T", bound=Splittable)
+
+
+class RoadPiece(Protocol):
+    """A piece of a road."""
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+
+
+P = TypeVar("P", bound=RoadPiece)
+S = TypeVar("S", bound=Strict)
+
+
+@dataclass(frozen=True, eq=False)
+class PieceTask(Generic[P, S]):
+    """Pieces of roads and the settings with which they are looked through. Sent to workers: it holds no data."""
+
+    store: Store
+    grid: TileGrid
+    context: ProductContext
+    settings: S
+    pieces: tuple[P, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of the pieces."""
+        return tuple(p.unit for p in self.pieces)
+
+    def singly(self) -> list[Self]:
+        """A task for each piece."""
+        return [replace(self, pieces=(one,)) for one in self.pieces]
 
 
 def run_units(

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
-from roadscan.jobs.condition.road_edges import EdgeTask, check_edge_polygons, edges_of_pieces
-from roadscan.jobs.condition.roughness_regions import PieceTask, regions_of_pieces
+from roadscan.jobs.condition.road_edges import check_edge_polygons, edges_of_pieces
+from roadscan.jobs.condition.roughness_regions import regions_of_pieces
 from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.surface_cells import check_surface_cells
-from roadscan.jobs.condition.tasks import run_units
+from roadscan.jobs.condition.tasks import P, PieceTask, S, run_units
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
 
@@ -50,9 +51,9 @@ class Condition(Stage):
         tasks = stretch_tasks(work.due_stretches, session.store, context, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
-        self._seek_edges(session, work)
+        self._look_through(session, edges_of_pieces, config.road_edges, work.due_edges, "edges of roads")
         work = plan_condition(session) if tasks or work.due_edges else work
-        self._look_for_regions(session, work)
+        self._look_through(session, regions_of_pieces, config.roughness_regions, work.due_pieces, "roughness regions")
         values = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in work.due_groups]
         bar = session.bar("values of condition")
         session.failed(self.name, run_units(values_of_group, values, session.manifest, session.compute, bar))
@@ -64,23 +65,20 @@ class Condition(Stage):
         failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
         session.failed(self.name, [(one.unit, reason) for one, reason in failed])
 
-    def _seek_edges(self, session: Session, work: ConditionWork) -> None:
-        config = session.survey.config.condition
-        if config is None or config.road_edges is None:
+    def _look_through(
+        self,
+        session: Session,
+        function: Callable[[PieceTask[P, S]], TaskResult],
+        settings: S | None,
+        due: Sequence[P],
+        title: str,
+    ) -> None:
+        """Pieces of roads, one to a task; none without settings."""
+        if settings is None:
             return
         grid, context = session.plan.ground.grid, product_context(session.plan)
-        tasks = [EdgeTask(session.store, grid, context, config.road_edges, (one,)) for one in work.due_edges]
-        bar = session.bar("edges of roads")
-        session.failed(self.name, run_units(edges_of_pieces, tasks, session.manifest, session.compute, bar))
-
-    def _look_for_regions(self, session: Session, work: ConditionWork) -> None:
-        config = session.survey.config.condition
-        if config is None or config.roughness_regions is None:
-            return
-        grid, context = session.plan.ground.grid, product_context(session.plan)
-        tasks = [PieceTask(session.store, grid, context, config.roughness_regions, (one,)) for one in work.due_pieces]
-        bar = session.bar("roughness regions")
-        session.failed(self.name, run_units(regions_of_pieces, tasks, session.manifest, session.compute, bar))
+        tasks = [PieceTask(session.store, grid, context, settings, (one,)) for one in due]
+        session.failed(self.name, run_units(function, tasks, session.manifest, session.compute, session.bar(title)))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Layers of lines and polygons can be opened as stated; there is a surface where its heights are asked for."""

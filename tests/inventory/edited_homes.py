@@ -34,9 +34,10 @@ class Memory(Home):
         return self.marks[-1] if self.marks else None
 
     def read(self) -> Content:
-        return Content({k: self._table(k) for k in KINDS})
+        return Content({k: self.shown(k) for k in KINDS})
 
-    def _table(self, kind: str) -> pa.Table:
+    def shown(self, kind: str) -> pa.Table:
+        """Rows of a kind."""
         schema = pa.schema([pa.field("fid", pa.int64()), *asset_table(kind)])
         return pa.Table.from_pylist(self.rows.get(kind, []), schema)
 
@@ -63,6 +64,10 @@ class Memory(Home):
 
 class InFile(GeoPackage):
     """A GeoPackage that a person edits through OGR."""
+
+    def shown(self, kind: str) -> pa.Table:
+        """Rows of a kind."""
+        return self._read_layer(kind, asset_schema(kind).table)
 
     def edit(self, kind: str, at: int, **values: Any) -> None:
         values = {n: shapely.from_wkb(v) if n == "geometry" else v for n, v in values.items()}
@@ -91,6 +96,11 @@ class InFile(GeoPackage):
 class InDatabase(PostGis):
     """Tables that a person edits by SQL."""
 
+    def shown(self, kind: str) -> pa.Table:
+        """Rows of a kind."""
+        with self._transaction() as cursor:
+            return self._read_table(cursor, kind)
+
     def _do(self, statement: str, values: list[Any]) -> None:
         import psycopg
 
@@ -103,7 +113,7 @@ class InDatabase(PostGis):
         return "%s", value
 
     def _row(self, kind: str, at: int) -> int:
-        return int(self.read().rows[kind]["fid"][at].as_py())
+        return int(self.shown(kind)["fid"][at].as_py())
 
     def edit(self, kind: str, at: int, **values: Any) -> None:
         given = {("geom" if n == "geometry" else n): self._value(n, v) for n, v in values.items()}

@@ -21,10 +21,12 @@ from affine import Affine
 from PIL import Image
 
 from roadscan.inventory.home import CHOICES, FaultyEditsError, HomeError
+from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import asset_columns, editable_columns
+from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, CRS, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
 PYTHON = "/usr/bin/python3"
@@ -90,7 +92,7 @@ def opened(street: Inventory, do: str, **task: Any) -> Iterator[dict[str, Any]]:
         complaints.open("w") as stream,
         subprocess.Popen(
             [PYTHON, str(PROGRAM)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True,
-            env={"PATH": os.defpath, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)},
+            env={"PATH": os.defpath, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PGUSER": "admin"},
         ) as program,
     ):  # fmt: skip
         assert program.stdin is not None and program.stdout is not None
@@ -193,7 +195,7 @@ def test_what_the_form_refuses_a_pull_names(street: Inventory) -> None:
     with pytest.raises(FaultyEditsError) as error:
         street.pull()
     assert sorted(f.reason.partition(":")[0] for f in error.value.faults) == [
-        "condition is 11, above 10", "its height is 0, and assets around it stand at 102.5", "lean_deg is 91, above 90",
+        "condition is 11, above 10", "its height is 0, and assets around it stand at 102.0", "lean_deg is 91, above 90",
         "status is 'gone', expected one of found, missing, confirmed, rejected",
     ]  # fmt: skip
 
@@ -221,3 +223,31 @@ def test_the_map_shows_each_kind_over_the_hillshade(street: Inventory, tmp_path:
     assert (picture == [int(gone[at : at + 2], 16) for at in (1, 3, 5)]).all(axis=1).sum() > 20
     assert (np.ptp(picture, axis=1) == 0).sum() > 100_000  # the hillshade's greys
     assert len(np.unique(picture[np.ptp(picture, axis=1) == 0], axis=0)) > 50
+
+
+def test_the_project_on_postgis_opens_and_is_edited(tmp_path: Path) -> None:
+    pytest.importorskip("psycopg")
+    with server() as address:
+        made = inventory(tmp_path, Everywhere())
+        made.home = PostGis(address, "street", 32632, project=tmp_path / "inventory-postgis.qgs")
+        made.record(found(things(6)))
+        made.publish()
+        layers = qgis(made, "look")["layers"]
+        assert layers.keys() == {*KINDS, "Conflicts", "Changes"}
+        assert all(layer["valid"] and layer["crs"] == CRS for layer in layers.values())
+        assert layers["Pole"]["features"] == 6 and layers["Pole"]["fields"]["condition"]["range"] == [1, 10]
+        first, second, third, *_ = ids(made)
+        moved = shapely.Point(EAST + 20.4, NORTH + 4.0, 101.5)
+        steps = [
+            {"do": "change", "layer": "Pole", "asset": first, "values": {"condition": 4}},
+            {"do": "change", "layer": "Pole", "asset": second, "wkt": moved.wkt},
+            {"do": "delete", "layer": "Pole", "asset": third},
+            {"do": "draw", "layer": "Pole", "wkt": f"POINT Z({EAST + 3} {NORTH - 6} 100.25)"},
+        ]
+        assert qgis(made, "edit", steps=steps)["broken"] == [[]] * len(steps)
+        done = made.pull()
+        new = next(e.asset_id for e in done.edits if e.action == "create")
+        assert {(e.asset_id, e.attribute, e.who) for e in done.edits} == {
+            (first, "condition", "admin"), (second, "geometry", "admin"), (third, "status", "admin"),
+            (new, "geometry", "admin"), (new, "status", "admin"),
+        }  # fmt: skip

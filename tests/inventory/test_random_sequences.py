@@ -38,6 +38,8 @@ from tests.inventory.postgres import server
 from tests.inventory.streets import CRS, EAST, NORTH, SPRING, asset, found
 
 COUNT = 8
+TELLS = 20
+"""Sequences between two lines of output."""
 
 
 DEATHS = st.runner().flatmap(lambda street: street.deaths)
@@ -87,6 +89,16 @@ class Street(RuleBasedStateMachine):
             in_force=len(state.edits.in_force), waiting=sum(map(len, state.edits.waiting.values())),
         )  # fmt: skip
         shutil.rmtree(self.folder, ignore_errors=True)
+        if self.tally["sequences"] % TELLS == 0:
+            self.tell()
+
+    @classmethod
+    def tell(cls) -> None:
+        """Print what has happened so far; the nightly tests take long."""
+        tally = cls.tally
+        stable = tally["stable"] / max(tally["asked"], 1)
+        sys.stdout.write(f"{cls.__name__}: {dict(tally)}, ids stable {stable:.4%}\n")
+        sys.stdout.flush()
 
     # --- what a program does
 
@@ -226,7 +238,7 @@ class Street(RuleBasedStateMachine):
     # --- what has to hold
 
     def home_rows(self, kind: str) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = self.home.read().rows[kind].to_pylist()
+        rows: list[dict[str, Any]] = self.home.shown(kind).to_pylist()
         return rows
 
     def values_of_home(self) -> dict[tuple[str, str], Any]:
@@ -312,7 +324,7 @@ def run(machine: type[Street], sequences: int, steps: int) -> Counter[str]:
     )  # fmt: skip
     run_state_machine_as_test(machine, settings=chosen)
     tally = machine.tally
-    sys.stdout.write(f"{machine.__name__}: {dict(tally)}, ids stable {tally['stable'] / max(tally['asked'], 1):.4%}\n")
+    machine.tell()
     assert tally["stable"] >= 0.995 * tally["asked"]
     return tally
 

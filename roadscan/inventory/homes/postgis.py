@@ -9,6 +9,7 @@ import contextlib
 import datetime as dt
 import io
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +38,7 @@ class PostGis(Home):
     address : as libpq takes it; its password is told to nobody else.
     srid : EPSG number of the map; 0 for a local one.
     kinds : of assets that have a table each; all where they are left out.
+    project : project file of QGIS that the first publication writes.
 
     Raises
     ------
@@ -45,8 +47,9 @@ class PostGis(Home):
     """
 
     def __init__(
-        self, address: str, schema: str = "inventory", srid: int | None = None, kinds: Sequence[str] | None = None
-    ) -> None:
+        self, address: str, schema: str = "inventory", srid: int | None = None, kinds: Sequence[str] | None = None,
+        project: Path | None = None,
+    ) -> None:  # fmt: skip
         try:
             import psycopg
         except ImportError as error:
@@ -63,6 +66,7 @@ class PostGis(Home):
         self.schema = schema
         self.srid = srid or 0
         self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
+        self._project = project
         self._seen: int | None = None
         """Last entry of the history when the rows were read."""
 
@@ -72,6 +76,11 @@ class PostGis(Home):
         host, port = self._parts.get("host") or "local", self._parts.get("port")
         place = f"{host}:{port}" if port else host
         return f"postgis {place}/{self._parts.get('dbname') or ''} {self.schema}"
+
+    @property
+    def project_file(self) -> Path | None:
+        """The one that was named."""
+        return self._project
 
     def layer_address(self, table: str) -> tuple[str, str]:
         """The table, without user and password: QGIS asks for them, or takes them from its own store."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 
 from roadscan.inventory.comparing import Change, Changes
@@ -19,6 +20,8 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_c
 _FORMULA: Final = re.compile(r"^[=@\t\r]|^[+-](?![\s\d.,])")
 """Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none."""
 _SAME_PLACE_M: Final = 0.05
+_AROUND_M: Final = 100.0
+_LEAST_HEIGHT_M: Final = 2.0
 _TYPES: Final = {"PointZ": "Point", "LineStringZ": "LineString", "PolygonZ": "Polygon"}
 
 
@@ -37,6 +40,7 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
         if reason is not None:
             found.append(EditFault(asset_schema(change.kind).table, change.record, reason))
     found += _doubles(changes, state, unit_m)
+    found += _at_zero(changes, state, unit_m)
     found += _circles(changes, state)
     found += _spans(changes, state)
     return found
@@ -119,6 +123,32 @@ def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
         if near.size:
             other = str(assets.ids[near[0]])
             yield EditFault(asset_schema(change.kind).table, change.record, f"it stands where {other} is: one of them")
+
+
+def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
+    """New and moved shapes at height 0, which programs give where none is set, among assets that stand elsewhere."""
+    for change in (*changes.drawn, *changes.changed):
+        if change.attribute != GEOMETRY or _geometry_fault(change.kind, change.new) is not None:
+            continue
+        points = shapely.get_coordinates(shapely.from_wkb(change.new), include_z=True)
+        if points[:, 2].any():
+            continue
+        around = _heights_around(state, points[0, :2], _AROUND_M / unit_m)
+        if around.size and abs(float(np.median(around))) > _LEAST_HEIGHT_M:
+            reason = f"its height is 0, and assets around it stand at {np.median(around):.1f}: give each point its Z"
+            yield EditFault(asset_schema(change.kind).table, change.record, reason)
+
+
+def _heights_around(state: State, place: npt.NDArray[np.float64], reach: float) -> npt.NDArray[np.float64]:
+    """Heights (n,) of the assets within a distance of a place, in the map's own unit."""
+    found = [np.empty(0)]
+    for assets in state.assets.values():
+        x, y, z = (
+            np.asarray(assets.rows[name].to_numpy(zero_copy_only=False), dtype=float)
+            for name in ("easting_m", "northing_m", "height_m")
+        )
+        found.append(z[(np.hypot(x - place[0], y - place[1]) <= reach) & np.isfinite(z)])
+    return np.concatenate(found)
 
 
 def _circles(changes: Changes, state: State) -> Iterator[EditFault]:

@@ -17,6 +17,12 @@ from roadscan.inventory.values import decoded, encoded, sigmas_apart
 from roadscan.tables.asset_schema import asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY
 
+CONFLICT_COLUMNS: Final = (
+    "asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit", "pictures",
+)  # fmt: skip
+"""Columns of the layer of conflicts that tell people what to decide."""
+DECISION: Final = "decision"
+"""Its column that they fill in."""
 SIGNIFICANT: Final = 3.0
 """σ from which on values differ."""
 
@@ -120,10 +126,9 @@ def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
             place = shapely.to_wkb(shapely.Point(points[0]), flavor="iso")
         values = {name: value_shown(one, name) for name in ("in_force", "other", "base")}
         layer = asset_schema(one.kind).table
-        named = {"layer": layer, "pictures": pictures_of(row), "decision": None, GEOMETRY: place}
+        named = {"layer": layer, "pictures": pictures_of(row), DECISION: None, GEOMETRY: place}
         rows.append(one._asdict() | values | named)
-    names = ["asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit"]
-    names += ["pictures", "decision", GEOMETRY]
+    names = [*CONFLICT_COLUMNS, DECISION, GEOMETRY]
     schema = pa.schema([pa.field(name, _TYPES.get(name, pa.string())) for name in names])
     return pa.Table.from_pylist([{name: row[name] for name in names} for row in rows], schema)
 

@@ -83,7 +83,8 @@ def home_of(session: Session, given: str | None = None) -> Home:
         from roadscan.inventory.homes.postgis import PostGis
 
         srid = None if crs is None else crs_from_text(crs).to_epsg()
-        return PostGis(address, settings.schema_name, srid)
+        home = survey.resolve(settings.home)
+        return PostGis(address, settings.schema_name, srid, project=home.with_name(f"{home.stem}-postgis.qgs"))
     return GeoPackage(Path(given) if given is not None else survey.resolve(settings.home), crs)
 
 

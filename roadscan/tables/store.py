@@ -317,7 +317,7 @@ class Store:
         parent = Path(self.path(_STAGING))
         for left in parent.iterdir() if parent.is_dir() else ():
             maker = left.name.split("-")[0]
-            if not (maker.isdigit() and _alive(int(maker))):
+            if not (maker.isdigit() and process_lives(int(maker))):
                 shutil.rmtree(left, ignore_errors=True)
                 left.unlink(missing_ok=True) if left.is_file() else None
 
@@ -470,7 +470,11 @@ def _check_dead(lock: Path) -> None:
         raise StoreError(
             f"the store's lock cannot be read: {error}", change="remove it if no run is at work", file=lock
         ) from error
-    if len(owner) != 2 or not owner[1].isdigit() or (owner[0] == socket.gethostname() and not _alive(int(owner[1]))):
+    if (
+        len(owner) != 2
+        or not owner[1].isdigit()
+        or (owner[0] == socket.gethostname() and not process_lives(int(owner[1])))
+    ):
         return
     raise StoreError(
         f"process {owner[1]} on {owner[0]} is working on this store",
@@ -479,7 +483,8 @@ def _check_dead(lock: Path) -> None:
     )
 
 
-def _alive(pid: int) -> bool:
+def process_lives(pid: int) -> bool:
+    """True if a process of this machine has that number."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,146 +1,62 @@
-"""Random sequences of edits, reprocessings, new epochs, undone runs and killed programs: no edit is ever lost."""
+"""Random sequences of edits, reprocessings, new epochs, undone runs and killed programs: no edit is ever lost.
+
+In the nightly tests on a GeoPackage and on PostGIS programs die by kill −9; in memory they stop at one of their writes.
+"""
 
 from __future__ import annotations
 
+import copy
 import datetime as dt
 import json
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-import pyarrow as pa
 import pytest
 import shapely
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
-from roadscan.inventory.home import Content, Home, Mark, Sheet
-from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
-from roadscan.inventory.recording import Rules
-from roadscan.inventory.state import State, live_commits, state_at
-from roadscan.model.settings.inventory import Matching
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.asset_truth import AssetTruth
-from roadscan.tables.inventory_schema import asset_table
-from roadscan.tables.store import Store
-from tests.inventory import qgis_edits as person
+from roadscan.inventory.state import State, commit_at, live_commits, state_at
+from tests.inventory.dying import Death, Job, Killed, Programs, Work, inventory_of, programs
+from tests.inventory.edited_homes import KINDS, InDatabase, InFile, Memory
 from tests.inventory.postgres import server
-from tests.inventory.streets import CRS, EAST, NORTH, SPRING, Everywhere, asset, found
+from tests.inventory.streets import CRS, EAST, NORTH, SPRING, asset, found
 
-KINDS = ("pole", "sign")
 COUNT = 8
+TELLS = 20
+"""Sequences between two lines of output."""
 
 
-class Killed(BaseException):
-    """A program ends at once: nothing that it had planned to do is done."""
-
-
-class DyingStore(Store):
-    """A store whose program dies at one of its writes: before it, or when the bytes lie in a scratch file."""
-
-    left: int | None = None
-
-    def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:
-        DyingStore._step()
-        super().write_bytes(relative, content, lasting=lasting)
-        DyingStore._step()
-
-    @classmethod
-    def _step(cls) -> None:
-        if cls.left is not None:
-            cls.left -= 1
-            if cls.left < 0:
-                raise Killed
-
-
-class DyingHome(Home):
-    """A home whose program dies before or after it writes to it."""
-
-    def __init__(self, inner: Home) -> None:
-        self.inner = inner
-
-    @property
-    def name(self) -> str:
-        return self.inner.name
-
-    def mark(self) -> Mark | None:
-        return self.inner.mark()
-
-    def read(self) -> Content:
-        return self.inner.read()
-
-    def write(self, content: Content, sheets: Any, mark: Mark) -> None:
-        DyingStore._step()
-        self.inner.write(content, sheets, mark)
-        DyingStore._step()
-
-    def note(self, mark: Mark) -> None:
-        DyingStore._step()
-        self.inner.note(mark)
-        DyingStore._step()
-
-
-class Memory(Home):
-    """A home without a file, whose rows a test changes as a person would."""
-
-    def __init__(self, name: str = "memory") -> None:
-        self._name = name
-        self.rows: dict[str, list[dict[str, Any]]] = {}
-        self.marks: list[Mark] = []
-        self.next_fid = 1
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    def mark(self) -> Mark | None:
-        return self.marks[-1] if self.marks else None
-
-    def read(self) -> Content:
-        return Content({k: self._table(k) for k in KINDS})
-
-    def _table(self, kind: str) -> pa.Table:
-        schema = pa.schema([pa.field("fid", pa.int64()), *asset_table(kind)])
-        return pa.Table.from_pylist(self.rows.get(kind, []), schema)
-
-    def write(self, content: Content, sheets: list[Sheet], mark: Mark) -> None:
-        self.rows = {k: content.rows[k].to_pylist() if k in content.rows else [] for k in KINDS}
-        self.marks.append(mark)
-
-    def note(self, mark: Mark) -> None:
-        self.marks.append(mark)
-
-    def edit(self, kind: str, at: int, **values: Any) -> None:
-        self.rows[kind][at] |= values
-
-    def delete(self, kind: str, at: int) -> None:
-        del self.rows[kind][at]
-
-    def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
-        fid = 1 + max(
-            (r["fid"] for r in self.rows[kind]), default=0
-        )  # the highest number is given again, as SQLite does
-        row = dict.fromkeys(asset_table(kind).names) | {"fid": fid, "geometry": geometry} | values
-        self.rows[kind].append(row)
+DEATHS = st.runner().flatmap(lambda street: street.deaths)
 
 
 class Street(RuleBasedStateMachine):
     """A street, its inventory, and a person; what the person did is written down beside."""
 
-    new_home: Callable[[Path], Any] = staticmethod(lambda folder: Memory())
+    deaths: Any = st.none() | st.integers(0, 8)
+    """When a program dies: at which of its writes, or after how much processor time (s)."""
+    tally: Counter[str] = Counter()
 
     def __init__(self) -> None:
         super().__init__()
         self.folder = Path(tempfile.mkdtemp())
-        DyingStore.left = None
-        self.home = self.new_home(self.folder)
+        Death.left = None
+        self.home = self.new_home()
         self.number = 0
         self.year = 0
         self.truth_poles = {n: (20.0 * n, 4.0) for n in range(COUNT)}
@@ -149,32 +65,63 @@ class Street(RuleBasedStateMachine):
         """Values that a pull took in, by asset and attribute."""
         self.drawn_at: list[tuple[float, float]] = []
         self.days: list[tuple[int, dict[str, Any]]] = []
-        self.stable = self.asked = self.checked = 0
+        self.checked = 0
+        self.is_edited = False
+
+    def new_home(self) -> Any:
+        return Memory()
 
     def inventory(self) -> Inventory:
-        truth = AssetTruth(DyingStore(str(self.folder / "store"), "street"))
-        return Inventory(truth, DyingHome(self.home), "street", Rules(Everywhere(), Matching()))
+        return inventory_of(self.folder, self.opened())
+
+    def opened(self) -> Any:
+        """The home as another program opens it."""
+        return self.home
 
     def teardown(self) -> None:
-        DyingStore.left = None
-        assert self.asked == 0 or self.stable / self.asked >= 0.995
+        Death.left = None
+        truth = self.inventory().truth
+        for commit, values in self.days:
+            assert values_of(state_at(truth, commit_at(truth, truth.commits[commit - 1].at))) == values
+        state = state_at(truth)
+        self.tally.update(
+            sequences=1, commits=state.commit, days=len(self.days), pulled=len(self.pulled), drawn=len(self.drawn_at),
+            in_force=len(state.edits.in_force), waiting=sum(map(len, state.edits.waiting.values())),
+        )  # fmt: skip
         shutil.rmtree(self.folder, ignore_errors=True)
+        if self.tally["sequences"] % TELLS == 0:
+            self.tell()
+
+    @classmethod
+    def tell(cls) -> None:
+        """Print what has happened so far; the nightly tests take long."""
+        tally = cls.tally
+        stable = tally["stable"] / max(tally["asked"], 1)
+        sys.stdout.write(f"{cls.__name__}: {dict(tally)}, ids stable {stable:.4%}\n")
+        sys.stdout.flush()
 
     # --- what a program does
 
-    def attempt(self, work: Callable[[Inventory], Any], dies_at: int | None) -> bool:
-        """Do something, die at one of its writes, and do it again as another program would."""
-        DyingStore.left = dies_at
-        try:
-            work(self.inventory())
-            return True
-        except Killed:
-            DyingStore.left = None
+    def attempt(self, work: Work, dies: float | None) -> None:
+        """Do something; where it dies of it, do it again as another program would."""
+        if dies is not None:
+            is_killed = self.dies(work, dies)
+            if not is_killed:
+                return
+            self.tally["killed"] += 1
             state_at(self.inventory().truth)  # whole at any instant
-            work(self.inventory())
+        work.do(self.inventory())
+
+    def dies(self, work: Work, dies: float) -> bool:
+        """Whether a program died of a work that it was given."""
+        Death.left = int(dies)
+        try:
+            work.do(self.inventory())
+        except Killed:
             return True
         finally:
-            DyingStore.left = None
+            Death.left = None
+        return False
 
     def rows(self, noise: float, seen: set[int], height: float) -> list[dict[str, Any]]:
         random = np.random.default_rng(self.number)
@@ -189,52 +136,49 @@ class Street(RuleBasedStateMachine):
 
     @initialize()
     def begin(self) -> None:
-        self.process(seen=set(range(COUNT)), noise=0.02, height=5.0, dies_at=None)
-        self.publish(dies_at=None)
+        self.process(seen=set(range(COUNT)), noise=0.02, height=5.0, dies=None)
+        self.publish(dies=None)
 
     @rule(
         seen=st.sets(st.integers(0, COUNT - 1), min_size=COUNT - 3, max_size=COUNT),
         noise=st.sampled_from([0.0, 0.02, 0.05]), height=st.sampled_from([5.0, 5.02, 6.5]),
-        dies_at=st.none() | st.integers(0, 5),
+        dies=DEATHS,
     )  # fmt: skip
-    def process(self, seen: set[int], noise: float, height: float, dies_at: int | None) -> None:
+    def process(self, seen: set[int], noise: float, height: float, dies: float | None) -> None:
         """The same drives again, with other parameters."""
         self.number += 1
         given = found(self.rows(noise, seen, height), f"year-{self.year}", KINDS)
         before = {n: self.names.get(n) for n in seen}
-        self.attempt(lambda i: i.record(given), dies_at)
+        self.attempt(Work(given), dies)
         state = state_at(self.inventory().truth)
         for n in seen:
             x, y = self.truth_poles[n]
             now = nearest_pole(state, x, y)
             if before[n] is not None:
-                self.asked += 1
-                self.stable += now == before[n]
+                self.tally["asked"] += 1
+                self.tally["stable"] += now == before[n]
             self.names[n] = now
 
     @rule(
         seen=st.sets(st.integers(0, COUNT - 1), min_size=COUNT - 2, max_size=COUNT),
-        dies_at=st.none() | st.integers(0, 5),
+        dies=DEATHS,
     )
-    def new_epoch(self, seen: set[int], dies_at: int | None) -> None:
+    def new_epoch(self, seen: set[int], dies: float | None) -> None:
         """A survey a year later."""
         self.year += 1
-        self.process(seen=seen, noise=0.02, height=5.0, dies_at=dies_at)
+        self.process(seen=seen, noise=0.02, height=5.0, dies=dies)
 
-    @rule(dies_at=st.none() | st.integers(0, 8))
-    def publish(self, dies_at: int | None) -> None:
-        def pull_and_publish(i: Inventory) -> None:
-            i.pull(who="eva") if i.home.mark() else None
-            i.publish()
-
+    @rule(dies=DEATHS)
+    def publish(self, dies: float | None) -> None:
         self.note_edits()
-        self.attempt(pull_and_publish, dies_at)
+        self.attempt(Work(publish=True), dies)
         self.seen_in_home = self.values_of_home()
 
-    @rule(dies_at=st.none() | st.integers(0, 8))
-    def pull(self, dies_at: int | None) -> None:
+    @precondition(lambda self: self.is_edited)
+    @rule(dies=DEATHS)
+    def pull(self, dies: float | None) -> None:
         self.note_edits()
-        self.attempt(lambda i: i.pull(who="eva"), dies_at)
+        self.attempt(Work(), dies)
         self.seen_in_home = self.values_of_home()
 
     @rule(data=st.data())
@@ -244,6 +188,7 @@ class Street(RuleBasedStateMachine):
         if len(runs) > 1:
             inventory.undo(data.draw(st.sampled_from(runs)).number)
 
+    @precondition(lambda self: self.checked not in [number for number, _ in self.days])
     @rule()
     def remember_the_day(self) -> None:
         truth = self.inventory().truth
@@ -256,12 +201,14 @@ class Street(RuleBasedStateMachine):
         rows = self.home_rows(kind)
         if rows:
             self.home.edit(kind, at % len(rows), condition=condition, comments=f"seen {n}")
+            self.is_edited = True
 
     @rule(at=st.integers(0, 50), height=st.sampled_from([3.0, 4.0, 9.0]))
     def edit_height(self, at: int, height: float) -> None:
         rows = self.home_rows("pole")
         if rows:
             self.home.edit("pole", at % len(rows), asset_height_m=height)
+            self.is_edited = True
 
     @rule(at=st.integers(0, 50), dx=st.floats(-0.3, 0.3), dy=st.floats(-0.3, 0.3))
     def move(self, at: int, dx: float, dy: float) -> None:
@@ -270,12 +217,14 @@ class Street(RuleBasedStateMachine):
             place = shapely.from_wkb(rows[at % len(rows)]["geometry"])
             moved = shapely.Point(place.x + dx, place.y + dy, place.z)
             self.home.edit("pole", at % len(rows), geometry=shapely.to_wkb(moved, flavor="iso"))
+            self.is_edited = True
 
     @rule(at=st.integers(0, 50))
     def delete(self, at: int) -> None:
         rows = self.home_rows("sign")
         if len(rows) > 3:
             self.home.delete("sign", at % len(rows))
+            self.is_edited = True
 
     @rule(slot=st.integers(0, 40), n=st.integers(0, 10**6))
     def draw(self, slot: int, n: int) -> None:
@@ -284,11 +233,12 @@ class Street(RuleBasedStateMachine):
             self.drawn_at.append(place)
             point = shapely.Point(EAST + place[0], NORTH + place[1], 100.0)
             self.home.draw("pole", shapely.to_wkb(point, flavor="iso"), comments=f"drawn {n}")
+            self.is_edited = True
 
     # --- what has to hold
 
     def home_rows(self, kind: str) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = self.home.read().rows[kind].to_pylist()
+        rows: list[dict[str, Any]] = self.home.shown(kind).to_pylist()
         return rows
 
     def values_of_home(self) -> dict[tuple[str, str], Any]:
@@ -304,6 +254,7 @@ class Street(RuleBasedStateMachine):
 
     def note_edits(self) -> None:
         """Write down what the person has changed since the home was read or written last."""
+        self.is_edited = False
         if not hasattr(self, "seen_in_home"):
             return
         now = self.values_of_home()
@@ -324,8 +275,6 @@ class Street(RuleBasedStateMachine):
         state = state_at(truth)
         self.no_edit_is_lost(state)
         self.each_asset_is_there_once(state)
-        for commit, values in self.days[-2:]:
-            assert values_of(state_at(truth, commit)) == values
 
     def no_edit_is_lost(self, state: State) -> None:
         waiting = {(key, json.loads(e.new or "null")) for key, es in state.edits.waiting.items() for e in es}
@@ -366,12 +315,18 @@ def values_of(state: State) -> dict[str, Any]:
     return {kind: assets.rows.to_pydict() for kind, assets in state.assets.items()}
 
 
-def run(machine: type[Street], sequences: int, steps: int) -> None:
+def run(machine: type[Street], sequences: int, steps: int) -> Counter[str]:
+    """Run sequences; what happened in them."""
+    machine.tally = Counter()
     chosen = settings(
         max_examples=sequences, stateful_step_count=steps, deadline=None,
         suppress_health_check=list(HealthCheck), phases=(Phase.explicit, Phase.generate),
     )  # fmt: skip
     run_state_machine_as_test(machine, settings=chosen)
+    tally = machine.tally
+    machine.tell()
+    assert tally["stable"] >= 0.995 * tally["asked"]
+    return tally
 
 
 def test_no_sequence_loses_an_edit() -> None:
@@ -384,89 +339,59 @@ def test_no_sequence_of_two_hundred_loses_an_edit() -> None:
     run(Street, sequences=200, steps=30)
 
 
-class InFile(GeoPackage):
-    """A GeoPackage that a person edits through OGR."""
+class StreetOfPrograms(Street):
+    """The same with a real home, on which programs work that are killed."""
 
-    def edit(self, kind: str, at: int, **values: Any) -> None:
-        values = {n: shapely.from_wkb(v) if n == "geometry" else v for n, v in values.items()}
-        table = asset_schema(kind).table
-        frame = person.layer(self.file, table)
-        for name, value in values.items():
-            if name == "geometry":
-                shapes = list(frame.geometry)
-                shapes[at] = value
-                frame = frame.set_geometry(shapes, crs=frame.crs)
-            else:
-                column = frame[name].astype(object)
-                column.iloc[at] = value
-                frame[name] = column if isinstance(value, str) else pd.to_numeric(column)
-        person.replace(self.file, table, frame)
+    deaths = st.none() | st.integers(0, 8) | st.floats(0.0, 0.3)
+    started: Programs
 
-    def delete(self, kind: str, at: int) -> None:
-        table = asset_schema(kind).table
-        frame = person.layer(self.file, table)
-        person.replace(self.file, table, frame.drop(frame.index[at]))
+    def opened(self) -> Any:
+        return copy.copy(self.home)
 
-    def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
-        person.draw(self.file, asset_schema(kind).table, shapely.from_wkb(geometry), **values)
+    def dies(self, work: Work, dies: float) -> bool:
+        at = (dies, None) if isinstance(dies, int) else (None, dies)
+        return self.started.run(Job(self.folder, self.opened(), work, *at))
 
 
-class StreetInFile(Street):
-    """The same with a real file."""
+class StreetInFile(StreetOfPrograms):
+    """The same with a GeoPackage."""
 
-    new_home = staticmethod(lambda folder: InFile(folder / "inventory.gpkg", CRS, KINDS))
+    def new_home(self) -> InFile:
+        return InFile(self.folder / "inventory.gpkg", CRS, KINDS)
+
+    def teardown(self) -> None:
+        assert {f.name for f in self.folder.iterdir()} <= {"store", "inventory.gpkg", "inventory.qgs"}
+        super().teardown()
+
+
+class StreetInDatabase(StreetOfPrograms):
+    """The same with PostGIS."""
+
+    address: str
+
+    def new_home(self) -> InDatabase:
+        return InDatabase(self.address, f"s{self.folder.name.lower().replace('-', '_')}", 32632, KINDS)
+
+    def teardown(self) -> None:
+        self.home.drop()
+        super().teardown()
+
+
+SEQUENCES = int(os.environ.get("ROADSCAN_SEQUENCES", "200"))
 
 
 @pytest.mark.nightly
 @pytest.mark.timeout(7200)
 def test_no_sequence_loses_an_edit_of_a_geopackage() -> None:
-    run(StreetInFile, sequences=int(os.environ.get("ROADSCAN_SEQUENCES", "200")), steps=20)
+    with programs() as StreetInFile.started:
+        tally = run(StreetInFile, SEQUENCES, steps=20)
+    assert tally["killed"] > 0.1 * SEQUENCES
 
 
 @pytest.mark.nightly
 @pytest.mark.timeout(7200)
 def test_no_sequence_loses_an_edit_of_postgis() -> None:
-    psycopg = pytest.importorskip("psycopg")
-    from roadscan.inventory.homes.postgis import PostGis
-
-    class InDatabase(PostGis):
-        """Tables that a person edits by SQL."""
-
-        def _do(self, statement: str, values: list[Any]) -> None:
-            with psycopg.connect(self._address) as connection:
-                connection.execute(statement, values)
-
-        def _value(self, name: str, value: Any) -> tuple[str, Any]:
-            if name == "geometry":
-                return "ST_SetSRID(ST_GeomFromWKB(%s), 32632)", value
-            return "%s", value
-
-        def _row(self, kind: str, at: int) -> int:
-            return int(self.read().rows[kind]["fid"][at].as_py())
-
-        def edit(self, kind: str, at: int, **values: Any) -> None:
-            given = {("geom" if n == "geometry" else n): self._value(n, v) for n, v in values.items()}
-            sets = ", ".join(f"{n} = {form}" for n, (form, _) in given.items())
-            table = f"{self.schema}.{asset_schema(kind).table}"
-            self._do(
-                f"UPDATE {table} SET {sets} WHERE fid = %s", [*(v for _, v in given.values()), self._row(kind, at)]
-            )
-
-        def delete(self, kind: str, at: int) -> None:
-            self._do(f"DELETE FROM {self.schema}.{asset_schema(kind).table} WHERE fid = %s", [self._row(kind, at)])
-
-        def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
-            form, value = self._value("geometry", geometry)
-            table = f"{self.schema}.{asset_schema(kind).table}"
-            self._do(f"INSERT INTO {table} (geom, comments) VALUES ({form}, %s)", [value, values["comments"]])
-
-    with server() as address:
-
-        class StreetInDatabase(Street):
-            """The same with a server."""
-
-            @staticmethod
-            def new_home(folder: Path) -> Any:
-                return InDatabase(address, f"s{folder.name.lower().replace('-', '_')}", 32632)
-
-        run(StreetInDatabase, sequences=int(os.environ.get("ROADSCAN_SEQUENCES", "200")), steps=20)
+    pytest.importorskip("psycopg")
+    with server() as StreetInDatabase.address, programs() as StreetInDatabase.started:
+        tally = run(StreetInDatabase, SEQUENCES, steps=20)
+    assert tally["killed"] > 0.1 * SEQUENCES

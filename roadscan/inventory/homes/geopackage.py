@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import os
+import re
 import sqlite3
 import stat
 import warnings
@@ -24,6 +25,7 @@ from roadscan.inventory.qgis.styles import add_styles
 from roadscan.inventory.values import iso_column
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
+from roadscan.tables.store import process_lives
 
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"
@@ -181,7 +183,14 @@ class GeoPackage(Home):
         except OSError as error:
             raise self._unwritable(error) from error
         finally:
-            for left in self.file.parent.glob(f"{scratch.name}*"):
+            self._clear()
+
+    def _clear(self) -> None:
+        """Remove files of this program, and of those that died while they wrote; one program writes at a time."""
+        scratch = re.compile(rf"\.{re.escape(self.file.stem)}-(\d+)\.gpkg(-.*)?")
+        for left in self.file.parent.glob(".*.gpkg*"):
+            made = scratch.fullmatch(left.name)
+            if made and (int(made[1]) == os.getpid() or not process_lives(int(made[1]))):
                 left.unlink(missing_ok=True)
 
     def _write_layers(self, file: Path, rows: Mapping[str, pa.Table], sheets: Sequence[Sheet], mark: Mark) -> None:
@@ -194,7 +203,7 @@ class GeoPackage(Home):
             self._layer(file, sheet, "Point Z" if GEOMETRY in sheet.rows.column_names else None)
         self._layer(file, Sheet(MARKS, MARKS, _mark_rows(mark)), None, "Not to be edited: what this file was made of.")
         add_value_lists(file, self.kinds)
-        add_styles(file, self.kinds)
+        add_styles(file, self.kinds, dt.datetime.fromisoformat(mark.at))
 
     def _layer(self, file: Path, sheet: Sheet, geometry: str | None, meaning: str = "") -> None:
         import pyogrio

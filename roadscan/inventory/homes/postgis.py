@@ -9,6 +9,7 @@ import contextlib
 import datetime as dt
 import io
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +37,8 @@ class PostGis(Home):
     ----------
     address : as libpq takes it; its password is told to nobody else.
     srid : EPSG number of the map; 0 for a local one.
+    kinds : of assets that have a table each; all where they are left out.
+    project : project file of QGIS that the first publication writes.
 
     Raises
     ------
@@ -43,7 +46,10 @@ class PostGis(Home):
         where the driver is missing, or the address is none.
     """
 
-    def __init__(self, address: str, schema: str = "inventory", srid: int | None = None) -> None:
+    def __init__(
+        self, address: str, schema: str = "inventory", srid: int | None = None, kinds: Sequence[str] | None = None,
+        project: Path | None = None,
+    ) -> None:  # fmt: skip
         try:
             import psycopg
         except ImportError as error:
@@ -59,6 +65,8 @@ class PostGis(Home):
         self._address = address
         self.schema = schema
         self.srid = srid or 0
+        self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
+        self._project = project
         self._seen: int | None = None
         """Last entry of the history when the rows were read."""
 
@@ -68,6 +76,11 @@ class PostGis(Home):
         host, port = self._parts.get("host") or "local", self._parts.get("port")
         place = f"{host}:{port}" if port else host
         return f"postgis {place}/{self._parts.get('dbname') or ''} {self.schema}"
+
+    @property
+    def project_file(self) -> Path | None:
+        """The one that was named."""
+        return self._project
 
     def layer_address(self, table: str) -> tuple[str, str]:
         """The table, without user and password: QGIS asks for them, or takes them from its own store."""
@@ -125,7 +138,7 @@ class PostGis(Home):
     def read(self) -> Content:
         """Rows of all tables at one instant, and who changed them since they were read last."""
         with self._transaction() as cursor:
-            rows = {kind: self._read_table(cursor, kind) for kind in asset_kind_names()}
+            rows = {kind: self._read_table(cursor, kind) for kind in self.kinds}
             cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")
             self._seen = int(cursor.fetchone()[0])
             return Content(rows, self._decisions(cursor), self._authors(cursor))
@@ -206,9 +219,9 @@ class PostGis(Home):
         """Replace all rows in one transaction."""
         with self._transaction("READ COMMITTED") as cursor:
             if self._mark(cursor) is None:
-                for statement in statements(self.schema, self.srid):
+                for statement in statements(self.schema, self.srid, self.kinds):
                     cursor.execute(statement)
-            tables = ", ".join(f"{self.schema}.{asset_schema(kind).table}" for kind in asset_kind_names())
+            tables = ", ".join(f"{self.schema}.{asset_schema(kind).table}" for kind in self.kinds)
             cursor.execute(f"LOCK TABLE {tables} IN ACCESS EXCLUSIVE MODE")
             cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")
             last = int(cursor.fetchone()[0])
@@ -216,8 +229,9 @@ class PostGis(Home):
                 raise HomeError("it was edited in this moment", change="pull, and publish again", file=self.name)
             cursor.execute("SET LOCAL roadscan.publishing = 'yes'")
             cursor.execute(f"TRUNCATE {tables} RESTART IDENTITY")
-            for kind, rows in content.rows.items():
-                self._fill(cursor, kind, rows)
+            for kind in self.kinds:
+                if kind in content.rows:
+                    self._fill(cursor, kind, content.rows[kind])
             for sheet in sheets:
                 self._sheet(cursor, sheet)
             self._note(cursor, mark, last)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
-from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
+from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_schema
 from roadscan.tables.inventory_schema import asset_columns
 
 _TYPES: Final = {
@@ -35,29 +35,29 @@ CREATE TABLE {s}.roadscan_inventory (
 """
 
 
-def statements(schema: str, srid: int) -> Iterator[str]:
+def statements(schema: str, srid: int, kinds: Sequence[str]) -> Iterator[str]:
     """Statements that make all tables in a new schema. Its name and the kinds' are checked: letters, digits, `_`."""
     yield "CREATE EXTENSION IF NOT EXISTS postgis"
     yield f"CREATE SCHEMA {schema}"
     yield _HISTORY.format(s=schema)
-    for kind in asset_kind_names():
+    for kind in kinds:
         yield from _kind(schema, kind, srid)
     for role in ROLES:
         yield (
             f"DO $$ BEGIN IF NOT EXISTS (SELECT FROM pg_roles WHERE rolname = '{schema}_{role}') THEN "
             f"CREATE ROLE {schema}_{role} NOLOGIN; END IF; END $$"
         )
-    yield from grants(schema)
+    yield from grants(schema, kinds)
 
 
-def grants(schema: str) -> Iterator[str]:
+def grants(schema: str, kinds: Sequence[str]) -> Iterator[str]:
     """What readers, editors and administrators may do: look; change assets and decide conflicts; all."""
     names = ", ".join(f"{schema}_{role}" for role in ROLES)
     yield f"GRANT USAGE ON SCHEMA {schema} TO {names}"
     yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {names}"
     yield f"GRANT ALL ON ALL TABLES IN SCHEMA {schema} TO {schema}_admin"
     yield f"GRANT CREATE ON SCHEMA {schema} TO {schema}_admin"
-    for kind in asset_kind_names():
+    for kind in kinds:
         table = asset_schema(kind).table
         for name in (table, f"{table}_current"):
             yield f"GRANT INSERT, UPDATE, DELETE ON {schema}.{name} TO {schema}_editor"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
 
+from roadscan.inventory.conflicts import CONFLICT_COLUMNS, DECISION
+from roadscan.inventory.home import CHOICES
 from roadscan.tables.asset_schema import AssetColumn, asset_schema
 from roadscan.tables.inventory_schema import asset_columns, editable_columns
 
@@ -43,6 +45,17 @@ def form_elements(kind: str) -> list[Element]:
     return [widgets, aliases, constraints, expressions, defaults, editable, *_layout(kind)]
 
 
+def decision_elements() -> list[Element]:
+    """Elements `fieldConfiguration` and `editable` of conflicts: a value list for what is decided, all else locked."""
+    widgets, editable = Element("fieldConfiguration"), Element("editable")
+    for name in (*CONFLICT_COLUMNS, DECISION):
+        field = SubElement(widgets, "field", name=name, configurationFlags="None")
+        is_free = name == DECISION
+        field.append(_value_map(CHOICES, nullable=True) if is_free else _configured("TextEdit", {"IsMultiline": True}))
+        SubElement(editable, "field", name=name, editable=str(int(is_free)))
+    return [widgets, editable]
+
+
 def _rule(column: AssetColumn) -> str:
     """What QGIS holds a value against; empty where any will do."""
     name = f'"{column.name}"'
@@ -65,7 +78,7 @@ def _rule_words(column: AssetColumn) -> str:
 
 def _widget(column: AssetColumn, *, is_editable: bool) -> Element:
     if column.values and is_editable:
-        return _value_map(column)
+        return _value_map(column.values, nullable=column.nullable)
     if column.type == "bool":
         return _configured("CheckBox", {"CheckedState": "", "UncheckedState": "", "AllowNullState": True})
     if column.type == "date":
@@ -78,13 +91,13 @@ def _widget(column: AssetColumn, *, is_editable: bool) -> Element:
     return _configured("TextEdit", {"IsMultiline": column.name in ("comments", "pictures"), "UseHtml": False})
 
 
-def _value_map(column: AssetColumn) -> Element:
+def _value_map(values: Sequence[str], *, nullable: bool) -> Element:
     widget = Element("editWidget", type="ValueMap")
     config = SubElement(widget, "config")
     options = SubElement(config, "Option", type="Map")
     listed = SubElement(options, "Option", type="List", name="map")
     null = "{2839923C-8B7D-419E-B84B-CA2FE9B80EC7}"  # QGIS's own text for NULL
-    for shown, value in [("", null)] * column.nullable + [(value, value) for value in column.values]:
+    for shown, value in [("", null)] * nullable + [(value, value) for value in values]:
         entry = SubElement(listed, "Option", type="Map")
         SubElement(entry, "Option", type="QString", name=shown, value=value)
     return widget

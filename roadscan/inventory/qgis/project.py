@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from roadscan.inventory.qgis.styles import QGIS_VERSION, style_elements
+from roadscan.inventory.qgis.styles import QGIS_VERSION, SHEETS, sheet_elements, style_elements
 from roadscan.model.crs import crs_from_text
 from roadscan.tables.asset_schema import asset_schema
 
@@ -51,8 +51,10 @@ def project_text(
     layers = SubElement(root, "projectlayers")
     order = SubElement(root, "layerorder")
     held: list[tuple[str, str, Source, Element]] = []
-    for name, shown in (("conflicts", "Conflicts"), ("changes", "Changes")):
-        held.append((name, shown, source(name), _vector(name, shown, "PointZ", source(name), crs)))
+    for name in SHEETS:
+        layer = _vector(name, name.capitalize(), "PointZ", source(name), crs)
+        layer.extend(sheet_elements(name))
+        held.append((name, name.capitalize(), source(name), layer))
     for kind in sorted(kinds, key=lambda k: (_ORDER.index(asset_schema(k).geometry), k)):
         schema = asset_schema(kind)
         layer = _vector(schema.table, schema.title, schema.geometry, source(schema.table), crs)
@@ -69,6 +71,9 @@ def project_text(
         SubElement(order, "layer", id=_id(name))
     properties = SubElement(root, "properties")
     SubElement(SubElement(properties, "Paths"), "Absolute", type="bool").text = "false"
+    # without it QGIS reads no CRS of the project
+    used = SubElement(SubElement(properties, "SpatialRefSys"), "ProjectionsEnabled", type="int")
+    used.text = str(int(crs is not None))
     indent(root, space=" ")
     return "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + tostring(root, encoding="unicode") + "\n"
 

@@ -70,7 +70,7 @@ def test_a_click_on_a_target_reads_its_coordinates(watched: Any, address: str) -
 
 
 def test_a_click_on_the_map_reads_place_and_height(watched: Any, address: str) -> None:
-    page = watched.open(address)
+    page = watched.open(f"{address}#views=map")
     page.locator("#search").fill(f"{EAST_M + 10.5} {NORTH_M + 2.5}")
     page.locator("#search").press("Enter")
     box = page.locator(".map-target").bounding_box()

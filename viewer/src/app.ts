@@ -178,6 +178,8 @@ export class App {
     const first: ViewName[] = ['map']
     if (WIDE.matches && survey.clouds) first.push('cloud')
     if (!NARROW.matches && survey.strips) first.push('strips')
+    const asked = this.#viewsOf(new URLSearchParams(location.hash.slice(1)))
+    if (asked.length) first.splice(1, first.length, ...asked.filter((one) => one !== 'map'))
     this.#dock.hidden = !first.includes('strips')
     for (const [name, view] of this.#views) view.hidden = !first.includes(name)
     if (first.includes('cloud')) this.parts.prepareCloud()
@@ -308,8 +310,13 @@ export class App {
     this.element.dataset['at'] = hash
   }
 
+  /** The views that a link asks for. */
+  #viewsOf(asked: URLSearchParams): ViewName[] {
+    return (asked.get('views') ?? '').split(',').filter((one): one is ViewName => this.#available.includes(one as ViewName))
+  }
+
   async #goToHash(asked: URLSearchParams): Promise<void> {
-    const views = (asked.get('views') ?? '').split(',').filter((one): one is ViewName => this.#available.includes(one as ViewName))
+    const views = this.#viewsOf(asked)
     if (views.length) this.desk.views.value = new Set(views)
     const at = (asked.get('at') ?? '').split(',').map(Number)
     const across_m = Number(asked.get('zoom')) || 30

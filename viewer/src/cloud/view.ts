@@ -115,6 +115,7 @@ export class CloudView {
   #listen(): void {
     const { desk } = this
     new ResizeObserver(() => this.#resize()).observe(this.element)
+    this.#canvas.addEventListener('pointerdown', () => this.#settle(), { capture: true })
     this.#canvas.addEventListener('click', (event) => {
       if (!this.#controls.dragging) this.#click(event.offsetX, event.offsetY)
     })
@@ -164,6 +165,14 @@ export class CloudView {
 
   #local([easting, northing, height]: readonly number[]): Vector3 {
     return new Vector3(easting! - this.#origin[0], northing! - this.#origin[1], height! - this.#origin[2])
+  }
+
+  /** Make the picture as large as its room, which may have changed since the last one: a press means what is seen now. */
+  #settle(): void {
+    const { clientWidth: width, clientHeight: height } = this.element
+    if (width === this.#size.width && height === this.#size.height) return
+    this.#resize()
+    this.#draw()
   }
 
   #resize(): void {

@@ -146,6 +146,13 @@ export class MapView {
       const over = !this.measuring.busy && map.hasFeatureAtPixel(event.pixel, { hitTolerance: 3, layerFilter: (layer) => this.layers.some((one) => one.layer === layer) })
       target.style.cursor = this.measuring.busy ? 'crosshair' : over ? 'pointer' : ''
     })
+    // A press means what is seen now, though the map may not have been told yet that it has other room.
+    target.addEventListener('pointerdown', () => {
+      const [width, height] = map.getSize() ?? [0, 0]
+      if (width === target.clientWidth && height === target.clientHeight) return
+      map.updateSize()
+      map.renderSync()
+    }, { capture: true })
     target.addEventListener('pointerleave', () => (desk.pointer.value = null))
     target.addEventListener('keydown', (event) => {
       if (event.key === 'Enter') {

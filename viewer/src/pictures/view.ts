@@ -27,6 +27,8 @@ export class PictureView {
   #picture: Picture | null = null
   #bitmap: ImageBitmap | null = null
   #view = { x: 0, y: 0, zoom: 1 }
+  /** Size of the frame that the view was made for. */
+  #fitted = [0, 0]
   #views: View[] = []
   #place: Place | null = null
   /** Counts what people ask for; an answer to what was asked before changes nothing. */
@@ -256,6 +258,7 @@ export class PictureView {
 
   #fit(): void {
     const [width, height] = [this.#frame.clientWidth, this.#frame.clientHeight]
+    this.#fitted = [width, height]
     const ratio = Math.min(2, window.devicePixelRatio || 1)
     for (const canvas of [this.#flat, this.#ball, this.#marks]) [canvas.width, canvas.height] = [Math.max(1, width * ratio), Math.max(1, height * ratio)]
     if (this.#bitmap) {
@@ -361,6 +364,7 @@ export class PictureView {
     const picture = this.#picture
     if (!picture || !this.#bitmap) return
     const box = this.#frame.getBoundingClientRect()
+    if (this.#frame.clientWidth !== this.#fitted[0] || this.#frame.clientHeight !== this.#fitted[1]) this.#fit() // the observer has not told yet
     const [u, v] = this.#pixelAt(clientX - box.left, clientY - box.top)
     await this.placeOf(picture, u, v, Math.max(CONE, this.#pixelAngle()))
   }
@@ -373,6 +377,7 @@ export class PictureView {
 
   /** The place that a pixel shows: where its ray meets the cloud first. */
   async placeOf(picture: Picture, u: number, v: number, cone: number): Promise<void> {
+    const turn = ++this.#turn
     const store = await this.cloud()
     if (!store) {
       this.desk.say('This site holds no point cloud, so a pixel has no place.')
@@ -381,6 +386,7 @@ export class PictureView {
     this.desk.say('Looking for the point …')
     const ray = { from: [picture.easting_m, picture.northing_m, picture.height_m] as const, direction: rayOf(picture.camera, picture, u, v) }
     const { nodes } = await store.within((one) => rayNear(one, ray, cone * 2, 80), RAY_POINTS)
+    if (turn !== this.#turn) return
     const met = meet(store, nodes, ray, cone, 0.8, 80) ?? meet(store, nodes, ray, cone * 3, 0.8, 80)
     if (!met) {
       this.desk.say('The ray of this pixel meets no point within 80 m.')
@@ -399,7 +405,9 @@ export class PictureView {
       ],
     }
     this.desk.place.value = this.#place
-    this.#views = (await this.pictures.seeing(coordinate)).slice(0, OFFERED)
+    const views = (await this.pictures.seeing(coordinate)).slice(0, OFFERED)
+    if (turn !== this.#turn) return
+    this.#views = views
     this.#drawList()
     this.#draw()
   }

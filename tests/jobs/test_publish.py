@@ -577,9 +577,15 @@ def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) ->
     assert served is not None
     survey = json.loads(served.file.read_bytes())
     (layer,) = (one for one in survey["layers"] if one["name"] == "asset_poles")
+    kinds = survey["edits"].pop("kinds")
     assert survey["edits"] == {
-        "layers": ["asset_poles"], "post": "edits", "inventory": session.survey.config.id, "commit": 1,
+        "layers": ["asset_poles"], "forms": "edits/forms.json", "post": "edits",
+        "inventory": session.survey.config.id, "commit": 1,
     }  # fmt: skip
+    assert {"layer": "asset_trees", "title": "Tree", "geometry": "point"} in kinds
+    forms = site.document("edits/forms.json")
+    assert forms is not None
+    assert {one["layer"] for one in kinds} == set(json.loads(forms.file.read_bytes())["columns"])
     columns = {one["name"]: one.get("edited") for one in layer["columns"]}
     assert columns["condition"] == {"type": "int32", "values": []} and columns["returns"] is None
     assert "rejected" in columns["status"]["values"]

@@ -36,14 +36,17 @@ class EditedSite:
     def document(self, path: str) -> Served | None:
         """A document as it is now."""
         if path == "survey.json":
-            layer = vectors.about(self._layer())
+            own = [vectors.about(layer) for layer in self._layers()]
+            names = [one["name"] for one in own]
             survey = json.loads((self._street / path).read_text())
-            survey["layers"] = [layer, *(one for one in survey["layers"] if one["name"] != "asset_poles")]
+            survey["layers"] = [*own, *(one for one in survey["layers"] if one["name"] not in names)]
             commit = self.inventory.state().commit
-            survey["edits"] = {"layers": ["asset_poles"], "post": "edits", "inventory": "street", "commit": commit}
+            survey["edits"] |= {"layers": names, "post": "edits", "inventory": "street", "commit": commit}
             return self._made(path, survey)
-        if path == "layers/asset_poles/whole.json":
-            return self._made(path, dict(vectors.files_of(self._layer()))[path]())
+        for layer in self._layers() if path.startswith("layers/asset_") else ():
+            files = dict(vectors.files_of(layer))
+            if path in files:
+                return self._made(path, files[path]())
         file = self._street / path
         return Served(file, path) if file.is_file() else None
 
@@ -66,14 +69,13 @@ class EditedSite:
         ids = {row["easting_m"]: row["asset_id"] for row in self.inventory.state().assets["pole"].rows.to_pylist()}
         return str(ids[sorted(ids)[number]])
 
-    def _layer(self) -> SiteLayer:
+    def _layers(self) -> list[SiteLayer]:
         state = self.inventory.state()
         material: Any = SimpleNamespace(
             inventory=("street", state), wishes=Wishes(edits="post"),
             context=SimpleNamespace(map=MapFrame(crs="EPSG:32632")),
         )  # fmt: skip
-        (layer,) = Assets().layers(material)
-        return layer
+        return list(Assets().layers(material))
 
     def _made(self, path: str, value: Any) -> Served:
         content = json_bytes(value)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from roadscan.codecs.copc import CopcWriter
 from roadscan.codecs.mesh import Mesh, write_glb
+from roadscan.jobs.publish.parts import edits
 from roadscan.model.crs import MapFrame
 from roadscan.points.octree import Cube, NodeCutter
 from roadscan.products.cloud_records import layout_of
@@ -79,11 +80,19 @@ def write_site(folder: Path) -> None:
         "catalog": None,
         "report": None,
         "left_out": [],
-        "edits": {"layers": ["asset_poles"], "post": None, "inventory": "street", "commit": 3},
+        "edits": {
+            "layers": ["asset_poles"],
+            "kinds": edits.kinds(),
+            "forms": edits.FORMS,
+            "post": None,
+            "inventory": "street",
+            "commit": 3,
+        },
     }
     _write_mesh(folder)
     _write_strips(folder)
     _write_pictures(folder)
+    _json(folder / edits.FORMS, edits.forms())
     _json(folder / "survey.json", survey)
 
 

@@ -11,6 +11,7 @@ import pytest
 import shapely
 
 from roadscan.jobs.publish.server import SiteServer
+from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from tests.viewer.conftest import go_to, serious
 from tests.viewer.inventory_site import POLES, EditedSite
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
@@ -61,6 +62,28 @@ def send(opened: Opened) -> list[tuple[str, str]]:
     return [(one.get_attribute("data-outcome"), one.inner_text()) for one in told.all()]
 
 
+def middle_of_map(page: Any) -> tuple[float, float]:
+    box = page.locator(".map-target").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def draw(page: Any, title: str, corners: list[tuple[float, float]], **fields: str) -> None:
+    """Draw an asset by clicks, of which a double one ends lines and areas, and fill in its form."""
+    page.locator('.edits [aria-label="Kind of the new asset"]').select_option(label=title)
+    page.locator(".edits button", has_text="Draw a new one").click()
+    held = page.locator(".edit-list li").count()
+    for corner in corners:
+        page.mouse.click(*corner)
+    if len(corners) > 1:
+        page.mouse.click(*corners[-1])
+    form = page.locator(f'.edit-form[aria-label="New: {title}"]')
+    form.wait_for()
+    for name, value in fields.items():
+        form.locator(f'[aria-label="{name}"]').fill(value)
+    form.locator("button.main").click()
+    page.locator(".edit-list li").nth(held).wait_for()
+
+
 def test_edits_go_into_the_inventory(opened: Opened) -> None:
     page, site = opened.page, opened.site
     assert opened.server.token not in page.url  # a link that is passed on allows nobody to edit
@@ -94,11 +117,8 @@ def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
     page, site = opened.page, opened.site
     go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 1.0}&zoom=2&views=map")
     page.wait_for_selector(STILL)
-    page.locator(".edits button", has_text="Add: Pole").click()
-    box = page.locator(".map-target").bounding_box()
-    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.click(*middle)
-    page.locator(".edit-list li", has_text="added").wait_for()
+    middle = middle_of_map(page)
+    draw(page, "Pole", [middle], Diameter="0.12")
     choose(opened, 1)
     page.wait_for_selector(STILL)
     page.locator(".edit button", has_text="Move").click()
@@ -118,6 +138,54 @@ def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
     assert abs(moved.y - NORTH_M - POLES[1][1]) <= 0.05
     assert moved.z == 40.0
     assert len(shapes) == len(POLES) + 1
+    assert 0.12 in state.assets["pole"].rows["diameter_m"].to_pylist()
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [("tree", "wall", "sidewalk"), pytest.param((), marks=pytest.mark.nightly)],
+    ids=["a point, a line, an area", "all"],
+)
+def test_kinds_that_are_not_there_yet_are_drawn_with_their_forms(opened: Opened, wanted: tuple[str, ...]) -> None:
+    page, site = opened.page, opened.site
+    go_to(page, f"at={EAST_M + 15.0},{NORTH_M}&zoom=6&views=map")
+    page.wait_for_selector(STILL)
+    x, y = middle_of_map(page)
+    kinds = {kind: asset_schema(kind) for kind in asset_kind_names()}
+    offered = page.locator('.edits [aria-label="Kind of the new asset"] option').all_inner_texts()
+    assert offered == sorted(one.title for one in kinds.values())
+    corners = {
+        "PointZ": [(x, y)],
+        "LineStringZ": [(x - 80, y), (x + 80, y + 30)],
+        "PolygonZ": [(x - 80, y), (x + 80, y), (x, y + 60)],
+    }
+    drawn = {kind: schema for kind, schema in kinds.items() if kind in wanted or not wanted}
+    for schema in drawn.values():
+        draw(page, schema.title, corners[schema.geometry], Condition="7")
+    assert [outcome for outcome, _ in send(opened)] == ["accepted"] * len(drawn)
+    for kind, schema in drawn.items():
+        rows = site.inventory.state().assets[kind].rows.to_pylist()
+        (row,) = (one for one in rows if one["condition"] == 7)
+        shape = shapely.from_wkb(row["geometry"])
+        assert (shape.geom_type, shape.has_z) == (schema.geometry.removesuffix("Z"), True)
+        assert abs(shape.centroid.x - EAST_M - 15.0) <= 0.5
+        # The list shows kinds that have just come into being.
+        page.locator(".layer-head label", has_text=schema.title).first.wait_for()
+
+
+def test_what_is_drawn_beside_the_surface_asks_for_its_height(opened: Opened) -> None:
+    page, site = opened.page, opened.site
+    go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 30.0}&zoom=6&views=map")
+    page.wait_for_selector(STILL)
+    page.locator('.edits [aria-label="Kind of the new asset"]').select_option(label="Tree")
+    page.locator(".edits button", has_text="Draw a new one").click()
+    page.locator("button", has_text="Put it at the cross").press("Enter")
+    page.locator('.edit-form [aria-label="Height of the ground m"]').fill("41.25")
+    page.locator(".edit-form button.main").press("Enter")
+    assert [outcome for outcome, _ in send(opened)] == ["accepted"]
+    (row,) = site.inventory.state().assets["tree"].rows.to_pylist()
+    shape = shapely.from_wkb(row["geometry"])
+    assert (shape.x, shape.y, shape.z) == pytest.approx((EAST_M + 15.0, NORTH_M + 30.0, 41.25), abs=1e-5)
 
 
 def test_an_address_without_the_token_is_read_only(open_page: Any, opened: Opened) -> None:

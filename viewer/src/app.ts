@@ -31,6 +31,7 @@ export class App {
   readonly #stage = h('main', { class: 'stage', 'aria-label': 'Views' })
   readonly #dock = h('section', { class: 'dock', 'aria-label': 'Strips, sections and rows', hidden: true })
   readonly #left = h('aside', { class: 'side left', 'aria-label': 'Layers' })
+  readonly #layers = h('div')
   readonly #right = h('aside', { class: 'side right', 'aria-label': 'Details' })
   readonly #toast = h('div', { class: 'toast', role: 'status', hidden: true })
   readonly #help = helpDialog()
@@ -56,6 +57,7 @@ export class App {
       edit: this.#editing && ((selected) => this.#editing!.controls(selected)),
     })
     this.#table = new TablePanel(desk, (feature) => this.#lookAt(feature))
+    this.#drawLayers()
     this.#build()
     this.#listen()
   }
@@ -73,10 +75,7 @@ export class App {
     fill(
       this.#left,
       h('div', { class: 'side-head' }, h('h2', {}, 'Layers'), iconButton('close', 'Close the list of layers', () => this.#open(null), { class: 'icon-button sheet-close' })),
-      layersPanel(this.map, (layer) => {
-        this.#table.open(layer).catch((error) => this.desk.complain(error))
-        this.#openDock('table')
-      }),
+      this.#layers,
       this.#about(),
     )
     fill(
@@ -87,6 +86,16 @@ export class App {
       this.#editing?.element ?? null,
     )
     fill(this.element, this.#header(), this.#left, this.#stage, this.#right, this.#dock, this.#footer(), this.#toast, this.#help)
+  }
+
+  #drawLayers(): void {
+    fill(
+      this.#layers,
+      layersPanel(this.map, (layer) => {
+        this.#table.open(layer).catch((error) => this.desk.complain(error))
+        this.#openDock('table')
+      }),
+    )
   }
 
   /** What is left out, and files for other programs. */
@@ -151,6 +160,7 @@ export class App {
       this.#rows.offer(hits)
       if (NARROW.matches && hits.length) this.#open('right')
     }
+    this.map.replaced = () => this.#drawLayers()
     desk.views.on((views) => this.#arrange(views), true)
     desk.message.on((message) => this.#say(message))
     desk.dark.on((dark) => {
@@ -168,6 +178,8 @@ export class App {
     const first: ViewName[] = ['map']
     if (WIDE.matches && survey.clouds) first.push('cloud')
     if (!NARROW.matches && survey.strips) first.push('strips')
+    const asked = this.#viewsOf(new URLSearchParams(location.hash.slice(1)))
+    if (asked.length) first.splice(1, first.length, ...asked.filter((one) => one !== 'map'))
     this.#dock.hidden = !first.includes('strips')
     for (const [name, view] of this.#views) view.hidden = !first.includes(name)
     if (first.includes('cloud')) this.parts.prepareCloud()
@@ -298,8 +310,13 @@ export class App {
     this.element.dataset['at'] = hash
   }
 
+  /** The views that a link asks for. */
+  #viewsOf(asked: URLSearchParams): ViewName[] {
+    return (asked.get('views') ?? '').split(',').filter((one): one is ViewName => this.#available.includes(one as ViewName))
+  }
+
   async #goToHash(asked: URLSearchParams): Promise<void> {
-    const views = (asked.get('views') ?? '').split(',').filter((one): one is ViewName => this.#available.includes(one as ViewName))
+    const views = this.#viewsOf(asked)
     if (views.length) this.desk.views.value = new Set(views)
     const at = (asked.get('at') ?? '').split(',').map(Number)
     const across_m = Number(asked.get('zoom')) || 30

@@ -65,6 +65,8 @@ export class CloudStore {
   readonly #decoders = new Decoders()
   readonly #queue: { node: CloudNode; needed: boolean; start: () => void }[] = []
   #running = 0
+  /** Pages of the hierarchy that are on their way. */
+  #paging = 0
   #kept = 0
 
   constructor(
@@ -90,7 +92,7 @@ export class CloudStore {
   }
 
   get loading(): number {
-    return this.#running + this.#queue.length
+    return this.#running + this.#queue.length + this.#paging
   }
 
   /** Open the sheets of a small cloud, and load the coarsest points of each. */
@@ -166,7 +168,11 @@ export class CloudStore {
     const page = sheet.pages.get(key)
     if (page) {
       sheet.pages.delete(key)
-      sheet.asked.set(key, this.#page(sheet, page).then(this.arrived, this.complain))
+      this.#paging++
+      sheet.asked.set(key, this.#page(sheet, page).catch(this.complain).finally(() => {
+        this.#paging--
+        this.arrived()
+      }))
     }
     return sheet.asked.get(key)
   }

@@ -1,7 +1,7 @@
 /** The point cloud: drawing, picking and the tools that measure in it. */
 
 import { Vector3 } from 'three'
-import type { Desk, Place } from '../core/desk'
+import type { Desk, Place, Target } from '../core/desk'
 import { fill, h, iconButton } from '../core/dom'
 import * as format from '../core/format'
 import { css, ramp, SCALE_NAMES } from '../core/scales'
@@ -51,7 +51,8 @@ export class CloudView {
   readonly #hiddenClasses = new Set<number>()
   readonly #hiddenPasses = new Set<number>()
   #look: Look
-  #size = { width: 1, height: 1 }
+  /** Zero until the page has given it room. */
+  #size = { width: 0, height: 0 }
   #nodes: Map<CloudNode, Float32Array> = new Map()
   #budget = FIRST_BUDGET
   #stale = true
@@ -63,6 +64,8 @@ export class CloudView {
   #coloured = false
   /** True once people have moved the eye. */
   #touched = false
+  /** Where it looks, as long as the height of the ground there is a guess. */
+  #guessed: Target | null = null
   #hover = 0
   #pause = 0
 
@@ -101,6 +104,7 @@ export class CloudView {
     this.#applyCodes()
     this.#drawSettings()
     this.fit()
+    if (desk.target.value) this.#goTo(desk.target.value)
   }
 
   #heights(): [number, number] {
@@ -111,6 +115,7 @@ export class CloudView {
   #listen(): void {
     const { desk } = this
     new ResizeObserver(() => this.#resize()).observe(this.element)
+    this.#canvas.addEventListener('pointerdown', () => this.#settle(), { capture: true })
     this.#canvas.addEventListener('click', (event) => {
       if (!this.#controls.dragging) this.#click(event.offsetX, event.offsetY)
     })
@@ -124,19 +129,22 @@ export class CloudView {
       this.#scene.setEmpty(dark ? [20, 22, 26] : [238, 240, 243])
       this.#redraw()
     }, true)
-    desk.target.on((goal) => {
-      if (!goal) return
-      const height = goal.height_m ?? this.groundAt(goal.easting_m, goal.northing_m)
-      this.#far = Math.max(2, goal.across_m ?? 15)
-      this.eye.lookAt(this.#local([goal.easting_m, goal.northing_m, height]), this.#far)
-      this.#moved()
-    })
+    desk.target.on((goal) => goal && this.#goTo(goal))
     desk.place.on(() => this.#redraw())
     this.tool.on(() => {
       this.#draft = []
       this.#canvas.style.cursor = this.tool.value === 'select' ? '' : 'crosshair'
       this.#redraw()
     })
+  }
+
+  /** Look at a place; without its height, at the ground there, once more when the points are here that tell it. */
+  #goTo(goal: Target): void {
+    const height = goal.height_m ?? this.groundAt(goal.easting_m, goal.northing_m)
+    this.#far = Math.max(2, goal.across_m ?? 15)
+    this.eye.lookAt(this.#local([goal.easting_m, goal.northing_m, height]), this.#far)
+    this.#moved()
+    this.#guessed = goal.height_m === undefined || goal.height_m === null ? goal : null
   }
 
   #key(event: KeyboardEvent): void {
@@ -159,6 +167,14 @@ export class CloudView {
     return new Vector3(easting! - this.#origin[0], northing! - this.#origin[1], height! - this.#origin[2])
   }
 
+  /** Make the picture as large as its room, which may have changed since the last one: a press means what is seen now. */
+  #settle(): void {
+    const { clientWidth: width, clientHeight: height } = this.element
+    if (width === this.#size.width && height === this.#size.height) return
+    this.#resize()
+    this.#draw()
+  }
+
   #resize(): void {
     const { clientWidth: width, clientHeight: height } = this.element
     if (!width || !height) return
@@ -173,6 +189,7 @@ export class CloudView {
 
   #moved(): void {
     this.#touched = true
+    this.#guessed = null
     this.#budget = BUDGET
     if (this.#meshes) void this.#meshes.then((meshes) => this.#lookForMeshes(meshes))
     this.#redraw(true)
@@ -181,7 +198,7 @@ export class CloudView {
   #redraw(choose = false): void {
     this.#stale ||= choose
     if (choose && this.#active) this.element.dataset['loading'] = 'waiting'
-    if (this.#asked || !this.#active) return
+    if (this.#asked || !this.#active || !this.#size.width) return
     this.#asked = true
     requestAnimationFrame(() => {
       this.#asked = false
@@ -246,7 +263,10 @@ export class CloudView {
       this.#coloured = true
       this.#drawSettings()
     }
-    if (!this.store.loading) this.#redraw(true)
+    if (!this.store.loading && this.#guessed) {
+      this.#goTo(this.#guessed)
+      this.#guessed = null
+    } else if (!this.store.loading) this.#redraw(true)
     else this.#pause ||= window.setTimeout(() => {
       this.#pause = 0
       this.#redraw(true)

@@ -46,9 +46,24 @@ export interface Survey {
 /** Which layers are edited, where edits are sent (null: into a file), and what they are made on. */
 export interface EditRules {
   layers: string[]
+  /** What can be drawn, whether the survey shows any of it or not. */
+  kinds: EditKind[]
+  /** Where their forms lie. */
+  forms: string
   post: string | null
   inventory: string
   commit: number
+}
+
+export interface EditKind {
+  layer: string
+  title: string
+  geometry: Geometry
+}
+
+/** By layer: the columns that people fill in. */
+export interface EditForms {
+  columns: Record<string, Column[]>
 }
 
 export interface Column {

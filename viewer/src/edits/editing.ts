@@ -1,13 +1,18 @@
 /** Edits: confirm, reject, move, correct and add, kept as one document that `roadscan inventory pull` reads. */
 
 import Feature from 'ol/Feature'
+import { unByKey } from 'ol/Observable'
+import type { EventsKey } from 'ol/events'
+import Point from 'ol/geom/Point'
+import type SimpleGeometry from 'ol/geom/SimpleGeometry'
 import Draw from 'ol/interaction/Draw'
 import Modify from 'ol/interaction/Modify'
+import Collection from 'ol/Collection'
 import VectorLayer from 'ol/layer/Vector'
 import VectorSource from 'ol/source/Vector'
 import type { Desk, Selected } from '../core/desk'
 import { fill, h, icon, iconButton } from '../core/dom'
-import type { Column, EditRules, Layer, Survey } from '../core/site'
+import type { Column, EditForms, EditKind, EditRules, Survey } from '../core/site'
 import type { MapView } from '../map/map'
 import { measuring } from '../map/styles'
 import { geometryOf } from '../map/vectors'
@@ -33,7 +38,8 @@ interface Outcome {
 }
 
 const TITLES: Record<Action, string> = { confirm: 'confirmed', reject: 'rejected', change: 'changed', add: 'added' }
-const ICONS = { point: 'point', line: 'line', polygon: 'area' } as const
+const DRAWN = { point: 'Point', line: 'LineString', polygon: 'Polygon' } as const
+const HOW = { point: 'Click its place on the map.', line: 'Click its corners on the map; a double click ends it.', polygon: 'Click the corners of its outline on the map; a double click ends it.' } as const
 const OUTCOMES: Record<Outcome['outcome'], string> = { accepted: 'accepted', same: 'nothing new', conflict: 'conflict', refused: 'refused' }
 const TOKEN_HEADER = 'X-Roadscan-Edit'
 const KEPT_TOKEN = 'roadscan-edit'
@@ -56,6 +62,11 @@ export class Editing {
   readonly #edits: Edit[] = []
   readonly #told: { text: string; outcome: Outcome }[] = []
   readonly #source = new VectorSource()
+  /** What was drawn, as long as its edit waits here. */
+  readonly #drawn = new Map<Edit, Feature>()
+  readonly #body = h('div', { class: 'edit-body' })
+  #forms: Promise<EditForms> | null = null
+  #kind = ''
   #author = ''
   #stop: (() => void) | null = null
 
@@ -69,7 +80,9 @@ export class Editing {
     const layer = new VectorLayer({ source: this.#source, zIndex: 5500 })
     desk.dark.on((dark) => layer.setStyle(measuring(dark)), true)
     map.map.addLayer(layer)
-    desk.selected.on(() => this.#end())
+    desk.selected.on(() => {
+      if (!this.#body.childElementCount) this.#end() // what is being drawn stays
+    })
     window.addEventListener('beforeunload', (event) => {
       if (this.#edits.length) event.preventDefault()
     })
@@ -116,7 +129,7 @@ export class Editing {
     this.#end()
     const feature = new Feature(geometryOf(selected.feature.geometry)!)
     this.#source.addFeature(feature)
-    const modify = new Modify({ source: this.#source, style: measuring(this.desk.dark.value) })
+    const modify = new Modify({ features: new Collection([feature]), style: measuring(this.desk.dark.value) })
     this.map.map.addInteraction(modify)
     this.map.drawing = true
     const done = h('button', { type: 'button', disabled: true, onclick: () => {
@@ -134,39 +147,95 @@ export class Editing {
     }
   }
 
-  #drawNew(layer: Layer): void {
+  /** Draw an asset of a kind on the map, then fill in its form. */
+  #drawNew(kind: EditKind): void {
     this.#end()
-    const draw = new Draw({ source: this.#source, type: ({ point: 'Point', line: 'LineString', polygon: 'Polygon' } as const)[layer.geometry], style: measuring(this.desk.dark.value) })
-    this.desk.say(`Draw the new row of ${layer.title} on the map; a double click ends it, Esc gives it up.`)
-    draw.on('drawend', ({ feature }) => {
-      const geometry = feature.getGeometry() as any
-      this.#end()
-      this.#addNew(layer, geometry.getType(), geometry.getCoordinates()).catch((error) => this.desk.complain(error))
+    this.map.tool.value = 'select'
+    const draw = new Draw({ source: this.#source, type: DRAWN[kind.geometry], style: measuring(this.desk.dark.value) })
+    const button = (title: string, onclick: () => void): HTMLElement => h('button', { type: 'button', onclick }, title)
+    const isPoint = kind.geometry === 'point'
+    fill(
+      this.#body,
+      h('p', { class: 'hint' }, `${kind.title}: ${HOW[kind.geometry]} Without a mouse, the cross in the middle of the map serves.`),
+      h('div', { class: 'actions' },
+        button(isPoint ? 'Put it at the cross' : 'Corner at the cross', () => {
+          const place = this.map.seen.centre
+          if (isPoint) this.#source.addFeature(new Feature(new Point(place)))
+          else draw.appendCoordinates([place])
+        }),
+        isPoint ? null : button('That was the last', () => draw.finishDrawing()),
+        button('Cancel', () => this.#end())),
+    )
+    // Draw adds what was drawn to the source, as the button does.
+    const key = this.#source.on('addfeature', ({ feature }) => {
+      this.#leave(draw, key)
+      this.#stop = () => this.#source.removeFeature(feature!)
+      this.#formNew(kind, feature!).catch((error) => this.desk.complain(error))
     })
     this.map.map.addInteraction(draw)
     this.map.drawing = true
-    this.#stop = () => {
-      this.map.map.removeInteraction(draw)
-      this.map.drawing = false
-    }
+    this.#stop = () => this.#leave(draw, key)
   }
 
-  /** A row that was drawn on the map gets the heights of the surface below it. */
-  async #addNew(layer: Layer, type: string, flat: any): Promise<void> {
-    const raised = async (place: any): Promise<any> => {
-      if (typeof place[0] !== 'number') return Promise.all(place.map(raised))
-      const height = await this.map.heightAt(place[0], place[1])
-      return height === null ? [place[0], place[1]] : [place[0], place[1], height]
+  #leave(draw: Draw, key: EventsKey): void {
+    unByKey(key)
+    this.map.map.removeInteraction(draw)
+    this.map.drawing = false
+  }
+
+  /** The form of what was drawn: its kind's columns, and its height where the surface does not tell it. */
+  async #formNew(kind: EditKind, feature: Feature): Promise<void> {
+    this.#forms ??= this.desk.source.json<EditForms>(this.rules.forms)
+    this.#forms.catch(() => (this.#forms = null))
+    const geometry = feature.getGeometry() as SimpleGeometry
+    const shape = { type: geometry.getType(), coordinates: geometry.getCoordinates() }
+    const [{ columns }, heights] = await Promise.all([this.#forms, this.#heightsOf(shape.coordinates)])
+    if (!this.#source.hasFeature(feature)) return
+    const fields = columns[kind.layer]!.map((column) => [column, field(column, null)] as const)
+    const comment = h('input', { type: 'text', 'aria-label': 'Comment', placeholder: 'Why: kept with the edit' })
+    const isKnown = heights.some(([, , height]) => height !== null)
+    const height = h('input', { type: 'number', step: 'any', required: !isKnown, 'aria-label': 'Height of the ground m' })
+    const keep = (event: Event): void => {
+      event.preventDefault()
+      const stated = fields.map(([column, input]) => [column.name, valueOf(column, input.value)] as const).filter(([, value]) => value !== null)
+      const coordinates = raised(shape.coordinates, heights, Number(height.value))
+      const edit: Edit = { layer: kind.layer, action: 'add', asset_id: null, attributes: Object.fromEntries(stated), geometry: { type: shape.type, coordinates }, comment: comment.value, edited_utc: new Date().toISOString() }
+      this.#drawn.set(edit, feature)
+      this.#edits.push(edit)
+      this.#stop = null
+      fill(this.#body)
+      this.#draw()
     }
-    const coordinates = await raised(flat)
-    this.#edits.push({ layer: layer.name, action: 'add', asset_id: null, attributes: {}, geometry: { type, coordinates }, comment: '', edited_utc: new Date().toISOString() })
-    this.#draw()
+    fill(
+      this.#body,
+      h('form', { class: 'edit-form', 'aria-label': `New: ${kind.title}`, onsubmit: keep },
+        isKnown ? null : h('label', {}, h('span', {}, 'Height of the ground, m'), height),
+        ...fields.map(([column, input]) => h('label', { title: column.meaning }, h('span', {}, column.title), input)),
+        comment,
+        h('div', { class: 'actions' }, h('button', { class: 'main' }, `Keep the new ${kind.title}`), h('button', { type: 'button', onclick: () => this.#end() }, 'Cancel'))),
+    )
+  }
+
+  /** Places of a shape with the height of the surface there; null where no raster knows it. */
+  #heightsOf(coordinates: any): Promise<Raised[]> {
+    const places = typeof coordinates[0] === 'number' ? [coordinates] : coordinates.flat(typeof coordinates[0][0] === 'number' ? 0 : 1)
+    return Promise.all(places.map(async ([e, n]: number[]) => [e, n, await this.map.heightAt(e!, n!)]))
   }
 
   /** Give up what is being drawn or moved. */
   #end(): void {
     this.#stop?.()
     this.#stop = null
+    fill(this.#body)
+  }
+
+  /** An edit that is here no more. */
+  #forget(edit: Edit): void {
+    const at = this.#edits.indexOf(edit)
+    if (at >= 0) this.#edits.splice(at, 1)
+    const drawn = this.#drawn.get(edit)
+    if (drawn) this.#source.removeFeature(drawn)
+    this.#drawn.delete(edit)
   }
 
   #add(selected: Selected, action: Action, attributes: Record<string, unknown>, geometry: Edit['geometry'], comment = ''): void {
@@ -193,12 +262,14 @@ export class Editing {
   }
 
   #draw(): void {
-    const layers = this.map.layers.map((one) => one.document).filter((one) => this.rules.layers.includes(one.name))
+    const { kinds } = this.rules
+    const kind = h('select', { 'aria-label': 'Kind of the new asset', onchange: () => (this.#kind = kind.value) }, ...kinds.map((one) => h('option', { value: one.layer, selected: one.layer === this.#kind }, one.title)))
     const author = h('input', { type: 'text', value: this.#author, placeholder: 'Your name', 'aria-label': 'Your name', oninput: () => (this.#author = author.value) })
     fill(
       this.element,
       h('h3', {}, 'Edits'),
-      h('div', { class: 'actions' }, ...layers.map((layer) => h('button', { type: 'button', onclick: () => this.#drawNew(layer) }, icon(ICONS[layer.geometry]), `Add: ${layer.title}`))),
+      h('div', { class: 'actions' }, kind, h('button', { type: 'button', onclick: () => this.#drawNew(kinds.find((one) => one.layer === kind.value)!) }, icon('plus'), 'Draw a new one')),
+      this.#body,
       this.#told.length > 0 && h('ul', { class: 'edit-told' }, ...this.#told.map(({ text, outcome }) => h('li', { 'data-outcome': outcome.outcome }, h('strong', {}, OUTCOMES[outcome.outcome]), ` ${text}`, outcome.reason && h('p', {}, outcome.reason)))),
       this.#edits.length ? h('ul', { class: 'edit-list' }, ...this.#edits.map((edit) => this.#line(edit))) : h('p', { class: 'hint' }, 'No edit yet. Select a row to confirm, reject, correct or move it.'),
       this.#edits.length > 0 && h('div', { class: 'actions' }, author, h('button', { type: 'button', class: 'main', onclick: () => void this.#save() }, this.rules.post ? 'Send the edits' : 'Save the edits')),
@@ -213,7 +284,7 @@ export class Editing {
 
   #line(edit: Edit): HTMLElement {
     return h('li', {}, h('span', {}, this.#text(edit)), iconButton('undo', 'Take this edit back', () => {
-      this.#edits.splice(this.#edits.indexOf(edit), 1)
+      this.#forget(edit)
       this.#draw()
     }, { class: 'icon-button small' }))
   }
@@ -250,7 +321,7 @@ export class Editing {
     for (const [index, edit] of sent.entries()) {
       const outcome = outcomes[index]!
       this.#told.push({ text: this.#text(edit), outcome })
-      if (outcome.outcome !== 'refused' && this.#edits.includes(edit)) this.#edits.splice(this.#edits.indexOf(edit), 1)
+      if (outcome.outcome !== 'refused') this.#forget(edit)
     }
     await this.#renew()
     this.#draw()
@@ -270,6 +341,19 @@ export class Editing {
     const feature = (await layer.loadAll()).find((one) => one.properties[key] === selected.feature.properties[key])
     this.desk.selected.value = feature ? { layer: layer.document, feature } : null
   }
+}
+
+/** A place with its height; null where it is not known. */
+type Raised = readonly [number, number, number | null]
+
+/** Coordinates with heights: the surface's, where it is unknown that of the nearest place that has one, else the one given. */
+function raised(coordinates: any, heights: readonly Raised[], given_m: number): any {
+  if (typeof coordinates[0] !== 'number') return coordinates.map((one: any) => raised(one, heights, given_m))
+  const [e, n] = coordinates as [number, number]
+  const apart = ([x, y]: Raised): number => Math.hypot(x - e, y - n)
+  const known = heights.filter(([, , height]) => height !== null)
+  const nearest = known.reduce<Raised | null>((best, one) => (best && apart(best) <= apart(one) ? best : one), null)
+  return [e, n, nearest ? nearest[2] : given_m]
 }
 
 /** A field of the form for a value; one with a list of values offers them. */

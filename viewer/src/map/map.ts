@@ -40,6 +40,8 @@ export class MapView {
   readonly measuring: Measuring
   /** Called with what lies below a click, nearest first; another part may take the click for itself. */
   clicked: (place: Place, hits: Hit[]) => void = () => {}
+  /** Called when layers were replaced. */
+  replaced: () => void = () => {}
   readonly #marks = new VectorSource()
   readonly #cross = new Feature()
   readonly #ring = new Feature()
@@ -47,6 +49,8 @@ export class MapView {
   readonly #tip = h('div', { class: 'map-tip', hidden: true })
   #drawing = false
   #drawn = 0
+  /** Where the way that the map goes by itself ends. */
+  #goal: { center: number[]; resolution: number } | null = null
   readonly #bar = h('div', { class: 'scale-bar', 'aria-hidden': 'true' })
 
   constructor(readonly desk: Desk) {
@@ -54,9 +58,7 @@ export class MapView {
     const extent = buffer(survey.extent_m as Extent, 0.5 * Math.max(getWidth(survey.extent_m), getHeight(survey.extent_m), 100))
     const projection = new Projection({ code: 'survey', units: 'm', extent, global: false })
     this.rasters = this.#makeRasters(projection)
-    this.layers = [...survey.layers]
-      .sort((a, b) => a.order - b.order)
-      .map((layer) => new FeatureLayer(layer, desk.source, desk.dark, (error) => desk.complain(error)))
+    this.layers = [...survey.layers].sort((a, b) => a.order - b.order).map((layer) => this.#layerOf(layer))
     const target = h('div', {
       class: 'map-target',
       tabindex: 0,
@@ -96,14 +98,34 @@ export class MapView {
   }
 
   #buttons(): HTMLElement {
-    const zoom = (factor: number) => () => this.map.getView().animate({ resolution: this.map.getView().getResolution()! * factor, duration: 150 })
     return h(
       'div',
       { class: 'view-buttons' },
-      iconButton('plus', 'Zoom in (+)', zoom(0.5)),
-      iconButton('minus', 'Zoom out (-)', zoom(2)),
+      iconButton('plus', 'Zoom in (+)', () => this.#zoom(0.5)),
+      iconButton('minus', 'Zoom out (-)', () => this.#zoom(2)),
       iconButton('fit', 'Show the whole survey (0)', () => this.fit()),
     )
+  }
+
+  /** Zoom by a factor; a press while the map is under way counts from where that ends. */
+  #zoom(factor: number): void {
+    const view = this.map.getView()
+    const under = view.getAnimating() ? this.#goal : null
+    const wanted = (under?.resolution ?? view.getResolution()!) * factor
+    this.#setOut(under?.center ?? view.getCenter()!, view.getConstrainedResolution(wanted) ?? wanted, 150)
+  }
+
+  #setOut(center: number[], resolution: number, duration: number): void {
+    const view = this.map.getView()
+    this.#goal = { center, resolution }
+    view.cancelAnimations()
+    view.animate({ center, resolution, duration })
+  }
+
+  /** Whether the map stands still, with all that it has to show: a picture from before it set out tells nothing. */
+  #tellDrawn(): void {
+    const drawn = !this.map.getView().getAnimating() && this.layers.every((one) => !one.isLoading)
+    this.element.dataset['drawn'] = String(drawn)
   }
 
   #listen(target: HTMLElement): void {
@@ -111,7 +133,8 @@ export class MapView {
     const still = (drawn: boolean): void => void (this.element.dataset['drawn'] = String(drawn))
     map.on('moveend', () => this.look())
     map.on('precompose', () => still(false))
-    map.on('rendercomplete', () => still(!map.getView().getAnimating())) // a picture from before the map set out tells nothing
+    map.getView().on('change', () => still(false))
+    map.on('rendercomplete', () => this.#tellDrawn())
     map.getView().on('change:resolution', () => this.#drawBar())
     map.on('singleclick', (event) => {
       if (!this.measuring.busy && !this.#drawing) void this.#click(event.pixel, event.coordinate)
@@ -123,6 +146,13 @@ export class MapView {
       const over = !this.measuring.busy && map.hasFeatureAtPixel(event.pixel, { hitTolerance: 3, layerFilter: (layer) => this.layers.some((one) => one.layer === layer) })
       target.style.cursor = this.measuring.busy ? 'crosshair' : over ? 'pointer' : ''
     })
+    // A press means what is seen now, though the map may not have been told yet that it has other room.
+    target.addEventListener('pointerdown', () => {
+      const [width, height] = map.getSize() ?? [0, 0]
+      if (width === target.clientWidth && height === target.clientHeight) return
+      map.updateSize()
+      map.renderSync()
+    }, { capture: true })
     target.addEventListener('pointerleave', () => (desk.pointer.value = null))
     target.addEventListener('keydown', (event) => {
       if (event.key === 'Enter') {
@@ -142,8 +172,8 @@ export class MapView {
       if (!goal) return
       still(false)
       const size = map.getSize() ?? [400, 400]
-      const resolution = goal.across_m ? goal.across_m / Math.max(100, Math.min(size[0]!, size[1]!)) : undefined
-      map.getView().animate({ center: [goal.easting_m, goal.northing_m], ...(resolution ? { resolution } : {}), duration: 350 })
+      const resolution = goal.across_m ? goal.across_m / Math.max(100, Math.min(size[0]!, size[1]!)) : map.getView().getResolution()!
+      this.#setOut([goal.easting_m, goal.northing_m], resolution, 350)
     })
     this.tool.on((tool) => this.measuring.use(tool))
     new ResizeObserver(() => {
@@ -200,10 +230,26 @@ export class MapView {
     )
   }
 
-  /** Show another state of some layers. */
+  /** Show another state of some layers, and layers that were not there before. */
   replace(layers: readonly Layer[]): void {
     const extent = this.map.getView().calculateExtent(this.map.getSize())
-    for (const document of layers) this.layers.find((one) => one.document.name === document.name)?.replace(document, extent)
+    for (const document of layers) {
+      const held = this.layers.find((one) => one.document.name === document.name)
+      if (held) held.replace(document, extent)
+      else {
+        const layer = this.#layerOf(document)
+        this.layers.push(layer)
+        this.map.addLayer(layer.layer)
+        layer.look(extent)
+      }
+    }
+    this.layers.sort((a, b) => a.document.order - b.document.order)
+    this.replaced()
+  }
+
+  #layerOf(document: Layer): FeatureLayer {
+    const { source, dark } = this.desk
+    return new FeatureLayer(document, source, dark, (error) => this.desk.complain(error))
   }
 
   /** Height of the surface at a place (m); null where no raster knows it. */

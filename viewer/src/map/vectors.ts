@@ -59,6 +59,8 @@ export class FeatureLayer {
   /** What is shown from far away; null until it is first wanted. */
   #overview: Promise<Feature[]> | null = null
   #far = false
+  /** Files that are on their way. */
+  #waiting = 0
 
   constructor(
     public document: Layer,
@@ -110,7 +112,7 @@ export class FeatureLayer {
   #lookFromFar(far: boolean): void {
     if (far === this.#far) return
     this.#far = far
-    this.#overview ??= this.files.json<FeatureCollection>(this.document.overview!).then(
+    this.#overview ??= this.#fetched(this.document.overview!).then(
       ({ features }) => features.flatMap((one) => {
         const geometry = geometryOf(one.geometry)
         return geometry ? new Feature({ geometry, row: one.properties, coarse: true }) : []
@@ -124,6 +126,22 @@ export class FeatureLayer {
       },
       (error) => this.complain(error),
     )
+  }
+
+  /** True while files are on their way. */
+  get isLoading(): boolean {
+    return this.#waiting > 0
+  }
+
+  /** A file of features; the map draws once more when it is there, whatever it holds. */
+  async #fetched(url: string): Promise<FeatureCollection> {
+    this.#waiting++
+    try {
+      return await this.files.json<FeatureCollection>(url)
+    } finally {
+      this.#waiting--
+      this.layer.changed()
+    }
   }
 
   #outline(part: Part): void {
@@ -147,7 +165,7 @@ export class FeatureLayer {
   }
 
   async #load(part: Part): Promise<void> {
-    const { features } = await this.files.json<FeatureCollection>(part.url)
+    const { features } = await this.#fetched(part.url)
     if (!this.document.parts.includes(part)) return // the layer was replaced meanwhile
     const outline = this.#outlines.get(part)
     if (outline) {

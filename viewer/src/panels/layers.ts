@@ -32,7 +32,7 @@ function featureRow(map: MapView, layer: FeatureLayer, openTable: (layer: Featur
   const count = h('span', { class: 'count' })
   const box = h('input', {
     type: 'checkbox',
-    checked: document.visible,
+    checked: layer.layer.getVisible(),
     onchange: () => {
       layer.setVisible(box.checked)
       map.look()
@@ -140,7 +140,7 @@ function rasterRow(one: RasterLayer): HTMLElement {
   const legend = h('div', { class: 'legend' })
   const box = h('input', {
     type: 'checkbox',
-    checked: raster.visible,
+    checked: layer.getVisible(),
     onchange: () => {
       layer.setVisible(box.checked)
       draw()

@@ -27,8 +27,12 @@ export class PictureView {
   #picture: Picture | null = null
   #bitmap: ImageBitmap | null = null
   #view = { x: 0, y: 0, zoom: 1 }
+  /** Size of the frame that the view was made for. */
+  #fitted = [0, 0]
   #views: View[] = []
   #place: Place | null = null
+  /** Counts what people ask for; an answer to what was asked before changes nothing. */
+  #turn = 0
   #drag: { x: number; y: number; moved: boolean } | null = null
   readonly #urls = new Map<string, Promise<ImageBitmap>>()
 
@@ -126,27 +130,29 @@ export class PictureView {
 
   /** The pictures that see a place; the best is opened. */
   async showPlace(place: Place): Promise<void> {
+    const turn = ++this.#turn
     this.#place = place
     this.#frame.dataset['state'] = 'loading'
     const at = [place.easting_m, place.northing_m, place.height_m ?? this.desk.survey.height_extent_m?.[0] ?? 0] as const
-    this.#views = (await this.pictures.seeing(at)).slice(0, OFFERED)
+    const views = (await this.pictures.seeing(at)).slice(0, OFFERED)
+    if (turn !== this.#turn) return
+    this.#views = views
     this.#drawList()
-    if (!this.#views.length) {
+    if (!views.length) {
       this.#caption.textContent = 'No picture sees this place.'
       return
     }
-    await this.open(this.#views[0]!.picture)
-    this.#frame.dataset['state'] = 'loading'
     await this.#findHidden(at)
-    this.#frame.dataset['state'] = 'shown'
+    if (turn !== this.#turn) return
+    this.#views = [...views.filter((one) => !one.hidden), ...views.filter((one) => one.hidden)]
+    await this.#open(this.#views[0]!.picture)
   }
 
-  /** Ask the cloud whether something stands before the place; a picture in which it is hidden comes last. */
+  /** Ask the cloud whether something stands before the place: a picture in which it is hidden comes last. */
   async #findHidden(at: readonly [number, number, number]): Promise<void> {
-    const store = await this.cloud()
+    const store = await this.cloud().catch(() => null)
     if (!store) return
-    const views = this.#views
-    for (const view of views.slice(0, CHECKED)) {
+    for (const view of this.#views.slice(0, CHECKED)) {
       const { picture } = view
       const from = [picture.easting_m, picture.northing_m, picture.height_m] as const
       const by = [0, 1, 2].map((axis) => at[axis]! - from[axis]!) as [number, number, number]
@@ -156,11 +162,6 @@ export class PictureView {
       const met = meet(store, nodes, ray, CONE * 4, 1, size - Math.max(0.4, size * 0.04))
       view.hidden = met !== null
     }
-    if (views !== this.#views) return
-    const first = views.find((one) => !one.hidden)
-    this.#views = [...views.filter((one) => !one.hidden), ...views.filter((one) => one.hidden)]
-    this.#drawList()
-    if (first && first.picture !== this.#picture && views.find((one) => one.picture === this.#picture)?.hidden) await this.open(first.picture)
   }
 
   async openUrl(url: string): Promise<void> {
@@ -170,14 +171,14 @@ export class PictureView {
   }
 
   async openFirst(): Promise<void> {
-    if (this.#picture) return
+    if (this.#turn) return // something was asked for already
     if (this.desk.place.value) return this.showPlace(this.desk.place.value)
     const { extent_m } = this.desk.survey
     const [e, n] = [(extent_m[0] + extent_m[2]) / 2, (extent_m[1] + extent_m[3]) / 2]
     const near = await this.pictures.near(e, n, Infinity)
     const apart = (one: Picture): number => Math.hypot(one.easting_m - e, one.northing_m - n)
     const first = near.reduce<Picture | null>((best, one) => (!best || apart(one) < apart(best) ? one : best), null)
-    if (first) await this.open(first)
+    if (first && !this.#turn) await this.open(first)
   }
 
   async #step(by: number): Promise<void> {
@@ -189,7 +190,13 @@ export class PictureView {
     else this.desk.say('There is no further picture of this camera.')
   }
 
+  /** Open a picture that people chose. */
   async open(picture: Picture): Promise<void> {
+    this.#turn++
+    await this.#open(picture)
+  }
+
+  async #open(picture: Picture): Promise<void> {
     this.#picture = picture
     this.#frame.dataset['state'] = 'loading'
     this.#caption.textContent = `Loading ${picture.camera.title} …`
@@ -251,6 +258,7 @@ export class PictureView {
 
   #fit(): void {
     const [width, height] = [this.#frame.clientWidth, this.#frame.clientHeight]
+    this.#fitted = [width, height]
     const ratio = Math.min(2, window.devicePixelRatio || 1)
     for (const canvas of [this.#flat, this.#ball, this.#marks]) [canvas.width, canvas.height] = [Math.max(1, width * ratio), Math.max(1, height * ratio)]
     if (this.#bitmap) {
@@ -356,6 +364,7 @@ export class PictureView {
     const picture = this.#picture
     if (!picture || !this.#bitmap) return
     const box = this.#frame.getBoundingClientRect()
+    if (this.#frame.clientWidth !== this.#fitted[0] || this.#frame.clientHeight !== this.#fitted[1]) this.#fit() // the observer has not told yet
     const [u, v] = this.#pixelAt(clientX - box.left, clientY - box.top)
     await this.placeOf(picture, u, v, Math.max(CONE, this.#pixelAngle()))
   }
@@ -368,6 +377,7 @@ export class PictureView {
 
   /** The place that a pixel shows: where its ray meets the cloud first. */
   async placeOf(picture: Picture, u: number, v: number, cone: number): Promise<void> {
+    const turn = ++this.#turn
     const store = await this.cloud()
     if (!store) {
       this.desk.say('This site holds no point cloud, so a pixel has no place.')
@@ -376,6 +386,7 @@ export class PictureView {
     this.desk.say('Looking for the point …')
     const ray = { from: [picture.easting_m, picture.northing_m, picture.height_m] as const, direction: rayOf(picture.camera, picture, u, v) }
     const { nodes } = await store.within((one) => rayNear(one, ray, cone * 2, 80), RAY_POINTS)
+    if (turn !== this.#turn) return
     const met = meet(store, nodes, ray, cone, 0.8, 80) ?? meet(store, nodes, ray, cone * 3, 0.8, 80)
     if (!met) {
       this.desk.say('The ray of this pixel meets no point within 80 m.')
@@ -394,7 +405,9 @@ export class PictureView {
       ],
     }
     this.desk.place.value = this.#place
-    this.#views = (await this.pictures.seeing(coordinate)).slice(0, OFFERED)
+    const views = (await this.pictures.seeing(coordinate)).slice(0, OFFERED)
+    if (turn !== this.#turn) return
+    this.#views = views
     this.#drawList()
     this.#draw()
   }

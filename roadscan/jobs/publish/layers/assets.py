@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import cycle
 from typing import Any, Final
 
@@ -31,7 +31,8 @@ from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_sc
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 FOLDER: Final = "products/assets"
-_GEOMETRY: Final[dict[str, Geometry]] = {"PointZ": "point", "LineStringZ": "line", "PolygonZ": "polygon"}
+GEOMETRY_OF: Final[dict[str, Geometry]] = {"PointZ": "point", "LineStringZ": "line", "PolygonZ": "polygon"}
+"""How a layer calls the geometry of a schema."""
 _WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}
 _COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
 _STATES: Final = {"found": BLUE, "confirmed": GREEN, "missing": RED, "rejected": GREY}
@@ -77,7 +78,7 @@ def _of_inventory(material: Material, kind: str) -> _Rows | None:
 
 def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) -> SiteLayer:
     schema, (rows, shapes_m) = asset_schema(kind), held
-    is_inventory, geometry = "asset_id" in rows.column_names, _GEOMETRY[schema.geometry]
+    is_inventory, geometry = "asset_id" in rows.column_names, GEOMETRY_OF[schema.geometry]
     columns = {c.name: c for c in (asset_columns(kind) if is_inventory else schema.columns)}
     names = [n for n in rows.column_names if n in columns]
     edited = editable_columns(kind) if is_inventory and material.wishes.edits else frozenset()
@@ -86,12 +87,13 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
         styles.append(Style("Status", _WIDTH_PX[geometry], by="status", values=_STATES))
     return SiteLayer(
         f"{LAYER}{schema.table}", schema.title, "assets", geometry, order, shapes_m, rows.select(names).to_pylist(),
-        [_column(columns[n], names, is_edited=n in edited) for n in names], styles,
+        [site_column(columns[n], names, is_edited=n in edited) for n in names], styles,
         key="asset_id" if is_inventory else "object",
     )  # fmt: skip
 
 
-def _column(column: AssetColumn, names: list[str], *, is_edited: bool) -> SiteColumn:
+def site_column(column: AssetColumn, names: Sequence[str], *, is_edited: bool) -> SiteColumn:
+    """A column of assets as the page reads it, with the one of `names` that holds its 1 σ."""
     sigma = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}.get(
         column.name, f"sigma_{column.name}"
     )

@@ -123,7 +123,7 @@ def _told(
         return Upright("delineator", shaft, probability, shaft.rows, values)
     values["lean_deg"] = lean
     out = arms(near, shaft)
-    if signal_head(scene, near) is not None and shaft.top_above_m < _SIGNAL_M:
+    if signal_head(scene, near, out) is not None and shaft.top_above_m < _SIGNAL_M:
         values["arm_m"] = out.reach_m if out else None
         return Upright("signal", shaft, probability, shaft.rows, values)
     if out is not None and shaft.top_above_m >= _LAMP_M:

@@ -142,10 +142,10 @@ def judged(street: Street) -> Iterator[Judged]:
     def on_line(kind: str) -> Callable[[Any], bool]:
         within = max(LINES[kind], 0.15)
         # a chain that follows a box is a wall, whichever kind of one
-        return lambda g: max(_share_near(g, lines[kind], within), _share_near(g, solid.boundary, 0.3)) >= 0.5
+        return lambda g: max(_share_near(g, lines[kind], within), _share_near(g, solid, 0.3)) >= 0.5
 
     rules: dict[str, Callable[[Any], bool]] = {kind: on_line(kind) for kind in LINES}
-    rules |= {kind: lambda g: _share_near(g, solid.boundary, 0.3) >= 0.5 for kind in NONE_THERE}
+    rules |= {kind: lambda g: _share_near(g, solid, 0.3) >= 0.5 for kind in NONE_THERE}
     rules |= {kind: lambda g, k=kind: _share_within(g, areas[k]) >= 0.5 for kind in AREAS}
     rules |= {
         "road_marking": lambda g: _share_within(g, paint) >= 0.5,
@@ -194,7 +194,7 @@ def _samples(shape: shapely.Geometry) -> Any:
 
 def _share_near(shape: shapely.Geometry, target: shapely.Geometry, within_m: float) -> float:
     points = _samples(shape)
-    if not points.size or target.is_empty:
+    if not points.size or target is None or target.is_empty:
         return 0.0
     shapely.prepare(target)
     return float(shapely.dwithin(points, target, within_m).mean())
@@ -301,7 +301,7 @@ def line_figures(street: Street) -> Iterator[Figure]:
         yield from _lane_lines(street, found) if kind == "lane_line" else ()
     for kind in NONE_THERE:
         table = street.found(kind)
-        false = sum(_share_near(g, solid.boundary, 0.3) < 0.5 for g in table.geometry)
+        false = sum(_share_near(g, solid, 0.3) < 0.5 for g in table.geometry)
         yield Figure(f"{kind}: false ones", float(false), "")
 
 

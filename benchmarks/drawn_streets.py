@@ -8,7 +8,7 @@ import numpy as np
 
 from roadscan.simulate import Scene
 
-LENGTH_M: Final = 44.0
+LENGTH_M: Final = 36.0
 _OFF: Final = {key: {"on": False} for key in ("profilers", "sick", "camera", "imu", "gnss", "encoder")}
 
 
@@ -27,7 +27,7 @@ def drawn_street(seed: int) -> Scene:
         id=f"drawn-{seed}", seed=1000 + seed, length_m=LENGTH_M,
         passes=[{"lane": int(random.integers(1, 3)), "direction": "forward"}],
         vehicle={"speed_m_per_s": speed, "standstill_s": 0.0},
-        lidar={"range_max_m": 45.0},
+        lidar={"range_max_m": 36.0},
         noise={"lidar_range_m": noise_m, "intensity": float(random.uniform(3, 9)), "position_m": 0.0,
                "attitude_deg": 0.0},
         road={

@@ -24,44 +24,52 @@ _LEAST_CELLS: Final = 4
 """So many cells of the corridor hang under a structure."""
 _PLANAR: Final = 0.4
 _UPRIGHT: Final = 0.25
+_BELOW_CUBES, _ABOVE_CUBES = 1, 4
+"""Edges and parapets of a deck reach so far below and above its level cubes."""
 _DECK_CELLS: Final = 7
 """A deck's lower face is so wide in both directions (cells of 0.3 m): that of a gantry is not."""
 
 
 def overhead_classes(
-    cubes: Cubes, grid: Grid, left_out: Bools, drive_xyh_m: npt.NDArray[np.float64]
+    cubes: Cubes, grid: Grid, leafy: Bools, left_out: Bools, drive_xyh_m: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.uint8]:
     """Class (cubes,) of each cube: bridge deck, overhead structure, or 0 for what is neither.
 
     What hangs together 2.5 m above the ground or higher, seen from above, is a structure over the way where a drive
-    passes beneath it. It is a bridge deck where it holds a level plane of 2.1 m by 2.1 m above that drive.
+    passes beneath it. It is a bridge deck where it holds a level plane of 2.1 m by 2.1 m above that drive; its edges
+    scatter in all directions as leaves do, and belong to it.
 
     Parameters
     ----------
-    left_out : (cubes,) those that are leaves, wires or walls.
+    leafy : (cubes,) those that scatter as leaves do; left_out : (cubes,) those that are wires or walls.
     drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass.
     """
     out = np.zeros(left_out.size, np.uint8)
-    hanging = ~left_out & (cubes.place[:, 2] * EDGE_M >= _LOWEST_M)
+    high = ~left_out & (cubes.place[:, 2] * EDGE_M >= _LOWEST_M)
     corridor = _corridors(grid, drive_xyh_m)
-    row, column = cubes.place[:, 0], cubes.place[:, 1]
-    if not (hanging & corridor[row, column]).any():
+    row, column, layer = cubes.place.T
+    if not (high & corridor[row, column]).any():
         return out
+    level = high & (cubes.features[:, voxels.PLANARITY] >= _PLANAR)
+    level &= cubes.features[:, voxels.NORMAL_UP] > _UPRIGHT
+    hanging = (high & ~leafy) | level
     cells = np.zeros(grid.shape, np.uint8)
     cells[row[hanging], column[hanging]] = 1
     count, label = cv2.connectedComponents(cv2.morphologyEx(cells, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)))
     over = np.bincount(label[corridor & (cells > 0)], minlength=count) >= _LEAST_CELLS
     over[0] = False
-    planar = hanging & (cubes.features[:, voxels.PLANARITY] >= _PLANAR)
-    level = planar & (cubes.features[:, voxels.NORMAL_UP] > _UPRIGHT)
     faces = np.zeros(grid.shape, np.uint8)
     faces[row[level], column[level]] = 1
     faces = cv2.morphologyEx(faces, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     wide = cv2.morphologyEx(faces, cv2.MORPH_OPEN, np.ones((_DECK_CELLS, _DECK_CELLS), np.uint8)) > 0
     decks = np.bincount(label[wide & corridor], minlength=count) > 0
     own = label[row, column]
-    out[hanging & over[own]] = classes.OVERHEAD_STRUCTURE
-    out[hanging & over[own] & decks[own]] = classes.BRIDGE_DECK
+    out[high & ~leafy & over[own]] = classes.OVERHEAD_STRUCTURE
+    for number in np.flatnonzero(over & decks).tolist():
+        about = cv2.dilate((label == number).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        layers = layer[level & (own == number)]
+        near = high & (layer >= layers.min() - _BELOW_CUBES) & (layer <= layers.max() + _ABOVE_CUBES)
+        out[near & about[row, column]] = classes.BRIDGE_DECK
     return out
 
 

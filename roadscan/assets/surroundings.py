@@ -65,7 +65,7 @@ def surroundings(
     if bits.size:
         leafy, wire = leaves(cubes, grid), wires(cubes, grid)
         walls, roofs = walls_and_roofs(cubes, grid)
-        over = overhead_classes(cubes, grid, leafy | wire | walls, drive_xyh_m)
+        over = overhead_classes(cubes, grid, leafy, wire | walls, drive_xyh_m)
         buildings = (walls | roofs) & (features[:, voxels.SCATTERING] <= _IN_LEAVES)
         bits |= LEAFY * leafy.view(np.uint8)
         bits |= WALL * buildings.view(np.uint8)

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.shafts import Shaft
@@ -20,6 +21,8 @@ _LEVEL_M: Final = 0.4
 _SECTORS: Final = 8
 _CROWN_REACH_M: Final = 4.5
 _HEAD_REACH_M: Final = 0.75
+_CROWN_M: Final = 1.5
+_BEYOND_SHARE: Final = 0.1
 _ARM_M: Final = 0.2
 """What hangs from an arm lies below its top by more."""
 _BRIGHT_SHARE: Final = 0.1
@@ -58,6 +61,7 @@ class Arms:
 def about(scene: Scene, shaft: Shaft) -> About:
     """Returns within 4.5 m of a shaft's axis."""
     rows = places_of(scene).within(shaft.axis.x_m, shaft.axis.y_m, _CROWN_REACH_M)
+    rows = rows[scene.classes[rows] != classes.BRIDGE_DECK]
     height = scene.returns.height_m[rows]
     x, y = shaft.axis.at(height)
     right, ahead = scene.returns.x_m[rows] - x, scene.returns.y_m[rows] - y
@@ -158,6 +162,13 @@ def signal_head(scene: Scene, near: About, out: Arms | None) -> tuple[float, flo
         at_end = np.hypot(near.right_m - out.end_m[0], near.ahead_m - out.end_m[1]) < _HEAD_REACH_M
         held = _head(scene, near, at_end & (near.above_m < out.top_above_m - _ARM_M))
     return held
+
+
+def is_head_alone(scene: Scene, near: About) -> bool:
+    """Whether a shaft carries a signal's head, and nothing about it reaches as far as a crown."""
+    crown = (near.away_m < _CROWN_M) & (near.above_m > 1.8)
+    beyond = crown & (near.away_m >= _HEAD_REACH_M)
+    return int(beyond.sum()) <= _BEYOND_SHARE * int(crown.sum()) and signal_head(scene, near, None) is not None
 
 
 def _head(scene: Scene, near: About, close: npt.NDArray[np.bool_]) -> tuple[float, float] | None:

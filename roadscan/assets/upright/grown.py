@@ -69,11 +69,12 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
                        for s in np.moveaxis(sums, -1, 0)])  # fmt: skip
     counted, n = pooled[0] >= _LEAST_RETURNS, np.maximum(pooled[0], 1.0)
     rough = np.sqrt(np.maximum(pooled[2] / n - (pooled[1] / n) ** 2, 1e-8))
-    road = _road_cells(scene, corner, shape) & counted
+    road = _cells_with(scene, classes.ROAD, corner, shape) & counted
     if not road.any():
         return PIECE_SCHEMA.empty_table()
     ratio = rough / float(np.median(rough[road]))
     chosen = (counted & (ratio >= options.rough_ratio)).astype(np.uint8)
+    chosen[cv2.dilate(_cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8), _WIDE) > 0] = 0
     chosen = cv2.erode(cv2.morphologyEx(chosen, cv2.MORPH_OPEN, _WIDE), _POOLED)
     grown = (chosen > 0) & ~road & (sums[..., 0] > 0)
     edge = np.zeros(shape, np.bool_)
@@ -94,11 +95,11 @@ def _sums(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Float64:
     return sums
 
 
-def _road_cells(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Bools:
-    """Cells (rows, columns) that hold returns of the road."""
-    on_road = np.flatnonzero(scene.classes == classes.ROAD)
+def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]) -> Bools:
+    """Cells (rows, columns) that hold returns of a class."""
+    rows = np.flatnonzero(scene.classes == code)
     grid = (float(corner[0]), float(corner[1]), CELL_M)
-    cell = cells_of(scene.returns.x_m[on_road], scene.returns.y_m[on_road], grid, shape)
+    cell = cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows], grid, shape)
     out = np.zeros(shape[0] * shape[1], np.bool_)
     out[cell[cell >= 0]] = True
     return out.reshape(shape)

@@ -16,6 +16,7 @@ ROAD: Final = 11
 WIRE: Final = 14
 BRIDGE_DECK: Final = 17
 HIGH_NOISE: Final = 18
+OVERHEAD_STRUCTURE: Final = 19
 POLE: Final = 64
 SIGN: Final = 65
 KERB: Final = 66
@@ -39,6 +40,7 @@ CLASS_NAMES: Final = {
     WIRE: "wire conductor",
     BRIDGE_DECK: "bridge deck",
     HIGH_NOISE: "high noise",
+    OVERHEAD_STRUCTURE: "overhead structure",
     POLE: "pole",
     SIGN: "sign",
     KERB: "kerb",
@@ -49,4 +51,4 @@ CLASS_NAMES: Final = {
     FENCE: "fence",
     SIDEWALK: "sidewalk",
 }
-"""Codes up to 18 are those of the ASPRS LAS 1.4 R15 table 17; those from 64 on are left to users by that table."""
+"""Codes up to 19 are those of the ASPRS LAS 1.4 R15 table 17; those from 64 on are left to users by that table."""

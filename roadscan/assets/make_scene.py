@@ -49,7 +49,7 @@ def make_scene(
     users = road_users(returns, ground.above_m, ground.on_ground, cubes, window)
     found[users.vehicle] = classes.VEHICLE
     found[users.person] = classes.PERSON
-    found = surroundings(returns, ground.above_m, found, cubes, window)
+    found = surroundings(returns, ground.above_m, found, cubes, window, drive)
     found[ground.on_ground & on_road(returns, ground.model, drive)] = classes.ROAD
     return Scene(returns, tile, window, ground.model, ground.above_m, found, drive)
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.cubes import EDGE_M, Cubes
 from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.overheads import overhead_classes
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.kernels.assets import voxels
@@ -50,20 +51,34 @@ _LOW_M: Final = 0.3
 
 
 def surroundings(
-    returns: Returns, above_m: Float32, found: npt.NDArray[np.uint8], cubes: Cubes, window: Box
+    returns: Returns,
+    above_m: Float32,
+    found: npt.NDArray[np.uint8],
+    cubes: Cubes,
+    window: Box,
+    drive_xyh_m: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.uint8]:
     """Classes (n,): those of `found`, and in place of `UNCLASSIFIED` what stands there."""
     grid = grid_over(window, EDGE_M)
     features, bits = cubes.features, np.zeros(len(cubes.place), np.uint8)
+    over = bits
     if bits.size:
-        bits |= LEAFY * leaves(cubes, grid).view(np.uint8)
-        bits |= WALL * (near_walls(cubes, grid) & (features[:, voxels.SCATTERING] <= _IN_LEAVES)).view(np.uint8)
-        bits |= WIRE * wires(cubes, grid).view(np.uint8)
+        leafy, wire = leaves(cubes, grid), wires(cubes, grid)
+        walls, roofs = walls_and_roofs(cubes, grid)
+        over = overhead_classes(cubes, grid, leafy, wire | walls, drive_xyh_m)
+        buildings = (walls | roofs) & (features[:, voxels.SCATTERING] <= _IN_LEAVES)
+        bits |= LEAFY * leafy.view(np.uint8)
+        bits |= WALL * buildings.view(np.uint8)
+        bits |= WIRE * wire.view(np.uint8)
         bits |= ALONE * (features[:, voxels.NUMBER] <= 1).view(np.uint8)
     place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
     sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
     out = found.copy()
     standing_classes(above_m, cubes.number, bits, place, sensor, (_LOW_M, _MEDIUM_M, _HIGH_M, _NEAR_M), _CODES, out)
+    if over.any():
+        own = np.append(over, np.uint8(0))[cubes.number]
+        rows = np.flatnonzero((own > 0) & (found == classes.UNCLASSIFIED))
+        out[rows] = own[rows]
     return out
 
 
@@ -79,8 +94,8 @@ def leaves(cubes: Cubes, grid: Grid) -> Bools:
     return np.asarray((sums[1] >= _LEAFY * sums[0])[row, column])
 
 
-def near_walls(cubes: Cubes, grid: Grid) -> Bools:
-    """Cubes (cubes,) at walls, the large upright planes, and roofs: large planes that are not, above a man's height."""
+def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bools, Bools]:
+    """Cubes (cubes,) at walls, the large upright planes, and of roofs: large planes that are not, above a man."""
     place, features = cubes.place, cubes.features
     row, column = place[:, 0], place[:, 1]
     planar = (features[:, voxels.PLANARITY] >= _PLANAR) & (features[:, voxels.THICKNESS] <= _THICK)
@@ -99,7 +114,7 @@ def near_walls(cubes: Cubes, grid: Grid) -> Bools:
     roofs = long_ones(
         cv2.morphologyEx(roofs.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0, _ROOF_LENGTH_M
     )
-    return np.asarray(walls[row, column] | (roofs[row, column] & roof))
+    return np.asarray(walls[row, column]), np.asarray(roofs[row, column] & roof)
 
 
 def long_ones(cells: Bools, least_m: float) -> Bools:

@@ -23,9 +23,12 @@ from roadscan.simulate.scene.roadside import (
     Guardrail,
     LampPost,
     MovingCar,
+    Overhead,
     ParkedCar,
+    Planting,
     Pole,
     Sign,
+    Signal,
     Standing,
     Tree,
 )
@@ -136,7 +139,8 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
     kinds: tuple[tuple[str, Sequence[Standing | Barrier]], ...] = (
         ("sign", side.signs), ("pole", side.poles), ("lamp_post", side.lamp_posts), ("tree", side.trees),
         ("parked_car", side.parked_cars), ("guardrail", side.guardrails), ("fence", side.fences),
-        ("facade", side.facades), ("box", side.boxes),
+        ("facade", side.facades), ("box", side.boxes), ("signal", side.signals), ("overhead", side.overheads),
+        ("planting", side.plantings),
     )  # fmt: skip
     for kind, described in kinds:
         for one in described:
@@ -331,13 +335,63 @@ def _(one: LampPost, place: _Place, surface: Surface) -> tuple[tuple[float, floa
     inwards = -1.0 if one.offset_m > 0.0 else 1.0
     rows = [_post(place.enh_m[:2], z, top, one.diameter_m / 2, one.shade)]
     if one.arm_m > 0.0:
-        middle = place.beside(0.0, inwards * one.arm_m / 2, place.heading_rad)
-        half = (_ARM_M / 2, one.arm_m / 2)
-        rows.append(_body(body.BOX, middle, place.heading_rad, half, (top - _ARM_M, top), one.shade))
-        end = place.beside(0.0, inwards * one.arm_m, place.heading_rad)
         lamp = (_LAMP_M[1] / 2, _LAMP_M[0] / 2)
-        rows.append(_body(body.BOX, end, place.heading_rad, lamp, (top - _LAMP_M[2], top), one.shade))
+        for side in (inwards, -inwards)[: 1 + one.is_double]:
+            rows.append(_arm(place, side * one.arm_m, top, one.shade))
+            end = place.beside(0.0, side * one.arm_m, place.heading_rad)
+            rows.append(_body(body.BOX, end, place.heading_rad, lamp, (top - _LAMP_M[2], top), one.shade))
     return (one.diameter_m, 2 * one.arm_m + _LAMP_M[0], one.height_m), 0.0, np.stack(rows)
+
+
+def _arm(place: _Place, right_m: float, top: float, shade: float) -> Float64:
+    """An arm from a post to the right (negative: to the left) of the road's direction."""
+    middle = place.beside(0.0, right_m / 2, place.heading_rad)
+    return _body(body.BOX, middle, place.heading_rad, (_ARM_M / 2, abs(right_m) / 2), (top - _ARM_M, top), shade)
+
+
+@_made.register
+def _(one: Signal, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    z = place.enh_m[2]
+    top, radius = z + one.height_m, one.diameter_m / 2
+    width, depth, tall = one.head_m
+    rows = [_post(place.enh_m[:2], z, top, radius, one.shade)]
+    right = 0.0
+    if one.arm_m > 0.0:
+        right = -one.arm_m if one.offset_m > 0.0 else one.arm_m
+        rows.append(_arm(place, right, top, one.shade))
+    side = 1.0 if one.faces == "forward" else -1.0
+    before = _ARM_M / 2 if one.arm_m > 0.0 else radius
+    head = place.beside(side * (before + 0.02 + depth / 2), right, place.heading_rad)
+    rows.append(_body(body.BOX, head, place.heading_rad, (depth / 2, width / 2), (top - tall, top), one.head_shade))
+    return (one.diameter_m, max(one.arm_m, width), one.height_m), 0.0, np.stack(rows)
+
+
+@_made.register
+def _(one: Overhead, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    turned = math.radians(one.heading_deg)
+    low = place.enh_m[2] + one.clearance_m
+    half = (one.length_m / 2, one.width_m / 2)
+    slab = _body(
+        body.BOX, place.enh_m[:2], place.heading_rad + turned, half, (low, low + one.thickness_m), one.shade
+    )  # fmt: skip
+    return (one.length_m, one.width_m, one.clearance_m + one.thickness_m), turned, slab[None]
+
+
+@_made.register
+def _(one: Planting, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    rows_along, rows_across = (max(round(m / one.tuft_m), 1) for m in (one.length_m, one.width_m))
+    ahead = (np.arange(rows_along) + 0.5) / rows_along * one.length_m - one.length_m / 2
+    right = (np.arange(rows_across) + 0.5) / rows_across * one.width_m - one.width_m / 2
+    stations, offsets = (v.ravel() for v in np.meshgrid(place.station_m + ahead, one.offset_m + right))
+    at, feet = _points(surface, stations, offsets)
+    # the golden ratio's multiples are spread evenly: tufts of all heights stand everywhere
+    tall = one.height_m * (0.5 + 0.5 * np.mod(np.arange(feet.size) * 0.6180339887, 1.0))
+    radius = 0.6 * one.tuft_m
+    tufts = [
+        _body(body.ELLIPSOID, (e, n), 0.0, (radius, 0.0), (z - h, z + h), one.shade, one.density)
+        for (e, n), z, h in zip(at.tolist(), feet.tolist(), tall.tolist(), strict=True)
+    ]
+    return (one.length_m, one.width_m, one.height_m), 0.0, np.stack(tufts)
 
 
 @_made.register

@@ -13,6 +13,7 @@ from roadscan.assets.surroundings import surroundings
 from tests.assets.scenes import semantic_kitti_scene
 from tests.assets.test_bare_earth import airborne, iou
 
+NO_DRIVE = np.zeros((0, 4))
 VEGETATION = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
@@ -22,7 +23,7 @@ def test_vegetation_and_buildings_of_a_street() -> None:
     assert iou(np.isin(scene.classes, VEGETATION), np.isin(labels, (70, 71)), labels) >= 0.80
 
 
-def classes_of(points: np.ndarray) -> np.ndarray:
+def classes_of(points: np.ndarray, drive: np.ndarray = NO_DRIVE) -> np.ndarray:
     """Classes of points (n, 3) over level ground at height 0, of a sensor 30 m away."""
     window, returns = Box(0.0, 0.0, 20.0, 20.0), airborne(points)
     far: Returns = returns.at(np.ones(len(points), np.bool_))
@@ -30,7 +31,7 @@ def classes_of(points: np.ndarray) -> np.ndarray:
         axis[:] = -30.0
     above = points[:, 2].astype(np.float32)
     cubes = cubes_of(far, above, np.ones(len(points), np.bool_), window)
-    return surroundings(far, above, np.full(len(points), classes.UNCLASSIFIED, np.uint8), cubes, window)
+    return surroundings(far, above, np.full(len(points), classes.UNCLASSIFIED, np.uint8), cubes, window, drive)
 
 
 def test_a_wall_a_bush_and_a_wire() -> None:
@@ -44,6 +45,19 @@ def test_a_wall_a_bush_and_a_wire() -> None:
     heights = bush[:, 2]
     assert (found[6000:9000][heights > 2.05] == classes.HIGH_VEGETATION).mean() > 0.95
     assert (found[9000:] == classes.WIRE).mean() > 0.95
+
+
+def test_a_bridge_a_gantry_and_a_roof() -> None:
+    rng = np.random.default_rng(7)
+    deck = np.column_stack([rng.uniform(1, 19, 20_000), rng.uniform(3, 8, 20_000), rng.normal(5.0, 0.01, 20_000)])
+    side = np.column_stack([rng.uniform(1, 19, 5000), rng.normal(3.0, 0.01, 5000), rng.uniform(5.0, 6.2, 5000)])
+    gantry = np.column_stack([rng.uniform(1, 19, 4000), rng.uniform(13, 13.6, 4000), rng.normal(5.5, 0.01, 4000)])
+    drive = np.column_stack([np.full(20, 10.0), np.arange(20.0), np.full(20, 2.0), np.ones(20)])
+    found = classes_of(np.concatenate([deck, side, gantry]), drive)
+    assert (found[:25_000] == classes.BRIDGE_DECK).mean() > 0.97
+    assert (found[25_000:] == classes.OVERHEAD_STRUCTURE).mean() > 0.97
+    beside = drive + np.array([60.0, 0.0, 0.0, 0.0])
+    assert not np.isin(classes_of(deck, beside), (classes.BRIDGE_DECK, classes.OVERHEAD_STRUCTURE)).any()
 
 
 def test_road_ends_at_a_kerb() -> None:

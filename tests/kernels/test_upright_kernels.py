@@ -8,7 +8,7 @@ from scipy import ndimage
 from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
 from roadscan.kernels.assets.corridors import mark_corridor
 from roadscan.kernels.assets.cylinders import fit_cylinder, radius_across
-from roadscan.kernels.assets.grown_cells import ground_moments
+from roadscan.kernels.assets.grown_cells import low_moments
 from roadscan.kernels.assets.slices import fill_slices, label_slices, owners, slices_above_one_another
 from roadscan.kernels.assets.upright_voxels import (
     gather_moments,
@@ -135,13 +135,12 @@ def test_cells_along_a_drive() -> None:
     assert (inside == wanted).all()
 
 
-def test_moments_of_ground() -> None:
+def test_moments_of_what_lies_low() -> None:
     rng = np.random.default_rng(5)
     x, y, above, light = rng.uniform(0, 1, (4, 100))
-    kind = rng.integers(0, 3, 100).astype(np.uint8)
-    sums = np.zeros((2, 2, 9))
-    ground_moments(x, y, above, light.astype(np.float32), kind, np.zeros(2), 0.5, sums)
-    own = (kind == 1) & (x >= 0.5) & (y < 0.5)
-    u, h = x[own] - 0.75, above[own]
-    np.testing.assert_allclose(sums[0, 1, [0, 1, 3, 4, 6]], [own.sum(), u.sum(), h.sum(), (u * h).sum(), (h * h).sum()])
-    assert sums[..., 8].sum() == (kind == 2).sum()
+    counted = rng.random(100) < 0.7
+    sums = np.zeros((2, 2, 4))
+    low_moments(x, y, above, light, counted, np.array([0.1, 0.8]), np.zeros(2), 0.5, sums)
+    own = counted & (x >= 0.5) & (y < 0.5) & (above >= 0.1) & (above <= 0.8)
+    h = above[own]
+    np.testing.assert_allclose(sums[0, 1], [own.sum(), h.sum(), (h * h).sum(), light[own].sum()])

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.shafts import Shaft
@@ -19,7 +20,11 @@ Int64 = npt.NDArray[np.int64]
 _LEVEL_M: Final = 0.4
 _SECTORS: Final = 8
 _CROWN_REACH_M: Final = 4.5
-_ARM_REACH_M: Final = 4.5
+_HEAD_REACH_M: Final = 0.75
+_CROWN_M: Final = 1.5
+_BEYOND_SHARE: Final = 0.1
+_ARM_M: Final = 0.2
+"""What hangs from an arm lies below its top by more."""
 _BRIGHT_SHARE: Final = 0.1
 """Heads of signals are dark; of the returns of a sign more are bright than this share."""
 
@@ -49,11 +54,14 @@ class Arms:
     """Height of its outer end above the foot."""
     top_above_m: float
     returns: int
+    end_m: tuple[float, float]
+    """Outer end of the longer side, to the east and to the north of the axis."""
 
 
 def about(scene: Scene, shaft: Shaft) -> About:
     """Returns within 4.5 m of a shaft's axis."""
     rows = places_of(scene).within(shaft.axis.x_m, shaft.axis.y_m, _CROWN_REACH_M)
+    rows = rows[scene.classes[rows] != classes.BRIDGE_DECK]
     height = scene.returns.height_m[rows]
     x, y = shaft.axis.at(height)
     right, ahead = scene.returns.x_m[rows] - x, scene.returns.y_m[rows] - y
@@ -122,7 +130,9 @@ def arms(near: About, shaft: Shaft) -> Arms | None:
     sine, cosine = math.sin(best * math.pi / 12), math.cos(best * math.pi / 12)
     held = (np.abs(-right * sine + ahead * cosine) <= 0.25) & (np.abs(right * cosine + ahead * sine) <= length[best])
     other = float(across.max()) if across.max() >= 0.5 else 0.0
-    return Arms(float(length[best]), other, reaches[best][1], float(np.quantile(above[held], 0.98)), int(held.sum()))
+    reach, lamp_above_m = reaches[best]
+    top, end = float(np.quantile(above[held], 0.98)), (reach * cosine, reach * sine)
+    return Arms(reach, other, lamp_above_m, top, int(held.sum()), end)
 
 
 def _reach(along: Float64, above: Float64) -> tuple[float, float]:
@@ -141,12 +151,28 @@ def _reach(along: Float64, above: Float64) -> tuple[float, float]:
     return reach, float(np.median(above[end]))
 
 
-def signal_head(scene: Scene, near: About) -> tuple[float, float] | None:
-    """Height of the middle above the foot, and height of a box that a shaft carries, as signals have them; else None.
+def signal_head(scene: Scene, near: About, out: Arms | None) -> tuple[float, float] | None:
+    """Height of the middle above the foot, and height of a box as signals have them; else None.
 
-    A box 0.15–0.6 m wide and deep and 0.55–1.5 m high, 1.8 m above the foot or more; plates are thinner, and bright.
+    A shaft carries it itself, or the end of its arm. It is 0.15–0.6 m wide and deep and 0.55–1.5 m high, 1.8 m above
+    the foot or more; plates are thinner, and bright.
     """
-    close = (near.away_m < 0.75) & (near.above_m > 1.8)
+    held = _head(scene, near, near.away_m < _HEAD_REACH_M)
+    if held is None and out is not None:
+        at_end = np.hypot(near.right_m - out.end_m[0], near.ahead_m - out.end_m[1]) < _HEAD_REACH_M
+        held = _head(scene, near, at_end & (near.above_m < out.top_above_m - _ARM_M))
+    return held
+
+
+def is_head_alone(scene: Scene, near: About) -> bool:
+    """Whether a shaft carries a signal's head, and nothing about it reaches as far as a crown."""
+    crown = (near.away_m < _CROWN_M) & (near.above_m > 1.8)
+    beyond = crown & (near.away_m >= _HEAD_REACH_M)
+    return int(beyond.sum()) <= _BEYOND_SHARE * int(crown.sum()) and signal_head(scene, near, None) is not None
+
+
+def _head(scene: Scene, near: About, close: npt.NDArray[np.bool_]) -> tuple[float, float] | None:
+    close = close & (near.above_m > 1.8)
     bright = scene.returns.intensity[near.rows[close]] >= 2.0 * ground_light(scene)
     if close.sum() < 15 or bright.mean() > _BRIGHT_SHARE:
         return None

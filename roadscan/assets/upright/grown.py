@@ -1,9 +1,10 @@
-"""Cells of the map that are planted or grown over: what stands on them, how rough and how bright they are."""
+"""Cells of the map that are planted or grown over: their height scatters, over an area, more than that of the road."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -11,19 +12,28 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets import classes
+from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
-from roadscan.assets.upright.pieces import passes_of
-from roadscan.kernels.assets.grown_cells import ground_moments
+from roadscan.kernels.assets.grown_cells import low_moments
 from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
-CELL_M: Final = 0.5
+CELL_M: Final = 0.25
 _LEAST_RETURNS: Final = 6
-_GROUND: Final = (classes.GROUND, classes.ROAD, classes.SIDEWALK, classes.MARKING, classes.KERB)
-_GROWN: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION)
+"""Of a cell with the eight around it."""
+_LOW_M: Final = (-0.3, 1.0)
+"""Heights above the ground of what grows, and of the ground below it."""
+_LOW: Final = (
+    classes.UNCLASSIFIED, classes.GROUND, classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.ROAD,
+)  # fmt: skip
+_WIDE: Final = np.ones((5, 5), np.uint8)
+"""Walls, rails, kerbs and fences are narrower than this (cells)."""
+_POOLED: Final = np.ones((3, 3), np.uint8)
+"""A cell is judged with those around it, which widens areas by one."""
 PIECE_SCHEMA: Final = pa.schema(
     [
         ("column", pa.int64()), ("row", pa.int64()), ("height_m", pa.float64()), ("probability", pa.float64()),
@@ -31,7 +41,7 @@ PIECE_SCHEMA: Final = pa.schema(
         ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip
-"""A row a cell of the map's grid of 0.5 m (easting // 0.5, northing // 0.5)."""
+"""A row a cell of the map's grid of 0.25 m (easting // 0.25, northing // 0.25)."""
 
 
 class LandscapeOptions(Strict):
@@ -39,90 +49,91 @@ class LandscapeOptions(Strict):
 
     least_area_m2: float = Field(default=4.0, gt=0.0)
     """Smaller areas are left out (m²)."""
-    rough_ratio: float = Field(default=2.0, gt=1.0)
-    """A cell is rough whose height scatters this many times as much as the road's."""
-    bright_ratio: float = Field(default=1.2, gt=1.0)
-    """A cell beside the road is as bright as grass at this multiple of the road's median intensity."""
+    rough_ratio: float = Field(default=3.0, gt=1.0)
+    """A cell is grown over whose heights scatter this many times as much as the road's."""
 
 
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
-    """Cells of the tile that are probably grown over: plants stand on them, or they are rough or as bright as grass."""
-    returns, tile = scene.returns, scene.tile
-    kind = np.zeros(256, np.uint8)
-    kind[list(_GROUND)], kind[list(_GROWN)] = 1, 2
-    kinds = kind[scene.classes]
-    columns = int(np.ceil((tile.x_max_m - tile.x_min_m) / CELL_M - 1e-9))
-    rows = int(np.ceil((tile.y_max_m - tile.y_min_m) / CELL_M - 1e-9))
-    corner = np.array([tile.x_min_m, tile.y_min_m])
-    sums = np.zeros((rows, columns, 9))
-    above = scene.above_ground_m.astype(np.float64)
-    ground_moments(returns.x_m, returns.y_m, above, returns.intensity, kinds, corner, CELL_M, sums)
-    counted = sums[..., 0] >= _LEAST_RETURNS
-    rough, bright = _roughness(sums), sums[..., 7] / np.maximum(sums[..., 0], 1.0)
-    road = _road_cells(scene, counted.shape, corner) & counted
+    """Cells of the tile that are probably grown over, with the scatter of their heights over that of the road.
+
+    Vosselman (2000) told vegetation from ground by how rough a surface is. What is narrow is left out by an opening.
+    """
+    tile, window = scene.tile, scene.window
+    margin = int((tile.x_min_m - window.x_min_m) / CELL_M)
+    corner = np.array([tile.x_min_m, tile.y_min_m]) - margin * CELL_M
+    inner = tuple(round((high - low) / CELL_M) for low, high in
+                  ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip
+    shape = (inner[0] + 2 * margin, inner[1] + 2 * margin)
+    sums = _sums(scene, corner, shape)
+    pooled = np.stack([cv2.boxFilter(s, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+                       for s in np.moveaxis(sums, -1, 0)])  # fmt: skip
+    counted, n = pooled[0] >= _LEAST_RETURNS, np.maximum(pooled[0], 1.0)
+    rough = np.sqrt(np.maximum(pooled[2] / n - (pooled[1] / n) ** 2, 1e-8))
+    road = _cells_with(scene, classes.ROAD, corner, shape) & counted
     if not road.any():
         return PIECE_SCHEMA.empty_table()
-    plain, dark = float(np.median(rough[road])), float(np.median(bright[road]))
-    plants = np.minimum(sums[..., 8] / np.maximum(sums[..., 0] + sums[..., 8], 1.0), 1.0)
-    z = -3.0 + 8.0 * plants
-    z += np.where(counted, 3.0 * (np.clip(rough / max(plain, 1e-4) / options.rough_ratio, 0.0, 2.0) - 0.7), 0.0)
-    z += np.where(counted & (bright > options.bright_ratio * dark), 3.0, 0.0)
-    probability = 1.0 / (1.0 + np.exp(-z))
-    chosen = (probability >= 0.5) & ~road & ((sums[..., 0] + sums[..., 8]) >= _LEAST_RETURNS)
-    return _table(scene, chosen, probability, kinds > 0)
+    ratio = rough / float(np.median(rough[road]))
+    chosen = (counted & (ratio >= options.rough_ratio)).astype(np.uint8)
+    chosen[cv2.dilate(_cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8), _WIDE) > 0] = 0
+    chosen = cv2.erode(cv2.morphologyEx(chosen, cv2.MORPH_OPEN, _WIDE), _POOLED)
+    grown = (chosen > 0) & ~road & (sums[..., 0] > 0)
+    edge = np.zeros(shape, np.bool_)
+    edge[margin : margin + inner[0], margin : margin + inner[1]] = True
+    return _table(scene, grown & edge, ratio / options.rough_ratio, corner)
 
 
-def _roughness(sums: Float64) -> Float64:
-    """Standard deviation (rows, columns) of the ground's height about a plane in each cell (m)."""
-    n = np.maximum(sums[..., 0], 1.0)
-    u, v, h, uh, vh, hh = (sums[..., k] / n for k in range(1, 7))
-    spread = CELL_M**2 / 12.0
-    square = hh - h * h - ((uh - u * h) ** 2 + (vh - v * h) ** 2) / spread
-    return np.sqrt(np.maximum(square, 1e-8))
-
-
-def _road_cells(scene: Scene, shape: tuple[int, ...], corner: Float64) -> npt.NDArray[np.bool_]:
-    """Cells (rows, columns) that hold returns of the road."""
-    on_road = np.flatnonzero(scene.classes == classes.ROAD)
-    column = np.floor((scene.returns.x_m[on_road] - corner[0]) / CELL_M).astype(np.int64)
-    row = np.floor((scene.returns.y_m[on_road] - corner[1]) / CELL_M).astype(np.int64)
-    inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
-    out = np.zeros(shape, np.bool_)
-    out[row[inside], column[inside]] = True
-    return out
-
-
-def _table(
-    scene: Scene, chosen: npt.NDArray[np.bool_], probability: Float64, counted: npt.NDArray[np.bool_]
-) -> pa.Table:
-    """Rows of the chosen cells."""
-    returns, tile = scene.returns, scene.tile
-    at = np.flatnonzero(counted & tile.holds(returns.x_m, returns.y_m))
-    column = np.floor((returns.x_m[at] - tile.x_min_m) / CELL_M).astype(np.int64)
-    row = np.floor((returns.y_m[at] - tile.y_min_m) / CELL_M).astype(np.int64)
-    inside = chosen[row, column]
-    at, flat = at[inside], (row * chosen.shape[1] + column)[inside]
-    order = np.argsort(flat, kind="stable")
-    parts = np.split(at[order], np.flatnonzero(np.diff(flat[order])) + 1) if at.size else []
-    first = (
-        round((returns.corner_m[0] + tile.x_min_m) / CELL_M), round((returns.corner_m[1] + tile.y_min_m) / CELL_M),
+def _sums(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Float64:
+    returns = scene.returns
+    counted = np.zeros(256, np.bool_)
+    counted[list(_LOW)] = True
+    sums = np.zeros((*shape, 4))
+    limits = np.array(_LOW_M)
+    low_moments(
+        returns.x_m, returns.y_m, scene.above_ground_m, returns.intensity, counted[scene.classes], limits, corner,
+        CELL_M, sums,
     )  # fmt: skip
-    found: list[dict[str, Any]] = []
-    for part in parts:
-        c = int((returns.x_m[part[0]] - tile.x_min_m) / CELL_M)
-        r = int((returns.y_m[part[0]] - tile.y_min_m) / CELL_M)
-        epochs = returns.epoch_gps_ns[part]
-        height = float(scene.ground.height_at(tile.x_min_m + (c + 0.5) * CELL_M, tile.y_min_m + (r + 0.5) * CELL_M))
-        if np.isfinite(height):
-            found.append(
-                {
-                    "column": first[0] + c, "row": first[1] + r, "height_m": height,
-                    "probability": float(probability[r, c]), "returns": int(part.size),
-                    "passes": passes_of(scene, part), "first_epoch_gps_ns": int(epochs.min()),
-                    "last_epoch_gps_ns": int(epochs.max()),
-                }
-            )  # fmt: skip
-    return pa.Table.from_pylist(found, schema=PIECE_SCHEMA)
+    return sums
+
+
+def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]) -> Bools:
+    """Cells (rows, columns) that hold returns of a class."""
+    rows = np.flatnonzero(scene.classes == code)
+    grid = (float(corner[0]), float(corner[1]), CELL_M)
+    cell = cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows], grid, shape)
+    out = np.zeros(shape[0] * shape[1], np.bool_)
+    out[cell[cell >= 0]] = True
+    return out.reshape(shape)
+
+
+def _table(scene: Scene, chosen: Bools, ratio: Float64, corner: Float64) -> pa.Table:
+    """Rows of the chosen cells, by row and column."""
+    returns, columns = scene.returns, chosen.shape[1]
+    low = np.flatnonzero((scene.above_ground_m >= _LOW_M[0]) & (scene.above_ground_m <= _LOW_M[1]))
+    grid = (float(corner[0]), float(corner[1]), CELL_M)
+    cell = cells_of(returns.x_m[low], returns.y_m[low], grid, chosen.shape)
+    held = np.flatnonzero(chosen.ravel())
+    number = np.full(chosen.size + 1, -1, np.int32)
+    number[held] = np.arange(held.size)
+    starts, order = in_bins(number[cell], held.size)
+    row, column = held // columns, held % columns
+    middle = [corner[k] + (v + 0.5) * CELL_M for k, v in enumerate((column, row))]
+    height = scene.ground.height_at(*middle)
+    kept = np.flatnonzero(np.isfinite(height) & (np.diff(starts) > 0))
+    rows = low[order]
+    epochs, passes = returns.epoch_gps_ns[rows], returns.pass_id[rows]
+    spans = [(int(starts[k]), int(starts[k + 1])) for k in kept]
+    east, north = (round((returns.corner_m[k] + corner[k]) / CELL_M) for k in (0, 1))
+    probability = ratio[row, column] ** 2 / (1.0 + ratio[row, column] ** 2)
+    return pa.table(
+        {
+            "column": east + column[kept], "row": north + row[kept], "height_m": height[kept],
+            "probability": probability[kept], "returns": np.diff(starts)[kept],
+            "passes": pa.array([np.unique(passes[a:b]).tolist() for a, b in spans], pa.list_(pa.int32())),
+            "first_epoch_gps_ns": np.array([int(epochs[a:b].min()) for a, b in spans], np.int64),
+            "last_epoch_gps_ns": np.array([int(epochs[a:b].max()) for a, b in spans], np.int64),
+        },
+        PIECE_SCHEMA,
+    )  # fmt: skip
 
 
 def components(column: Int64, row: Int64) -> list[Int64]:
@@ -138,8 +149,12 @@ def components(column: Int64, row: Int64) -> list[Int64]:
     return sorted(parts, key=lambda p: (int(row[p[0]]), int(column[p[0]])))
 
 
-def area_of(column: Int64, row: Int64) -> shapely.Geometry:
+def area_of(column: Int64, row: Int64, cell_m: float = CELL_M) -> shapely.Geometry:
     """Union of cells of the map's grid (easting and northing, m)."""
-    return shapely.union_all(
-        shapely.box(column * CELL_M, row * CELL_M, (column + 1) * CELL_M, (row + 1) * CELL_M), grid_size=1e-3
-    )
+    order = np.lexsort((column, row))
+    column, row = column[order], row[order]
+    ends = np.flatnonzero((np.diff(column) != 1) | (np.diff(row) != 0))
+    first, last = np.append(0, ends + 1), np.append(ends, column.size - 1)
+    runs = shapely.box(column[first] * cell_m, row[first] * cell_m, (column[last] + 1) * cell_m,
+                       (row[first] + 1) * cell_m)  # fmt: skip
+    return shapely.union_all(runs, grid_size=1e-3)

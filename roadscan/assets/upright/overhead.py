@@ -23,6 +23,7 @@ Int64 = npt.NDArray[np.int64]
 
 CELL_M: Final = 0.5
 _SUPPORT_M: Final = 0.25
+_NOISE_M: Final = 0.1
 _NEAR_M: Final = 12.0
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 PIECE_SCHEMA: Final = pa.schema(
@@ -109,7 +110,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
     i = int(supported[0])
     low = part[i]
     near = part[(heights >= heights[i]) & (heights <= heights[i] + 2 * _SUPPORT_M)]
-    x, y, height = float(returns.x_m[low]), float(returns.y_m[low]), float(heights[i])
+    x, y, height = float(returns.x_m[low]), float(returns.y_m[low]), _lowest(heights[i:])
     ground = float(scene.ground.height_at(x, y))
     if not np.isfinite(ground):
         return None
@@ -123,6 +124,15 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
         "passes": passes_of(scene, near), "first_epoch_gps_ns": int(epochs.min()),
         "last_epoch_gps_ns": int(epochs.max()),
     }  # fmt: skip
+
+
+def _lowest(heights: Float64) -> float:
+    """Height of what hangs lowest, of ascending heights: a tenth of the returns within 0.1 m lie below it.
+
+    The lowest of many returns lies as far below a surface as their noise reaches.
+    """
+    near = heights[: int(np.searchsorted(heights, heights[0] + _NOISE_M, side="right"))]
+    return float(near[near.size // 10])
 
 
 def lowest_places(pieces: pa.Table, apart_m: float) -> list[dict[str, Any]]:

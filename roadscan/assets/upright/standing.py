@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, signal_head
+from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, is_head_alone, signal_head
 from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import Shaft, shafts_of
@@ -51,7 +51,10 @@ def uprights_of(scene: Scene) -> list[Upright]:
     judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts_of(scene)]
     probable = _apart([(s, p) for s, p in judged if p >= LEAST])
     near = [about(scene, shaft) for shaft, _ in probable]
-    crowns = [tree_probability(shaft, crown_share(a, shaft)) for (shaft, _), a in zip(probable, near, strict=True)]
+    crowns = [
+        0.0 if is_head_alone(scene, a) else tree_probability(shaft, crown_share(a, shaft))
+        for (shaft, _), a in zip(probable, near, strict=True)
+    ]
     trunks = np.array([[s.axis.x_m, s.axis.y_m] for (s, _), c in zip(probable, crowns, strict=True) if c >= 0.5])
     return [
         _told(scene, shaft, probability, a, c, trunks.reshape(-1, 2))
@@ -123,7 +126,7 @@ def _told(
         return Upright("delineator", shaft, probability, shaft.rows, values)
     values["lean_deg"] = lean
     out = arms(near, shaft)
-    if signal_head(scene, near) is not None and shaft.top_above_m < _SIGNAL_M:
+    if signal_head(scene, near, out) is not None and shaft.top_above_m < _SIGNAL_M:
         values["arm_m"] = out.reach_m if out else None
         return Upright("signal", shaft, probability, shaft.rows, values)
     if out is not None and shaft.top_above_m >= _LAMP_M:

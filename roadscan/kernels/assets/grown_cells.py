@@ -1,4 +1,4 @@
-"""Moments of ground returns and counts of what grows on it, by cells."""
+"""Moments of what lies low, by cells."""
 
 from __future__ import annotations
 
@@ -6,30 +6,22 @@ from roadscan.kernels.options import kernel
 
 
 @kernel
-def ground_moments(x, y, above, intensity, kind, corner, cell_m, sums):
-    """Add returns to their cells: sums (rows, columns, 9) float64.
+def low_moments(x, y, above, intensity, is_counted, limits, corner, cell_m, sums):
+    """Add low returns to their cells: sums (rows, columns, 4) float64: n, Σh, Σh², Σ intensity.
 
-    x, y : (n,) places (m); above : (n,) height above the ground (m); intensity : (n,); kind : (n,) 1 ground, 2 what
-    grows, else left out; corner : (x, y) of cell (0, 0). Sums of ground: n, Σu, Σv, Σh, Σuh, Σvh, Σh² with u, v from
-    the middle of the cell (m), Σ intensity; last the number of returns of what grows.
+    x, y : (n,) places (m); above : (n,) h, height above the ground (m); intensity : (n,); is_counted : (n,) bool;
+    limits : (2,) least and greatest h that counts (m); corner : (x, y) of cell (0, 0).
     """
     rows, columns = sums.shape[:2]
     for i in range(x.size):
-        if kind[i] != 1 and kind[i] != 2:
+        h = above[i]
+        if not is_counted[i] or not (limits[0] <= h <= limits[1]):
             continue
         a, b = (x[i] - corner[0]) / cell_m, (y[i] - corner[1]) / cell_m
         if not (a >= 0.0 and b >= 0.0 and a < columns and b < rows):
             continue
         r, c = int(b), int(a)
-        if kind[i] == 2:
-            sums[r, c, 8] += 1.0
-            continue
-        u, v, h = (a - c - 0.5) * cell_m, (b - r - 0.5) * cell_m, above[i]
         sums[r, c, 0] += 1.0
-        sums[r, c, 1] += u
-        sums[r, c, 2] += v
-        sums[r, c, 3] += h
-        sums[r, c, 4] += u * h
-        sums[r, c, 5] += v * h
-        sums[r, c, 6] += h * h
-        sums[r, c, 7] += intensity[i]
+        sums[r, c, 1] += h
+        sums[r, c, 2] += h * h
+        sums[r, c, 3] += intensity[i]

@@ -26,7 +26,8 @@ _COLOURS: Final = {
     classes.MEDIUM_VEGETATION: (80, 160, 70), classes.HIGH_VEGETATION: (60, 150, 60), classes.BUILDING: (206, 140, 110),
     classes.POLE: (240, 220, 120), classes.SIGN: (240, 90, 80), classes.KERB: (250, 160, 60),
     classes.BARRIER: (120, 190, 240), classes.MARKING: (255, 255, 255), classes.VEHICLE: (150, 130, 210),
-    classes.FENCE: (190, 160, 240), classes.SIDEWALK: (190, 170, 150),
+    classes.FENCE: (190, 160, 240), classes.SIDEWALK: (190, 170, 150), classes.BRIDGE_DECK: (140, 200, 200),
+    classes.OVERHEAD_STRUCTURE: (110, 170, 180),
 }  # fmt: skip
 _OTHER: Final = (170, 176, 186)
 _LEAST_M: Final = 2.0

@@ -73,8 +73,29 @@ class LampPost(Standing):
     """Diameter of the post (m)."""
     arm_m: float = Field(default=1.5, ge=0.0, le=6.0)
     """Length of the arm towards the reference line (m)."""
+    is_double: bool = False
+    """True: it has the same arm away from the road."""
     shade: Shade = 110.0
     """Intensity."""
+
+
+class Signal(Standing):
+    """A traffic signal: a post with a head of three lamps, or an arm over the road with a head at its end."""
+
+    height_m: float = Field(default=3.4, gt=1.0, le=12.0)
+    """Height of the post, and of the arm (m)."""
+    diameter_m: float = Field(default=0.12, gt=0.02, le=1.0)
+    """Diameter of the post (m)."""
+    arm_m: float = Field(default=0.0, ge=0.0, le=8.0)
+    """Length of the arm towards the reference line (m); 0: the head is on the post."""
+    head_m: tuple[float, float, float] = (0.35, 0.30, 0.95)
+    """Width, depth and height of the head (m); its upper edge is level with the post's top."""
+    faces: Literal["forward", "backward"] = "backward"
+    """Whom it faces: backward is read by traffic towards growing stations."""
+    shade: Shade = 100.0
+    """Intensity of post and arm."""
+    head_shade: Shade = 40.0
+    """Intensity of the head."""
 
 
 class Tree(Standing):
@@ -201,6 +222,40 @@ class Box(Standing):
     """Intensity."""
 
 
+class Overhead(Standing):
+    """A level slab over the road: the deck of a bridge, a footbridge, a gantry; its piers are boxes."""
+
+    length_m: float = Field(gt=0.05, le=100.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(gt=0.05, le=100.0)
+    """Extent across the road (m)."""
+    clearance_m: float = Field(default=5.0, gt=1.5, le=30.0)
+    """Height of its lower face above the ground at its middle (m)."""
+    thickness_m: float = Field(default=0.9, gt=0.05, le=10.0)
+    """From its lower face to its upper one (m)."""
+    heading_deg: float = 0.0
+    """Turned from the direction of the road, clockwise (degrees)."""
+    shade: Shade = 130.0
+    """Intensity."""
+
+
+class Planting(Standing):
+    """A bed of low plants: tufts side by side, each of which lets some beams through."""
+
+    length_m: float = Field(gt=0.2, le=200.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(gt=0.2, le=50.0)
+    """Extent across the road (m)."""
+    height_m: float = Field(default=0.4, gt=0.02, le=3.0)
+    """Height of the tallest tufts; the lowest are half as tall (m)."""
+    tuft_m: float = Field(default=0.5, ge=0.1, le=2.0)
+    """From tuft to tuft (m)."""
+    density: float = Field(default=0.7, gt=0.0, le=1.0)
+    """Share of beams that a tuft stops on each of its sides."""
+    shade: Shade = 110.0
+    """Intensity."""
+
+
 class Roadside(Strict):
     """Everything that stands and moves."""
 
@@ -224,3 +279,9 @@ class Roadside(Strict):
     """Fronts of buildings."""
     boxes: list[Box] = []
     """Boxes."""
+    signals: list[Signal] = []
+    """Traffic signals."""
+    overheads: list[Overhead] = []
+    """Bridges and gantries."""
+    plantings: list[Planting] = []
+    """Beds of plants."""

@@ -28,6 +28,7 @@ _PAINT_FROM: Final = 150.0
 """Shade from which on the road is paint."""
 _KINDS: Final = {
     "tree": (0.55, 0.85, 0.42), "facade": (1.0, 0.93, 0.80), "fence": (0.95, 0.82, 0.66), "box": (0.95, 0.95, 1.0),
+    "planting": (0.50, 0.86, 0.40), "signal": (0.85, 0.88, 0.85), "overhead": (1.0, 0.98, 0.95),
 }  # fmt: skip
 _CARS: Final = ((1.0, 1.0, 1.0), (0.95, 0.45, 0.40), (0.50, 0.62, 0.95), (0.85, 0.86, 0.90), (0.55, 0.60, 0.58))
 _ASPHALT: Final = (1.0, 0.99, 0.97)

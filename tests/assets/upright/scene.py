@@ -20,7 +20,14 @@ ROADSIDE = {
     "fences": [{"offset_m": 11.0, "start_m": -2.0, "end_m": 22.0, "height_m": 1.5}],
     "boxes": [{"station_m": 31.0, "offset_m": 9.5, "length_m": 10.0, "width_m": 0.3, "height_m": 1.9}],
     "trees": [{"station_m": 5.0, "offset_m": 8.0, "every_m": 15.0, "count": 2, "height_m": 8.0, "trunk_m": 0.3}],
-    "lamp_posts": [{"station_m": 12.0, "offset_m": 6.2, "height_m": 6.0, "arm_m": 4.5}],
+    "lamp_posts": [
+        {"station_m": 12.0, "offset_m": 6.2, "height_m": 6.0, "arm_m": 4.5},
+        {"station_m": 34.0, "offset_m": 6.2, "height_m": 6.0, "arm_m": 1.8, "is_double": True},
+    ],
+    "signals": [
+        {"station_m": 30.0, "offset_m": 6.0},
+        {"station_m": 34.0, "offset_m": -6.6, "height_m": 5.8, "arm_m": 2.2, "diameter_m": 0.18},
+    ],
     "poles": [
         {"station_m": 20.0, "offset_m": -7.5, "every_m": 8.0, "count": 2, "height_m": 4.0, "diameter_m": 0.10},
         {"station_m": 24.0, "offset_m": -8.0, "height_m": 5.0, "diameter_m": 0.25},

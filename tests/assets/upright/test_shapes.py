@@ -41,5 +41,5 @@ def test_areas_are_cells_that_share_a_side() -> None:
     assert [sorted(zip(column[p].tolist(), row[p].tolist(), strict=True)) for p in parts] == [
         [(4, 7), (5, 7), (5, 8)], [(9, 8)], [(6, 9)],
     ]  # fmt: skip
-    area = area_of(column[parts[0]], row[parts[0]])
+    area = area_of(column[parts[0]], row[parts[0]], 0.5)
     assert area.area == pytest.approx(0.75) and area.bounds == pytest.approx((2.0, 3.5, 3.0, 4.5))

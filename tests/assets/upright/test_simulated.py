@@ -11,7 +11,7 @@ import pytest
 from roadscan.assets.kind import AssetObject
 from tests.assets.upright.scene import objects_of, simulated
 
-POLES = ("pole", "lighting", "tree", "delineator")
+SHAFTS = ("pole", "lamp_post", "tree", "sign", "signal")
 
 
 def placed(one: AssetObject) -> np.ndarray:
@@ -30,25 +30,33 @@ def nearest(one: AssetObject, kinds: tuple[str, ...]) -> tuple[pd.Series, float]
 
 def test_each_shaft_is_found_where_it_stands_as_what_it_is() -> None:
     scene, _truth = simulated()
-    wanted = {"pole": 5, "lighting": 1, "tree": 2, "delineator": 2, "signal": 0}
+    wanted = {"pole": 5, "lighting": 2, "tree": 2, "delineator": 2, "signal": 2}
     for kind, number in wanted.items():
         found = objects_of(scene, kind)
         assert len(found) == number, kind
         for one in found:
-            thing, away = nearest(one, ("pole", "lamp_post", "tree", "sign"))
+            thing, away = nearest(one, SHAFTS)
             assert away < 0.03, (kind, thing.kind)
             assert abs(one.geometry.z - thing.height_m) < 0.08
             assert one.probability > 0.6 and one.returns > 50 and one.passes == 1
-    lamp = objects_of(scene, "lighting")[0]
-    assert lamp.attributes["type"] == "arm" and abs(lamp.attributes["arm_m"] - 4.5) < 0.3
-    assert {nearest(o, ("pole", "lamp_post", "tree", "sign"))[0].kind for o in objects_of(scene, "tree")} == {"tree"}
+    lamps = {lamp.attributes["type"]: lamp.attributes["arm_m"] for lamp in objects_of(scene, "lighting")}
+    assert lamps["arm"] == pytest.approx(4.5, abs=0.3) and lamps["double_arm"] == pytest.approx(1.8, abs=0.3)
+    assert {nearest(o, SHAFTS)[0].kind for o in objects_of(scene, "tree")} == {"tree"}
+
+
+def test_heads_on_posts_and_on_arms_are_signals() -> None:
+    for one in objects_of(simulated()[0], "signal"):
+        thing, _ = nearest(one, SHAFTS)
+        assert thing.kind == "signal"
+        reach = one.attributes["arm_m"]
+        assert reach is None if thing.size_up_m < 5.0 else reach == pytest.approx(2.2, abs=0.3)
 
 
 @pytest.mark.parametrize("kind", ["pole", "lighting"])
 def test_diameters_and_heights_of_poles(kind: str) -> None:
     scene, _ = simulated()
     for one in objects_of(scene, kind):
-        thing, _ = nearest(one, ("pole", "lamp_post", "sign"))
+        thing, _ = nearest(one, ("pole", "lamp_post", "sign", "signal"))
         wide = {"sign": 0.06, "lamp_post": 0.16}.get(thing.kind, thing.width_m)
         assert abs(one.attributes["diameter_m"] - wide) < 0.02
         assert abs(one.attributes["asset_height_m"] - thing.size_up_m) < 0.1

@@ -1,0 +1,463 @@
+"""What was found on a simulated street, held against what stands there: by points, along lines, by area, by cells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, Final, NamedTuple
+
+import geopandas
+import laspy
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import rasterio
+import shapely
+
+from benchmarks.asset_streets import LOW_POST_M, Street
+from benchmarks.timing import Figure
+from roadscan.assets import classes
+
+Float64 = npt.NDArray[np.float64]
+
+NEAR_M: Final = 0.5
+"""A post or a plate is the one that stands there when it is found so near to it."""
+_STEP_M: Final = 0.1
+_PAINT_FROM: Final = 150.0
+"""Digital numbers of the simulator: paint is 190, a kerb 135."""
+_CELL_M: Final = 0.1
+_PLATE_BEFORE_POST_M: Final = 0.04
+_HEIGHT_SHARE: Final = {"round": 1.0, "triangle": math.sqrt(3.0) / 2.0, "octagon": 1.0, "diamond": 1.0}
+_POST_OF_SIGN_M: Final = 0.06
+POINTS: Final = ("sign", "pole", "lighting", "signal", "tree", "delineator")
+LINES: Final = {"kerb": 0.05, "guardrail": 0.15, "facade": 0.3, "fence": 0.15, "lane_line": 0.05}
+"""How near a line has to lie (m)."""
+AREAS: Final = ("sidewalk", "landscape_area")
+NONE_THERE: Final = ("wall", "barrier", "attenuator", "median")
+"""Kinds that the streets lack, but for boxes."""
+
+
+class Judged(NamedTuple):
+    """An object that was found."""
+
+    kind: str
+    probability: float
+    is_right: bool
+
+
+# --- what is true ------------------------------------------------------------------------------------
+
+
+def true_points(street: Street) -> dict[str, pd.DataFrame]:
+    """Foot, size and heading of what stands at a place, by kind; a sign stands on a pole of its own."""
+    things = street.things[street.things.station_m.between(*street.ends_m)]
+    posts = things[things.kind == "pole"]
+    signs = things[things.kind == "sign"]
+    sign_posts = signs.assign(width_m=_POST_OF_SIGN_M)
+    return {
+        "sign": signs,
+        "pole": pd.concat([posts[posts.size_up_m > LOW_POST_M], sign_posts]),
+        "delineator": posts[posts.size_up_m <= LOW_POST_M],
+        "lighting": things[things.kind == "lamp_post"],
+        "signal": things[things.kind == "signal"],
+        "tree": things[things.kind == "tree"],
+    }
+
+
+def true_lines(street: Street) -> dict[str, shapely.Geometry]:
+    """Lines of barriers, kerbs and painted lines, by kind."""
+    side, road = street.scene.roadside, street.scene.road
+    sign = {"left": -1.0, "right": 1.0}
+    kerbs = [
+        street.line(sign[k.side] * (road.paved_m + k.face_m / 2), -math.inf, math.inf) for k in road.kerbs
+    ]  # fmt: skip
+    fronts = []
+    for one in side.facades:
+        fronts.append(street.line(one.offset_m, one.start_m, one.end_m))
+        for station in (one.start_m, one.end_m):
+            if street.ends_m[0] <= station <= street.ends_m[1]:
+                away = one.offset_m + math.copysign(one.depth_m, one.offset_m)
+                east, north, _ = street.surface.place(np.full(2, station), np.array([one.offset_m, away]))
+                fronts.append(shapely.LineString(np.column_stack([east, north])))
+    return {
+        "kerb": shapely.union_all(kerbs),
+        "guardrail": shapely.union_all([street.line(g.offset_m, g.start_m, g.end_m) for g in side.guardrails]),
+        "fence": shapely.union_all([street.line(f.offset_m, f.start_m, f.end_m) for f in side.fences]),
+        "facade": shapely.union_all(fronts),
+        "lane_line": shapely.union_all([street.line(m.offset_m, m.start_m, m.end_m) for m in road.markings]),
+    }
+
+
+def true_areas(street: Street) -> dict[str, shapely.Geometry]:
+    """Areas of plants, and of sidewalks where a façade or a fence ends them."""
+    side, road = street.scene.roadside, street.scene.road
+    walks = []
+    for kerb in road.kerbs:
+        sign = -1.0 if kerb.side == "left" else 1.0
+        for one in (*side.facades, *side.fences):
+            if one.offset_m * sign > road.paved_m:
+                near = sign * (road.paved_m + kerb.face_m)
+                walks.append(street.area(near, one.offset_m, one.start_m, one.end_m))
+    beds = [
+        street.area(p.offset_m - p.width_m / 2, p.offset_m + p.width_m / 2, s - p.length_m / 2, s + p.length_m / 2)
+        for p in side.plantings
+        for s in [p.station_m + n * p.every_m for n in range(p.count if p.every_m > 0.0 else 1)]
+    ]
+    return {"sidewalk": shapely.union_all(walks), "landscape_area": shapely.union_all(beds)}
+
+
+def boxes(street: Street) -> shapely.Geometry:
+    """Outlines of the boxes, which may be found as walls, barriers or façades."""
+    found = []
+    for one in street.things[street.things.kind == "box"].itertuples():
+        sine, cosine = math.sin(math.radians(one.heading_deg)), math.cos(math.radians(one.heading_deg))
+        a, b = one.length_m / 2, one.width_m / 2
+        ring = [(one.easting_m + u * sine + v * cosine, one.northing_m + u * cosine - v * sine)
+                for u, v in ((a, b), (a, -b), (-a, -b), (-a, b))]  # fmt: skip
+        found.append(shapely.Polygon(ring))
+    return shapely.union_all(found)
+
+
+def overhead(street: Street) -> shapely.Geometry:
+    """What hangs over the street, seen from above: slabs, arms, crowns."""
+    found = []
+    for one in street.things[street.things.kind.isin(["overhead", "tree", "lamp_post", "signal"])].itertuples():
+        place = shapely.Point(one.easting_m, one.northing_m)
+        reach = math.hypot(one.length_m, one.width_m) / 2 if one.kind == "overhead" else max(one.width_m, one.length_m)
+        found.append(place.buffer(reach + 0.3))
+    return shapely.union_all(found)
+
+
+# --- objects one by one ------------------------------------------------------------------------------
+
+
+def judged(street: Street) -> Iterator[Judged]:
+    """Each object that was found, its probability, and whether it is what it says."""
+    points, lines, areas, solid = true_points(street), true_lines(street), true_areas(street), boxes(street)
+    paint, above = _painted(street), overhead(street)
+    edges = shapely.union_all(
+        [street.line(s * street.scene.road.paved_m, -math.inf, math.inf) for s in (-1.0, 1.0)]
+    )  # fmt: skip
+
+    def on_line(kind: str) -> Callable[[Any], bool]:
+        within = max(LINES[kind], 0.15)
+        # a chain that follows a box is a wall, whichever kind of one
+        return lambda g: max(_share_near(g, lines[kind], within), _share_near(g, solid, 0.3)) >= 0.5
+
+    rules: dict[str, Callable[[Any], bool]] = {kind: on_line(kind) for kind in LINES}
+    rules |= {kind: lambda g: _share_near(g, solid, 0.3) >= 0.5 for kind in NONE_THERE}
+    rules |= {kind: lambda g, k=kind: _share_within(g, areas[k]) >= 0.5 for kind in AREAS}
+    rules |= {
+        "road_marking": lambda g: _share_within(g, paint) >= 0.5,
+        "road_edge": lambda g: _share_near(g, edges, 0.3) >= 0.5,
+        "clearance": lambda g: bool(shapely.dwithin(shapely.force_2d(g), above, 0.5)),
+    }
+    for kind in POINTS:
+        rules[kind] = lambda g, k=kind: _nearest(points[k], g.x, g.y)[1] <= NEAR_M
+    for kind, rule in rules.items():
+        table = street.found(kind)
+        for shape, probability in zip(table.geometry, table["probability"], strict=True):
+            yield Judged(kind, float(probability), bool(rule(shape)))
+
+
+def _painted(street: Street) -> shapely.Geometry:
+    """Outlines of zebra crossings and stop bars, and of lines."""
+    road = street.scene.road
+    found = [street.area(c.from_m, c.to_m, c.station_m - c.length_m / 2, c.station_m + c.length_m / 2)
+             for c in road.crosswalks]  # fmt: skip
+    found += [street.area(b.from_m, b.to_m, b.station_m - b.width_m / 2, b.station_m + b.width_m / 2)
+              for b in road.stop_bars]  # fmt: skip
+    return shapely.union_all([f.buffer(0.1) for f in found])
+
+
+def _nearest(some: pd.DataFrame, x: float, y: float) -> tuple[int, float]:
+    """Row of the thing nearest to a place, and how far off; infinitely where there is none."""
+    if not len(some):
+        return -1, math.inf
+    away = np.hypot(some.easting_m.to_numpy() - x, some.northing_m.to_numpy() - y)
+    return int(np.argmin(away)), float(away.min())
+
+
+def _samples(shape: shapely.Geometry) -> Any:
+    """Points each 0.1 m along a line or an outline, seen from above."""
+    flat = shapely.force_2d(shape)
+    lines = flat.boundary if flat.geom_type.endswith("Polygon") and flat.area > 0.05 else flat
+    if lines.geom_type.endswith("Polygon"):
+        lines = shapely.LineString(shapely.get_coordinates(lines))
+    parts = []
+    for line in getattr(lines, "geoms", [lines]):
+        if line.length > 0.0:
+            steps = np.arange(_STEP_M / 2, line.length, _STEP_M)
+            parts.append(shapely.line_interpolate_point(line, steps))
+    return np.concatenate(parts) if parts else np.zeros(0, object)
+
+
+def _share_near(shape: shapely.Geometry, target: shapely.Geometry, within_m: float) -> float:
+    points = _samples(shape)
+    if not points.size or target is None or target.is_empty:
+        return 0.0
+    shapely.prepare(target)
+    return float(shapely.dwithin(points, target, within_m).mean())
+
+
+def _share_within(shape: shapely.Geometry, target: shapely.Geometry) -> float:
+    flat = shapely.make_valid(shapely.force_2d(shape))
+    return float(flat.intersection(target).area / flat.area) if flat.area > 0.0 else 0.0
+
+
+# --- figures -----------------------------------------------------------------------------------------
+
+
+def figures_of(street: Street) -> Iterator[Figure]:
+    """All figures of a street, beside the bars that were asked for."""
+    yield from points_figures(street)
+    yield from line_figures(street)
+    yield from area_figures(street)
+    yield from clearance_figures(street)
+    yield from marking_figures(street)
+    yield from ground_figures(street)
+
+
+def points_figures(street: Street) -> Iterator[Figure]:
+    """Recall and precision of what stands at a place, and how well it is measured."""
+    truth = true_points(street)
+    bars = {"sign": 0.98, "pole": 0.98, "tree": 0.90, "delineator": 0.90}
+    for kind in POINTS:
+        some, found = truth[kind], street.found(kind)
+        if not len(some) and not len(found):
+            continue
+        right = [_nearest(some, g.x, g.y) for g in found.geometry]
+        held = {k for k, away in right if away <= NEAR_M}
+        if len(some):
+            yield Figure(f"{kind}: recall of {len(some)}", len(held) / len(some), "", bars.get(kind))
+        if len(found):
+            share = sum(away <= NEAR_M for _, away in right) / len(found)
+            yield Figure(f"{kind}: precision of {len(found)}", share, "", bars.get(kind))
+        pairs = [(some.iloc[k], found.iloc[i]) for i, (k, away) in enumerate(right) if away <= NEAR_M]
+        yield from _sizes(street, kind, pairs)
+
+
+def _sizes(street: Street, kind: str, pairs: list[tuple[Any, Any]]) -> Iterator[Figure]:
+    """How far off measures are, in the worst case and of signs and poles."""
+    if not pairs:
+        return
+    if kind in ("pole", "lighting", "signal", "delineator"):
+        away = [math.hypot(t.easting_m - f.geometry.x, t.northing_m - f.geometry.y) for t, f in pairs]
+        yield Figure(f"{kind}: axis, worst", 1000 * max(away), "mm")
+    if kind == "pole":
+        wide = [abs(t.width_m - f.diameter_m) for t, f in pairs]
+        yield Figure("pole: diameter, worst", 1000 * max(wide), "mm", 20.0)
+    if kind == "sign":
+        described = {round(s.station_m, 2): s for s in _signs(street)}
+        off, size, turn = [], [], []
+        for thing, sign in pairs:
+            one = described[round(thing.station_m, 2)]
+            ahead = math.radians(thing.heading_deg - 90.0)
+            side = 1.0 if one.faces == "forward" else -1.0
+            tall = one.width_m * _HEIGHT_SHARE[one.shape] if one.shape in _HEIGHT_SHARE else one.height_m
+            middle = (
+                thing.easting_m + side * _PLATE_BEFORE_POST_M * math.sin(ahead),
+                thing.northing_m + side * _PLATE_BEFORE_POST_M * math.cos(ahead),
+                thing.height_m + one.clearance_m + tall / 2,
+            )
+            off.append(math.dist(middle, (sign.geometry.x, sign.geometry.y, sign.geometry.z)))
+            size.append(max(abs(sign.width_m - one.width_m), abs(sign.plate_height_m - tall)))
+            facing = math.degrees(ahead) + (0.0 if side > 0.0 else 180.0)
+            turn.append(abs((sign.facing_deg - facing + 180.0) % 360.0 - 180.0))
+        yield Figure("sign: centre, worst", 1000 * max(off), "mm", 30.0)
+        yield Figure("sign: size, worst", 1000 * max(size), "mm", 50.0)
+        yield Figure("sign: facing, worst", max(turn), "°", 5.0)
+
+
+def _signs(street: Street) -> list[Any]:
+    out = []
+    for sign in street.scene.roadside.signs:
+        count = sign.count if sign.every_m > 0.0 else 1
+        out += [sign.model_copy(update={"station_m": sign.station_m + n * sign.every_m}) for n in range(count)]
+    return out
+
+
+def line_figures(street: Street) -> Iterator[Figure]:
+    """Share of each kind of line that is found, and share of what is found that lies on one."""
+    bars = {"kerb": (0.97, 0.98), "guardrail": (0.95, 0.95), "facade": (0.95, 0.95), "fence": (0.90, 0.90)}
+    solid = boxes(street)
+    for kind, truth in true_lines(street).items():
+        if truth.is_empty:
+            continue
+        found = street.tables.get(kind, geopandas.GeoDataFrame(geometry=[]))
+        points = [_inside(street, _samples(g)) for g in found.geometry]
+        every = np.concatenate([np.zeros(0, object), *points])
+        if kind == "facade":
+            every = every[~shapely.dwithin(every, solid, 0.4)] if not solid.is_empty else every
+        lines = shapely.union_all([_as_line(g) for g in found.geometry])
+        within, (full, right) = LINES[kind], bars.get(kind, (None, None))
+        if kind != "lane_line":  # those of dashed lines lie between dashes too
+            yield Figure(f"{kind}: within {within} m, found", _share_near(truth, lines, within), "", full)
+        shapely.prepare(truth)
+        if every.size:
+            share = float(shapely.dwithin(every, truth, within).mean())
+            yield Figure(f"{kind}: within {within} m, right", share, "", right)
+        yield from _kerb_heights(street, found) if kind == "kerb" else ()
+        yield from _lane_lines(street, found) if kind == "lane_line" else ()
+    for kind in NONE_THERE:
+        table = street.found(kind)
+        false = sum(_share_near(g, solid, 0.3) < 0.5 for g in table.geometry)
+        yield Figure(f"{kind}: false ones", float(false), "")
+
+
+def _as_line(shape: shapely.Geometry) -> shapely.Geometry:
+    flat = shapely.force_2d(shape)
+    return shapely.LineString(shapely.get_coordinates(flat)) if flat.geom_type == "Polygon" else flat
+
+
+def _inside(street: Street, points: Any) -> Any:
+    """Points between the ends of what is judged."""
+    if not points.size:
+        return points
+    station, _ = street.along(shapely.get_x(points), shapely.get_y(points))
+    return points[(station >= street.ends_m[0]) & (station <= street.ends_m[1])]
+
+
+def _kerb_heights(street: Street, found: geopandas.GeoDataFrame) -> Iterator[Figure]:
+    """Height of kerbs that are not dropped, mean of the error weighted by length."""
+    full = {"left": 0.0, "right": 0.0} | {k.side: k.height_m for k in street.scene.road.kerbs}
+    off, length = [], []
+    for one in found[found["type"] != "dropped"].itertuples():
+        _, offset = street.along(one.easting_m, one.northing_m)
+        off.append(abs(one.step_m - full["left" if float(offset) < 0.0 else "right"]))
+        length.append(one.length_m)
+    if off:
+        order = np.argsort(off)
+        below = int((np.cumsum(np.array(length)[order]) <= 0.95 * sum(length)).sum())
+        worst = off[order[min(below, len(off) - 1)]]
+        yield Figure("kerb: height, 95 % of the length", 1000 * worst, "mm", 8.0)
+
+
+def _lane_lines(street: Street, found: geopandas.GeoDataFrame) -> Iterator[Figure]:
+    """Width and type of lane lines, by length."""
+    off, typed, length = [], [], []
+    for one in found.itertuples():
+        coordinates = shapely.get_coordinates(one.geometry)
+        station, offset = street.along(*coordinates.T)
+        middle = float(np.median(station))
+        lines = [m for m in street.scene.road.markings if m.start_m <= middle <= m.end_m]
+        near = [m for m in lines if abs(m.offset_m - float(np.median(offset))) <= 0.15]
+        if near:
+            off.append(abs(one.width_m - near[0].width_m))
+            typed.append(one.type == ("dashed" if near[0].dash_m > 0.0 else "solid"))
+            length.append(one.length_m)
+    if length:
+        total = np.array(length)
+        yield Figure("lane_line: width, worst", 1000 * max(off), "mm", 10.0)
+        yield Figure("lane_line: type right, by length", float(total @ np.array(typed) / total.sum()), "", 0.98)
+
+
+def area_figures(street: Street) -> Iterator[Figure]:
+    """Share of sidewalks and landscape areas that is found, and share of what is found that is one."""
+    judged_on = true_areas(street)
+    beyond = street.area(-60.0, 60.0, -math.inf, math.inf)
+    for kind, truth in judged_on.items():
+        if truth.is_empty:
+            continue
+        table = street.tables.get(kind, geopandas.GeoDataFrame(geometry=[]))
+        found = shapely.union_all([shapely.make_valid(shapely.force_2d(g)) for g in table.geometry])
+        # where no façade or fence ends a sidewalk, nobody says how wide it is
+        region = _beside_walls(street) if kind == "sidewalk" else beyond
+        found = found.intersection(region)
+        both = found.intersection(truth).area
+        yield Figure(f"{kind}: area found", both / truth.area, "", 0.90)
+        if found.area > 0.0:
+            yield Figure(f"{kind}: area right", both / found.area, "", 0.90)
+
+
+def _beside_walls(street: Street) -> shapely.Geometry:
+    side = street.scene.roadside
+    parts = [
+        street.area(0.0, math.copysign(30.0, w.offset_m), w.start_m, w.end_m) for w in (*side.facades, *side.fences)
+    ]
+    return shapely.union_all(parts)
+
+
+def clearance_figures(street: Street) -> Iterator[Figure]:
+    """Height of the lowest places under slabs."""
+    found = street.found("clearance")
+    off = []
+    slabs = [o for o in street.scene.roadside.overheads if street.ends_m[0] <= o.station_m <= street.ends_m[1]]
+    seen = 0
+    for slab in slabs:
+        east, north, _ = (float(v) for v in street.surface.place(slab.station_m, slab.offset_m))
+        under = float(street.surface.height_m(east, north, texture=False)) + slab.clearance_m
+        outline = street.area(
+            slab.offset_m - slab.width_m / 2, slab.offset_m + slab.width_m / 2,
+            slab.station_m - slab.length_m / 2 - 0.3, slab.station_m + slab.length_m / 2 + 0.3,
+        )  # fmt: skip
+        own = [g.z - under for g in found.geometry if outline.contains(shapely.Point(g.x, g.y))]
+        seen += bool(own)
+        off += own
+    if slabs:
+        yield Figure(f"clearance: slabs found of {len(slabs)}", seen / len(slabs), "")
+    if off:
+        yield Figure("clearance: height, worst", 1000 * max(map(abs, off)), "mm", 30.0)
+
+
+def marking_figures(street: Street) -> Iterator[Figure]:
+    """F1 of cells of 0.1 m; a cell is paint where half of its returns are, in truth and as found."""
+    both = told = true = 0
+    for path in street.session.store.files("products/classified_points", ".laz"):
+        with laspy.open(street.session.store.path(path)) as reader:
+            las = reader.read()
+        code = np.asarray(las.classification)
+        ground = np.isin(code, (classes.GROUND, classes.ROAD, classes.MARKING, classes.KERB, classes.SIDEWALK))
+        x, y, z = (np.asarray(v)[ground] for v in (las.x, las.y, las.z))
+        marked = code[ground] == classes.MARKING
+        station, offset = street.along(x, y)
+        kept = (station >= street.ends_m[0]) & (station <= street.ends_m[1])
+        kept &= np.abs(offset) <= street.scene.road.paved_m
+        x, y, z, marked = x[kept], y[kept], z[kept], marked[kept]
+        if not x.size:
+            continue
+        kept = np.abs(z - street.surface.height_m(x, y, texture=False)) <= 0.1
+        x, y, marked = x[kept], y[kept], marked[kept]
+        painted = street.surface.intensity(x, y) > _PAINT_FROM
+        place = np.floor(np.stack([x - x.min(), y - y.min()]) / _CELL_M).astype(np.int64)
+        _, cell = np.unique(place[0] * 1_000_000 + place[1], return_inverse=True)
+        count = np.bincount(cell)
+        truth, found = (np.bincount(cell, weights=v) >= count / 2 for v in (painted, marked))
+        both, told, true = both + int((truth & found).sum()), told + int(found.sum()), true + int(truth.sum())
+    if told + true:
+        yield Figure("markings: F1 of cells of 0.1 m", 2 * both / (told + true), "", 0.95)
+
+
+def ground_figures(street: Street) -> Iterator[Figure]:
+    """Root mean square error of bare earth where the ground was seen."""
+    road = street.scene.road
+    beds = true_areas(street)["landscape_area"]
+    off: dict[str, list[Float64]] = {"on the road": [], "beside it": [], "under plants": []}
+    for path in street.session.store.files("products/bare_earth", ".tif"):
+        with rasterio.open(street.session.store.path(path)) as raster:
+            seen = raster.read(1)
+            rows, columns = np.nonzero(np.isfinite(seen))
+            x, y = (np.asarray(v) for v in rasterio.transform.xy(raster.transform, rows, columns))
+        if not x.size:
+            continue
+        station, offset = street.along(x, y)
+        away, error = np.abs(offset), seen[rows, columns] - street.surface.height_m(x, y, texture=False)
+        inside = (station >= street.ends_m[0]) & (station <= street.ends_m[1]) & np.isfinite(error)
+        planted = shapely.contains_xy(beds, x, y) if not beds.is_empty else np.zeros(x.size, np.bool_)
+        off["on the road"].append(error[inside & (away <= road.paved_m - 0.2)])
+        beside = inside & (away >= road.paved_m + 0.2) & (away <= road.edge_m - 0.1)
+        off["beside it"].append(error[beside & ~planted])
+        off["under plants"].append(error[beside & planted])
+    for where, bar in (("on the road", 8.0), ("beside it", 15.0), ("under plants", None)):
+        errors = np.concatenate(off[where]) if off[where] else np.zeros(0)
+        if errors.size:
+            yield Figure(f"bare earth: RMSE {where}", 1000 * float(np.sqrt(np.mean(errors**2))), "mm", bar)
+
+
+def calibration_error(objects: list[Judged], bins: int = 10) -> float:
+    """Expected calibration error: mean distance of stated probability and share that is right, over even bins."""
+    stated = np.array([o.probability for o in objects])
+    right = np.array([o.is_right for o in objects])
+    number = np.minimum((stated * bins).astype(int), bins - 1)
+    bins_held = [number == b for b in np.unique(number)]
+    return float(sum(abs(stated[b].mean() - right[b].mean()) * b.mean() for b in bins_held))

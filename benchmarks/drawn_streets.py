@@ -1,0 +1,101 @@
+"""Short streets drawn at random, each unlike the others: what stands on them, how large, how bright, how noisy."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from roadscan.simulate import Scene
+
+LENGTH_M: Final = 36.0
+_OFF: Final = {key: {"on": False} for key in ("profilers", "sick", "camera", "imu", "gnss", "encoder")}
+
+
+def drawn_street(seed: int) -> Scene:
+    """A street of a drawn kind: town, suburb or country road, driven once at 30 to 60 km/h."""
+    random = np.random.default_rng([seed, 23])
+    is_town = bool(random.random() < 0.5)
+    paved = 3.25 + (2.0 if is_town else 0.75)
+    near = paved + 0.7
+    speed = float(random.uniform(8.5, 16.5))
+    noise_m = float(random.uniform(0.008, 0.022))
+    kerb = [{"side": side, "height_m": float(random.uniform(0.06, 0.15)),
+             "ramps": [{"station_m": float(random.uniform(8, LENGTH_M - 8)), "length_m": 3.5}]}
+            for side in ("left", "right") if is_town or random.random() < 0.3]  # fmt: skip
+    return Scene.load("urban_street").changed(
+        id=f"drawn-{seed}", seed=1000 + seed, length_m=LENGTH_M,
+        passes=[{"lane": int(random.integers(1, 3)), "direction": "forward"}],
+        vehicle={"speed_m_per_s": speed, "standstill_s": 0.0},
+        lidar={"range_max_m": 36.0},
+        noise={"lidar_range_m": noise_m, "intensity": float(random.uniform(3, 9)), "position_m": 0.0,
+               "attitude_deg": 0.0},
+        road={
+            "alignment": [{"kind": "straight", "length_m": 300.0}], "lead_m": 60.0, "kerbs": kerb,
+            "shoulder_width_m": paved - 3.25, "verge_width_m": 11.0,
+            "verge_slope": float(random.uniform(-0.03, 0.08)), "humps": [], "crosswalks": _crossing(random),
+            "stop_bars": [], "alligators": [], "cracks": [], "potholes": [], "patches": [], "stains": [],
+            "tyre_marks": [],
+            "brightness": {"marking": float(random.uniform(125, 200))},
+            "markings": [{"offset_m": 0.0, "width_m": 0.12, "dash_m": 3.0, "gap_m": float(random.uniform(3, 6))},
+                         {"offset_m": 3.1, "width_m": 0.12}, {"offset_m": -3.1, "width_m": 0.12}],
+        },
+        roadside=_roadside(random, is_town, near), **_OFF,
+    )  # fmt: skip
+
+
+def _crossing(random: np.random.Generator) -> list[dict[str, Any]]:
+    if random.random() < 0.5:
+        return []
+    return [{"station_m": float(random.uniform(10, LENGTH_M - 10)), "from_m": -3.0, "to_m": 3.0}]
+
+
+def _roadside(random: np.random.Generator, is_town: bool, near: float) -> dict[str, Any]:
+    """Things of each kind, as they come on such a street."""
+
+    def places(most: int, offset: tuple[float, float]) -> list[dict[str, Any]]:
+        count = int(random.integers(0, most + 1))
+        stations = random.permutation(np.arange(3.0, LENGTH_M - 2.0, 3.4))[:count]
+        sides = random.choice([-1.0, 1.0], count)
+        stations = stations + random.uniform(-0.8, 0.8, count)
+        offsets = sides * (near + random.uniform(*offset, count))
+        return [{"station_m": float(s), "offset_m": float(o)} for s, o in zip(stations, offsets, strict=True)]
+
+    shapes = ("round", "rectangle", "triangle", "octagon", "diamond")
+    far = near + float(random.uniform(3.0, 5.0))
+    sides = [-1.0, 1.0]
+    walls = [s for s in sides if random.random() < (0.7 if is_town else 0.2)]
+    fences = [s for s in sides if s not in walls and random.random() < 0.5]
+    rails = [] if is_town else [s for s in sides if random.random() < 0.5]
+    return {
+        "signs": [p | {"shape": str(random.choice(shapes)), "width_m": float(random.uniform(0.5, 0.9)),
+                       "height_m": float(random.uniform(0.5, 0.9)), "clearance_m": float(random.uniform(1.8, 2.6)),
+                       "shade": float(random.uniform(150, 255)),
+                       "faces": str(random.choice(["forward", "backward"]))} for p in places(4, (0.0, 1.5))],
+        "poles": [
+            *[p | {"height_m": float(random.uniform(2.0, 7.0)), "diameter_m": float(random.uniform(0.06, 0.3))}
+              for p in places(4, (0.0, 3.0))],
+            *[p | {"height_m": float(random.uniform(0.6, 1.2)), "diameter_m": float(random.uniform(0.06, 0.16))}
+              for p in places(5, (-0.4, 0.4))],
+        ],
+        "lamp_posts": [p | {"height_m": float(random.uniform(4.5, 8.0)), "arm_m": float(random.uniform(1.0, 2.5))}
+                       for p in places(2, (0.0, 1.0))],
+        "signals": places(2 if is_town else 0, (0.0, 0.5)),
+        "trees": [p | {"height_m": float(random.uniform(5.0, 10.0)), "crown_m": float(random.uniform(2.5, 5.0)),
+                       "trunk_m": float(random.uniform(0.15, 0.5)), "density": float(random.uniform(0.4, 0.9))}
+                  for p in places(4, (1.0, 3.5))],
+        "parked_cars": [{"station_m": float(s), "offset_m": (near + 3.25) / 2 - 0.2, "heading_deg": 0.0}
+                        for s in np.arange(6.0, LENGTH_M, 7.0) if is_town and random.random() < 0.3],
+        "moving_cars": [],
+        "facades": [{"offset_m": s * far, "start_m": -40.0, "end_m": LENGTH_M + 40.0,
+                     "height_m": float(random.uniform(5, 14))} for s in walls],
+        "fences": [{"offset_m": s * far, "start_m": -20.0, "end_m": LENGTH_M + 20.0,
+                    "height_m": float(random.uniform(1.0, 2.0)), "density": float(random.uniform(0.25, 0.6))}
+                   for s in fences],
+        "guardrails": [{"offset_m": s * (near - 0.2), "start_m": -20.0, "end_m": LENGTH_M + 20.0} for s in rails],
+        "plantings": [{"station_m": float(random.uniform(8, LENGTH_M - 8)), "offset_m": s * (near + 2.0),
+                       "length_m": float(random.uniform(5, 15)), "width_m": float(random.uniform(1.5, 2.5)),
+                       "height_m": float(random.uniform(0.15, 0.8))} for s in sides if random.random() < 0.5],
+        "boxes": [p | {"length_m": float(random.uniform(0.5, 1.5)), "width_m": 0.5,
+                       "height_m": float(random.uniform(0.8, 1.6))} for p in places(2, (0.3, 2.0))],
+    }  # fmt: skip

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +16,8 @@ from roadscan.kernels.options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
+
+_AROUND_M: Final = 2.0
 
 
 class Box(NamedTuple):
@@ -70,3 +74,21 @@ class Scene:
     """(n,) class of each return (:mod:`roadscan.assets.classes`): ground, vegetation, building, vehicle, person …"""
     drive_xyh_m: Float64
     """(p, 4) the drives through the window: x, y, height of the sensor, and the pass, in the order of time."""
+
+    @cached_property
+    def extent(self) -> Box:
+        """The part of the window that holds returns, 2 m wider and in whole metres from its south-western corner.
+
+        Finders make their rasters over it; a window without returns is its own extent.
+        """
+        sides = [self._held(axis, values) for axis, values in enumerate((self.returns.x_m, self.returns.y_m))]
+        return Box(sides[0][0], sides[1][0], sides[0][1], sides[1][1])
+
+    def _held(self, axis: int, values_m: Float64) -> tuple[float, float]:
+        """Least and greatest place of the extent along an axis (m)."""
+        least, greatest = self.window[axis], self.window[axis + 2]
+        if not values_m.size:
+            return least, greatest
+        first = math.floor(float(values_m.min()) - _AROUND_M - least)
+        last = math.floor(float(values_m.max()) + _AROUND_M - least) + 1
+        return least + max(first, 0), min(least + last, greatest)

@@ -96,8 +96,8 @@ def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
 
 @once_a_scene
 def raster_of(scene: Scene) -> HeightRaster:
-    """The raster of a scene's window; its cells are those of a grid that all tiles share."""
-    window, used, returns = scene.window, may_be_ground(scene), scene.returns
+    """The raster of a scene's extent; its cells are those of a grid that all tiles share."""
+    window, used, returns = scene.extent, may_be_ground(scene), scene.returns
     x_min, y_min = (CELL_M * math.floor(v / CELL_M + 1e-6) for v in window[:2])
     columns = max(math.ceil((window.x_max_m - x_min) / CELL_M - 1e-6), 8)
     rows = max(math.ceil((window.y_max_m - y_min) / CELL_M - 1e-6), 8)

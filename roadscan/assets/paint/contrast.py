@@ -61,7 +61,7 @@ class Contrast:
     cell: Int64
     """(n,) cell of each return: row · columns + column."""
     box: Box
-    """The window, from the corner of the scene's returns."""
+    """The extent of the scene, from the corner of its returns."""
     mean: Float32
     """Contrast, as the weighted mean of the returns around each cell; 0 where there are none."""
     sigma: Float32
@@ -80,7 +80,7 @@ def contrast_of(scene: Scene) -> Contrast:
     found = scene.returns
     with np.errstate(invalid="ignore"):
         on_ground = np.abs(scene.above_ground_m) <= ON_GROUND_M
-    window = scene.window
+    window = scene.extent
     on_ground &= (scene.classes != VEHICLE) & (scene.classes != PERSON) & window.holds(found.x_m, found.y_m)
     rows = np.flatnonzero(on_ground)
     rows = rows[~_seen_flat(found, rows)]

@@ -68,7 +68,7 @@ class Region:
 @once_a_scene
 def regions_of(scene: Scene) -> list[Region]:
     """Upright surfaces at least 0.7 m long, pieces on one plane joined over gaps of 1.6 m."""
-    window, returns = scene.window, scene.returns
+    window, returns = scene.extent, scene.returns
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
     index = np.full((LAYERS, rows, columns), -1, np.int32)

@@ -65,7 +65,7 @@ def usable(scene: Scene) -> npt.NDArray[np.bool_]:
 @once_a_scene
 def slices_of(scene: Scene) -> Slices:
     """Slices of a scene, and their compact components: cells that touch, at most 1.1 m wide."""
-    returns, window = scene.returns, scene.window
+    returns, window = scene.returns, scene.extent
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / CELL_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / CELL_M - 1e-9))
     above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)

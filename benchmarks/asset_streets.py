@@ -61,10 +61,10 @@ def town(length_m: float = 160.0) -> Scene:
 
 
 def motorway(length_m: float = 180.0) -> Scene:
-    """The motorway in its three lanes, with a bridge and a gantry over it and shrubs beside it."""
+    """The motorway in its outer lanes, with a bridge and a gantry over it and shrubs beside it."""
     scene = Scene.load("highway_three_lanes")
     return scene.changed(
-        length_m=length_m,
+        length_m=length_m, passes=[{"lane": 1}, {"lane": 3}],
         roadside={
             "overheads": [
                 {"station_m": 150.0, "offset_m": 0.0, "length_m": 11.0, "width_m": 44.0, "clearance_m": 5.3},

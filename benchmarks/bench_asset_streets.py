@@ -16,7 +16,7 @@ from benchmarks.timing import Figure
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """The town street in both directions, then the motorway in three lanes."""
+    """The town street in both directions, then the motorway in two of its lanes."""
     for name, scene in (("town", town()), ("motorway", motorway())):
         for figure in figures_of(processed(scene, bench_folder(folder) / f"assets-{name}")):
             yield replace(figure, what=f"{name}, {figure.what}", against="" if figure.other is None else "the bar")

@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of
+from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
@@ -48,7 +49,7 @@ class Beside(NamedTuple):
 @once_a_scene
 def pieces_beside(scene: Scene) -> pa.Table:
     """Rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
-    raster, edges = raster_of(scene), edges_of(scene)
+    raster, edges = raster_of(scene), free_edges(scene)
     parts = []
     if edges:
         beside = beside_of(scene)

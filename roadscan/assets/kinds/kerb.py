@@ -17,7 +17,7 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets import classes
-from roadscan.assets.edges.find import edges_of
+from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut_at, dense, joined_lines, pieces_table
 from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.raster import HeightRaster, raster_of
@@ -30,12 +30,6 @@ Float64 = npt.NDArray[np.float64]
 SLOPED_FACE_M = 0.12
 """A face wider than this is sloped."""
 _FACE_NODES, _LEAST_NODES = 31, 4
-_FENCE_M, _LEAST_STANDING, _AT_FOOT = (0.35, 1.2), 2, 0.5
-_NO_FENCE = (
-    classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
-    classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
-)  # fmt: skip
-"""What stands at a kerb and is no fence."""
 FACE_REACH_M = 0.15
 """Returns this near to the line, between the foot and the top of the step, belong to the kerb."""
 
@@ -62,8 +56,7 @@ class Kerb(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Parts of the scene's steps within its tile."""
         raster = raster_of(scene)
-        edges = clear_of(_standing(scene, raster), map(columns_of, edges_of(scene)), raster)
-        parts = [part for edge in edges for part in cut_at(edge, scene.tile)]
+        parts = [part for edge in free_edges(scene) for part in cut_at(columns_of(edge), scene.tile)]
         return Evidence(pieces_table(parts, scene, raster), _marked([p.nodes for p in parts], scene, raster))
 
     def objects(
@@ -82,24 +75,6 @@ class Kerb(AssetKind):
                 # Runs share the node between them, so that no piece of the kerb is missing.
                 yield _kerb(line, slice(begin, min(end + 1, len(types))), str(name), probability)
                 begin = end
-
-
-def _standing(scene: Scene, raster: HeightRaster) -> npt.NDArray[np.bool_]:
-    """Cells (rows, columns) at which a fence or a wall stands: two returns or more at its height."""
-    above, counted = scene.above_ground_m, np.ones(256, np.bool_)
-    counted[list(_NO_FENCE)] = False
-    stands = (above > _FENCE_M[0]) & (above < _FENCE_M[1]) & counted[scene.classes] & (raster.cell >= 0)
-    number = np.bincount(raster.cell[stands], minlength=raster.count.size).reshape(raster.count.shape)
-    return cv2.dilate((number >= _LEAST_STANDING).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-
-
-def clear_of(
-    standing: npt.NDArray[np.bool_], edges: Iterable[Float64], raster: HeightRaster
-) -> Iterable[Float64]:  # fmt: skip
-    """Edges (nodes, columns) without those whose nodes lie, for the most part, at the foot of something."""
-    for nodes in edges:
-        if not np.mean(standing[raster.cells_of(nodes[:, 0], nodes[:, 1])]) > _AT_FOOT:
-            yield nodes
 
 
 def types_along(line: Line, dropped_m: float) -> list[str]:

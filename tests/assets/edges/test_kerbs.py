@@ -19,7 +19,7 @@ from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
 from tests.assets.edges.labelled_edges import SIDEWALK, labelled_edges, points_along, share_within
 from tests.assets.edges.simulated import SimulatedStreet, town_street
-from tests.assets.edges.streets import amsterdam_street
+from tests.assets.edges.streets import amsterdam_street, returns_of
 from tests.assets.scenes import recordings_folder, semantic_kitti_returns
 
 TERRAIN = 72
@@ -162,3 +162,18 @@ def test_cells_alone_are_enough(street: SimulatedStreet) -> None:
         assert share_within(truth_line(street, side, FACE_OFFSET_M, np.arange(4.0, 24.0, 0.1)), found, 0.05) >= 0.97
     _, offset = street.surface.station_offset_m(found[:, 0] + street.corner_m[0], found[:, 1] + street.corner_m[1])
     assert np.mean(np.abs(np.abs(offset) - FACE_OFFSET_M) <= 0.05) >= 0.98
+
+
+def test_the_foot_of_a_fence_is_no_kerb() -> None:
+    rng = np.random.default_rng(8)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-8.0, 8.0, 0.05)))
+    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    z = 100.0 + np.where(np.abs(y) > 5.0, 0.08, 0.0) + rng.normal(0.0, 0.005, x.size)
+    fence = np.column_stack([rng.uniform(0.0, 20.0, 9000), np.full(9000, -5.0), 100.0 + rng.uniform(0.0, 1.4, 9000)])
+    points = np.concatenate([np.column_stack([x, y, z]), fence])
+    sensor = np.column_stack([points[:, 0], np.zeros(len(points)), np.full(len(points), 102.0)])
+    returns = returns_of(points, np.full(len(points), 1000.0), np.arange(len(points)), sensor)
+    drive = np.column_stack([np.arange(0.0, 20.0), np.zeros(20), np.full(20, 102.0), np.ones(20)])
+    box = Box(0.0, -8.0, 20.0, 8.0)
+    found = kerbs_of(make_scene(returns, box, box, drive))
+    assert found and all(one.geometry.centroid.y > 4.5 for one in found)

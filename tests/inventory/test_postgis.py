@@ -14,6 +14,7 @@ from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
 from roadscan.model.errors import ConfigError, RoadscanError
+from tests.inventory import qgis_edits as person
 from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
@@ -94,6 +95,22 @@ def test_an_edit_survives_a_new_epoch_and_conflicts_are_shown(street: Inventory,
     street.pull()
     assert street.state().row(one)["asset_height_m"] == 6.0
     assert street.conflicts() == []
+
+
+def test_an_editor_of_a_copy_and_one_of_the_database(street: Inventory, tmp_path: Path, address: str) -> None:
+    copy = inventory(tmp_path, Everywhere())
+    copy.publish()
+    first, second, third, *_ = list(street.assets("pole").sort_values("station_m")["asset_id"])
+    for one, column, value in ((first, "condition", 3), (second, "condition", 4), (third, "comments", "copy")):
+        person.edit(tmp_path / "inventory.gpkg", "poles", one, **{column: value})
+    execute(address, f"UPDATE street.poles SET condition = 8 WHERE asset_id = '{first}'")
+    execute(address, f"UPDATE street.poles SET comments = 'database' WHERE asset_id = '{second}'")
+    street.pull(who="eva")
+    street.pull(home=copy.home, who="max")
+    rows = {one: street.state().row(one) for one in (first, second, third)}
+    assert (rows[second]["condition"], rows[second]["comments"], rows[third]["comments"]) == (4, "database", "copy")
+    (conflict,) = street.conflicts()
+    assert (conflict.asset_id, conflict.reason, conflict.in_force, conflict.other) == (first, "edit", "8", "3")
 
 
 def test_readers_may_look_and_editors_may_not_change_the_history(street: Inventory, address: str) -> None:

@@ -79,7 +79,10 @@ class Street(RuleBasedStateMachine):
         return self.home
 
     def teardown(self) -> None:
+        """At the end of a sequence all is taken in, and each remembered day is asked for."""
         Death.left = None
+        self.publish(None)
+        self.all_is_well()
         truth = self.inventory().truth
         for commit, values in self.days:
             assert values_of(state_at(truth, commit_at(truth, truth.commits[commit - 1].at))) == values
@@ -88,9 +91,13 @@ class Street(RuleBasedStateMachine):
             sequences=1, commits=state.commit, days=len(self.days), pulled=len(self.pulled), drawn=len(self.drawn_at),
             in_force=len(state.edits.in_force), waiting=sum(map(len, state.edits.waiting.values())),
         )  # fmt: skip
+        self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
         if self.tally["sequences"] % TELLS == 0:
             self.tell()
+
+    def close(self) -> None:
+        """Look at what is left over of the home, and remove it."""
 
     @classmethod
     def tell(cls) -> None:
@@ -359,9 +366,8 @@ class StreetInFile(StreetOfPrograms):
     def new_home(self) -> InFile:
         return InFile(self.folder / "inventory.gpkg", CRS, KINDS)
 
-    def teardown(self) -> None:
+    def close(self) -> None:
         assert {f.name for f in self.folder.iterdir()} <= {"store", "inventory.gpkg", "inventory.qgs"}
-        super().teardown()
 
 
 class StreetInDatabase(StreetOfPrograms):
@@ -372,9 +378,8 @@ class StreetInDatabase(StreetOfPrograms):
     def new_home(self) -> InDatabase:
         return InDatabase(self.address, f"s{self.folder.name.lower().replace('-', '_')}", 32632, KINDS)
 
-    def teardown(self) -> None:
+    def close(self) -> None:
         self.home.drop()
-        super().teardown()
 
 
 SEQUENCES = int(os.environ.get("ROADSCAN_SEQUENCES", "200"))

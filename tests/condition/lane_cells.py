@@ -32,9 +32,14 @@ class LaneOfCells:
         self.tile = TileId(int(east[8] // EDGE_M), int(north[8] // EDGE_M))
 
     def table(
-        self, cell_m: float, readings: int, between_m: tuple[float, float] = (3.6, 10.2), beside_m: float = 0.1
+        self,
+        cell_m: float,
+        readings: int,
+        between_m: tuple[float, float] = (3.6, 10.2),
+        beside_m: float = 0.1,
+        noise_m: float = 0.0003,
     ) -> CellTable:
-        """The cells of the tile between two stations, each with so many readings (a square number) of 0.3 mm noise.
+        """The cells of the tile between two stations, each with so many readings (a square number).
 
         beside_m : how far beyond the lane there are cells.
         """
@@ -51,7 +56,7 @@ class LaneOfCells:
         inside = np.stack(np.meshgrid(np.arange(along), np.arange(along)), axis=-1).reshape(-1, 2)
         place = np.column_stack([column, row])[:, None] + (inside + rng.uniform(size=(row.size, readings, 2))) / along
         place = corner + cell_m * place
-        height = self.surface.height_m(place[..., 0], place[..., 1]) + rng.normal(0.0, 0.0003, place.shape[:2])
+        height = self.surface.height_m(place[..., 0], place[..., 1]) + rng.normal(0.0, noise_m, place.shape[:2])
         shade = (self.surface.intensity(place[..., 0], place[..., 1]) + rng.normal(0.0, 3.0, place.shape[:2])).mean(1)
         n, nan = row.size, np.full(row.size, np.nan)
         cells = TileCells(

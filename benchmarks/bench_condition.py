@@ -1,13 +1,20 @@
-"""Indices of one profile: samples a second of a core, beside a loop over NumPy's matrices as it is usually written."""
+"""Indices of one profile: samples a second of a core, beside a loop over NumPy's matrices as it is usually written.
+
+Then the memory of a process that computes the condition of lanes of 0.5, 1 and 2 km from their tiles.
+"""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import expm
 
+from benchmarks.bench_lanes import RoughSurvey, rough_scene
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.condition.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
 from roadscan.condition.ride import ride
@@ -18,10 +25,17 @@ from roadscan.kernels.condition.quarter_car import roll
 
 SAMPLES = 1_000_000
 PLAIN_SAMPLES = 20_000
+LENGTHS_M = (500.0, 1000.0, 2000.0)
 
 
-def figures(_: Path) -> Iterator[Figure]:
-    """IRI at three spacings, then the other indices."""
+def figures(folder: Path) -> Iterator[Figure]:
+    """IRI at three spacings, then the other indices, then memory."""
+    yield from rates()
+    yield from memory(folder)
+
+
+def rates() -> Iterator[Figure]:
+    """Samples a second."""
     rng = np.random.default_rng(0)
     h = np.cumsum(rng.normal(0.0, 3e-4, SAMPLES))
     stations = {
@@ -42,6 +56,31 @@ def figures(_: Path) -> Iterator[Figure]:
     yield rate("straightedge of 3 m", lambda: straightedge_mm(x, h, 3.0))
     fine = 5e-5 * np.arange(SAMPLES)
     yield rate("texture, a sample each 50 µm", lambda: texture_segments(fine, 1e-3 * rng.normal(size=SAMPLES)))
+
+
+def memory(folder: Path) -> Iterator[Figure]:
+    """Peak memory of a process that follows a lane, which does all tasks itself, as a worker does some of them."""
+    first = 0.0
+    for length_m in LENGTHS_M:
+        passes = [{"lane": 2, "speed_m_per_s": 27.7}]
+        scene = rough_scene(2.0, length_m, passes=passes, profilers={"spacing_m": 0.1, "readings": 100})
+        made = RoughSurvey.made(scene, folder / f"{length_m:.0f}m")
+        peaks = [_peak_mb(made.file, stages) for stages in ("ingest navigate footprints tiles", "condition")]
+        first = first or peaks[1]
+        yield Figure(f"condition of {length_m / 1000:g} km of lane: peak memory", peaks[1], "MiB", first, "0.5 km")
+
+
+def _peak_mb(survey_file: Path, stages: str) -> float:
+    """Peak resident memory (MiB) of a process of its own that does some stages."""
+    script = (
+        "import json, resource, sys; from pathlib import Path; from benchmarks.bench_lanes import RoughSurvey;"
+        "from roadscan.jobs.run import run_stages; from roadscan.jobs.stage import stage_named;"
+        "run_stages(RoughSurvey(Path(sys.argv[1])).session('store'), [stage_named(n) for n in sys.argv[2].split()]);"
+        "print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))"
+    )
+    command = [sys.executable, "-c", script, str(survey_file), stages]
+    out = subprocess.run(command, check=True, capture_output=True, text=True)
+    return float(json.loads(out.stdout.splitlines()[-1])) / 1024
 
 
 def kernel_rate(x: np.ndarray, heights: np.ndarray) -> float:

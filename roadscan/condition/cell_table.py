@@ -33,6 +33,8 @@ def cell_table(tiles: Sequence[TileCells], cell_m: float) -> CellTable:
         height=_joined([t.height_robust_m for t in held], np.float64),
         noise=std * std * count,
         readings=count,
+        intensity=_joined([t.intensity_mean for t in held], np.float32),
+        passes=_joined([t.pass_count for t in held], np.float32),
         cell=np.array([cell_m, cell_m]),
         edge=np.array([edge, edge], np.int64),
     )

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.cracks_on_lane import CrackOnLane
+from roadscan.condition.on_lane.lines import LaneLines
+from roadscan.condition.on_lane.squares import TextureSquares
 from roadscan.condition.road_edges.on_lane import EdgesOnLane
 from roadscan.model.settings.condition import SectionConfig
 
@@ -79,6 +81,8 @@ class LaneData:
     sign: int
     """1 where the lane is driven along the reference line, −1 against it."""
     width_m: float
+    width_from: str
+    """What the width was taken from: stated, or default."""
     cell_m: float
     """Edge of the cells that the heights come from."""
     sections_m: tuple[tuple[float, float], ...]
@@ -86,6 +90,9 @@ class LaneData:
     profiles: Mapping[str, Profile]
     """By wheel path: left and right."""
     cross_sections: CrossSections
+    texture: TextureSquares
+    lines: LaneLines
+    """Painted lines beside it."""
     config: SectionConfig
     curvature_per_m: Float64
     """(n,) curvature of the reference line at the cross-sections (1/m), positive to the right."""

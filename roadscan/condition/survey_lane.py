@@ -1,4 +1,4 @@
-"""Heights of a stretch of lane from cells: along its wheel paths, and across it."""
+"""A stretch of lane from cells: heights along its wheel paths and across it, its texture, lines beside it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.condition.on_lane.lines import LINE_REACH_M, LaneLines, lane_lines
+from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.kernels.condition.sampling import CellTable, sample
 from roadscan.model.settings.condition import SectionConfig
@@ -66,6 +68,8 @@ class LaneHeights:
 
     paths: Mapping[str, PathHeights]
     cross: CrossHeights
+    texture: TextureSquares
+    lines: LaneLines
 
 
 def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -77,8 +81,9 @@ def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float]
 
 
 def reach_m(config: SectionConfig, cell_m: float) -> float:
-    """How far from its place a height depends on cells (m)."""
-    return max(math.hypot(*half) for half in windows_m(config, cell_m)) + cell_m
+    """How far beyond a lane's border, and before and behind a place, what is surveyed depends on cells (m)."""
+    of_heights = max(math.hypot(*half) for half in windows_m(config, cell_m)) + cell_m
+    return max(of_heights, LINE_REACH_M + cell_m)
 
 
 def survey_lane(
@@ -101,7 +106,10 @@ def survey_lane(
         sample(table, places, *profile, False, values)
         paths[name] = PathHeights(station, offset, places, values)
     every = _multiples(config.cross_section_spacing_m, between_m)
-    return LaneHeights(paths, _cross_heights(table, line, lane, every, config, across))
+    return LaneHeights(
+        paths, _cross_heights(table, line, lane, every, config, across), texture_squares(table, line, lane, between_m),
+        lane_lines(table, line, lane, between_m),
+    )  # fmt: skip
 
 
 def _cross_heights(

@@ -12,7 +12,7 @@ from scipy.spatial import Voronoi
 
 from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.noise import stream
-from roadscan.simulate.scene.road import Alligator, Joints, Patch, Road
+from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road
 
 Float64 = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def of_road(road: Road, seed: int, first_m: float, last_m: float, length_m: floa
         nothing = [np.zeros((0, n)) for n in (7, 2, 8, 2, 8, 2)]
         return Features(*nothing)
     again = _shifts(road.repeat_m, length_m)
-    once = _table(_potholes(road) + _cracks(road) + _alligators(road, seed), 7)
+    once = _table(_potholes(road) + _cracks(road) + _alligators(road, seed) + _lost_stones(road, seed), 7)
     defects = np.concatenate([_repeated(once, again, (3,), (5,)), _table(_joints(road, first_m, last_m), 7)])
     patches = _repeated(_table([_patch(p) for p in road.patches], 8), again, (1,), ())
     spilt = _repeated(_table(_spilt(road), 8), again, (2,), (6,))
@@ -154,6 +154,30 @@ def _cell_borders(field: Alligator, rng: np.random.Generator) -> list[tuple[tupl
             (s0, o0), (s1, o1) = (corners[[a, b]] + middle).tolist()
             borders.append(((s0, o0), (s1, o1)))
     return borders
+
+
+def _lost_stones(road: Road, seed: int) -> list[list[float]]:
+    rows: list[list[float]] = []
+    for number, place in enumerate(road.ravelling):
+        rng = stream(seed, number, "ravelling")
+        middles = _within(place, rng)
+        size = rng.uniform(0.7, 1.3, len(middles))
+        depth = place.depth_m * rng.uniform(0.7, 1.3, len(middles))
+        per_m = 2.0 / (place.stone_m * size)
+        rows += [[0.0, d, r, s, o, 0.0, 0.0] for d, r, (s, o) in zip(depth, per_m, middles.tolist(), strict=True)]
+    return rows
+
+
+def _within(place: Ravelling, rng: np.random.Generator) -> Float64:
+    """Middles of lost stones (n, 2), stations and offsets, even over the place."""
+    half = np.array([place.length_m, place.width_m]) / 2
+    mean_square = 1.0 + 0.6**2 / 12  # of diameters over their mean
+    count = round(place.lost_share * 4.0 * half[0] * half[1] / (math.pi * place.stone_m**2 / 4 * mean_square))
+    inside = rng.uniform(-1.0, 1.0, (count, 2))
+    if place.shape == "ellipse":
+        inside = inside[np.sum(inside * inside, axis=1) < 1.0]
+    middle: Float64 = inside * half + np.array([place.station_m, place.offset_m])
+    return middle
 
 
 def _patch(p: Patch) -> list[float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -36,18 +37,21 @@ from roadscan.model.errors import ConfigError
 from roadscan.products.distress.cracks import COLUMNS as CRACKS
 from roadscan.products.geo_table import write_geo_table
 from roadscan.tables.manifest import OutputRecord
+from roadscan.tables.schema import table_schema
 from roadscan.tables.sql import query
 from roadscan.tables.store import bytes_digest
+from roadscan.tables.writer import parquet_bytes
 
 STEP_MM = 5.0
+LINES = [{"offset_m": 0.1, "dash_m": 3.0, "gap_m": 6.0}, {"offset_m": 3.4}]
 
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> RoughSurvey:
-    """160 m of lane 2 at 80 km/h, with ruts of 12 and 25 mm and a slab that is sunk by 5 mm, run once."""
+    """160 m of lane 2 at 80 km/h, with ruts of 12 and 25 mm, lines and a slab that is sunk by 5 mm, run once."""
     slab = {"station_m": 60.0, "offset_m": 1.75, "length_m": 12.0, "width_m": 3.5, "height_m": -1e-3 * STEP_MM}
     scene = rough_scene(
-        2.0, 160.0, passes=[{"lane": 2, "speed_m_per_s": 22.2}], road={"patches": [slab]},
+        2.0, 160.0, passes=[{"lane": 2, "speed_m_per_s": 22.2}], road={"patches": [slab], "markings": LINES},
         profilers={"spacing_m": 0.05, "readings": 200},
     )  # fmt: skip
     made = RoughSurvey.made(scene, tmp_path_factory.mktemp("rough") / "survey")
@@ -120,6 +124,7 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     assert len(table) == len(text) == len(layer) == 2 * 4  # the stated lane 1 was not driven
     assert table.crs.to_epsg() == layer.crs.to_epsg() == 32632
     own = table[table["lane"] == "2"].reset_index(drop=True)
+    other = table[table["lane"] == "1"]
     assert own["name"].unique().tolist() == ["Test road"]
     assert own["station_from_m"].tolist()[1:] == [50.0, 100.0, 150.0]
     assert own["measure_from"].tolist()[1:] == pytest.approx([12.05, 12.10, 12.15], abs=1e-3)
@@ -128,11 +133,15 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     assert own["joints"].tolist()[1] == 2
     assert own.length[1] == pytest.approx(50.0, rel=0.02)
     np.testing.assert_allclose(own["mri_m_per_km"][:3], text[text["lane"] == 2]["mri_m_per_km"][:3])
-    other = table[table["lane"] == "1"]
     assert other["mri_m_per_km"].isna().all()
     assert other["reason"].str.contains("of the wheel path were measured").tolist() == [True, True, True, False]
     assert "m long; roughness takes 20 m or more" in other["reason"].iloc[3]
-    assert own["reason"].str.contains("mpd_mean_mm: heights of the wheel paths are 50 mm apart").all()
+    assert own["reason"].str.contains("mpd_mean_mm: cells have 50 mm; a mean profile depth takes 10 mm or less").all()
+    assert own["lane_width_from"].tolist() == ["markings"] * 4
+    assert (np.abs(own["lane_width_m"] - 3.3) <= 3.0 * own["sigma_lane_width_m"]).all()
+    assert (own["sigma_lane_width_m"] < 0.03).all()
+    assert other["lane_width_from"].tolist() == ["stated"] * 4
+    assert other["lane_width_m"].tolist() == [3.5] * 4
     assert own["reason"].str.contains("there is no table of cracks").all()
     assert own["reason"].str.contains("the profile begins in it").tolist() == [True, False, False, False]
     assert own["share_measured"].iloc[1] == 1.0
@@ -363,3 +372,42 @@ def test_a_second_survey_tells_what_changed_and_what_did_not(surveyed: RoughSurv
     assert len(pd.read_csv(tmp_path / "changes.csv")) == len(frame)
     with pytest.raises(ConfigError, match=r"\.csv or \.parquet"):
         changes.write(tmp_path / "changes.xlsx")
+
+
+def test_patches_that_have_lost_stones_are_outlined_on_the_map(surveyed: RoughSurvey, tmp_path: Path) -> None:
+    """Texture of 0.8 mm, and of 1.6 mm over 3 × 0.8 m in the right wheel path."""
+    session = again(surveyed, tmp_path)
+    rng = np.random.default_rng(5)
+    for record in session.manifest.of(stretches.LANE_TEXTURE).values():
+        table = session.store.read_table(record.path)
+        station, rows = table["station_m"].to_numpy(), table.num_rows
+        offset = table["first_m"][0].as_py() + 0.2 * np.arange(len(table["texture_mm"][0]))
+        texture = 0.8 * np.exp(rng.normal(0.0, 0.03, (rows, offset.size)))
+        texture[(np.abs(station[:, None] - 70.0) < 1.5) & (np.abs(offset - 0.9) < 0.4)] = 1.6
+        for name, values in (("texture_mm", texture), ("loss_mm", texture / 2), ("passes_share", 0.0 * texture)):
+            lists = pa.array(list(values.astype(np.float32)), table.schema.field(name).type)
+            table = table.set_column(table.schema.get_field_index(name), table.schema.field(name), lists)
+        content = parquet_bytes(table, table_schema(stretches.LANE_TEXTURE))
+        session.store.write_bytes(record.path, content)
+        session.manifest.add([replace(record, bytes=len(content), digest=bytes_digest(content))])
+    stage_named("condition").run(session)
+    assert session.failures == []
+    folder = tmp_path / "survey" / "store" / "survey=rough" / "products"
+    (file,) = (folder / "ravelling_patches").rglob("*/2/*.parquet")
+    patches = geopandas.read_parquet(file)
+    assert patches.crs.to_epsg() == 32632
+    (patch,) = patches.to_dict("records")
+    assert patch["area_m2"] == pytest.approx(3.0 * 0.8, abs=0.01)
+    assert patches.area[0] == pytest.approx(patch["area_m2"], rel=0.01)
+    assert patch["ratio"] == pytest.approx(2.0, rel=0.03)
+    assert patch["loss_mm"] == pytest.approx(0.4, abs=0.02)
+    group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
+    at = np.array([70.0])
+    centre = group.line.places(at, group.lane.offsets(at, 0.9))[0, :2]
+    assert patches.centroid[0].distance(shapely.Point(centre)) < 0.15
+    assert len(list((folder / "ravelling_pictures").glob("*_2_*.png"))) == 1
+    table = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    own = table[table["lane"] == "2"]
+    assert own["ravelled_area_m2"].tolist()[1] == pytest.approx(2.4, abs=0.01)
+    assert own["ravelling_patches"].tolist()[:3] == [0.0, 1.0, 0.0]
+    assert own["ravelling_loss_cm3_per_m2"].tolist()[1] == pytest.approx(400.0 * 2.4 / (50.0 * 3.4), rel=0.05)

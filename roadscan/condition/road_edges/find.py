@@ -20,6 +20,7 @@ import scipy.ndimage
 
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, SideRaster
 from roadscan.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
+from roadscan.edges.painted_line import PAINT, without_lines
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
@@ -44,10 +45,6 @@ _TRUST: Final = (1.0, 1.0, 0.95, 0.7)
 _AROUND: Final = 3
 _ROUNDS: Final = 3
 _LEAST_EVIDENCE: Final = 0.6
-_LINE_M: Final = 0.6
-"""Painted lines are narrower than this."""
-_PAINT: Final = 0.25
-"""A painted line is so much brighter than the road (share of its intensity)."""
 _LINE_INSIDE_M: Final = 0.8
 _LINE_OUTSIDE_M: Final = 0.8
 """How far inside and outside the lane's border its edge line may be."""
@@ -88,7 +85,7 @@ def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -
     spacing = (STATION_M, OFFSET_M)
     step, bend = evidence_across(raster.height_m, np.full(raster.height_m.shape, _SIGMA_HEIGHT_M), spacing)
     grey = _relative(raster)
-    surface = _opened(grey)
+    surface = without_lines(grey, OFFSET_M)
     change, _ = evidence_across(surface, np.full(grey.shape, _SIGMA_GREY), spacing, _GREY)
     # Beside a step the slopes of both sides differ as well.
     stepped = scipy.ndimage.maximum_filter(np.nan_to_num(np.abs(step)), (1, 2 * round(DEFAULT.across_m / OFFSET_M) + 1))
@@ -125,15 +122,6 @@ def _relative(raster: SideRaster) -> Float64:
     return raster.intensity / level if level > 0.0 else np.full(raster.intensity.shape, np.nan)
 
 
-def _opened(grey: Float64) -> Float64:
-    """Intensities without what is brighter than its surroundings and narrower than a painted line may be."""
-    cells = round(_LINE_M / OFFSET_M)
-    cells += 1 - cells % 2
-    low = scipy.ndimage.minimum_filter(np.where(np.isnan(grey), np.inf, grey), (1, cells), mode="nearest")
-    opened = scipy.ndimage.maximum_filter(np.where(np.isinf(low), -np.inf, low), (1, cells), mode="nearest")
-    return np.where(np.isnan(grey) | np.isinf(opened), np.nan, opened)
-
-
 def _lasting(change: Float64, surface: Float64) -> Float64:
     """Changes of intensity (σ), no more of each than the mean intensities of both sides differ by."""
     size = (2 * round(DEFAULT.along_m / STATION_M) + 1, round(DEFAULT.across_m / OFFSET_M))
@@ -154,7 +142,7 @@ def _edge_line(bright: Float64, raster: SideRaster, lane_width_m: float) -> tupl
     border = 0.5 * lane_width_m
     near = (raster.away_m >= max(border - _LINE_INSIDE_M, NEAREST_M)) & (raster.away_m <= border + _LINE_OUTSIDE_M)
     columns = np.flatnonzero(near)
-    strength = counted(np.maximum(np.nan_to_num(bright[:, columns]), 0.0) * DEFAULT.chance / _PAINT)
+    strength = counted(np.maximum(np.nan_to_num(bright[:, columns]), 0.0) * DEFAULT.chance / PAINT)
     path = path_along(strength, (STATION_M, OFFSET_M), DEFAULT)
     away = _places(strength, path.cell, raster.away_m[columns])
     return path.evidence >= _LEAST_EVIDENCE, away, path.evidence

@@ -1,6 +1,7 @@
-"""Stretches of lanes: cells of the tiles on the way → longitudinal profiles and cross-sections.
+"""Stretches of lanes: cells of the tiles on the way → profiles, cross-sections, texture and painted lines.
 
-A height depends on the cells around its place and on the line there, so it has the same bits whatever the stretches.
+What a row says depends on the cells around its place and on the line there, so it has the same bits whatever the
+stretches.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import shapely
 
 from roadscan.code_reach import code_digest
 from roadscan.condition.cell_table import cell_table
+from roadscan.condition.on_lane.squares import SQUARE_M
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
 from roadscan.jobs.condition.lines import Roads
@@ -39,6 +41,10 @@ PROFILES: Final = "profiles_longitudinal"
 SURFACE_FILES: Final = "surface"
 """Product whose files hold the reconstructed surface."""
 CROSS_SECTIONS: Final = "cross_sections"
+LANE_TEXTURE: Final = "lane_texture"
+LANE_LINES: Final = "lane_lines"
+OF_STRETCHES: Final = (CROSS_SECTIONS, PROFILES, LANE_TEXTURE, LANE_LINES)
+"""Tables of which a stretch has a file each."""
 STRETCH_M: Final = 50
 """Length of a stretch; changes no height."""
 _TASK_STRETCHES: Final = 8
@@ -129,7 +135,7 @@ def _box(b: Bounds) -> shapely.Polygon:
 
 def due_stretches(stretches: Sequence[Stretch], manifest: Manifest) -> list[Stretch]:
     """Those that are missing or stale."""
-    return [s for s in stretches if not all(manifest.is_current(n, s.unit, s.key) for n in (CROSS_SECTIONS, PROFILES))]
+    return [s for s in stretches if not all(manifest.is_current(n, s.unit, s.key) for n in OF_STRETCHES)]
 
 
 def stretch_tasks(
@@ -148,7 +154,7 @@ def _batches(own: Sequence[Stretch]) -> Iterator[tuple[Stretch, ...]]:
 
 
 def survey_stretches(task: StretchTask) -> TaskResult:
-    """Write profiles and cross-sections of the stretches of a task (runs on a worker)."""
+    """Write the tables of the stretches of a task (runs on a worker)."""
     tiles = _Tiles(task.store, task.context)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
@@ -189,8 +195,9 @@ class _Tiles:
 
 
 def _write(store: Store, one: Stretch, held: LaneHeights) -> Iterator[OutputRecord]:
-    """Both files of a stretch."""
-    for name, columns in ((CROSS_SECTIONS, _cross_columns(one, held)), (PROFILES, _profile_columns(one, held))):
+    """The files of a stretch."""
+    columns_of = (_cross_columns, _profile_columns, _texture_columns, _line_columns)
+    for name, columns in zip(OF_STRETCHES, (make(one, held) for make in columns_of), strict=True):
         schema = table_schema(name)
         rows = pa.table(columns, schema=schema.arrow())
         content, target = parquet_bytes(rows, schema), f"{schema.location}/{one.unit}.parquet"
@@ -219,14 +226,7 @@ def _profile_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
 
 def _cross_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
     c = held.cross
-    rows, count = c.height_m.shape
-    ends = np.arange(0, rows * count + 1, max(count, 1), dtype=np.int32)[: rows + 1]
-    element = pa.field("element", pa.float32(), nullable=False)
-
-    def lists(values: npt.NDArray[np.float64]) -> pa.Array:
-        flat = pa.array(np.ascontiguousarray(values, np.float32).ravel(), pa.float32())
-        return pa.ListArray.from_arrays(ends, flat, type=pa.list_(element))
-
+    rows = len(c.height_m)
     return {
         "road": pa.array([one.lane.road] * rows, pa.string()),
         "lane": pa.array([one.lane.name] * rows, pa.string()),
@@ -237,6 +237,46 @@ def _cross_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
         "first_m": pa.array(np.full(rows, c.offset_m[0])),
         "step_m": pa.array(np.full(rows, c.offset_m[1] - c.offset_m[0])),
         "height_m": pa.array(c.base_m),
-        "relative_height_m": lists(c.height_m),
-        "sigma_height_m": lists(c.sigma_m),
+        "relative_height_m": _lists(c.height_m),
+        "sigma_height_m": _lists(c.sigma_m),
     }
+
+
+def _texture_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    t = held.texture
+    rows = t.station_m.size
+    return {
+        "road": pa.array([one.lane.road] * rows, pa.string()),
+        "lane": pa.array([one.lane.name] * rows, pa.string()),
+        "station_m": pa.array(t.station_m),
+        "first_m": pa.array(np.full(rows, t.offset_m[0])),
+        "step_m": pa.array(np.full(rows, SQUARE_M)),
+        "texture_mm": _lists(t.texture_mm),
+        "loss_mm": _lists(t.loss_mm),
+        "mpd_mm": _lists(t.mpd_mm),
+        "intensity": _lists(t.intensity),
+        "passes_share": _lists(t.passes_share),
+    }
+
+
+def _line_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    seen = held.lines
+    rows = seen.station_m.size
+    return {
+        "road": pa.array([one.lane.road] * rows, pa.string()),
+        "lane": pa.array([one.lane.name] * rows, pa.string()),
+        "station_m": pa.array(seen.station_m),
+        "side": pa.array(seen.side, pa.string()),
+        "own_offset_m": pa.array(seen.own_m),
+        "width_m": pa.array(seen.width_m),
+        "contrast": pa.array(seen.contrast),
+    }
+
+
+def _lists(values: npt.NDArray[np.float64]) -> pa.Array:
+    """A list of 32-bit floats for each row of values (rows, count)."""
+    rows, count = values.shape
+    ends = np.arange(0, rows * count + 1, max(count, 1), dtype=np.int32)[: rows + 1]
+    element = pa.field("element", pa.float32(), nullable=False)
+    flat = pa.array(np.ascontiguousarray(values, np.float32).ravel(), pa.float32())
+    return pa.ListArray.from_arrays(ends, flat, type=pa.list_(element))

@@ -1,4 +1,4 @@
-"""Values of the indices: profiles and cross-sections of a lane along some sections → table `condition_values`."""
+"""Values of the indices: what was surveyed of a lane along some sections → table `condition_values`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,21 @@ from roadscan.code_reach import code_digest, name_of
 from roadscan.condition.cracks_on_lane import PIECE_M, CrackOnLane, located
 from roadscan.condition.index import ConditionIndex, Value, condition_indices
 from roadscan.condition.lane_data import CrossSections, LaneData, Profile
+from roadscan.condition.on_lane.lines import LaneLines
+from roadscan.condition.on_lane.squares import TextureSquares, columns_of
 from roadscan.condition.road_edges.on_lane import EdgeRows, EdgesOnLane, edges_on_lane
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.jobs.condition.lines import Roads
 from roadscan.jobs.condition.road_edges import EDGE_PIECE_M, EDGES, edge_unit
-from roadscan.jobs.condition.stretches import CROSS_SECTIONS, PROFILES, STRETCH_M, unit_of
+from roadscan.jobs.condition.stretches import (
+    CROSS_SECTIONS,
+    LANE_LINES,
+    LANE_TEXTURE,
+    OF_STRETCHES,
+    PROFILES,
+    STRETCH_M,
+    unit_of,
+)
 from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tiles import TaskResult
@@ -49,6 +59,9 @@ class Group:
     profiles: tuple[OutputRecord, ...]
     """Records of the stretches of profiles on its way, and before and behind it."""
     cross_sections: tuple[OutputRecord, ...]
+    texture: tuple[OutputRecord, ...]
+    lines: tuple[OutputRecord, ...]
+    """Records of the same stretches' texture and painted lines."""
     cracks: OutputRecord | None
     """Record of the table of cracks, where there is one."""
     edges: tuple[OutputRecord, ...] | None
@@ -87,7 +100,7 @@ def plan_groups(
     roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float, *, with_edges: bool
 ) -> list[Group]:
     """All groups of sections, with all indices; `with_edges` says whether the road's edges are sought."""
-    profiles, crossings = manifest.of(PROFILES), manifest.of(CROSS_SECTIONS)
+    held = {name: dict(manifest.of(name)) for name in OF_STRETCHES}
     indices, cracks = condition_indices(), manifest.get("cracks", "cracks.parquet")
     of_cracks = None if cracks is None else cracks.digest
     entry = "roadscan.jobs.condition.values:values_of_group"
@@ -104,15 +117,15 @@ def plan_groups(
             near = [unit_of(lane, k) for k in range(
                 max(int(own[0][0] - lead) // STRETCH_M, 0), int(own[-1][1] + lead) // STRETCH_M + 1
             )]  # fmt: skip
-            read = tuple(profiles[u] for u in near if u in profiles)
-            read_cross = tuple(crossings[u] for u in near if u in crossings)
+            read = {name: tuple(records[u] for u in near if u in records) for name, records in held.items()}
             shape = [
                 lane.sign,
                 lane.width_m,
+                lane.width_from,
                 lane.sigma_roll_deg,
                 lane.sigma_height_m,
                 own,
-                [(r.unit, r.digest) for r in (*read, *read_cross)],
+                [(r.unit, r.digest) for name in OF_STRETCHES for r in read[name]],
                 cell_m,
             ]
             edges: tuple[OutputRecord, ...] | None = None
@@ -127,7 +140,10 @@ def plan_groups(
                 for name in sorted(indices)
             )
             line = roads.lines[lane.road].stretch(own[0][0] - 20.0, own[-1][1] + 20.0)
-            found.append(Group(line, lane, number, own, read, read_cross, cracks, edges, beside, keys))
+            found.append(
+                Group(line, lane, number, own, read[PROFILES], read[CROSS_SECTIONS], read[LANE_TEXTURE],
+                      read[LANE_LINES], cracks, edges, beside, keys)
+            )  # fmt: skip
     return found
 
 
@@ -216,7 +232,7 @@ def values_table(lane: Lane, index: ConditionIndex, values: Sequence[Value]) -> 
 
 
 def load_lane(task: GroupTask) -> LaneData:
-    """Profiles and cross-sections of a group."""
+    """What was surveyed of a group's lane."""
     group = task.group
     profiles = _tables(task.store, group.profiles, table_schema(PROFILES).arrow())
     crossings = _tables(task.store, group.cross_sections, table_schema(CROSS_SECTIONS).arrow())
@@ -227,10 +243,13 @@ def load_lane(task: GroupTask) -> LaneData:
     return LaneData(
         sign=group.lane.sign,
         width_m=group.lane.width_m,
+        width_from=group.lane.width_from,
         cell_m=task.cell_m,
         sections_m=group.sections_m,
         profiles={side: _profile(profiles, side, group.lane.sign) for side in ("left", "right")},
         cross_sections=_within(cross, group.sections_m),
+        texture=_texture(_tables(task.store, group.texture, table_schema(LANE_TEXTURE).arrow()), group.lane),
+        lines=_lines(_tables(task.store, group.lines, table_schema(LANE_LINES).arrow())),
         config=task.config,
         curvature_per_m=group.line.curvature_per_m(_within(cross, group.sections_m).station_m),
         cracks=_cracks(task),
@@ -310,16 +329,33 @@ def _profile(table: pa.Table, side: str, sign: int) -> Profile:
 
 def _cross_sections(table: pa.Table, config: SectionConfig, width_m: float) -> CrossSections:
     order = np.argsort(table["station_m"].to_numpy(), kind="stable")
-    n = table.num_rows
     count = 2 * int(width_m / 2 / config.cross_section_step_m + 1e-6) + 1
     offset = config.cross_section_step_m * (np.arange(count, dtype=np.float64) - count // 2)
 
-    def lists(name: str) -> npt.NDArray[np.float64]:
-        flat = table[name].combine_chunks().flatten().to_numpy().astype(np.float64)
-        held: npt.NDArray[np.float64] = flat.reshape(n, count)[order]
-        return held
-
     return CrossSections(
-        table["station_m"].to_numpy()[order], offset, lists("relative_height_m"), lists("sigma_height_m"),
-        table["height_m"].to_numpy()[order],
+        table["station_m"].to_numpy()[order], offset, _lists(table, "relative_height_m", count)[order],
+        _lists(table, "sigma_height_m", count)[order], table["height_m"].to_numpy()[order],
     )  # fmt: skip
+
+
+def _texture(table: pa.Table, lane: Lane) -> TextureSquares:
+    order = np.argsort(table["station_m"].to_numpy(), kind="stable")
+    offset = columns_of(lane)
+    names = ("texture_mm", "loss_mm", "mpd_mm", "intensity", "passes_share")
+    held = (_lists(table, name, offset.size)[order] for name in names)
+    return TextureSquares(table["station_m"].to_numpy()[order], offset, *held)
+
+
+def _lines(table: pa.Table) -> LaneLines:
+    held = table.sort_by([("station_m", "ascending"), ("side", "ascending")])
+    station, own, width, contrast = (
+        held[name].to_numpy() for name in ("station_m", "own_offset_m", "width_m", "contrast")
+    )
+    return LaneLines(station, tuple(held["side"].to_pylist()), own, width, contrast)
+
+
+def _lists(table: pa.Table, name: str, count: int) -> npt.NDArray[np.float64]:
+    """(rows, count) values of a column of lists."""
+    flat = table[name].combine_chunks().flatten().to_numpy().astype(np.float64)
+    held: npt.NDArray[np.float64] = flat.reshape(table.num_rows, count)
+    return held

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from roadscan.jobs.condition.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
 from roadscan.jobs.condition.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
+from roadscan.jobs.condition.ravelling import RAVELLING, RAVELLING_PICTURES, PatchTask, due_patches, plan_patches
 from roadscan.jobs.condition.road_edges import EDGES, SURFACES, EdgePiece, due_edges, plan_edges, stated_surface
 from roadscan.jobs.condition.roughness_regions import (
     REGION_PICTURES,
@@ -18,8 +19,7 @@ from roadscan.jobs.condition.roughness_regions import (
 )
 from roadscan.jobs.condition.sections import SECTIONS, SectionFiles, due_files, plan_sections
 from roadscan.jobs.condition.stretches import (
-    CROSS_SECTIONS,
-    PROFILES,
+    OF_STRETCHES,
     SURFACE_FILES,
     Stretch,
     due_stretches,
@@ -34,8 +34,8 @@ from roadscan.model.settings.condition import ConditionConfig
 from roadscan.tables.manifest import OutputRecord
 
 MADE = (
-    LINES, LANES, PROFILES, CROSS_SECTIONS, EDGES, SURFACES, VALUES, SECTIONS, PICTURES, REGIONS, REGION_SECTIONS,
-    REGION_PICTURES,
+    LINES, LANES, *OF_STRETCHES, EDGES, SURFACES, VALUES, SECTIONS, PICTURES, RAVELLING, RAVELLING_PICTURES, REGIONS,
+    REGION_SECTIONS, REGION_PICTURES,
 )  # fmt: skip
 """Names of all outputs in the manifest."""
 
@@ -53,6 +53,9 @@ class ConditionWork:
     files: SectionFiles | None = None
     due_files: Sequence[str] = ()
     due_pictures: Sequence[PictureTask] = ()
+    patches: Sequence[PatchTask] = ()
+    """Groups of sections whose ravelled patches are written."""
+    due_patches: Sequence[PatchTask] = ()
     edges: Sequence[EdgePiece] = ()
     """Pieces of roads whose edges are sought."""
     due_edges: Sequence[EdgePiece] = ()
@@ -94,10 +97,12 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     units = [one.unit(name) for one in groups for name, _ in one.indices]
     tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
     pictures = plan_pictures(tasks, manifest)
+    patches = plan_patches(tasks)
     files = plan_sections(session.store, manifest, roads, units, context)
     pieces = plan_pieces(roads, measured, grid, config.roughness_regions)
     gone = [
-        *manifest.beside({PROFILES, CROSS_SECTIONS}, {s.unit for s in stretches}),
+        *manifest.beside(set(OF_STRETCHES), {s.unit for s in stretches}),
+        *manifest.beside({RAVELLING, RAVELLING_PICTURES}, {unit for one in patches for unit in one.units}),
         *manifest.beside({EDGES, SURFACES}, {one.unit for one in edges}),
         *manifest.beside({VALUES}, set(units)),
         *manifest.beside({PICTURES}, {one.unit for one in pictures}),
@@ -105,7 +110,7 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     ]
     return ConditionWork(
         key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
-        due_files(files, manifest), due_pictures(pictures, manifest), edges, due_edges(edges, manifest), pieces,
-        due_pieces(pieces, manifest),
+        due_files(files, manifest), due_pictures(pictures, manifest), patches, due_patches(patches, manifest), edges,
+        due_edges(edges, manifest), pieces, due_pieces(pieces, manifest),
         gone,
     )  # fmt: skip

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from roadscan.jobs.condition.lines import check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
+from roadscan.jobs.condition.ravelling import patches_of_group
 from roadscan.jobs.condition.road_edges import check_edge_polygons, edges_of_pieces
 from roadscan.jobs.condition.roughness_regions import regions_of_pieces
 from roadscan.jobs.condition.sections import write_sections
@@ -60,6 +61,8 @@ class Condition(Stage):
         work = plan_condition(session) if values else work
         if work.files is not None and work.due_files:
             session.manifest.add(write_sections(work.files))
+        bar = session.bar("ravelled patches")
+        session.failed(self.name, run_units(patches_of_group, work.due_patches, session.manifest, session.compute, bar))
         manifest, due = session.manifest, work.due_pictures
         bar = session.bar("pictures of condition")
         failed = run_bundles(draw_picture, due, lambda _: 1, _PICTURES, manifest, session.compute, bar) if due else []
@@ -96,7 +99,8 @@ class Condition(Stage):
             return StageState()
         work = plan_condition(session)
         stale = self._stale(work)
-        units = len(work.stretches) + len(work.edges) + len(work.pieces) + sum(len(g.indices) for g in work.groups)
+        units = len(work.stretches) + len(work.edges) + len(work.pieces) + len(work.patches)
+        units += sum(len(g.indices) for g in work.groups)
         current = units - stale
         return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
 
@@ -108,13 +112,15 @@ class Condition(Stage):
             + work.values_due
             + len(work.due_files)
             + len(work.due_pictures)
+            + len(work.due_patches)
             + len(work.due_pieces)
         )
 
     def folders(self) -> Sequence[str]:
-        """Tables of lines, lanes, profiles, cross-sections, edges, values and regions, and the section table."""
+        """Tables of lines, lanes and what was surveyed of them, of edges, values, patches, regions and sections."""
         return (
             "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
+            "tables/lane_texture", "tables/lane_lines", "products/ravelling_patches", "products/ravelling_pictures",
             "tables/road_edge_offsets", "products/road_surface", "tables/condition_values",
             "products/condition_sections", "products/condition_pictures", "tables/roughness_sections",
             "products/roughness_regions", "products/roughness_pictures",

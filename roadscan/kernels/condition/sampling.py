@@ -44,6 +44,10 @@ class CellTable(NamedTuple):
     """(n,) sum of the squared deviations of the cell's readings (m²), NaN where it is not known."""
     readings: npt.NDArray[np.float32]
     """(n,) readings."""
+    intensity: npt.NDArray[np.float32]
+    """(n,) mean intensity of the readings, NaN where there is none."""
+    passes: npt.NDArray[np.float32]
+    """(n,) drives that they come from."""
     cell: npt.NDArray[np.float64]
     """(2,) edges of a cell, east and north (m)."""
     edge: npt.NDArray[np.int64]
@@ -59,6 +63,8 @@ class Cells(NamedTuple):
     weight: npt.NDArray[np.float64]
     noise: npt.NDArray[np.float64]
     readings: npt.NDArray[np.float64]
+    at: npt.NDArray[np.int64]
+    """Their places in the table."""
 
 
 @inlined
@@ -117,6 +123,7 @@ def gather(table, place, half_along, half_across, stride, found):
                     found.weight[count] = (1.0 - abs(s) / half_along) * (1.0 - abs(o) / half_across)
                     found.noise[count] = table.noise[k]
                     found.readings[count] = table.readings[k]
+                    found.at[count] = k
                     count += 1
                 k += 1
     return count
@@ -266,7 +273,7 @@ def sample(table, places, half_along, half_across, bend, out):
         not known), and the share of the window that holds cells.
     """
     room = np.empty((6, MOST_CELLS))
-    found = Cells(room[0], room[1], room[2], room[3], room[4], room[5])
+    found = Cells(room[0], room[1], room[2], room[3], room[4], room[5], np.empty(MOST_CELLS, np.int64))
     surface, away = np.zeros(TERMS), np.empty(MOST_CELLS)
     wanted = 4 if bend else 3
     window = 4.0 * half_along * half_across / (table.cell[0] * table.cell[1])

@@ -161,6 +161,30 @@ class Alligator(Strict):
     """Depth of its cracks (m)."""
 
 
+class Ravelling(Strict):
+    """A place where the surface has lost stones: round holes at random, within an ellipse or a rectangle.
+
+    A hole has the shape of a pothole: depth · (1 − (ρ / radius)⁴)² below the worn surface, and its intensity.
+    """
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    shape: Literal["rectangle", "ellipse"] = "ellipse"
+    """Outline; the middles of all holes lie in it."""
+    length_m: float = Field(default=2.0, gt=0.05, le=50.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(default=0.8, gt=0.05, le=20.0)
+    """Extent across the road (m)."""
+    lost_share: float = Field(default=0.2, gt=0.0, le=0.6)
+    """Area of all holes over that of the place, where holes that overlap count twice."""
+    stone_m: float = Field(default=0.012, ge=0.004, le=0.04)
+    """Mean diameter of a hole (m); diameters are even between 0.7 and 1.3 of it."""
+    depth_m: float = Field(default=0.005, gt=0.0, le=0.03)
+    """Mean depth of a hole (m), of the same spread."""
+
+
 class Joints(Strict):
     """Transverse joints at even distances, over the whole paved width."""
 
@@ -399,18 +423,20 @@ class Road(Strict):
     ruts: list[Rut] = []
     """Wheel paths."""
     potholes: list[Pothole] = []
-    """Potholes; where any of potholes, cracks and joints overlap, the deepest counts."""
+    """Potholes; where any of potholes, cracks, lost stones and joints overlap, the deepest counts."""
     cracks: list[Crack] = []
     """Cracks."""
     alligators: list[Alligator] = []
     """Fields of alligator cracks."""
+    ravelling: list[Ravelling] = []
+    """Places that have lost stones."""
     joints: list[Joints] = []
     """Transverse joints."""
     patches: list[Patch] = []
     """Patches and utility cuts."""
     repeat_m: float = Field(default=0.0, ge=0.0)
-    """Potholes, cracks, alligator cracks, patches, stains and tyre marks come again each this many metres of
-    station; 0: they do not."""
+    """Potholes, cracks, alligator cracks, lost stones, patches, stains and tyre marks come again each this many metres
+    of station; 0: they do not."""
     markings: list[Marking] = []
     """Lane markings."""
     stop_bars: list[StopBar] = []

@@ -1,4 +1,4 @@
-"""Layers of the roads: reference lines, lanes, surfaces, sections in colours of their condition, roughness regions."""
+"""Layers of the roads: reference lines, lanes, surfaces, sections in colours of their condition, patches, regions."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ _STYLES = (
     Style("Cracked wheel path (%)", 6, by="cracked_wheel_path_percent", limits=(1.0, 5.0, 20.0, 40.0)),
     Style("Faulting (mm)", 6, by="faulting_mean_mm", limits=(1.0, 2.5, 3.8, 6.0)),
     Style("Cross-slope (%)", 6, by="cross_slope_mean_percent", limits=(-4.0, -1.0, 1.0, 4.0)),
+    Style("Ravelled (%)", 6, by="ravelled_percent", limits=(0.1, 2.0, 10.0, 20.0)),
     Style("Mean profile depth (mm)", 6, by="mpd_mean_mm", limits=(0.4, 0.6, 0.8, 1.2)),
 )
 """Limits of good, fair and poor for IRI, rutting, cracking and faulting are those of 23 CFR 490.313 (IRI 95 and 170
@@ -46,5 +47,8 @@ class Condition(LayerKind):
                 [Style("one colour", 1, SKY)], visible=False)),
             ("roughness_regions", described("roughness_regions", "Roughness regions", "condition", "polygon", 310,
                 [Style("one colour", 1, BLUE)], visible=False)),
+            ("ravelling_patches", described("ravelling_patches", "Ravelled patches", "condition", "polygon", 311,
+                [Style("Texture over that of the section", 1, by="ratio", limits=(1.2, 1.4, 2.0, 3.0))],
+                visible=False)),
         ):  # fmt: skip
             yield from table_layer(material, table, about)

@@ -17,6 +17,7 @@ from rasterio.io import MemoryFile
 
 from roadscan.jobs.adjust.outcome import PICTURES as ADJUSTMENT_PICTURES
 from roadscan.jobs.condition.pictures import PICTURES as CONDITION_PICTURES
+from roadscan.jobs.condition.ravelling import RAVELLING_PICTURES
 from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.jobs.report.section import Material, Section
@@ -29,7 +30,7 @@ _EDGE: Final = 900
 _MOST_BYTES: Final = 512_000_000
 """A file of an object store that is larger is not fetched for a small picture."""
 _MOST_OF_A_PRODUCT: Final = 4
-_SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, REGION_PICTURES)
+_SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, RAVELLING_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
 
 UInt8 = npt.NDArray[np.uint8]

@@ -1,0 +1,104 @@
+"""Width of a lane: between its painted lines, else between the road's edges, else as it is stated.
+
+A line is that of the middles found along 15 m before and behind a place, their median; width is the distance of the
+lines' middles. Where a side has no line, the edge of the road's surface stands for it if no other lane lies between.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import ClassVar, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.index import ConditionIndex, Quantity, Value
+from roadscan.condition.lane_data import LaneData
+from roadscan.condition.on_lane.lines import SPACING_M, LaneLines
+
+Float64 = npt.NDArray[np.float64]
+
+_AROUND_M: Final = 15.0
+_LEAST_PLACES: Final = 5
+_ALIKE_M: Final = 0.15
+"""Middles farther than this from their median are those of other paint."""
+_SIGMA_LINE_M: Final = 0.005
+"""What the middle of a line is known to at the best: its paint is worn, and the road's axis was smoothed."""
+
+
+class _Side(NamedTuple):
+    own_m: Float64
+    """(n,) offset of the border from the lane's middle; NaN where it is not known."""
+    sigma_m: Float64
+
+
+class LaneWidth(ConditionIndex):
+    """Width of the lane."""
+
+    name: ClassVar[str] = "lane_width"
+    title: ClassVar[str] = "width of the lane between its lines, else between the road's edges, else as stated"
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("lane_width_m", "m", "Width of the lane, mean; its remark says what it was taken from"),
+        Quantity("lane_lines_percent", "%", "Share of the section where both lines are known"),
+    )
+    drawn: ClassVar[tuple[str, ...]] = ("lane_width_m",)
+    lead_m: ClassVar[float] = 20.0
+
+    def values(self, lane: LaneData) -> Iterator[Value]:
+        """Values of sections."""
+        for from_m, to_m in lane.sections_m:
+            first, end = (math.ceil(one / SPACING_M) for one in (from_m, to_m))
+            station: Float64 = SPACING_M * np.arange(first, end, dtype=np.float64)
+            sides = {side: _line(lane.lines, side, station) for side in ("left", "right")}
+            painted = float(np.mean(np.isfinite(sides["left"].own_m + sides["right"].own_m))) if station.size else 0.0
+            yield Value("lane_lines_percent", "section", from_m, to_m, 100.0 * painted, math.nan, 1.0)
+            width, sigma, share = _width(sides)
+            source = "markings"
+            if share < 0.5:
+                source = "edges"
+                width, sigma, share = _width({name: _edge(lane, name, side, station) for name, side in sides.items()})
+            if share < 0.5:
+                source, width, sigma, share = lane.width_from, lane.width_m, math.nan, 1.0
+            yield Value("lane_width_m", "section", from_m, to_m, width, sigma, share, source)
+
+
+def _line(lines: LaneLines, side: str, station: Float64) -> _Side:
+    """The line on one side at stations."""
+    own = np.array([one == side for one in lines.side], bool)
+    at, middle = lines.station_m[own], lines.own_m[own]
+    place, sigma = np.full(station.size, np.nan), np.full(station.size, np.nan)
+    first = np.searchsorted(at, station - _AROUND_M)
+    end = np.searchsorted(at, station + _AROUND_M)
+    for k, (a, b) in enumerate(zip(first.tolist(), end.tolist(), strict=True)):
+        near = middle[a:b]
+        if near.size >= _LEAST_PLACES:
+            near = near[np.abs(near - np.median(near)) <= _ALIKE_M]
+        if near.size >= _LEAST_PLACES:
+            spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
+            place[k] = np.median(near)
+            sigma[k] = math.hypot(spread * math.sqrt(math.pi / 2.0 / near.size), _SIGMA_LINE_M)
+    return _Side(place, sigma)
+
+
+def _edge(lane: LaneData, name: str, line: _Side, station: Float64) -> _Side:
+    """The line, or where it is not known the edge of the road's surface."""
+    if lane.edges is None or not lane.edges.sides[name].beside:
+        return line
+    edge, sign = lane.edges.sides[name], 1.0 if name == "right" else -1.0
+    at = np.clip(np.searchsorted(lane.edges.station_m, station - 1e-6), 0, lane.edges.station_m.size - 1)
+    known = np.isfinite(line.own_m)
+    return _Side(
+        np.where(known, line.own_m, sign * edge.away_m[at]), np.where(known, line.sigma_m, edge.sigma_m[at])
+    )  # fmt: skip
+
+
+def _width(sides: dict[str, _Side]) -> tuple[float, float, float]:
+    """Mean width, its standard deviation (errors along the section are taken as alike), and the share where known."""
+    left, right = sides["left"], sides["right"]
+    width = right.own_m - left.own_m
+    known = np.isfinite(width) & (width > 0.0)
+    if not known.any():
+        return math.nan, math.nan, 0.0
+    sigma = np.hypot(left.sigma_m, right.sigma_m)[known]
+    return float(width[known].mean()), float(np.sqrt(np.mean(sigma**2))), float(known.mean())

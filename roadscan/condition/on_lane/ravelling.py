@@ -1,0 +1,156 @@
+"""Patches of a lane that have lost stones: squares whose texture is coarser than that of their section."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+import shapely
+
+from roadscan.condition.on_lane.squares import SQUARE_M, TextureSquares
+
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+LEAST_RATIO: Final = 1.15
+"""A square's texture is coarser by so much at least, and by :data:`_SIGMAS` of its section's own spread."""
+_SIGMAS: Final = 5.0
+LEAST_AREA_M2: Final = 0.12
+LEAST_SQUARES: Final = 250
+"""Squares that tell what the texture of a section is."""
+_SHARED: Final = 0.5
+"""Squares of which more was measured by several drives are held against one another alone: drives differ."""
+_DIFFERS: Final = 3.0
+"""Intensities differ where a patch's median is so many standard deviations of its section's squares off."""
+SEVERITIES: Final = {"low": 1.4, "moderate": 2.0, "high": math.inf}
+"""Texture of a patch over that of its section, at the most. The limits are roadscan's own."""
+_CROSS: Final = scipy.ndimage.generate_binary_structure(2, 1)
+_SQUARE: Final = scipy.ndimage.generate_binary_structure(2, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class RavelledPatch:
+    """A patch that has lost stones."""
+
+    outline: shapely.Geometry
+    """Of its squares: station along the reference line, and offset from the lane's middle (m), positive to the right in
+    the direction of travel."""
+    area_m2: float
+    sigma_area_m2: float
+    """Its border may run anywhere within a square's width; errors along it are taken as alike."""
+    texture_mm: float
+    """Root mean square texture, median of its squares."""
+    ratio: float
+    """That over the texture of the section."""
+    sigma_ratio: float
+    """From the spread of its squares."""
+    loss_mm: float
+    """Mean depth of lost material over its area, above that of the section; NaN where cells do not tell it."""
+    contrast: float
+    """Share by which its intensity is higher than that of the section; NaN without intensities."""
+    severity: str
+    evidence: Literal["texture", "texture and intensity"]
+
+
+@dataclass(frozen=True, eq=False)
+class RavelledSection:
+    """A section of a lane, looked through for patches."""
+
+    patches: tuple[RavelledPatch, ...]
+    measured_m2: float
+    """Area of its squares whose texture was judged."""
+    share: float
+    """The same over the area of all of its squares."""
+    background_mm: float
+    """Texture of the section: the median of its squares."""
+    reason: str = ""
+    """Why it was not judged."""
+
+
+def ravelled_section(squares: TextureSquares, inside: Bool) -> RavelledSection:
+    """Patches of a section whose squares (n, m) are given.
+
+    The logarithm of a square's texture is held against the median of its section and the spread of its lower half,
+    which patches do not widen. Where more than half of a section has lost stones, that is its texture, and nothing is
+    found.
+    A patch ends halfway between its own texture and that of the section, and with its section.
+
+    inside : (n, m) squares that lie on the road.
+    """
+    known = np.isfinite(squares.texture_mm) & (squares.texture_mm > 0.0) & inside
+    shared = np.nan_to_num(squares.passes_share) > _SHARED
+    excess, judged = np.full(known.shape, np.nan), np.zeros(known.shape, bool)
+    middles, limits = {}, np.full(known.shape, np.inf)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        texture = np.log(squares.texture_mm)
+    for one in (False, True):
+        own = known & (shared == one)
+        if own.sum() < LEAST_SQUARES:
+            continue
+        middle = float(np.median(texture[own]))
+        below = middle - texture[own & (texture <= middle)]
+        excess[own], judged[own], middles[one] = texture[own] - middle, True, middle
+        limits[own] = max(math.log(LEAST_RATIO), _SIGMAS * 1.4826 * float(np.median(below)))
+    all_m2, measured_m2 = SQUARE_M**2 * float(inside.sum()), SQUARE_M**2 * float(judged.sum())
+    share = measured_m2 / all_m2 if all_m2 else 0.0
+    if not judged.any():
+        return RavelledSection((), 0.0, 0.0, math.nan, f"the texture of {int(known.sum())} squares is known")
+    background = math.exp(float(np.median(texture[judged])))
+    patches = tuple(_patches(squares, excess, judged, limits))
+    return RavelledSection(patches, measured_m2, share, background)
+
+
+def _patches(squares: TextureSquares, excess: Float64, judged: Bool, limits: Float64) -> Iterator[RavelledPatch]:
+    coarse = judged & (np.nan_to_num(excess, nan=-np.inf) > limits)
+    # Holes of one square are closed; what is one square wide is no patch.
+    coarse |= scipy.ndimage.binary_closing(np.pad(coarse, 1), _CROSS)[1:-1, 1:-1] & judged
+    label, count = scipy.ndimage.label(scipy.ndimage.binary_opening(coarse, np.ones((2, 2))), _SQUARE)
+    sound = judged & ~scipy.ndimage.binary_dilation(coarse, _SQUARE)
+    for number in range(1, count + 1):
+        core = label == number
+        half = 0.5 * float(np.median(excess[core]))
+        wide = scipy.ndimage.binary_dilation(core, _SQUARE) & judged
+        own = wide & (excess > half) & ((label == number) | (label == 0))
+        if own.sum() * SQUARE_M**2 >= LEAST_AREA_M2:
+            yield _measured(squares, excess, own, sound)
+
+
+def _measured(squares: TextureSquares, excess: Float64, own: Bool, sound: Bool) -> RavelledPatch:
+    count = int(own.sum())
+    border = int((own & ~scipy.ndimage.binary_erosion(own, _CROSS)).sum())
+    ratio = math.exp(float(np.median(excess[own])))
+    spread = 1.4826 * float(np.median(np.abs(excess[own] - np.median(excess[own]))))
+    lost = [float(np.nanmedian(v)) if np.isfinite(v).any() else math.nan
+            for v in (squares.loss_mm[own], squares.loss_mm[sound])]  # fmt: skip
+    contrast, differs = _contrast(squares.intensity, own, sound)
+    row, column = np.nonzero(own)
+    station, offset, h = squares.station_m[row], squares.offset_m[column], 0.5 * SQUARE_M
+    outline = shapely.union_all(shapely.box(station - h, offset - h, station + h, offset + h), grid_size=1e-6)
+    return RavelledPatch(
+        outline=outline,
+        area_m2=count * SQUARE_M**2,
+        sigma_area_m2=SQUARE_M**2 * border / math.sqrt(12.0),
+        texture_mm=float(np.median(squares.texture_mm[own])),
+        ratio=ratio,
+        sigma_ratio=ratio * spread * math.sqrt(math.pi / 2.0 / count),
+        loss_mm=lost[0] - lost[1],
+        contrast=contrast,
+        severity=next(name for name, most in SEVERITIES.items() if ratio <= most),
+        evidence="texture and intensity" if differs else "texture",
+    )
+
+
+def _contrast(intensity: Float64, own: Bool, sound: Bool) -> tuple[float, bool]:
+    """Contrast of a patch's intensity, and whether it differs from that of the section."""
+    inside, around = intensity[own & np.isfinite(intensity)], intensity[sound & np.isfinite(intensity)]
+    if not inside.size or not around.size or np.median(around) <= 0.0:
+        return math.nan, False
+    level = float(np.median(around))
+    off = float(np.median(inside)) - level
+    spread = 1.4826 * float(np.median(np.abs(around - level)))
+    return off / level, abs(off) > max(_DIFFERS * spread, 0.01 * level)

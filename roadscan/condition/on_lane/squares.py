@@ -1,0 +1,90 @@
+"""Texture of a lane from cells, by squares of 0.2 m."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.kernels.condition.lane_texture import (
+    FIGURES,
+    INTENSITY,
+    LINE,
+    LOSS,
+    PEAKS,
+    SHARE,
+    SHARED,
+    TEXTURE,
+    WITHIN,
+    texture_of_squares,
+)
+from roadscan.kernels.condition.sampling import CellTable
+
+Float64 = npt.NDArray[np.float64]
+
+SQUARE_M: Final = 0.2
+"""Edge of a square (m): two segments of a texture profile."""
+LEAST_SHARE: Final = 0.5
+"""Share of a square that has to hold cells."""
+_MM: Final = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class TextureSquares:
+    """Squares of a lane, rows along it and columns from left to right in the direction of travel."""
+
+    station_m: Float64
+    """(n,) of the squares' middles, ascending."""
+    offset_m: Float64
+    """(m,) of the same from the lane's middle, positive to the right in the direction of travel."""
+    texture_mm: Float64
+    """(n, m) root mean square of the heights within 50 mm about their plane; NaN where it is not known, as below."""
+    loss_mm: Float64
+    """(n, m) mean depth below the level of the sound surface."""
+    mpd_mm: Float64
+    """(n, m) mean profile depth, as :func:`texture_squares` takes it from cells."""
+    intensity: Float64
+    """(n, m) mean intensity."""
+    passes_share: Float64
+    """(n, m) share of the cells that several drives measured."""
+
+    def between(self, from_m: float, to_m: float) -> TextureSquares:
+        """Squares whose middle lies in [from, to)."""
+        own = (self.station_m >= from_m) & (self.station_m < to_m)
+        held = {one.name: getattr(self, one.name)[own] for one in fields(self) if one.name != "offset_m"}
+        return replace(self, **held)
+
+
+def columns_of(lane: Lane) -> Float64:
+    """(m,) offsets of the middles of the squares of a lane from its middle (m)."""
+    count = int(lane.width_m / SQUARE_M + 1e-6)
+    return SQUARE_M * (np.arange(count, dtype=np.float64) - 0.5 * (count - 1))
+
+
+def texture_squares(table: CellTable, line: RoadLine, lane: Lane, between_m: tuple[float, float]) -> TextureSquares:
+    """Texture of the squares of a lane whose middles lie between two stations.
+
+    The mean profile depth is that of lines along the lane with a height a cell, cut into segments of 100 mm as in
+    ISO 13473-1, without its low-pass: waves shorter than two cells do not show, and the means of cells dampen others.
+    It is multiplied by how much larger the scatter of all readings is than that of these heights, so that it stands for
+    all waves wherever cells hold several readings. Noise of the readings is texture to it.
+    """
+    own = columns_of(lane)
+    first, end = (round(one / SQUARE_M) for one in between_m)
+    station: Float64 = SQUARE_M * (np.arange(first, end, dtype=np.float64) + 0.5)
+    every = np.repeat(station, own.size)
+    places = line.places(every, lane.offsets(every, np.tile(own, station.size)))
+    found = np.empty((every.size, FIGURES))
+    texture_of_squares(table, places, SQUARE_M, found)
+    found[found[:, SHARE] < LEAST_SHARE] = np.nan
+    with np.errstate(invalid="ignore", divide="ignore"):
+        grown = np.sqrt((found[:, LINE] + found[:, WITHIN]) / found[:, LINE])
+    shape = (station.size, own.size)
+    return TextureSquares(
+        station, own, _MM * found[:, TEXTURE].reshape(shape), _MM * found[:, LOSS].reshape(shape),
+        _MM * (found[:, PEAKS] * grown).reshape(shape), found[:, INTENSITY].reshape(shape),
+        found[:, SHARED].reshape(shape),
+    )  # fmt: skip

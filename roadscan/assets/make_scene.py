@@ -14,7 +14,7 @@ from roadscan.assets.ground.road import road_cells
 from roadscan.assets.ground.surface import Place
 from roadscan.assets.moving import road_users
 from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.scene import Box, GroundModel, Scene, extent_of
 from roadscan.assets.surroundings import surroundings
 from roadscan.kernels.assets.columns import marked
 from roadscan.model.settings.asset_ground import GroundSettings
@@ -45,11 +45,12 @@ def make_scene(
     found[ground.on_ground] = classes.GROUND
     found[ground.below] = classes.LOW_NOISE
     above = ~ground.on_ground & (ground.above_m > _ABOVE_M)
-    cubes = cubes_of(returns, ground.above_m, above, window)
-    users = road_users(returns, ground.above_m, ground.on_ground, cubes, window)
+    extent = extent_of(window, returns)
+    cubes = cubes_of(returns, ground.above_m, above, extent)
+    users = road_users(returns, ground.above_m, ground.on_ground, cubes, extent)
     found[users.vehicle] = classes.VEHICLE
     found[users.person] = classes.PERSON
-    found = surroundings(returns, ground.above_m, found, cubes, window, drive)
+    found = surroundings(returns, ground.above_m, found, cubes, extent, drive)
     found[ground.on_ground & on_road(returns, ground.model, drive)] = classes.ROAD
     return Scene(returns, tile, window, ground.model, ground.above_m, found, drive)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from roadscan.kernels.options import read_only
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 
-_AROUND_M: Final = 2.0
+_AROUND_M, _STEP_M = 2.0, 3.0
 
 
 class Box(NamedTuple):
@@ -32,6 +32,27 @@ class Box(NamedTuple):
         """Which points (any shape) lie in the rectangle."""
         x, y = np.asarray(x_m), np.asarray(y_m)
         return (x >= self.x_min_m) & (x < self.x_max_m) & (y >= self.y_min_m) & (y < self.y_max_m)
+
+    def comes_near(self, places_m: Float64, reach_m: float) -> bool:
+        """Whether the box around places (n, 2), wider by a reach on all sides, shares a place with the rectangle."""
+        (west, south), (east, north) = places_m.min(axis=0) - reach_m, places_m.max(axis=0) + reach_m
+        return bool(west < self.x_max_m and east >= self.x_min_m and south < self.y_max_m and north >= self.y_min_m)
+
+
+def extent_of(window: Box, returns: Returns) -> Box:
+    """The part of a window that returns lie in, 2 m wider and in steps of 3 m from its south-western corner.
+
+    3 m is a whole number of the cells of all rasters, so these have the same cells as over the whole window.
+    """
+    if not len(returns):
+        return window
+    sides = []
+    for least, greatest, values in zip(window[:2], window[2:], (returns.x_m, returns.y_m), strict=True):
+        first = math.floor((float(values.min()) - _AROUND_M - least) / _STEP_M)
+        last = math.floor((float(values.max()) + _AROUND_M - least) / _STEP_M) + 1
+        sides.append((least + _STEP_M * max(first, 0), min(least + _STEP_M * last, greatest)))
+    (west, east), (south, north) = sides
+    return Box(west, south, east, north)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +98,8 @@ class Scene:
 
     @cached_property
     def extent(self) -> Box:
-        """The part of the window that holds returns, 2 m wider and in whole metres from its south-western corner.
+        """The part of the window that holds returns, 2 m wider and in steps of 3 m from its south-western corner.
 
         Finders make their rasters over it; a window without returns is its own extent.
         """
-        sides = [self._held(axis, values) for axis, values in enumerate((self.returns.x_m, self.returns.y_m))]
-        return Box(sides[0][0], sides[1][0], sides[0][1], sides[1][1])
-
-    def _held(self, axis: int, values_m: Float64) -> tuple[float, float]:
-        """Least and greatest place of the extent along an axis (m)."""
-        least, greatest = self.window[axis], self.window[axis + 2]
-        if not values_m.size:
-            return least, greatest
-        first = math.floor(float(values_m.min()) - _AROUND_M - least)
-        last = math.floor(float(values_m.max()) + _AROUND_M - least) + 1
-        return least + max(first, 0), min(least + last, greatest)
+        return extent_of(self.window, self.returns)

@@ -9,7 +9,14 @@ import scipy.ndimage
 from roadscan.kernels.assets.beams import ground_heights, log_gains, meet_ground
 from roadscan.kernels.assets.buckets import by_number, raster_cells, rows_within
 from roadscan.kernels.assets.corridors import mark_strip
-from roadscan.kernels.assets.paint_levels import contrasts, distinct_in_groups, paint_sums
+from roadscan.kernels.assets.ground_cells import least_over_disk
+from roadscan.kernels.assets.paint_levels import (
+    contrasts,
+    distinct_in_groups,
+    paint_sums,
+    scan_lines,
+    seen_on_ground,
+)
 from roadscan.kernels.assets.smoothing import convolve, window_means
 from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
 from roadscan.kernels.assets.step_filter import sizes_of, take_excess
@@ -92,6 +99,39 @@ def test_sums_of_paint_are_those_of_its_cells() -> None:
     assert sums[0] == pytest.approx([1.0, 0.5, 0.01, 1.0, 1.0])
     assert sums[1].tolist() == [0.0] * 5
     assert sums[2] == pytest.approx([2.0, 3.0, 0.13, 5.0, 13.0])
+
+
+def test_least_heights_over_a_disk_are_those_of_scipy() -> None:
+    z = RNG.uniform(0.0, 9.0, (13, 17)).astype(np.float32)
+    for radius in (1, 4, 15):
+        reach = np.arange(-radius, radius + 1)
+        disk = reach**2 + reach[:, None] ** 2 <= radius**2
+        widths = np.array([np.count_nonzero(row) // 2 for row in disk[radius:]])
+        out = np.full(z.shape, np.inf, np.float32)
+        least_over_disk(z, widths, np.empty(17, np.float32), out)
+        assert (out == scipy.ndimage.minimum_filter(z, footprint=disk, mode="constant", cval=np.inf)).all()
+
+
+def test_returns_on_the_ground_are_those_met_steeply() -> None:
+    place = tuple(map(np.array, ([5.0, 5.0, 5.0, 10.0, 5.0, 5.0], [0.0] * 6, [0.0] * 6)))
+    up = np.array([2.0, 2.0, 0.4, 2.0, np.nan, 2.0])  # sines 0.37, 0.37, 0.08 (flat), beyond the box, not known, 0.37
+    sensor = (np.zeros(6), np.zeros(6), up)
+    above = np.array([0.05, 0.2, 0.0, 0.0, -0.1, 0.0], np.float32)  # the second one lies too high
+    wanted, rows = np.array([True] * 5 + [False]), np.empty(6, np.int64)
+    count = seen_on_ground(place, sensor, above, wanted, (0.11, 0.1), (0.0, 0.0, 10.0, 1.0), rows)
+    assert rows[:count].tolist() == [0, 4]
+
+
+def test_a_scan_line_is_one_laser_within_a_step_of_time() -> None:
+    epoch = np.array([5, 19, 21, -3, 5, 5], np.int64)
+    sensor, laser = np.array([0, 0, 0, 0, 1, 0], np.uint8), np.array([3, 3, 3, 3, 3, 4], np.uint16)
+    out = np.empty(5, np.int64)
+    scan_lines(np.array([0, 1, 2, 4, 5]), epoch, sensor, laser, 20, out)
+    assert len(set(out.tolist())) == 4
+    assert out[0] == out[1]
+    scan_lines(np.array([3, 0, 3, 2, 1]), epoch, sensor, laser, 20, out)
+    assert out[0] == out[2] == out[1] - (1 << 24) == out[3] - (2 << 24)
+    assert out[4] == out[1]
 
 
 def test_values_of_a_group_count_once() -> None:

@@ -171,7 +171,7 @@ def node_names(schema: pa.Schema) -> tuple[str, ...]:
 
 def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> list[Seen]:
     """What saw each of some lines (k, 2): returns of the ground within a quarter of a metre of it, each once."""
-    label = np.full(raster.count.shape, -1, np.int64)
+    label = np.full(raster.count.shape, -1, np.int32)
     reach = np.arange(-round(NEAR_M / raster.cell_m), round(NEAR_M / raster.cell_m) + 1)
     for number, line in enumerate(lines):
         x, y = dense(line, raster.cell_m / 2)
@@ -184,7 +184,7 @@ def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> lis
         return []
     at = np.where(raster.used, label.ravel()[raster.cell], -1)
     rows = np.flatnonzero(at >= 0)
-    at = at[rows]
+    at = at[rows].astype(np.int64)
     return gathered(at, len(lines), scene.returns.pass_id[rows], scene.returns.epoch_gps_ns[rows])
 
 

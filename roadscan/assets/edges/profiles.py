@@ -9,7 +9,7 @@ import numpy.typing as npt
 import scipy.linalg
 import scipy.ndimage
 
-from roadscan.assets.bins import in_bins
+from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.edges.paths import Chain
 from roadscan.assets.edges.raster import HeightRaster
 from roadscan.kernels.assets import step_profiles as kernel
@@ -86,9 +86,8 @@ def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
     if x_m.size == 0:
         return Heights(x_m, y_m, height_m, np.zeros(2, np.int64), (0.0, 0.0, _BIN_M, 1.0, 1.0))
     x_min, y_min = _BIN_M * np.floor(x_m.min() / _BIN_M), _BIN_M * np.floor(y_m.min() / _BIN_M)
-    column, row = ((x_m - x_min) / _BIN_M).astype(np.int64), ((y_m - y_min) / _BIN_M).astype(np.int64)
-    columns, rows = int(column.max()) + 1, int(row.max()) + 1
-    number = row * columns + column
+    columns, rows = int((x_m.max() - x_min) / _BIN_M) + 1, int((y_m.max() - y_min) / _BIN_M) + 1
+    number = cells_of(x_m, y_m, (float(x_min), float(y_min), _BIN_M), (rows, columns))
     starts, order = in_bins(number, rows * columns)
     bins = (float(x_min), float(y_min), _BIN_M, float(rows), float(columns))
     return Heights(x_m[order], y_m[order], height_m[order], starts, bins)

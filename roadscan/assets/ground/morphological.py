@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
+from roadscan.kernels.assets.ground_cells import least_over_disk
 from roadscan.model.settings.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
@@ -24,24 +25,14 @@ _GROWTH: Final = 1.15
 
 def opened(z: Float32, radius: int) -> Float32:
     """Opening of a surface (rows, columns) by a disk of so many cells; what lies outside does not count."""
-    return _over_disk(_over_disk(z, radius, np.minimum), radius, np.maximum)
+    return -_least_over_disk(-_least_over_disk(z, radius), radius)
 
 
-def _over_disk(z: Float32, radius: int, extreme: np.ufunc) -> Float32:
-    """Least or greatest height within a disk about each cell: of the cells whose middles lie within `radius` cells.
-
-    Pieces of rows grow cell by cell, and each row of the disk takes the piece of its own width.
-    """
-    out, line = z.copy(), z.copy()
-    widths = [math.isqrt(radius * radius - up * up) for up in range(min(radius + 1, len(z)))]
-    for width in range(radius + 1):
-        if 0 < width < z.shape[1]:
-            extreme(line[:, width:], z[:, :-width], out=line[:, width:])
-            extreme(line[:, :-width], z[:, width:], out=line[:, :-width])
-        for up in (k for k, own in enumerate(widths) if own == width):
-            rest = len(z) - up
-            extreme(out[up:], line[:rest], out=out[up:])
-            extreme(out[:rest], line[up:], out=out[:rest])
+def _least_over_disk(z: Float32, radius: int) -> Float32:
+    """Least height within a disk about each cell: of the cells whose middles lie within `radius` cells."""
+    widths = np.array([math.isqrt(radius * radius - up * up) for up in range(radius + 1)])
+    out = np.full(z.shape, np.inf, np.float32)
+    least_over_disk(np.ascontiguousarray(z, np.float32), widths, np.empty(z.shape[1], np.float32), out)
     return out
 
 

@@ -8,11 +8,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.bins import in_bins
+from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
-from roadscan.kernels.assets.paint_levels import contrasts, paint_levels, paint_sums
+from roadscan.kernels.assets.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
+from roadscan.kernels.options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -78,37 +79,37 @@ class Contrast:
 def contrast_of(scene: Scene) -> Contrast:
     """Contrast of the returns of a scene that lie on the ground and on no vehicle or person."""
     found = scene.returns
-    with np.errstate(invalid="ignore"):
-        on_ground = np.abs(scene.above_ground_m) <= ON_GROUND_M
     window = scene.extent
-    on_ground &= (scene.classes != VEHICLE) & (scene.classes != PERSON) & window.holds(found.x_m, found.y_m)
-    rows = np.flatnonzero(on_ground)
-    rows = rows[~_seen_flat(found, rows)]
+    rows = _on_surface(scene, window)
     x, y, intensity = found.x_m[rows], found.y_m[rows], found.intensity[rows].astype(np.float64)
     contrast, noise = np.empty(rows.size), np.empty(rows.size)
     grid = (float(window.x_min_m), float(window.y_min_m), _LEVEL_CELL_M)
     contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
-    shape = tuple(round(v / CELL_M) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
-    column = np.clip(((x - window.x_min_m) / CELL_M).astype(np.int64), 0, shape[1] - 1)
-    row = np.clip(((y - window.y_min_m) / CELL_M).astype(np.int64), 0, shape[0] - 1)
-    cell = row * shape[1] + column
-    mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows].astype(np.float64), (shape[0], shape[1]))
+    shape = round((window.y_max_m - window.y_min_m) / CELL_M), round((window.x_max_m - window.x_min_m) / CELL_M)
+    cell = np.maximum(cells_of(x, y, (grid[0], grid[1], CELL_M), shape), 0).astype(np.int64)
+    mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows], shape)
     return Contrast(rows, x, y, found.height_m[rows], contrast, noise, _lines(found, rows), cell, window, mean, sigma)
 
 
-def _seen_flat(found: Returns, rows: Int64) -> npt.NDArray[np.bool_]:
-    """Which of the returns at `rows` a beam met at a small angle; none where it is not known where the sensor stood."""
-    up = found.sensor_height_m[rows] - found.height_m[rows]
-    dx, dy = found.x_m[rows] - found.sensor_x_m[rows], found.y_m[rows] - found.sensor_y_m[rows]
-    return np.asarray(up < _FLATTEST * np.sqrt(dx**2 + dy**2 + up**2))
+def _on_surface(scene: Scene, box: Box) -> Int64:
+    """Rows of the returns on the ground and on no road user; those that a beam met at a small angle are left out,
+    where it is known where the sensor stood.
+    """
+    r, looked_at = scene.returns, np.ones(256, np.bool_)
+    looked_at[[VEHICLE, PERSON]] = False
+    rows = np.empty(len(r), np.int64)
+    place = tuple(map(read_only, (r.x_m, r.y_m, r.height_m)))
+    sensor = tuple(map(read_only, (r.sensor_x_m, r.sensor_y_m, r.sensor_height_m)))
+    limits = (ON_GROUND_M, _FLATTEST)
+    count = seen_on_ground(place, sensor, scene.above_ground_m, looked_at[scene.classes], limits, tuple(box), rows)
+    return np.asarray(rows[:count].copy())
 
 
 def _lines(found: Returns, rows: Int64) -> Int64:
     """Number (n,) of the scan line of each return at `rows`."""
-    slot = found.epoch_gps_ns[rows] // _LINE_NS
-    slot = slot - (slot.min() if slot.size else 0)
-    beam = found.sensor[rows].astype(np.int64) * (1 << 16) + found.laser[rows]
-    return np.asarray(slot * (1 << 24) + beam, np.int64)
+    out = np.empty(rows.size, np.int64)
+    scan_lines(rows, read_only(found.epoch_gps_ns), found.sensor, found.laser, _LINE_NS, out)
+    return out
 
 
 def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Float64, Float64]:
@@ -116,9 +117,9 @@ def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Fl
     from scipy import ndimage
 
     edge = _LEVEL_CELL_M
-    shape = tuple(int(np.ceil(v / edge)) for v in (window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m))
-    u, v = (y - window.y_min_m) / edge, (x - window.x_min_m) / edge
-    own = np.clip(u.astype(np.int64), 0, shape[0] - 1) * shape[1] + np.clip(v.astype(np.int64), 0, shape[1] - 1)
+    sides = window.y_max_m - window.y_min_m, window.x_max_m - window.x_min_m
+    shape = int(np.ceil(sides[0] / edge)), int(np.ceil(sides[1] / edge))
+    own = cells_of(x, y, (float(window.x_min_m), float(window.y_min_m), edge), shape)
     first, order = in_bins(own, shape[0] * shape[1])
     level, upper = np.empty(shape), np.empty(shape)
     paint_levels(intensity[order], first, _LEVEL_HALF, level, upper)
@@ -133,14 +134,14 @@ def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Fl
 
 
 def _means(
-    cell: Int64, contrast: Float64, noise: Float64, height: Float64, shape: tuple[int, int]
+    cell: Int64, contrast: Float64, noise: Float64, height: Float32, shape: tuple[int, int]
 ) -> tuple[Float32, Float32]:
     """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough."""
     import cv2
 
-    sums = np.zeros((shape[0] * shape[1], 5))
+    sums = np.zeros((shape[0] * shape[1], 5), np.float32)
     paint_sums(cell, contrast, noise, height, sums)
-    number, contrasted, noisy, high, squares = (column.astype(np.float32).reshape(shape) for column in sums.T)
+    number, contrasted, noisy, high, squares = map(np.asarray, cv2.split(sums.reshape(*shape, 5)))
 
     def raster(counts: Float32, sigma_m: float) -> Float32:
         reach = 2 * int(np.ceil(3 * sigma_m / CELL_M)) + 1

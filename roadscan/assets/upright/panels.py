@@ -13,7 +13,7 @@ from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.kernels.assets.upright_voxels import passing_lines
 
@@ -28,6 +28,8 @@ _HIGH_M: Final = 4.0
 _BESIDE_M: Final = 0.2
 """Returns of a region that lie this far beside its line or less make the surface."""
 _OPEN_DEG: Final = 1.2
+_NEAR_M: Final = 3.0
+"""What belongs to a surface lies within this of its line."""
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
@@ -60,6 +62,10 @@ class Panel:
     rows: Int64
     stretch: Int64
     """Stretch of each row."""
+
+    def comes_near(self, tile: Box) -> bool:
+        """Whether a tile may hold a part of it, or a return that belongs to it."""
+        return tile.comes_near(self.xy_m, _NEAR_M)
 
 
 @once_a_scene
@@ -143,7 +149,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     some = slice(None, None, step)
     taken = np.zeros(len(returns), np.bool_)
     taken[some] = True
-    low = [_is_low(p) for p in panels]
+    low = [p.comes_near(scene.tile) and _is_low(p) for p in panels]
     rectangles = np.concatenate(
         [np.zeros((0, 6))]
         + [

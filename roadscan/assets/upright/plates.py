@@ -26,6 +26,8 @@ Int64 = npt.NDArray[np.int64]
 _VOXEL_M: Final = 0.2
 _THICK_M: Final = 0.06
 _SEARCHED_ABOVE_M: Final = 1.0
+_BESIDE_M: Final = 0.7
+"""Returns this far beyond a cluster tell how large its plate is."""
 _LEAST_BRIGHT: Final = 8
 _ENOUGH_BRIGHT: Final = 60
 """So many bright returns tell the outline by themselves."""
@@ -66,7 +68,7 @@ class Plate:
 
 
 def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
-    """Plates in the scene and its halo, by their place."""
+    """Plates of which the scene's tile may hold a part, by their place."""
     bright = _bright(scene, options.intensity_ratio)
     rows = np.flatnonzero(bright & ~_in_large_planes(scene, options.greatest_board_m))
     found = [_plate(scene, cluster, bright, options) for cluster in _clusters(scene, rows)]
@@ -145,6 +147,9 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     returns = scene.returns
     xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
     spread = np.ptp(xyh, axis=0)
+    reach = 0.5 * math.hypot(spread[0], spread[1]) + _BESIDE_M
+    if not scene.tile.comes_near(xyh[:, :2], reach):
+        return None
     if math.hypot(spread[0], spread[1]) > options.greatest_board_m or spread[2] > options.greatest_board_m:
         return None
     middle, normal, residual = _plane(xyh)
@@ -153,7 +158,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
         return None
     seen = np.array([np.median(returns.sensor_x_m[cluster]), np.median(returns.sensor_y_m[cluster])])
     normal = normal if float(normal[:2] @ (seen - middle[:2])) > 0.0 else -normal
-    near = places_of(scene).within(float(middle[0]), float(middle[1]), 0.5 * math.hypot(spread[0], spread[1]) + 0.7)
+    near = places_of(scene).within(float(middle[0]), float(middle[1]), reach)
     inside, about = _on_plane(scene, near, middle, normal, xyh)
     rows = np.union1d(cluster, inside)
     edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)

@@ -60,9 +60,12 @@ def probability_of(chain: Chain) -> float:
 
 @once_a_scene
 def _names_of_panels(scene: Scene) -> list[set[Surface | None]]:
-    """What the chains of each panel look like."""
+    """What the chains of each panel look like; nothing where it does not come near the tile."""
     whole = replace(scene, tile=scene.window)
-    return [{told(c) for c in chains_of(pieces_of_panels(whole, [panel]))} for panel in panels_of(scene)]
+    return [
+        {told(c) for c in chains_of(pieces_of_panels(whole, [panel]))} if panel.comes_near(scene.tile) else set()
+        for panel in panels_of(scene)
+    ]
 
 
 @once_a_scene

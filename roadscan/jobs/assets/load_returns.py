@@ -310,7 +310,7 @@ def _falls(c: _Columns) -> Bool:
 
 def _by_source(source: npt.NDArray[np.uint16], count: int) -> Iterator[tuple[int, slice]]:
     """Rows of each source, which are ascending."""
-    ends = np.searchsorted(source, np.arange(count + 1))
+    ends = np.searchsorted(source, np.arange(count + 1, dtype=source.dtype))
     for number in range(count):
         if ends[number] < ends[number + 1]:
             yield number, slice(int(ends[number]), int(ends[number + 1]))

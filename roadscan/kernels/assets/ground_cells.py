@@ -98,3 +98,34 @@ def cell_heights(x, y, above, chosen, origin, per_m, middle, half, sums):
                     sums[i, j, 0] += 1.0
                     sums[i, j, 1] += h
                     sums[i, j, 2] += h * h
+
+
+@kernel
+def least_over_disk(z, widths, line, out):
+    """Least height within a disk about each cell of a raster.
+
+    Pieces of a row grow cell by cell, and each row of the disk takes the piece of its own width.
+    z : (rows, columns) float32, finite. widths : (radius + 1,) int64, half the width of the disk in each of its rows,
+    from the middle one on (cells). line : (columns,) float32, working space. out : (rows, columns) float32, infinite
+    before.
+    """
+    rows, columns = z.shape
+    radius = widths.size - 1
+    for i in range(rows):
+        for j in range(columns):
+            line[j] = z[i, j]
+        up = radius
+        for width in range(radius + 1):
+            if 0 < width < columns:
+                for j in range(columns - width):
+                    line[j + width] = z[i, j] if z[i, j] < line[j + width] else line[j + width]
+                for j in range(columns - width):
+                    line[j] = z[i, j + width] if z[i, j + width] < line[j] else line[j]
+            while up >= 0 and widths[up] == width:
+                if i + up < rows:
+                    for j in range(columns):
+                        out[i + up, j] = line[j] if line[j] < out[i + up, j] else out[i + up, j]
+                if up > 0 and i >= up:
+                    for j in range(columns):
+                        out[i - up, j] = line[j] if line[j] < out[i - up, j] else out[i - up, j]
+                up -= 1

@@ -89,6 +89,46 @@ def contrasts(x, y, intensity, grid, level, upper, bounds, contrast, noise):
 
 
 @kernel
+def seen_on_ground(place, sensor, above, wanted, limits, box, rows):
+    """Numbers of the returns on the ground that beams met steeply enough, to `rows` (n,) int64; how many there are.
+
+    place, sensor : three (n,) float64 arrays, x, y and height of the return and of the sensor (m); returns whose sensor
+    is not known count as met steeply. above : (n,) float32 height above the ground (m). wanted : (n,) bool. limits :
+    (greatest distance from the ground (m), least sine of the angle between beam and level). box : least x and y, which
+    belong to it, and those that it ends before.
+    """
+    found = 0
+    for i in range(wanted.size):
+        if not (wanted[i] and abs(above[i]) <= limits[0]):
+            continue
+        x, y = place[0][i], place[1][i]
+        if not (box[0] <= x < box[2] and box[1] <= y < box[3]):
+            continue
+        up, dx, dy = sensor[2][i] - place[2][i], x - sensor[0][i], y - sensor[1][i]
+        if up < limits[1] * math.sqrt(dx * dx + dy * dy + up * up):
+            continue
+        rows[found] = i
+        found += 1
+    return found
+
+
+@kernel
+def scan_lines(rows, epoch, sensor, laser, step, out):
+    """Number of the scan line of some returns: out (k,) int64, what one laser of a sensor saw within a step of time.
+
+    rows : (k,) int64 numbers of returns; epoch : (n,) int64 and step, of one unit; sensor : (n,) uint8; laser : (n,)
+    uint16.
+    """
+    begin, slot = np.int64(0), np.int64(0)
+    for k in range(rows.size):
+        at = epoch[rows[k]]
+        if not 0 <= at - begin < step or k == 0:
+            slot = at // step
+            begin = slot * step
+        out[k] = (slot << 24) + (np.int64(sensor[rows[k]]) << 16) + np.int64(laser[rows[k]])
+
+
+@kernel
 def paint_sums(cell, contrast, noise, height_m, sums):
     """Add returns to their cells: sums (cells, 5), number, contrast, noise², height (m), height².
 

@@ -16,9 +16,13 @@ def between_ticks(epochs, step, first, number, at, out):
     at : (k, 3) float64, places at ticks; NaN where there is none.
     out : (n, 3) float64, out.
     """
+    begin, row = first * step, number[0]
     for i in range(epochs.size):
-        tick = epochs[i] // step
-        share = (epochs[i] - tick * step) / step
-        row = number[tick - first]
+        past = epochs[i] - begin
+        if past < 0 or past >= step:  # epochs follow one another, so that a tick holds many of them
+            tick = epochs[i] // step
+            begin, row = tick * step, number[tick - first]
+            past = epochs[i] - begin
+        share = past / step
         for axis in range(3):
             out[i, axis] = at[row, axis] * (1.0 - share) + at[row + 1, axis] * share

@@ -57,9 +57,9 @@ class LandscapeOptions(Strict):
 
 
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
-    """Cells of the tile that are probably grown over, with the scatter of their heights over that of the road.
+    """Cells of the tile that are probably grown over: heights scatter more than the road's, over an area.
 
-    Vosselman (2000) told vegetation from ground by how rough a surface is. What is narrow is left out by an opening.
+    Long upright surfaces take no part, and an opening leaves out what is narrow.
     """
     tile, window = scene.tile, scene.window
     margin = int((tile.x_min_m - window.x_min_m) / CELL_M)

@@ -178,6 +178,8 @@ def _painted(street: Street) -> shapely.Geometry:
              for c in road.crosswalks]  # fmt: skip
     found += [street.area(b.from_m, b.to_m, b.station_m - b.width_m / 2, b.station_m + b.width_m / 2)
               for b in road.stop_bars]  # fmt: skip
+    # the end of a line far off may be a marking of its own
+    found += [street.line(m.offset_m, m.start_m, m.end_m).buffer(m.width_m / 2) for m in road.markings]
     return shapely.union_all([f.buffer(0.1) for f in found])
 
 
@@ -313,7 +315,7 @@ def line_figures(street: Street) -> Iterator[Figure]:
             share = float(shapely.dwithin(every, truth, within).mean())
             yield Figure(f"{kind}: within {within} m, right", share, "", right)
         yield from _kerb_heights(street, found, truth) if kind == "kerb" else ()
-        yield from _lane_lines(street, found) if kind == "lane_line" else ()
+        yield from _lane_lines(street, street.found(kind)) if kind == "lane_line" else ()
     for kind in NONE_THERE:
         table = street.found(kind)
         false = sum(_share_near(g, solid, 0.3) < 0.5 for g in table.geometry)
@@ -425,7 +427,7 @@ def marking_figures(street: Street) -> Iterator[Figure]:
             las = reader.read()
         code = np.asarray(las.classification)
         ground = np.isin(code, (classes.GROUND, classes.ROAD, classes.MARKING, classes.KERB, classes.SIDEWALK))
-        x, y, z = (np.asarray(v)[ground] for v in (las.x, las.y, las.z))
+        x, y, z = (np.asarray(v)[ground] * u for v, u in ((las.x, street.unit_m), (las.y, street.unit_m), (las.z, 1.0)))
         marked = code[ground] == classes.MARKING
         station, offset = street.along(x, y)
         kept = (station >= street.ends_m[0]) & (station <= street.ends_m[1])
@@ -454,7 +456,7 @@ def ground_figures(street: Street) -> Iterator[Figure]:
         with rasterio.open(street.session.store.path(path)) as raster:
             seen = raster.read(1)
             rows, columns = np.nonzero(np.isfinite(seen))
-            x, y = (np.asarray(v) for v in rasterio.transform.xy(raster.transform, rows, columns))
+            x, y = (np.asarray(v) * street.unit_m for v in rasterio.transform.xy(raster.transform, rows, columns))
         if not x.size:
             continue
         station, offset = street.along(x, y)

@@ -10,6 +10,7 @@ import geopandas
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
+import pyproj
 import shapely
 
 from roadscan.jobs.run import run_stages
@@ -92,6 +93,8 @@ class Street:
     """What stands there, as the truth states it; stations and offsets are those of its foot."""
     ends_m: tuple[float, float]
     """Stations between which it is judged."""
+    unit_m: float
+    """Length of the unit of the map's coordinates (m); tables are in metres here."""
 
     def along(self, easting_m: Any, northing_m: Any) -> tuple[Float64, Float64]:
         """Station and offset of places (n,)."""
@@ -141,5 +144,12 @@ def street_in(folder: Path, session: Session, *, end_m: float = 4.0) -> Street:
         for kind, file in files.items()
         if session.store.exists(file)
     }
+    unit_m = float(pyproj.CRS(known.scene.map.crs).axis_info[0].unit_conversion_factor)
+    if unit_m != 1.0:
+        for table in tables.values():
+            table.geometry = shapely.transform(
+                table.geometry.to_numpy(), lambda xyz: xyz * [unit_m, unit_m, 1.0], include_z=True
+            )
     things = objects_table(known.scene, known.surface).to_pandas()
-    return Street(known.scene, known.surface, session, tables, things, (end_m, known.scene.length_m - end_m))
+    ends_m = (end_m, known.scene.length_m - end_m)
+    return Street(known.scene, known.surface, session, tables, things, ends_m, unit_m)

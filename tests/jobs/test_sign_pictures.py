@@ -46,6 +46,7 @@ SCENE = Scene.load("demo").changed(
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(1800)
 def test_signs_of_a_street_are_found_named_and_read(tmp_path: Path) -> None:
     file = simulate(SCENE, tmp_path / "survey").survey_file
     assets = {"kinds": ["sign", "lane_line"], "classified": False, "bare_earth": False}

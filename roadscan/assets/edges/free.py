@@ -1,4 +1,4 @@
-"""Edges at whose foot nothing stands: along the foot of a fence heights differ as they do at a step."""
+"""Edges that may be kerbs: along the foot of a fence, and of a rut under the vehicle, heights differ as at a step."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from roadscan.assets.edges.line_pieces import columns_of
 from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.kernels.assets.corridors import mark_corridor
 
 _FENCE_M: Final = (0.35, 1.2)
 """Heights above the ground at which every fence and wall is seen."""
 _LEAST_RETURNS: Final = 2
-_AT_FOOT: Final = 0.5
+_MOST: Final = 0.5
+_VEHICLE_M: Final = 0.9
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -28,14 +30,25 @@ _OTHERS: Final = (
 
 @once_a_scene
 def free_edges(scene: Scene) -> list[Edge]:
-    """The scene's edges without those that lie, at most of their nodes, where something stands."""
-    raster, standing = raster_of(scene), _standing(scene)
+    """The scene's edges without those that lie, at most of their nodes, where something stands or a drive went."""
+    raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
     kept = []
     for edge in edges_of(scene):
         nodes = columns_of(edge)
-        if np.mean(standing[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _AT_FOOT:
+        if np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST:
             kept.append(edge)
     return kept
+
+
+def _driven(scene: Scene) -> npt.NDArray[np.bool_]:
+    """Cells (rows, columns) of the raster within half a vehicle's width of a drive."""
+    raster, drive = raster_of(scene), scene.drive_xyh_m
+    inside = np.zeros(raster.count.shape, np.bool_)
+    corner = np.array([raster.x_min_m, raster.y_min_m])
+    for number in np.unique(drive[:, 3]).tolist():
+        x, y = (np.ascontiguousarray(drive[drive[:, 3] == number, k]) for k in (0, 1))
+        mark_corridor(x, y, _VEHICLE_M, corner, raster.cell_m, inside)
+    return inside
 
 
 def _standing(scene: Scene) -> npt.NDArray[np.bool_]:
@@ -45,4 +58,5 @@ def _standing(scene: Scene) -> npt.NDArray[np.bool_]:
     counted[list(_OTHERS)] = False
     stands = (above > _FENCE_M[0]) & (above < _FENCE_M[1]) & counted[scene.classes] & (raster.cell >= 0)
     number = np.bincount(raster.cell[stands], minlength=raster.count.size).reshape(raster.count.shape)
-    return cv2.dilate((number >= _LEAST_RETURNS).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    wider = cv2.dilate((number >= _LEAST_RETURNS).astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(wider > 0)

@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, Final
 
+import numpy as np
 import pyarrow as pa
 
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.paint.detection import paint_of, rows_of_paint
+from roadscan.assets.paint.detection import Patch, paint_of, rows_of_paint
 from roadscan.assets.paint.markings import markings
 from roadscan.assets.paint.patch_pieces import PATCH_PIECES, patch_pieces
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.places import places_of
+
+_LARGE_M2: Final = 0.5
+_STANDS_M: Final = (0.3, 1.5)
+_LEAST_STANDING: Final = 5
+
+
+def _at_foot(scene: Scene, patch: Patch) -> bool:
+    """Whether a small patch is the foot of a post: something stands on it."""
+    if patch.shape.area > _LARGE_M2:
+        return False
+    west, south, east, north = patch.shape.bounds
+    reach = math.hypot(east - west, north - south) / 2
+    rows = places_of(scene).within((west + east) / 2, (south + north) / 2, reach)
+    above = scene.above_ground_m[rows]
+    return int(np.count_nonzero((above > _STANDS_M[0]) & (above < _STANDS_M[1]))) >= _LEAST_STANDING
 
 
 class RoadMarking(AssetKind):
@@ -25,6 +44,7 @@ class RoadMarking(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Polygons of markings in the tile."""
         paint = paint_of(scene)
+        paint = replace(paint, patches=tuple(p for p in paint.patches if not _at_foot(scene, p)))
         return Evidence(patch_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.patches), MARKING),))
 
     def objects(

@@ -15,6 +15,7 @@ from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
+from roadscan.assets.upright.panels import panels_of
 from roadscan.kernels.assets.grown_cells import low_moments
 from roadscan.model.strict import Strict
 
@@ -30,8 +31,10 @@ _LOW_M: Final = (-0.3, 1.0)
 _LOW: Final = (
     classes.UNCLASSIFIED, classes.GROUND, classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.ROAD,
 )  # fmt: skip
-_WIDE: Final = np.ones((5, 5), np.uint8)
-"""Walls, rails, kerbs and fences are narrower than this (cells)."""
+_LONG_M: Final = 2.0
+"""Upright surfaces longer than this are rails, fences and walls."""
+_WIDE: Final = np.ones((7, 7), np.uint8)
+"""Walls, rails, kerbs and fences, with a cell to each side, are narrower than this (cells)."""
 _POOLED: Final = np.ones((3, 3), np.uint8)
 """A cell is judged with those around it, which widens areas by one."""
 PIECE_SCHEMA: Final = pa.schema(
@@ -54,9 +57,9 @@ class LandscapeOptions(Strict):
 
 
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
-    """Cells of the tile that are probably grown over, with the scatter of their heights over that of the road.
+    """Cells of the tile that are probably grown over: heights scatter more than the road's, over an area.
 
-    Vosselman (2000) told vegetation from ground by how rough a surface is. What is narrow is left out by an opening.
+    Long upright surfaces take no part, and an opening leaves out what is narrow.
     """
     tile, window = scene.tile, scene.window
     margin = int((tile.x_min_m - window.x_min_m) / CELL_M)
@@ -74,7 +77,8 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
         return PIECE_SCHEMA.empty_table()
     ratio = rough / float(np.median(rough[road]))
     chosen = (counted & (ratio >= options.rough_ratio)).astype(np.uint8)
-    chosen[cv2.dilate(_cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8), _WIDE) > 0] = 0
+    walls = _cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8)
+    chosen[cv2.dilate(walls, _POOLED, iterations=2) > 0] = 0
     chosen = cv2.erode(cv2.morphologyEx(chosen, cv2.MORPH_OPEN, _WIDE), _POOLED)
     grown = (chosen > 0) & ~road & (sums[..., 0] > 0)
     edge = np.zeros(shape, np.bool_)
@@ -84,14 +88,17 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
 
 def _sums(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Float64:
     returns = scene.returns
-    counted = np.zeros(256, np.bool_)
-    counted[list(_LOW)] = True
+    low = np.zeros(256, np.bool_)
+    low[list(_LOW)] = True
+    counted = low[scene.classes]
+    for panel in panels_of(scene):
+        if float(np.hypot(*np.diff(panel.xy_m, axis=0).T).sum()) > _LONG_M:
+            counted[panel.rows] = False
     sums = np.zeros((*shape, 4))
     limits = np.array(_LOW_M)
     low_moments(
-        returns.x_m, returns.y_m, scene.above_ground_m, returns.intensity, counted[scene.classes], limits, corner,
-        CELL_M, sums,
-    )  # fmt: skip
+        returns.x_m, returns.y_m, scene.above_ground_m, returns.intensity, counted, limits, corner, CELL_M, sums
+    )
     return sums
 
 

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 import shapely
@@ -31,7 +32,7 @@ def address() -> Iterator[str]:
 def street(tmp_path: Path, address: str) -> Iterator[Inventory]:
     """Six poles and a sign, published into a schema of its own."""
     made = inventory(tmp_path, Everywhere())
-    made.home = PostGis(address, "street", 32632)
+    made.home = PostGis(address, "street", 32632, project=tmp_path / "inventory-postgis.qgs")
     made.record(found([*poles(), asset("sign", (20.1, 4.0, 103.0), message='STOP, "all"\nway', width_m=0.6)]))
     made.publish()
     yield made
@@ -52,6 +53,19 @@ def test_it_shows_what_was_found_and_takes_back_nothing(street: Inventory, addre
     assert execute(address, "SELECT message, parent FROM street.road_signs") == [('STOP, "all"\nway', rows[1][0])]
     assert street.pull().commit is None
     assert street.status().to_pull == 0
+
+
+def test_its_project_names_the_tables_and_no_password(street: Inventory, tmp_path: Path, address: str) -> None:
+    text = (tmp_path / "inventory-postgis.qgs").read_text()
+    layers = {
+        layer.findtext("layername"): layer for layer in ElementTree.fromstring(text.split("\n", 1)[1]).iter("maplayer")
+    }
+    assert layers["Pole"].findtext("provider") == "postgres" and "Conflicts" in layers
+    port = psycopg.conninfo.conninfo_to_dict(address)["port"]
+    assert layers["Pole"].findtext("datasource") == (
+        f"dbname='postgres' host='127.0.0.1' port='{port}' key='fid' srid=32632 table=\"street\".\"poles\" (geom)"
+    )
+    assert "secret" not in text and "admin" not in text
 
 
 def test_edits_of_several_people_are_taken_in_with_their_names(street: Inventory, address: str) -> None:

@@ -111,7 +111,7 @@ class Thing(NamedTuple):
 
 
 STREETS = 6
-LENGTH_M = 130.0
+LENGTH_M = 70.0
 FATES = ("removed", "added", "moved", "hidden", "stays", "stays", "stays", "stays")
 CHANGES = ("appeared", "gone", "moved")
 

@@ -347,12 +347,20 @@ export class CloudView {
   fit(): void {
     const { min, max } = this.#extent()
     const middle = new Vector3(...[0, 1, 2].map((axis) => (min[axis]! + max[axis]!) / 2))
-    const size = Math.hypot(max[0]! - min[0]!, max[1]! - min[1]!)
     this.eye.heading = 0
     this.eye.tilt = 0.75
-    const narrowest = Math.min(1, this.#size.width / this.#size.height || 1)
-    this.#far = Math.max(5, (size * 0.8) / Math.max(0.3, narrowest))
-    this.eye.lookAt(middle, this.#far)
+    const [ahead, right] = [this.eye.direction(), this.eye.right()]
+    const up = new Vector3().crossVectors(right, ahead)
+    const high = Math.tan((this.eye.camera.fov * Math.PI) / 360)
+    const wide = high * (this.#size.width / this.#size.height || 1)
+    // Each corner of the cloud's box is to be within the picture.
+    let far = 5
+    for (let corner = 0; corner < 8; corner++) {
+      const by = new Vector3(...[0, 1, 2].map((axis) => ((corner >> axis) & 1 ? max[axis]! : min[axis]!))).sub(middle)
+      far = Math.max(far, 1.05 * Math.max(Math.abs(by.dot(right)) / wide, Math.abs(by.dot(up)) / high) - by.dot(ahead))
+    }
+    this.#far = far
+    this.eye.lookAt(middle, far)
     this.#redraw(true)
   }
 

@@ -24,6 +24,8 @@ from roadscan.tables.manifest import OutputRecord
 
 _SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")
 _TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
+_DIGITS: Final = {"sigma": 4, "share": 4}
+"""Significant digits that are told of what qualifies a value; values are told whole."""
 _CODE: Final = "roadscan.jobs.publish.parts.strips"
 
 Float64 = npt.NDArray[np.float64]
@@ -180,7 +182,12 @@ def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
     for kind in sorted(kinds.to_pylist(), key=lambda k: (k["quantity"], k["extent"])):
         both = pc.and_(pc.equal(ordered["quantity"], kind["quantity"]), pc.equal(ordered["extent"], kind["extent"]))
         own = ordered.filter(both)
-        yield {**kind, **{told: own.column(name).to_pylist() for name, told in zip(_SERIES, _TOLD, strict=True)}}
+        columns = {told: own.column(name).to_pylist() for name, told in zip(_SERIES, _TOLD, strict=True)}
+        yield {**kind, **columns, **{told: [_short(v, n) for v in columns[told]] for told, n in _DIGITS.items()}}
+
+
+def _short(value: float | None, digits: int) -> float | None:
+    return None if value is None else float(f"{value:.{digits}g}")
 
 
 def _crossings(lane: Lane, record: OutputRecord) -> Any:

@@ -1,0 +1,175 @@
+"""The labelled street of SemanticKITTI with its pictures, as a survey that is run and published."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.publish.material import Material, Wishes
+from roadscan.jobs.publish.site import publish
+from roadscan.jobs.run import run_stages
+from roadscan.jobs.session import Session
+from roadscan.jobs.stage import stage_named
+from roadscan.model.survey import Survey
+from roadscan.tables.store import Store
+
+Float64 = npt.NDArray[np.float64]
+
+FOCAL_PX: Final = 718.856
+PRINCIPAL_PX: Final = (607.1928, 185.2157)
+CAMERA_FROM_VELODYNE: Final = np.array(
+    [
+        [4.276802385584e-04, -9.999672484946e-01, -8.084491683471e-03],
+        [-7.210626507497e-03, 8.081198471645e-03, -9.999413164504e-01],
+        [9.999738645903e-01, 4.859485810390e-04, -7.206933692422e-03],
+    ]
+)
+"""Camera axes: x right, y down, z ahead."""
+CAMERA_FROM_VELODYNE_M: Final = np.array([-1.198459927713e-02, -5.403984729748e-02, -2.921968648686e-01])
+POLE: Final = 80
+TRUNK: Final = 71
+
+_BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
+_SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+_SURVEY: Final = """
+id = "semantic_kitti_00"
+rig = "rig.toml"
+store = "store"
+[map.local]
+name = "Velodyne axes at sweep 0"
+[tiles]
+cell_m = 0.2
+[adjust]
+on = false
+[[runs]]
+id = "drive"
+[[runs.logs]]
+path = "poses.csv"
+format = "pose_matrices"
+crs = "local"
+clock = { system = "unix_utc" }
+options = { axes = "flu" }
+[[runs.logs]]
+path = "sweeps"
+format = "kitti"
+sensor = "velodyne"
+clock = { system = "unix_utc" }
+options = { stamps = "../stamps.csv", stamp_column = "unix_utc_s", turn = "compensated" }
+[[runs.logs]]
+path = "image_0"
+format = "images"
+sensor = "camera"
+clock = { system = "unix_utc", unit = "s" }
+options = { stamps = "../pictures.csv" }
+"""
+
+
+@dataclass(frozen=True)
+class RecordedStreet:
+    """What was recorded, and the site that was made of it."""
+
+    site: Path
+    pictures: Path
+    places: Float64
+    """(n, 3) returns in the frame of sweep 0: ahead, left, up (m)."""
+    labels: npt.NDArray[np.uint8]
+    poses: Float64
+    """(p, 3, 4) velodyne to sweep 0."""
+    first: npt.NDArray[np.int64]
+    """(s + 1,) first return of each sweep."""
+
+    def sweep(self, number: int) -> Float64:
+        """Returns (n, 3) of a sweep in the frame of sweep 0."""
+        return self.places[self.first[number] : self.first[number + 1]]
+
+    def leaps_m(self, number: int) -> Float64:
+        """By how much the return beside each one (n,) of a sweep, of the same laser, is farther away (m)."""
+        pose = self.poses[number]
+        own = (self.sweep(number) - pose[:, 3]) @ pose[:, :3]
+        range_m = np.linalg.norm(own, axis=1)
+        azimuth, elevation = np.arctan2(own[:, 1], own[:, 0]), np.arcsin(own[:, 2] / range_m)
+        beside = (np.abs(np.diff(azimuth)) < 0.02) & (np.abs(np.diff(elevation)) < 0.01)
+        farther = np.where(beside, np.diff(range_m), 0.0)
+        leap = np.maximum(np.append(farther, 0.0), np.insert(-farther, 0, 0.0))
+        return np.where(range_m < 40.0, leap, 0.0)
+
+    def pixel(self, place: Float64, picture: int) -> Float64:
+        """Pixels (n, 2) of places (n, 3) by the recording's own calibration."""
+        pose = self.poses[picture]
+        seen = ((place - pose[:, 3]) @ pose[:, :3]) @ CAMERA_FROM_VELODYNE.T + CAMERA_FROM_VELODYNE_M
+        return FOCAL_PX * seen[:, :2] / seen[:, 2:] + PRINCIPAL_PX
+
+    def depth_m(self, place: Float64, picture: int) -> Float64:
+        """How far ahead of the camera places lie."""
+        pose = self.poses[picture]
+        return ((place - pose[:, 3]) @ pose[:, :3]) @ CAMERA_FROM_VELODYNE[2] + CAMERA_FROM_VELODYNE_M[2]
+
+
+def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
+    """Run and publish the recording as a survey below a folder."""
+    table = np.loadtxt(recording / "poses.csv", delimiter=",", skiprows=1)
+    (folder / "poses.csv").write_bytes((recording / "poses.csv").read_bytes())
+    shutil.copytree(recording / "image_0", folder / "image_0")
+    with tarfile.open(recording / "sweeps.tar.xz") as archive:
+        archive.extractall(folder / "sweeps", filter="data")
+    stamps = (recording / "poses.csv").read_text().splitlines()
+    frames = [(line.split(",")[0], line.split(",")[1]) for line in stamps[1:]]
+    swept = [one for one in frames if (folder / f"sweeps/velodyne_points/data/{int(one[0]):010d}.bin").is_file()]
+    _write_csv(folder / "stamps.csv", ["frame", "unix_utc_s"], swept)
+    names = [(f"{int(frame):06d}.png", stamp) for frame, stamp in frames]
+    _write_csv(
+        folder / "pictures.csv", ["file", "time"], [n for n in names if (recording / "image_0" / n[0]).is_file()]
+    )
+    (folder / "rig.toml").write_text(_rig())
+    (folder / "SURVEY.toml").write_text(_SURVEY)
+    survey = Survey.load(folder / "SURVEY.toml")
+    session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
+    run_stages(session, [stage_named(name) for name in ("ingest", "footprints", "tiles", "products")])
+    session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
+    publish(Material(session, Wishes()), folder / "site")
+    poses = table[:, 2:14].reshape(-1, 3, 4)
+    places, labels = [], []
+    for frame, _ in swept:
+        sweep = np.fromfile(folder / f"sweeps/velodyne_points/data/{int(frame):010d}.bin", "<f4").reshape(-1, 4)
+        pose = poses[int(frame)]
+        places.append(sweep[:, :3].astype(np.float64) @ pose[:, :3].T + pose[:, 3])
+        labels.append(np.fromfile(folder / f"sweeps/labels/{int(frame):010d}.label", np.uint8))
+    first = np.cumsum([0, *map(len, places)])
+    return RecordedStreet(
+        folder / "site", recording / "image_0", np.concatenate(places), np.concatenate(labels), poses, first
+    )
+
+
+def _rig() -> str:
+    turn = _BODY_FROM_VELODYNE @ CAMERA_FROM_VELODYNE.T @ _SENSOR_FROM_CAMERA.T
+    arm_m = _BODY_FROM_VELODYNE @ (-CAMERA_FROM_VELODYNE.T @ CAMERA_FROM_VELODYNE_M)
+    return f"""
+name = "KITTI car (2011)"
+[sensors.velodyne]
+kind = "lidar"
+axes = "flu"
+range_min_m = 2.5
+[sensors.camera]
+kind = "camera"
+lever_arm_body_m = {arm_m.tolist()}
+body_from_sensor = {turn.tolist()}
+[sensors.camera.interior]
+width_px = 1241
+height_px = 376
+focal_px = [{FOCAL_PX}, {FOCAL_PX}]
+principal_px = [{PRINCIPAL_PX[0]}, {PRINCIPAL_PX[1]}]
+"""
+
+
+def _write_csv(path: Path, names: list[str], rows: list[tuple[str, str]]) -> None:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([names, *rows])

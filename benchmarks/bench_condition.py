@@ -60,27 +60,33 @@ def rates() -> Iterator[Figure]:
 
 def memory(folder: Path) -> Iterator[Figure]:
     """Peak memory of a process that follows a lane, which does all tasks itself, as a worker does some of them."""
-    first = 0.0
+    first, spent = 0.0, {}
     for length_m in LENGTHS_M:
         passes = [{"lane": 2, "speed_m_per_s": 27.7}]
         scene = rough_scene(2.0, length_m, passes=passes, profilers={"spacing_m": 0.1, "readings": 100})
         made = RoughSurvey.made(scene, folder / f"{length_m:.0f}m")
-        peaks = [_peak_mb(made.file, stages) for stages in ("ingest navigate footprints tiles", "condition")]
-        first = first or peaks[1]
-        yield Figure(f"condition of {length_m / 1000:g} km of lane: peak memory", peaks[1], "MiB", first, "0.5 km")
+        _used(made.file, "ingest navigate footprints tiles")
+        peak_mb, spent[length_m] = _used(made.file, "condition")
+        first = first or peak_mb
+        yield Figure(f"condition of {length_m / 1000:g} km of lane: peak memory", peak_mb, "MiB", first, "0.5 km")
+    # The difference leaves out what starting and compiling cost.
+    more_km = (LENGTHS_M[-1] - LENGTHS_M[0]) / 1000
+    each = (spent[LENGTHS_M[-1]] - spent[LENGTHS_M[0]]) / more_km
+    yield Figure("condition of a kilometre more of lane, 50 mm cells, with its pictures (bar 20)", each, "core-s")
 
 
-def _peak_mb(survey_file: Path, stages: str) -> float:
-    """Peak resident memory (MiB) of a process of its own that does some stages."""
+def _used(survey_file: Path, stages: str) -> tuple[float, float]:
+    """Peak resident memory (MiB) and processor time (s) of a process of its own that does some stages."""
     script = (
-        "import json, resource, sys; from pathlib import Path; from benchmarks.bench_lanes import RoughSurvey;"
+        "import json, resource, sys, time; from pathlib import Path; from benchmarks.bench_lanes import RoughSurvey;"
         "from roadscan.jobs.run import run_stages; from roadscan.jobs.stage import stage_named;"
         "run_stages(RoughSurvey(Path(sys.argv[1])).session('store'), [stage_named(n) for n in sys.argv[2].split()]);"
-        "print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))"
+        "print(json.dumps([resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.process_time()]))"
     )
     command = [sys.executable, "-c", script, str(survey_file), stages]
     out = subprocess.run(command, check=True, capture_output=True, text=True)
-    return float(json.loads(out.stdout.splitlines()[-1])) / 1024
+    peak_mb, spent_s = json.loads(out.stdout.splitlines()[-1])
+    return float(peak_mb), float(spent_s)
 
 
 def kernel_rate(x: np.ndarray, heights: np.ndarray) -> float:

@@ -147,6 +147,7 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
     failures: list[tuple[str, str]] = []
     due = {one.square: one for one in task.work}
     store, gains = task.store, None
+    search: _Search | None = None
     if task.gains is not None:
         gains = store.parse_table(read_recorded(store, task.gains), task.gains.path)
     with store.scratch() as folder:
@@ -158,6 +159,7 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
                 failures += search.failures
             except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
                 failures.append((str(work.square), reason_of(error)))
+            search = loaded = None  # type: ignore[assignment]  # noqa: PLW2901  the next square takes their room
     return TaskResult.of(records, failures)
 
 

@@ -86,8 +86,8 @@ class _Columns(NamedTuple):
     number_of_returns: npt.NDArray[np.uint8]
 
     def at(self, rows: Any) -> _Columns:
-        """Some of them."""
-        return _Columns._make(column[rows] for column in self)
+        """Some of them; columns without values stay so."""
+        return _Columns._make(column[rows] if column.size else column for column in self)
 
 
 class _Block:
@@ -115,20 +115,22 @@ class _Block:
         c = self._columns
         ends = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
         rows = np.empty(c.x.size, np.int64)
-        own = c.at(rows[: rows_within(c.x, c.y, ends, rows)])
+        rows = rows[: rows_within(c.x, c.y, ends, rows)]
         corner = grid.corner_m(square)
-        x, y = _metres(own.x - np.int64(west)), _metres(own.y - np.int64(south))
+        x, y = _metres(c.x[rows] - np.int64(west)), _metres(c.y[rows] - np.int64(south))
         if self._centre is not None:
             w = grid.window(square)
             box = (w.easting_min_m, w.northing_min_m, w.easting_max_m, w.northing_max_m)
             near = self._centre.keeps(corner[0] + x, corner[1] + y, box)
-            own, x, y = own.at(near), x[near], y[near]
+            rows, x, y = rows[near], x[near], y[near]
+        height, nothing = _metres(c.height[rows]), np.zeros(0, np.int32)
+        own = c._replace(x=nothing, y=nothing, height=nothing).at(rows)
         places = self._sensor_places(own)
         returns = Returns(
             corner_m=corner,
             x_m=x,
             y_m=y,
-            height_m=_metres(own.height),
+            height_m=height,
             intensity=own.intensity.astype(np.float32),
             epoch_gps_ns=own.epoch_gps_ns,
             pass_id=own.pass_id,
@@ -205,10 +207,8 @@ class _Block:
 
     def _sensor_places(self, own: _Columns) -> Float64:
         """(n, 3) easting, northing, height of the sensor; NaN where it is not known."""
-        found = np.full((own.source.size, 3), np.nan)
-        for number, rows in _by_source(own.source, len(self._sources)):
-            found[rows] = self._places(number, own.epoch_gps_ns[rows])
-        return found
+        parts = [self._places(k, own.epoch_gps_ns[rows]) for k, rows in _by_source(own.source, len(self._sources))]
+        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, 3)), *parts])
 
     def _places(self, number: int, epochs_gps_ns: Int64) -> Float64:
         trajectory, source = self._trajectories[number], self._sources[number]

@@ -46,7 +46,7 @@ class RoadEdge(AssetKind):
         settings: RoadEdgeOptions = options
         for right in (False, True):
             side = [i for i, row in enumerate(pieces["right"].to_pylist()) if (row[0] > 0.5) == right]
-            for line in joined_lines(pieces.take(side)):
+            for line in joined_lines(pieces.take(pa.array(side, pa.int64()))):
                 yield from _edges(line, right, settings.least_length_m)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import shapely
 
@@ -99,6 +100,17 @@ def test_a_median_has_width_and_height() -> None:
     assert found[0].geometry.area == pytest.approx(2.4 * 30.0, rel=0.1)
     walks = Sidewalk()
     assert not list(walks.objects(walks.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
+
+
+def test_a_road_may_have_edges_on_one_side_alone() -> None:
+    kind = RoadEdge()
+    pieces = kind.evidence(island(2.4, 0.15), RoadEdgeOptions()).pieces
+    for right in (False, True):
+        own = pieces.filter(pa.array([(row[0] > 0.5) == right for row in pieces["right"].to_pylist()], pa.bool_()))
+        assert {o.attributes["side"] for o in kind.objects(own, RoadEdgeOptions(), {})} <= {
+            "right" if right else "left"
+        }
+    assert len(pieces)
 
 
 def test_the_edge_of_a_road_without_kerbs_is_where_its_verge_begins() -> None:

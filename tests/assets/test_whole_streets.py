@@ -1,0 +1,44 @@
+"""What the stage finds on two whole simulated streets: at least what the manual says (docs/assets.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.asset_scores import calibration_error, figures_of
+from benchmarks.asset_streets import motorway, processed, town
+from benchmarks.bench_asset_probability import SEEDS, judged_street
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
+SCENES = {"town": town, "motorway": motorway}
+SHARES = (
+    ": recall",
+    ": precision",
+    "m, found",
+    "m, right",
+    "area found",
+    "area right",
+    "slabs found",
+    "F1",
+    "type right",
+)
+FLOORS: dict[tuple[str, str], float] = {}
+"""What is reached where a bar is missed."""
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_whole_street(name: str, tmp_path: Path) -> None:
+    missed = []
+    for figure in figures_of(processed(SCENES[name](), tmp_path / name)):
+        bar = FLOORS.get((name, figure.what), figure.other)
+        is_share = any(words in figure.what for words in SHARES)
+        if bar is not None and (figure.value < bar if is_share else figure.value > bar):
+            missed.append((figure.what, figure.value, bar))
+    assert not missed
+
+
+def test_probabilities_of_drawn_streets_hold(tmp_path: Path) -> None:
+    objects = [one for seed in SEEDS for one in judged_street(seed, tmp_path)]
+    assert len(objects) > 150
+    assert calibration_error(objects) <= 0.05

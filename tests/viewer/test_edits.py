@@ -181,6 +181,7 @@ def test_what_is_drawn_beside_the_surface_asks_for_its_height(opened: Opened) ->
     page.locator(".edits button", has_text="Draw a new one").click()
     page.locator("button", has_text="Put it at the cross").press("Enter")
     page.locator('.edit-form [aria-label="Height of the ground m"]').fill("41.25")
+    assert serious(page) == []
     page.locator(".edit-form button.main").press("Enter")
     assert [outcome for outcome, _ in send(opened)] == ["accepted"]
     (row,) = site.inventory.state().assets["tree"].rows.to_pylist()

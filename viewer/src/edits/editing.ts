@@ -122,7 +122,7 @@ export class Editing {
       this.#add(selected, 'change', attributes, null, comment.value)
       fill(body)
     }
-    fill(body, h('form', { class: 'edit-form', onsubmit: save }, ...fields.map(([column, input]) => h('label', {}, h('span', {}, column.title), input)), comment, h('button', {}, 'Keep the correction')))
+    fill(body, h('form', { class: 'edit-form', onsubmit: save }, ...fields.map(([column, input]) => h('label', { title: column.meaning }, h('span', {}, titleOf(column)), input)), comment, h('button', {}, 'Keep the correction')))
   }
 
   #move(selected: Selected, body: HTMLElement): void {
@@ -210,7 +210,7 @@ export class Editing {
       this.#body,
       h('form', { class: 'edit-form', 'aria-label': `New: ${kind.title}`, onsubmit: keep },
         isKnown ? null : h('label', {}, h('span', {}, 'Height of the ground, m'), height),
-        ...fields.map(([column, input]) => h('label', { title: column.meaning }, h('span', {}, column.title), input)),
+        ...fields.map(([column, input]) => h('label', { title: column.meaning }, h('span', {}, titleOf(column)), input)),
         comment,
         h('div', { class: 'actions' }, h('button', { class: 'main' }, `Keep the new ${kind.title}`), h('button', { type: 'button', onclick: () => this.#end() }, 'Cancel'))),
     )
@@ -354,6 +354,11 @@ function raised(coordinates: any, heights: readonly Raised[], given_m: number): 
   const known = heights.filter(([, , height]) => height !== null)
   const nearest = known.reduce<Raised | null>((best, one) => (best && apart(best) <= apart(one) ? best : one), null)
   return [e, n, nearest ? nearest[2] : given_m]
+}
+
+/** A column as a form names it, with its unit. */
+function titleOf({ title, unit }: Column): string {
+  return unit && !['text', 'number', '1', 'date'].includes(unit) ? `${title}, ${unit}` : title
 }
 
 /** A field of the form for a value; one with a list of values offers them. */

@@ -7,6 +7,9 @@ its making can come across the edited lines. Comments and docstrings do not coun
 
 What is found by looking into a folder or at an entry point (formats, products, stages) is not reached, since no name
 leads there: each of these belongs to the keys of its own outputs.
+
+To walk the syntax trees of a hundred modules takes half a second. What a source says by names alone, its outline, is
+kept on the disk beside the compiled kernels, with the digest of that source.
 """
 
 from __future__ import annotations
@@ -17,13 +20,19 @@ import functools
 import gc
 import hashlib
 import importlib.util
+import json
+import secrets
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
+
+from roadscan.private_folder import UnsafeFolderError, cache_place, check_private, make_private
 
 Place: TypeAlias = tuple[str, str | None]
 """A module and a name in it; None for all of the module."""
+Brought: TypeAlias = tuple[str, str, str | None]
+"""A name that an import brings, the module that it names, and the name in that; None where it brings the module."""
 
 CARRIERS: Final = (
     "roadscan.compiler",
@@ -108,28 +117,107 @@ class _Module:
     """What a name that the module imports stands for."""
 
 
+class _Definition(NamedTuple):
+    """What a source says of a name that it defines."""
+
+    name: str
+    text: str
+    names: list[str]
+    """Names that occur in it."""
+    brought: list[Brought]
+    """By imports inside it."""
+
+
+class _Outline(NamedTuple):
+    """What a module's source says, whatever other modules there are."""
+
+    brought: list[Brought]
+    definitions: list[_Definition]
+
+
 @functools.cache
 def _module(name: str) -> _Module:
     file = _file_of(name)
     if file is None:
         raise LookupError(f"there is no module {name}")
-    source = file.read_text(encoding="utf-8")
-    with _uncollected():
-        return _read_module(name, source, _package_of(name, file))
-
-
-def _read_module(name: str, source: str, package: str) -> _Module:
-    lines, tree = source.splitlines(), ast.parse(source)
-    module = _Module(texts={_EFFECTS: ""}, uses={_EFFECTS: []})
-    defined = [(own, node) for node in tree.body for own in _names_of(node)]
-    for node in tree.body:
-        module.imports |= _imported(node, package)
-    known = {own for own, _ in defined}
-    for own, node in defined:
-        parts = list(_parts(node))
-        module.texts[own] = module.texts.get(own, "") + _text(node, parts, lines)
-        module.uses[own] = module.uses.get(own, []) + _used(parts, known, module.imports, name, package)
+    outline = _outline_of(name, file.read_bytes(), _package_of(name, file))
+    module = _Module(texts={_EFFECTS: ""}, uses={_EFFECTS: []}, imports=_meant(outline.brought))
+    known = {one.name for one in outline.definitions}
+    for own, text, names, brought in outline.definitions:
+        within, found = _meant(brought), dict[Place, None]()
+        for used in names:
+            if used in within:
+                found[within[used]] = None
+            elif used in known:
+                found[name, used] = None
+            elif used in module.imports:
+                found[module.imports[used]] = None
+        module.texts[own] = module.texts.get(own, "") + text
+        module.uses[own] = module.uses.get(own, []) + list(found)
     return module
+
+
+def _meant(brought: Iterable[Brought]) -> dict[str, Place]:
+    """What each name stands for that imports bring, as far as a package of ours defines it."""
+    found: dict[str, Place] = {}
+    for name, source, inside in brought:
+        if inside is None:
+            if _file_of(source):
+                found[name] = (source, None)
+        elif _file_of(below := f"{source}.{inside}"):
+            found[name] = (below, None)
+        elif _file_of(source):
+            found[name] = (source, inside)
+    return found
+
+
+def _outline_of(name: str, source: bytes, package: str) -> _Outline:
+    """The outline of a module, as it was kept or made from its source and kept."""
+    folder, digest = _kept_outlines(), hashlib.blake2b(package.encode() + b"\0" + source, digest_size=16).hexdigest()
+    if folder is None:
+        return _read_outline(source.decode(), package)
+    file = folder / f"{name}.json"
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        kept: dict[str, Any] = json.loads(file.read_bytes())
+        if kept["of"] == digest:
+            return _Outline(kept["brought"], [_Definition(*one) for one in kept["definitions"]])
+    outline = _read_outline(source.decode(), package)
+    scratch = file.with_suffix(f".{secrets.token_hex(4)}")
+    with contextlib.suppress(OSError):
+        scratch.write_text(json.dumps({"of": digest, **outline._asdict()}), encoding="utf-8")
+        scratch.replace(file)
+    return outline
+
+
+@functools.cache
+def _kept_outlines() -> Path | None:
+    """Folder of the outlines that this code made; None where it cannot be written, or others could write to it."""
+    version = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=6).hexdigest()
+    folder = cache_place() / f"outlines-{version}"
+    try:
+        make_private(folder)
+        check_private(folder)
+    except (OSError, UnsafeFolderError):
+        return None
+    return folder
+
+
+def _read_outline(source: str, package: str) -> _Outline:
+    with _uncollected():
+        lines, tree = source.splitlines(), ast.parse(source)
+        brought = [one for node in tree.body for one in _brought(node, package)]
+        return _Outline(brought, [one for node in tree.body for one in _definitions(node, lines, package)])
+
+
+def _definitions(node: ast.stmt, lines: list[str], package: str) -> Iterator[_Definition]:
+    if not (defined := _names_of(node)):
+        return
+    parts = list(_parts(node))
+    text = _text(node, parts, lines)
+    names = list(dict.fromkeys(name for part in parts for name in _names_in(part)))
+    brought = [one for part in parts if isinstance(part, _IMPORTS) for one in _brought(part, package)]
+    for own in defined:
+        yield _Definition(own, text, names, brought)
 
 
 @contextlib.contextmanager
@@ -189,23 +277,6 @@ def _text(node: ast.stmt, parts: Iterable[ast.AST], lines: list[str]) -> str:
     return "\n".join(line for line in kept if line and not line.lstrip().startswith("#")) + "\n"
 
 
-def _used(parts: list[ast.AST], known: set[str], imports: dict[str, Place], module: str, package: str) -> list[Place]:
-    """What the names in a definition stand for, as far as a package of ours defines it."""
-    within: dict[str, Place] = {}
-    for part in parts:
-        if isinstance(part, _IMPORTS):
-            within |= _imported(part, package)
-    found: dict[Place, None] = {}
-    for name in dict.fromkeys(name for part in parts for name in _names_in(part)):
-        if name in within:
-            found[within[name]] = None
-        elif name in known:
-            found[module, name] = None
-        elif name in imports:
-            found[imports[name]] = None
-    return list(found)
-
-
 _IMPORTS = (ast.Import, ast.ImportFrom, ast.If)
 
 
@@ -216,26 +287,19 @@ def _names_in(part: ast.AST) -> Iterator[str]:
         yield from (n.id for n in ast.walk(ast.parse(str(part.annotation.value))) if isinstance(n, ast.Name))
 
 
-def _imported(node: ast.AST, package: str) -> dict[str, Place]:
-    """What each name stands for that an import statement, or those under `if TYPE_CHECKING`, brings."""
-    found: dict[str, Place] = {}
+def _brought(node: ast.AST, package: str) -> Iterator[Brought]:
+    """What an import statement, or those under `if TYPE_CHECKING`, brings."""
     match node:
         case ast.If(test=ast.Name(id="TYPE_CHECKING"), body=body):
             for one in body:
-                found |= _imported(one, package)
+                yield from _brought(one, package)
         case ast.Import(names=names):
             for alias in names:
-                if _file_of(alias.name):
-                    found[alias.asname or alias.name.partition(".")[0]] = (alias.name, None)
+                yield alias.asname or alias.name.partition(".")[0], alias.name, None
         case ast.ImportFrom(names=names):
             source = _absolute(node, package)
             for alias in names:
-                below = f"{source}.{alias.name}"
-                if _file_of(below):
-                    found[alias.asname or alias.name] = (below, None)
-                elif _file_of(source):
-                    found[alias.asname or alias.name] = (source, alias.name)
-    return found
+                yield alias.asname or alias.name, source, alias.name
 
 
 def _absolute(node: ast.ImportFrom, package: str) -> str:

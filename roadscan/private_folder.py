@@ -90,6 +90,12 @@ def _is_private(group: int) -> bool:
     return found.gr_name == user and set(found.gr_mem) <= {user}
 
 
+def cache_place() -> Path:
+    """Folder below which roadscan keeps what it has compiled and read of its own code; it may not be there yet."""
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "roadscan"
+
+
 def make_private(folder: Path) -> None:
     """Make a folder, and those above it that are missing, for this user alone."""
     for place in reversed([one for one in (folder, *folder.parents) if not one.exists()]):

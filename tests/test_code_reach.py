@@ -64,7 +64,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def forget() -> None:
-    for known in (code_reach._file_of, code_reach._module, code_reach._digest_of):
+    for known in (code_reach._file_of, code_reach._module, code_reach._digest_of, code_reach._kept_outlines):
         known.cache_clear()
 
 
@@ -145,3 +145,23 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
         for p in reached
         if p.startswith(("roadscan.model.settings.smoothing:Smoother", "roadscan.model.settings.calibration:C"))
     ]
+
+
+def test_outlines_are_kept_for_the_next_process(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are used as long as they are whole, of this very source, and where nobody else may write."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    before = digest()
+    (kept,) = tmp_path.glob("kept/roadscan/outlines-*/added_package.maker.json")
+    with monkeypatch.context() as patch:
+        patch.setattr(code_reach.ast, "parse", None)
+        assert digest() == before
+    whole = kept.read_bytes()
+    for damaged in (b"", b"{}", whole[:50], whole.replace(b'"brought"', b'"other"')):
+        kept.write_bytes(damaged)
+        assert digest() == before
+        assert kept.read_bytes() == whole
+    other = whole.replace(b"SCALE = 2", b"SCALE = 3")
+    kept.write_bytes(other)
+    assert digest() != before
+    kept.parent.chmod(0o777)
+    assert digest() == before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import datetime as dt
 import functools
 import hashlib
@@ -12,11 +13,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import laspy
+import lazrs
 import numpy as np
 import numpy.typing as npt
 from blake3 import blake3
 from laspy.header import GpsTimeType
-from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
+from laspy.vlrs.known import ClassificationLookupVlr, LasZipVlr, WktCoordinateSystemVlr
 from lazrs import LazrsError
 from pyproj.exceptions import CRSError
 
@@ -29,6 +31,8 @@ VLR_RECORD_ID: Final = 1
 
 ONE_OF_ONE: Final = 0x11
 """Return number and number of returns in the byte that holds both."""
+_RETURN_NUMBER: Final = 0x0F
+"""The bits of the return number in it."""
 
 _ABOUT_FACTS: Final = "survey, tile, rounding"
 _CHUNK_POINTS: Final = 1_000_000
@@ -52,15 +56,18 @@ class Layout:
     @property
     def header(self) -> laspy.LasHeader:
         """A new header of LAS 1.4 without a date or points."""
-        return _header(self)
+        header = copy.copy(_header(self))
+        header.vlrs = header.vlrs  # which copies the list, and makes the record of further dimensions anew
+        return header
 
-    @functools.cached_property
+    @property
     def records(self) -> np.dtype[np.void]:
         """A point record as it lies in the file."""
-        kind: np.dtype[np.void] = self.header.point_format.dtype()
+        kind: np.dtype[np.void] = _header(self).point_format.dtype()
         return kind
 
 
+@functools.lru_cache(maxsize=16)
 def _header(layout: Layout) -> laspy.LasHeader:
     header = laspy.LasHeader(version="1.4", point_format=layout.point_format)
     header.scales = np.array(layout.scales)
@@ -103,15 +110,34 @@ def write_points(
     header = layout.header
     header.offsets, header.creation_date = np.array(offsets), date
     header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, _ABOUT_FACTS, stated))
-    points = laspy.ScaleAwarePointRecord(records, header.point_format, header.scales, header.offsets)
-    backend = laspy.LazBackend.Lazrs
-    with (
-        path.open("wb+") as stream,  # laspy leaves a file of its own open where the disk is full
-        laspy.open(stream, "w", header=header, do_compress=compress, laz_backend=backend, closefd=False) as writer,
-    ):
-        writer.write_points(points)
-        for one in _descriptions(writer.header):
-            _state_extremes(one, records[one.format_name()])
+    _state_points(header, records)
+    content = np.ascontiguousarray(records).view(np.uint8)
+    with path.open("wb") as stream:
+        if not compress:
+            header.write_to(stream)
+            stream.write(content.data)
+            return
+        kind = header.point_format
+        laz = lazrs.LazVlr.new_for_compression(kind.id, kind.num_extra_bytes)
+        header.vlrs.append(LasZipVlr(laz.record_data()))
+        header.are_points_compressed = True
+        header.write_to(stream)
+        compressor = lazrs.LasZipCompressor(stream, laz)
+        compressor.compress_many(content)
+        compressor.done()
+
+
+def _state_points(header: laspy.LasHeader, records: npt.NDArray[np.void]) -> None:
+    """State in the header how many points there are, their box, and the extremes of each further dimension."""
+    least, greatest = (
+        np.array([getattr(records[axis], which)() for axis in "XYZ"]) * header.scales + header.offsets
+        for which in ("min", "max")
+    )
+    header.point_count, header.mins, header.maxs = len(records), least, greatest
+    returns = np.bincount(records["bit_fields"] & _RETURN_NUMBER, minlength=_RETURN_NUMBER + 1)
+    header.number_of_points_by_return = returns[1:].astype(np.uint64)
+    for one in _descriptions(header):
+        _state_extremes(one, records[one.format_name()])
 
 
 def _descriptions(header: laspy.LasHeader) -> list[Any]:

@@ -46,6 +46,12 @@ _CARTESIAN_AXES: Final = {
 }
 
 
+@functools.lru_cache(maxsize=64)
+def _unit_m(crs: str, axis: int) -> float:
+    """Length in metres of the unit of one of a CRS's axes."""
+    return float(crs_from_text(crs).axis_info[axis].unit_conversion_factor)
+
+
 def crs_from_text(text: str, key: str = "CRS") -> pyproj.CRS:
     """CRS from ``"EPSG:25832"``, WKT or PROJJSON; a clear error, which names the `key` that holds it, otherwise."""
     try:
@@ -239,14 +245,12 @@ class MapFrame:
     @property
     def horizontal_unit_m(self) -> float:
         """Length of the CRS's horizontal unit in metres."""
-        return 1.0 if self.crs is None else float(crs_from_text(self.crs).axis_info[0].unit_conversion_factor)
+        return 1.0 if self.crs is None else _unit_m(self.crs, 0)
 
     @property
     def vertical_unit_m(self) -> float:
         """Length of the CRS's height unit in metres (1 unless a vertical CRS says otherwise)."""
-        if self.vertical_crs is None:
-            return 1.0
-        return float(crs_from_text(self.vertical_crs).axis_info[-1].unit_conversion_factor)
+        return 1.0 if self.vertical_crs is None else _unit_m(self.vertical_crs, -1)
 
     def wkt(self, version: Literal["WKT1_GDAL", "WKT2_2019"] = "WKT2_2019") -> str:
         """WKT of the horizontal CRS, compound where a vertical CRS is named."""

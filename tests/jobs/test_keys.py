@@ -64,7 +64,7 @@ def tiles_of(finished: Simulated) -> int:
 def edited(tmp_path: Path, finished: Simulated) -> Callable[..., tuple[int, int, int, bool]]:
     """What another state of the code says of the finished survey: stale footprints, tiles, products; complete."""
     package = Path(roadscan.__file__).parent
-    shutil.copytree(package, tmp_path / "roadscan", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(package, tmp_path / "roadscan")  # with what Python has compiled, which still fits the copies
     shutil.copytree(package.parent / "schemas", tmp_path / "schemas")
 
     def status(*changes: tuple[str, str, str]) -> tuple[int, int, int, bool]:

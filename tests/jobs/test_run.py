@@ -93,21 +93,22 @@ def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, t
     assert results[0] == results[1]
 
 
-def test_killed_and_resumed_at_random_points(finished: Simulated, tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [4, pytest.param(10, marks=pytest.mark.nightly)])
+def test_killed_and_resumed_at_random_points(finished: Simulated, tmp_path: Path, times: int) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     command = [sys.executable, "-m", "tests.jobs.killed_run", "run", str(copy.survey_file), "--workers", "0"]
     chance = random.Random(11)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY) as runs:
         assert runs.stdin is not None and runs.stdout is not None
         kills = 0
-        while kills < 10:
+        while kills < times:
             print(chance.uniform(0.0, LONGEST_S), file=runs.stdin, flush=True)
             if (ended := runs.stdout.readline().strip()) == "killed":
                 kills += 1
                 _nothing_half_written(copy.store())
                 continue
             assert ended == "0"
-            copy.store().remove("manifest/outputs")  # finished too soon: begin again, to be killed ten times in all
+            copy.store().remove("manifest/outputs")  # finished too soon: begin again, to be killed so many times in all
         print(1e9, file=runs.stdin, flush=True)
         assert runs.stdout.readline().strip() == "0"
         runs.stdin.close()

@@ -16,7 +16,7 @@ from roadscan.condition.texture import texture_segments
 from roadscan.edges.painted_line import painted_line, without_lines
 from roadscan.kernels.condition.intensity_means import mean_intensities
 from roadscan.kernels.condition.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
-from roadscan.kernels.condition.sampling import CellTable
+from roadscan.kernels.condition.sampling import MOST_CELLS, Cells, CellTable, gather
 from tests.condition.lane_cells import LaneOfCells
 
 TEXTURE_OF = {"mpd_mm": 1.0}
@@ -128,6 +128,9 @@ def test_figures_of_squares_and_windows_are_those_of_their_cells() -> None:
     assert out[0, TEXTURE] == pytest.approx(np.sqrt(1e-6 * 25 / 22 + within), rel=0.01)
     assert out[0, SHARE] == pytest.approx(1.0)
     assert out[0, INTENSITY] == pytest.approx(9.5)
+    room = Cells(*np.empty((6, MOST_CELLS)), np.empty(MOST_CELLS, np.int64))
+    assert gather(table, place[0], 0.05, 0.05, 1, room) == 100
+    assert sorted(room.at[:100]) == np.flatnonzero((abs(row - 9.5) < 5) & (abs(column - 9.5) < 5)).tolist()
     mean = np.empty(2)
     mean_intensities(table, np.array([[0.055, 0.1, 1.0, 0.0], [9.0, 9.0, 1.0, 0.0]]), 0.025, 0.05, mean)
     assert mean[0] == pytest.approx(5.0)

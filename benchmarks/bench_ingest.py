@@ -22,6 +22,7 @@ from typing import Any
 import geopandas
 import laspy
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import PIL.Image
 import pyarrow as pa
@@ -169,7 +170,8 @@ def ingest_figures(log: Log, folder: Path) -> Iterator[Figure]:
 def makers() -> dict[str, Callable[[Path], Log]]:
     """Makers of logs, by format and form."""
     return {
-        "sbet": sbet, "smrmsg": smrmsg, "trajectory_csv": trajectory_csv, "pose_matrices": pose_matrices,
+        "sbet": sbet, "smrmsg": smrmsg, "trajectory_csv": trajectory_csv, "trajectory_table": trajectory_table,
+        "returns_table": returns_table, "pose_matrices": pose_matrices,
         "pose_quaternions csv": pose_quaternions, "pose_quaternions parquet": pose_parquet, "pospac": pospac,
         "rtklib_pos": rtklib_pos, "nmea": nmea, "imu_csv": imu_csv, "encoder_csv": encoder_csv,
         "control_csv": control_csv, "control_vector": control_vector, "road_lines": road_lines,
@@ -220,16 +222,45 @@ def smrmsg(folder: Path) -> Log:
     return Log("smrmsg", "", path, {}, {"clock": WEEK}, other=other, against="numpy.fromfile, turned")
 
 
-def trajectory_csv(folder: Path) -> Log:
-    t, east, north = moving(300_000)
-    columns = {
+def courses(n: int) -> dict[str, Float64]:
+    """Columns of a trajectory with attitude."""
+    t, east, north = moving(n)
+    return {
         "time_s": T0 + t, "latitude_deg": 50 + north / 111e3, "longitude_deg": 10 + east / 71e3,
         "height_m": 100 + 0 * t, "roll_deg": np.sin(t), "pitch_deg": np.cos(t), "heading_deg": 90 + np.sin(t),
         "sigma_north_m": 0.02 + 0 * t,
     }  # fmt: skip
-    path = columns_csv(folder / "a.csv", columns)
+
+
+def trajectory_csv(folder: Path) -> Log:
+    path = columns_csv(folder / "a.csv", courses(300_000))
     stated = {"clock": GPS, "crs": "EPSG:4979"}
     return Log("trajectory_csv", "", path, {}, stated, other=with_pandas(path), against="pandas.read_csv")
+
+
+def columns_parquet(path: Path, columns: dict[str, npt.NDArray[Any]]) -> tuple[Path, Callable[[], int]]:
+    """A Parquet file, and its reading by Arrow alone."""
+    pq.write_table(pa.table(columns), path)
+    return path, lambda: pq.read_table(path).num_rows
+
+
+def trajectory_table(folder: Path) -> Log:
+    path, other = columns_parquet(folder / "a.parquet", courses(1_000_000))
+    stated = {"clock": GPS, "crs": "EPSG:4979"}
+    return Log("trajectory_table", "", path, {}, stated, other=other, against="pyarrow.parquet.read_table")
+
+
+def returns_table(folder: Path) -> Log:
+    n = 5_000_000
+    t = np.arange(n)
+    columns: dict[str, npt.NDArray[Any]] = {
+        "epoch_gps_ns": 1_461_900_018 * 10**9 + 1_400 * t,
+        "x_sensor_m": 20.0 * np.cos(t / 700), "y_sensor_m": 20.0 * np.sin(t / 700),
+        "z_sensor_m": -2.0 + 0.01 * (t % 32),
+        "intensity": (t % 4096).astype(np.uint16), "laser": (t % 32).astype(np.uint8),
+    }  # fmt: skip
+    path, other = columns_parquet(folder / "a.parquet", columns)
+    return Log("returns_table", "", path, {}, {}, other=other, against="pyarrow.parquet.read_table")
 
 
 def pose_matrices(folder: Path) -> Log:
@@ -261,9 +292,7 @@ def pose_quaternions(folder: Path) -> Log:
 
 
 def pose_parquet(folder: Path) -> Log:
-    path = folder / "a.parquet"
-    pq.write_table(pa.table(quaternions(1_000_000)), path)
-    other = lambda: pq.read_table(path).num_rows  # noqa: E731
+    path, other = columns_parquet(folder / "a.parquet", quaternions(1_000_000))
     stated = {"clock": GPS, "crs": "local"}
     against = "pyarrow.parquet.read_table"
     return Log("pose_quaternions", "Parquet", path, {"axes": "flu"}, stated, other=other, against=against)

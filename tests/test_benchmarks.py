@@ -12,7 +12,7 @@ import pytest
 import rasterio
 
 import benchmarks
-from benchmarks import skilled_user, surveys
+from benchmarks import bench_ingest, skilled_user, surveys
 from benchmarks.by_hand import CELL_M, ByHand, from_store
 from benchmarks.course import HOUR_UTC, START_GPS_NS
 from benchmarks.packets import PACKETS_PER_S, repeat_capture
@@ -26,7 +26,7 @@ from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.strict import load_toml
 from roadscan.model.survey import Survey
-from roadscan.sensors.base import LogSource, format_named
+from roadscan.sensors.base import LogSource, format_named, log_formats
 from roadscan.tables.manifest import Manifest
 from roadscan.tables.store import Store
 
@@ -144,3 +144,7 @@ def test_roofline() -> None:
 @pytest.mark.parametrize("name", sorted(m.name for m in pkgutil.iter_modules(benchmarks.__path__)))
 def test_every_module_finds_what_it_imports(name: str) -> None:
     importlib.import_module(f"benchmarks.{name}")
+
+
+def test_each_format_of_logs_has_a_benchmark() -> None:
+    assert {name.split(" ", 1)[0] for name in bench_ingest.makers()} == set(log_formats())

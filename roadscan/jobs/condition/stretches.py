@@ -42,7 +42,7 @@ SURFACE_FILES: Final = "surface"
 """Product whose files hold the reconstructed surface."""
 CROSS_SECTIONS: Final = "cross_sections"
 LANE_TEXTURE: Final = "lane_texture"
-LANE_LINES: Final = "lane_lines"
+LANE_LINES: Final = "lane_line_offsets"
 OF_STRETCHES: Final = (CROSS_SECTIONS, PROFILES, LANE_TEXTURE, LANE_LINES)
 """Tables of which a stretch has a file each."""
 STRETCH_M: Final = 50

@@ -119,9 +119,10 @@ class Condition(Stage):
     def folders(self) -> Sequence[str]:
         """Tables of lines, lanes and what was surveyed of them, of edges, values, patches, regions and sections."""
         return (
-            "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal", "tables/cross_sections",
-            "tables/lane_texture", "tables/lane_line_offsets", "products/ravelling_patches", "products/ravelling_pictures",
-            "tables/road_edge_offsets", "products/road_surface", "tables/condition_values",
-            "products/condition_sections", "products/condition_pictures", "tables/roughness_sections",
-            "products/roughness_regions", "products/roughness_pictures",
+            "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal",
+            "tables/cross_sections", "tables/lane_texture", "tables/lane_line_offsets",
+            "products/ravelling_patches", "products/ravelling_pictures", "tables/road_edge_offsets",
+            "products/road_surface", "tables/condition_values", "products/condition_sections",
+            "products/condition_pictures", "tables/roughness_sections", "products/roughness_regions",
+            "products/roughness_pictures",
         )  # fmt: skip

@@ -24,7 +24,8 @@ KILLS = 5
 LONGEST_S = 20.0
 """Processor time after which a run is killed."""
 SCENE = Scene.load("urban_street").changed(
-    length_m=16.0, road={"lead_m": 90.0}, passes=[{"lane": 2}], lidar={"range_max_m": 20.0}, vehicle={"speed_m_per_s": 14.0},
+    length_m=16.0, road={"lead_m": 90.0}, passes=[{"lane": 2}],
+    lidar={"range_max_m": 20.0}, vehicle={"speed_m_per_s": 14.0},
     **{key: {"on": False} for key in ("profilers", "sick", "camera", "imu", "gnss", "encoder")},
     roadside={"signals": [{"station_m": 9.0, "offset_m": 5.8}], "moving_cars": []},
 )  # fmt: skip

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.surface.picture_colours import HEIGHT, WIDTH, sample, take_better
+from roadscan.kernels.surface.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
 from roadscan.model.camera import Interior
 
 Float64 = npt.NDArray[np.float64]
@@ -19,7 +19,7 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
 
-__all__ = ["HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
+__all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip
 
 NO_VIEW: Final = -1
@@ -50,7 +50,7 @@ class Lens:
     """Interior orientation of a camera, and what its pictures show of its own vehicle."""
 
     parameters: Float64
-    """(12,) as the kernel takes them."""
+    """(13,) as the kernel takes them."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Polygons of pixels (u, v) that show the own vehicle."""
 
@@ -59,8 +59,14 @@ class Lens:
         """From the rig's values."""
         k1, k2, p1, p2, k3 = interior.distortion
         size = float(interior.width_px), float(interior.height_px)
-        lens = [*interior.focal_px, *interior.principal_px, k1, k2, p1, p2, k3, _fold(k1, k2, k3), *size]
+        around = float(interior.model == "equirectangular")
+        lens = [*interior.focal_px, *interior.principal_px, k1, k2, p1, p2, k3, _fold(k1, k2, k3), *size, around]
         return cls(np.array(lens), own_vehicle_px)
+
+    @property
+    def is_around(self) -> bool:
+        """True for pictures of 360°."""
+        return bool(self.parameters[AROUND])
 
     @functools.cached_property
     def hidden(self) -> Bool:

@@ -1,4 +1,4 @@
-"""Rasters of a survey as square pictures of ever larger pixels: height, shaded relief and intensity.
+"""Rasters of a survey as square pictures of ever larger pixels: height, shaded relief, intensity, pavement.
 
 Pictures of the finest levels come from cells and overviews of the tiles; a coarser one is the mean of the pixels of the
 pictures below it.
@@ -18,14 +18,19 @@ import numpy.typing as npt
 
 from roadscan.model.errors import StoreError
 from roadscan.model.ids import TileId
+from roadscan.model.strict import Strict
 from roadscan.products.base import LoadCells, TileSummary
 from roadscan.products.hillshade import HillshadeOptions, shade
+from roadscan.products.pavement import IntensityOptions, ShadedOptions
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.pyramid import overview_factors
 
 Float32 = npt.NDArray[np.float32]
-Raster: TypeAlias = Literal["height", "hillshade", "intensity"]
+Raster: TypeAlias = Literal["height", "hillshade", "intensity", "pavement_intensity", "pavement_shaded"]
 RASTERS: Final[tuple[Raster, ...]] = ("height", "hillshade", "intensity")
+"""What every survey has."""
+PAVEMENT: Final[tuple[Raster, ...]] = ("pavement_intensity", "pavement_shaded")
+"""What a survey has that makes these products, in the greys of their settings."""
 
 HEIGHT_STEP_M: Final = 1e-4
 COARSER: Final = 4
@@ -219,11 +224,22 @@ class TileWindows:
         return self._tiles[level, tile]
 
 
-def write_picture(path: Path, raster: Raster, window: Window, pixel_m: float, scales: Scales) -> None:
-    """Write a raster's picture as PNG: grey with opacity, or a height as a number of 24 bits in red, green and blue."""
-    if raster == "hillshade":
-        grey = shade(window.height_m, pixel_m, HillshadeOptions())
+def write_picture(
+    path: Path, raster: Raster, window: Window, pixel_m: float, scales: Scales, settings: Strict | None = None
+) -> None:
+    """Write a raster's picture as PNG: grey with opacity, or a height as a number of 24 bits in red, green and blue.
+
+    settings : of the product that a raster of the pavement is named after.
+    """
+    if raster in ("hillshade", "pavement_shaded"):
+        light = settings if isinstance(settings, ShadedOptions) else HillshadeOptions()
+        grey = shade(window.height_m, pixel_m, light)
         _write_grey(path, grey, grey > 0)
+    elif raster == "pavement_intensity" and isinstance(settings, IntensityOptions):
+        inner = window.intensity[1:-1, 1:-1].astype(np.float64)
+        known = ~np.isnan(inner)
+        steps = (np.where(known, inner, 0.0) - settings.black) * (254.0 / (settings.white - settings.black))
+        _write_grey(path, np.floor(np.clip(steps, 0.0, 254.0) + 1.5).astype(np.uint8), known)
     elif raster == "intensity":
         inner = window.intensity[1:-1, 1:-1]
         known = ~np.isnan(inner)

@@ -179,11 +179,12 @@ def _sensor(
 
 def _interior(camera: Camera) -> list[str]:
     """Interior orientation as it is in truth: no calibration of a simulated camera errs."""
+    size = ["[sensors.camera.interior]", f"width_px = {camera.width_px}", f"height_px = {camera.height_px}"]
+    if camera.model == "equirectangular":
+        return [*size, f"model = {_text(camera.model)}"]
     lens = Lens.of(camera)
     return [
-        "[sensors.camera.interior]",
-        f"width_px = {camera.width_px}",
-        f"height_px = {camera.height_px}",
+        *size,
         f"focal_px = {[lens.focal_px, lens.focal_px]}",
         f"principal_px = {[float(c) for c in lens.principal_px]}",
         f"distortion = {[float(k) for k in lens.distortion]}",

@@ -35,7 +35,7 @@ from roadscan.jobs.publish.document import json_bytes
 from roadscan.jobs.publish.edit_door import EditDoor
 from roadscan.jobs.publish.live import LiveSite, open_survey
 from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
-from roadscan.jobs.publish.parts import vectors
+from roadscan.jobs.publish.parts import strips, vectors
 from roadscan.jobs.publish.parts.edits import Edits
 from roadscan.jobs.publish.parts.rasters import images_of
 from roadscan.jobs.publish.parts.strips import Strips
@@ -77,6 +77,10 @@ def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = simulate(scene, tmp_path_factory.mktemp("site") / "survey").survey_file
     with file.open("a") as survey:
         survey.write("\n[condition]\nsection_m = 10\n")
+        names = ("las", "hillshade", "mosaic", "tile_table", "pavement_intensity", "pavement_shaded")
+        survey.write(f"\n[products]\nmake = {json.dumps(names)}\n")
+        survey.write("\n[products.options.pavement_intensity]\nblack = 2000\nwhite = 30000\n")
+        survey.write("\n[products.options.pavement_shaded]\naltitude_deg = 30\n")
     run_stages(opened(file), stages())
     return file
 
@@ -218,6 +222,89 @@ def test_a_coarser_picture_is_the_mean_of_four_by_four_known_pixels(raster: Rast
             if len(known):
                 weights = [65536, 256, 1] if bands == 4 else [1]
                 assert out[y, x, :-1] @ weights == round(float(np.mean(known[:, :-1] @ weights)))
+
+
+@pytest.mark.parametrize("name", ["pavement_intensity", "pavement_shaded"])
+def test_the_pavement_on_the_map_is_that_of_its_pictures(name: str, survey_file: Path, published: Published) -> None:
+    """Pixel by pixel the product's own file, without the cells along the tile's border, where neighbours differ."""
+    session, entry = opened(survey_file), read(published, "survey.json")
+    raster = next(one for one in entry["rasters"] if one["name"] == name)
+    level, compared = entry["raster_grid"]["levels"][0], 0
+    for record in [r for r in session.manifest.of(name).values() if r.path.endswith(".png")][:3]:
+        own = np.asarray(Image.open(io.BytesIO(session.store.read_bytes(record.path))))
+        place = session.store.read_bytes(record.path.replace(".png", ".pgw")).decode().split()
+        west, north = float(place[4]), float(place[5])  # the middle of the upper left pixel
+        for y, x in np.argwhere(own > 0)[::11].tolist():
+            easting, northing = west + x * level["pixel_m"], north - y * level["pixel_m"]
+            if min(easting % 10.0, northing % 10.0, -easting % 10.0, -northing % 10.0) < 2 * level["pixel_m"]:
+                continue
+            column, row = int(easting // level["tile_m"]), int(northing // level["tile_m"])
+            picture = np.asarray(Image.open(published.folder / raster["url"].format(level=0, column=column, row=row)))
+            at = (
+                int(((row + 1) * level["tile_m"] - northing) / level["pixel_m"]),
+                int((easting - column * level["tile_m"]) / level["pixel_m"]),
+            )
+            assert abs(int(picture[at][0]) - int(own[y, x])) <= (0 if name == "pavement_intensity" else 1)
+            compared += 1
+    assert compared > 50
+    if name == "pavement_intensity":
+        assert raster["offset"] + raster["step"] == pytest.approx(2000.0)
+        assert raster["offset"] + 255 * raster["step"] == pytest.approx(30000.0)
+
+
+def test_a_long_lane_has_bins_and_pieces(
+    survey_file: Path, published: Published, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(strips, "_WHOLE_M", 5.0)
+    monkeypatch.setattr(strips, "_BINS", 4)
+    documents = {d.path: d for d in Strips().documents(Material(opened(survey_file)))}
+
+    def written(path: str) -> Any:
+        documents[path].write(tmp_path / "one.json", Path)
+        return json.loads((tmp_path / "one.json").read_bytes())
+
+    binned = 0
+    for lane in written("strips/index.json")["lanes"]:
+        whole = {(s["quantity"], s["extent"]): s for s in read(published, lane["url"])["series"]}
+        coarse = {(s["quantity"], s["extent"]): s for s in written(lane["url"])["series"]}
+        assert coarse.keys() == whole.keys()
+        pieces = [written(piece["url"]) for piece in lane["pieces"]]
+        assert [p["from_m"] for p in pieces[1:]] == [p["to_m"] for p in pieces[:-1]]
+        for name, own in whole.items():
+            held = [s for p in pieces for s in p["series"] if (s["quantity"], s["extent"]) == name]
+            for column in ("from_m", "to_m", "value", "sigma", "reason"):
+                assert [one for part in held for one in part[column]] == own[column]
+            bins = coarse[name]
+            if "low" not in bins:
+                assert bins == own and len(own["value"]) <= 8
+                continue
+            middle = (np.array(own["from_m"]) + own["to_m"]) / 2
+            value, binned = np.array(own["value"], float), binned + 1
+            for k, (a, b) in enumerate(zip(bins["from_m"], bins["to_m"], strict=True)):
+                inside = value[(middle >= a) & ((middle < b) | (k == 3)) & ~np.isnan(value)]
+                told = [bins[n][k] for n in ("low", "value", "high")]
+                expected = [inside.min(), inside.mean(), inside.max()] if inside.size else [None] * 3
+                assert told == (pytest.approx(expected, rel=1e-5) if inside.size else expected)
+    assert binned > 3
+
+
+def test_evidence_names_what_the_site_holds(published: Published) -> None:
+    entry = read(published, "survey.json")
+    features = {
+        layer["name"]: [f for part in layer["parts"] for f in read(published, part["url"])["features"]]
+        for layer in entry["layers"]
+    }
+    passes = {str(one["properties"]["pass"]) for one in features["passes"]}
+    logs = [one["title"] for feature in features["passes"] for one in feature["evidence"]]
+    assert any("camera: " in title for title in logs) and len(set(logs)) > 3
+    shown = {one["row"] for feature in features["tiles"] for one in feature.get("evidence", ())}
+    assert shown == passes
+    index = read(published, "strips/index.json")
+    lanes = {(lane["road"], lane["lane"]) for lane in index["lanes"]}
+    for feature in features["condition_sections"]:
+        (station,) = feature["evidence"]
+        assert (station["road"], station["lane"]) in lanes
+        assert station["station_m"] == pytest.approx(feature["properties"]["station_from_m"], abs=1e-3)
 
 
 def test_a_cloud_holds_every_point_of_the_survey_once(survey_file: Path, published: Published) -> None:

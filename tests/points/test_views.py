@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.camera import Interior
+from roadscan.model.errors import ConfigError
 from roadscan.points.views import NO_VIEW, Lens, PictureRule, Views, best_views, sampled
 
 LENSES = (
@@ -109,3 +111,46 @@ def test_samples_are_bilinear() -> None:
 def test_a_pinhole_has_no_fold() -> None:
     assert np.isinf(Lens.of(LENSES[1]).parameters[9])
     assert Lens.of(LENSES[0], (HIDDEN,)).hidden.sum() == 441 * 100
+
+
+def test_a_picture_of_360_degrees_shows_what_lies_all_around() -> None:
+    """Against the angles of spherical trigonometry; the finest of two such pictures and a pinhole is taken."""
+    size = {"width_px": 1600, "height_px": 800}
+    ball = Interior.parse({"model": "equirectangular", **size})
+    assert ball.focal_px == pytest.approx((800 / np.pi, 800 / np.pi)) and ball.principal_px == (799.5, 399.5)
+    rng = np.random.default_rng(6)
+    sensor = Rotation.from_euler("ZYX", [130.0, 7.0, -4.0], degrees=True).as_matrix()
+    turn = np.stack([-sensor[:, 1], -sensor[:, 2], sensor[:, 0]])
+    eye = np.array([[1.0, 2.0, 2.3], [7.0, 2.0, 2.3]])
+    number = np.zeros(2, np.int64)
+    seen = Views(eye, np.stack([turn, turn]), np.tile([0.0, 0.0, 1.0], (2, 1)), number, number, (Lens.of(ball),))
+    point = eye[rng.integers(0, 2, 3000)] + rng.normal(0.0, 3.0, (3000, 3))
+    shown = best_views([point], seen, PictureRule((), 9.0, -90.0, 1))
+    nearer = np.linalg.norm(point[:, None] - eye, axis=2).argmin(axis=1)
+    local = np.einsum("ij,nj->ni", turn, point - eye[nearer])
+    zenith = np.degrees(np.arccos(-local[:, 1] / np.linalg.norm(local, axis=1)))
+    azimuth = np.degrees(np.arctan2(local[:, 0], local[:, 2]))
+    expected = np.column_stack([(azimuth + 180.0) / 360.0 * 1600 - 0.5, zenith / 180.0 * 800 - 0.5])
+    inside = ((expected >= 1) & (expected <= [1598, 798])).all(axis=1) & (np.linalg.norm(local, axis=1) < 9.0)
+    assert inside.mean() > 0.95 and (local[inside, 2] < 0).mean() > 0.3
+    assert np.array_equal(shown.view[inside], nearer[inside])
+    assert np.abs(shown.pixel[inside] - expected[inside]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("values", "wrong"),
+    [
+        (
+            {"model": "equirectangular", "width_px": 800, "height_px": 400, "distortion": [0.1, 0, 0, 0, 0]},
+            "distortion",
+        ),
+        (
+            {"model": "equirectangular", "width_px": 800, "height_px": 400, "focal_px": [100.0, 127.0]},
+            "more than a turn",
+        ),
+        ({"width_px": 800, "height_px": 400}, "focal_px"),
+    ],
+)
+def test_an_interior_orientation_that_cannot_be_is_refused(values: dict[str, object], wrong: str) -> None:
+    with pytest.raises(ConfigError, match=wrong):
+        Interior.parse(values)

@@ -35,6 +35,15 @@ FOCAL_PX: Final = 500.0
 BALL_PX: Final = (1024, 512)
 CAMERA: Final = (553_012.0, 6_020_000.5, 42.0)
 LENS: Final = (0.05, -0.02, 0.001, -0.002, 0.003)
+EVIDENCE: Final = [
+    {"title": "cut-out", "kind": "cut_out", "url": "pictures/cut_outs/sign/a_1.jpg"},
+    {"title": f"picture {HOSTILE}", "kind": "picture", "url": "pictures/0/000001.jpg"},
+    {"title": "tile 55302_602000", "kind": "tile", "tile": "55302_602000"},
+    {"title": "pole 1", "kind": "row", "layer": "asset_poles", "row": "1"},
+    {"title": "strip at 20 m", "kind": "station", "road": "road1", "lane": HOSTILE, "station_m": 20.0},
+    {"title": "lidar: raw/lidar.pcap", "kind": "log"},
+]
+"""Of the crack."""
 
 
 def height_m(east: Any, north: Any) -> Any:
@@ -108,7 +117,7 @@ def _layers() -> list[tuple[dict[str, Any], list[dict[str, Any]]]]:
     pole = {"type": "Point", "coordinates": [*CURB, 40.0]}
     poles = [_feature(1, pole, {"pole": 1, "name": HOSTILE, "height_m": 4.25, "sigma_height_m": 0.012})]
     line = {"type": "LineString", "coordinates": [[EAST_M + 5, NORTH_M - 2], [EAST_M + 12, NORTH_M - 1.5]]}
-    cracks = [_feature(7, line, {"crack": 7, "type": "transverse", "length_m": 7.02})]
+    cracks = [_feature(7, line, {"crack": 7, "type": "transverse", "length_m": 7.02}) | {"evidence": EVIDENCE}]
     return [
         (
             _layer("asset_poles", "Poles", "assets", "point", 500, label="name")
@@ -377,6 +386,8 @@ def _write_pictures(folder: Path) -> None:
     ball = np.zeros((BALL_PX[1], BALL_PX[0], 3), np.uint8)
     ball[..., 1] = np.linspace(40, 220, BALL_PX[0]).astype(np.uint8)
     cv2.imwrite(str(folder / "pictures/0/000001.jpg"), ball)
+    (folder / "pictures/cut_outs/sign").mkdir(parents=True)
+    cv2.imwrite(str(folder / "pictures/cut_outs/sign/a_1.jpg"), np.full((30, 40, 3), (0, 0, 250), np.uint8))
     cameras = [
         {
             "camera": 0,
@@ -396,8 +407,8 @@ def _write_pictures(folder: Path) -> None:
             "model": "equirectangular",
             "width_px": BALL_PX[0],
             "height_px": BALL_PX[1],
-            "focal_px": None,
-            "principal_px": None,
+            "focal_px": [BALL_PX[0] / (2 * math.pi), BALL_PX[1] / math.pi],
+            "principal_px": [(BALL_PX[0] - 1) / 2, (BALL_PX[1] - 1) / 2],
             "distortion": None,
         },
     ]

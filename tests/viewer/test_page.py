@@ -110,6 +110,29 @@ def test_the_cross_section_of_the_cloud_agrees_with_the_table(watched: Any, addr
     assert float(page.locator(".section-panel").get_attribute("data-rms")) <= 1.0
 
 
+def test_a_profile_along_a_line_agrees_with_the_street(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    page.locator('.cloud-view ~ .toolbar [aria-label="Profile along a line"]').click()
+    # Along the crown and then across a rut, in three clicks.
+    for east, north in ((8.0, 0.4), (11.0, 0.4), (13.0, 2.4)):
+        _look(page, (EAST_M + east, NORTH_M + north, float(height_m(EAST_M + east, NORTH_M + north))), across_m=4)
+        _middle(page)
+    page.locator(".cloud-canvas").focus()
+    page.keyboard.press("Enter")
+    page.locator(".section-head h2", has_text="Profile").wait_for()
+    with page.expect_download() as download:
+        page.locator("button", has_text="Save as CSV").click()
+    text = Path(download.value.path()).read_text().splitlines()
+    assert text[0] == "along_m,easting_m,northing_m,height_m,sigma_height_m,points"
+    along, east, north, height, sigma, _ = np.array([line.split(",") for line in text[1:]], float).T
+    assert along[-1] == pytest.approx(3.0 + np.hypot(2.0, 2.0), abs=0.1)
+    assert len(along) > 80 and np.ptp(height_m(east, north)) > 0.03
+    apart_mm = 1e3 * (height - height_m(east, north))
+    # Points lie 4 cm from one another in a strip of 10 cm, across a rut whose sides fall by 3 cm a metre.
+    assert np.sqrt(np.mean(apart_mm**2)) <= 1.0
+    assert np.median(sigma) <= 0.001
+
+
 def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) -> None:
     page = watched.open_cloud(f"{address}#row=asset_poles/1")
     details = page.locator(".details")
@@ -127,6 +150,41 @@ def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) 
         page.locator(".codes li", has_text="<script>").wait_for()
     assert page.evaluate("window.hit") is None
     assert page.locator("img").count() == 0
+
+
+def test_evidence_leads_to_what_it_names(watched: Any, address: str) -> None:
+    page = watched.open_cloud(f"{address}#row=cracks/7")
+    evidence = page.locator(".evidence")
+    evidence.locator("li").nth(5).wait_for()
+    assert "lidar: raw/lidar.pcap" in evidence.inner_text()
+    red = "() => [...document.querySelector('canvas.cut-out').getContext('2d').getImageData(20, 15, 1, 1).data]"
+    page.wait_for_function("() => document.querySelector('canvas.cut-out').width === 40")
+    assert page.evaluate(red)[0] > 230
+    evidence.locator("button", has_text="picture <script>").click()
+    page.locator(".picture-caption", has_text="ball ·").wait_for()
+    # The crack's middle is marked, as high as the raster has it there.
+    mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
+    assert min(np.abs(mark - _in_the_ball(place)).max() for place in _corners_of_the_crack()) <= 0.1
+    evidence.locator("button", has_text="strip at 20 m").click()
+    page.locator(".strips-head", has_text="Station 20.00 m").wait_for()
+    evidence.locator("button", has_text="pole 1").click()
+    page.locator(".details h2", has_text="<script>").wait_for()
+    page.locator('.details button:has-text("Pictures of it")').click()
+    page.locator(".picture-list button").nth(1).wait_for()
+    assert page.evaluate("window.hit") is None
+
+
+def _corners_of_the_crack() -> list[np.ndarray[Any, Any]]:
+    corners = ((EAST_M + 5, NORTH_M - 2), (EAST_M + 12, NORTH_M - 1.5))
+    return [np.array([east, north, height_m(east, north)]) for east, north in corners]
+
+
+def _in_the_ball(place: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Pixel of a place in the picture of 360°."""
+    by = place - (553_008.0, 6_020_000.5, 42.0)
+    right, down, ahead = -by[1], -by[2], by[0]
+    u = (np.arctan2(right, ahead) / (2 * np.pi) + 0.5) * 1024 - 0.5
+    return np.array([u, (np.arcsin(down / np.linalg.norm(by)) / np.pi + 0.5) * 512 - 0.5])
 
 
 def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: str) -> None:
@@ -158,13 +216,7 @@ def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
     page.locator(".picture-list button", has_text="ball").click()
     page.locator(".picture-caption", has_text="ball ·").wait_for()
     mark = np.array(page.locator(".picture-frame").get_attribute("data-mark").split(), float)
-    by = np.array(TARGET) - (553_008.0, 6_020_000.5, 42.0)
-    right, down, ahead = -by[1], -by[2], by[0]
-    expected = (
-        (np.arctan2(right, ahead) / (2 * np.pi) + 0.5) * 1024 - 0.5,
-        (np.arcsin(down / np.linalg.norm(by)) / np.pi + 0.5) * 512 - 0.5,
-    )
-    assert np.abs(mark - expected).max() <= 0.02
+    assert np.abs(mark - _in_the_ball(np.array(TARGET))).max() <= 0.02
 
 
 def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
@@ -257,3 +309,56 @@ def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     page.locator(".details .hint").first.wait_for()
     page.keyboard.press("?")
     assert page.locator("dialog.help").is_visible()
+
+
+_UNREACHED = """(place) => {
+  const root = document.querySelector(place)
+  const wide = document.documentElement.clientWidth, high = document.documentElement.clientHeight
+  const told = []
+  for (const one of root.querySelectorAll('button, select, input, a[href], summary, [tabindex="0"], [role="tab"]')) {
+    if (!one.checkVisibility({ visibilityProperty: true, opacityProperty: true })) continue
+    one.scrollIntoView({ block: 'center', inline: 'center' })
+    const box = one.getBoundingClientRect()
+    if (!box.width || !box.height) continue
+    const large = box.width > wide * 0.5 && box.height > high * 0.2
+    const inside = box.left >= -1 && box.top >= -1 && box.right <= wide + 1 && box.bottom <= high + 1
+    const met = document.elementFromPoint((box.left + box.right) / 2, (box.top + box.bottom) / 2)
+    const shown = met && (one.contains(met) || met.contains(one) || met.closest('label')?.contains(one))
+    if ((!inside && !large) || (!shown && !large))
+      told.push(`${one.tagName} ${one.className} ${one.ariaLabel ?? one.textContent} ${JSON.stringify(box)}`)
+  }
+  for (const one of root.querySelectorAll('button, h2, h3, dd, dt, td, label span')) {
+    const { overflow, textOverflow } = getComputedStyle(one)
+    const cut = overflow === 'hidden' && textOverflow !== 'ellipsis' && one.scrollWidth > one.clientWidth + 1
+    if (cut && one.checkVisibility({ visibilityProperty: true })) told.push(`cut off: ${one.textContent}`)
+  }
+  return told
+}"""
+
+
+@pytest.mark.parametrize("window", [(1440, 900), (1280, 1024), (1024, 768)])
+def test_at_200_percent_nothing_is_cut_off_or_out_of_reach(
+    open_page: Any, address: str, window: tuple[int, int]
+) -> None:
+    width, height = window[0] // 2, window[1] // 2
+    with open_page(viewport={"width": width, "height": height}, device_scale_factor=2) as watched:
+        page = watched.open(f"{address}#row=asset_poles/1&views=map,strips")
+        page.locator(".strips .panel").first.wait_for()
+        page.wait_for_selector('.app[data-code="all"]')
+        found: dict[str, list[str]] = {}
+        for view, ready in (
+            ("Map", ".map-target"),
+            ("3D", '.cloud-view[data-loading="0"]'),
+            ("Pictures", ".picture-frame"),
+        ):
+            page.locator(f'nav.views button[title^="{view}"]').click()
+            page.locator(ready).wait_for()
+            found[view] = page.evaluate(_UNREACHED, "body")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for sheet, side in (("Layers (L)", ".side.left"), ("Details", ".side.right")):
+            page.locator(f'[aria-label="{sheet}"]').click()
+            page.locator(side).wait_for()
+            found[sheet] = page.evaluate(_UNREACHED, side)
+            page.locator(f"{side} .sheet-close").click()
+        assert {name: wrong for name, wrong in found.items() if wrong} == {}
+        assert serious(page) == []

@@ -51,9 +51,14 @@ export class App {
     const token = survey.edits?.post ? editToken() : null
     this.#editing = survey.edits && (token || !survey.edits.post) ? new Editing(desk, this.map, survey.edits, token) : null
     this.#rows = new RowPanel(desk, {
-      openPicture: (url) => void this.parts.openPicture(url),
+      openPicture: (url, place) => void this.parts.openPicture(url, place),
       openPictures: (place) => void this.parts.picturesOf(place),
-      openTile: (tile) => this.#goToTile(tile),
+      openTile: (tile) => void this.#goToRow('tiles', tile).then((found) => found || this.#goToTile(tile)),
+      openRow: (layer, row) => void this.#goToRow(layer, row),
+      openStation: ({ road, lane, station_m }) => {
+        this.#openDock('strips')
+        void this.parts.goToStationOf(road ?? '', lane ?? null, station_m ?? 0)
+      },
       edit: this.#editing && ((selected) => this.#editing!.controls(selected)),
     })
     this.#table = new TablePanel(desk, (feature) => this.#lookAt(feature))
@@ -321,8 +326,8 @@ export class App {
     const at = (asked.get('at') ?? '').split(',').map(Number)
     const across_m = Number(asked.get('zoom')) || 30
     if (at.length >= 2 && at.every(Number.isFinite)) this.desk.goTo({ easting_m: at[0]!, northing_m: at[1]!, height_m: at[2] ?? null, across_m })
-    const [layer, id] = (asked.get('row') ?? '').split('/')
-    if (layer && id) await this.#goToRow(layer, id)
+    const row = parseSearch(asked.get('row') ?? '') // an id may hold slashes, spaces and signs
+    if (row.kind === 'row') await this.#goToRow(row.layer, row.id)
     const station = asked.get('station')
     if (station && this.desk.survey.strips) await this.parts.goToStation(Number(station), asked.has('lane') ? Number(asked.get('lane')) : null)
   }

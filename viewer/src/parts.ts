@@ -265,6 +265,19 @@ export class ModelParts {
     if (place) this.desk.goTo({ ...place, across_m: 30 })
   }
 
+  /** Go to a station of a road, in a lane of it where one is named. */
+  async goToStationOf(road: string, lane: string | null, station_m: number): Promise<void> {
+    try {
+      const { lanes } = (await this.#openStripsOnce()).index
+      const own = lanes.filter((one) => one.road === road)
+      const found = own.find((one) => one.lane === lane) ?? own[0]
+      if (found) await this.goToStation(station_m, found.lane_id)
+      else this.desk.say(`The road ${road} has no strips.`)
+    } catch (error) {
+      this.desk.complain(error)
+    }
+  }
+
   /** A cross-section of the tables beside the cloud along the same line. */
   #crossSection(lane: StripLane, section: CrossSection): void {
     if (section.direction_deg === null) {
@@ -320,18 +333,26 @@ export class ModelParts {
     }
   }
 
-  async openPicture(url: string): Promise<void> {
+  async openPicture(url: string, place: Place | null): Promise<void> {
     this.desk.show('pictures')
-    const { view } = await this.#openPicturesOnce()
-    await view.openUrl(url)
+    try {
+      const { view } = await this.#openPicturesOnce()
+      await view.openUrl(url, place && { ...place, height_m: await this.#heightOf(place) })
+    } catch (error) {
+      this.desk.complain(error)
+    }
+  }
+
+  /** The height of a place: its own, that of the map's raster, or that of the points that are loaded. */
+  async #heightOf(place: Place): Promise<number | null> {
+    return place.height_m ?? (await this.map.heightAt(place.easting_m, place.northing_m)) ?? this.#view?.groundAt(place.easting_m, place.northing_m) ?? null
   }
 
   async picturesOf(place: Place): Promise<void> {
     this.desk.show('pictures')
-    const height_m = place.height_m ?? this.#view?.groundAt(place.easting_m, place.northing_m) ?? null
     try {
       const { view } = await this.#openPicturesOnce()
-      await view.showPlace({ ...place, height_m })
+      await view.showPlace({ ...place, height_m: await this.#heightOf(place) })
     } catch (error) {
       this.desk.complain(error)
     }

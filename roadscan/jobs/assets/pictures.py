@@ -25,7 +25,7 @@ from roadscan.jobs.engine.compute import reason_of
 from roadscan.jobs.surfaces.picture_colours import ColourSource, world_places
 from roadscan.jobs.surfaces.pictures import Pictures
 from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.points.views import NO_VIEW, Sights, best_views
+from roadscan.points.views import NO_VIEW, WIDTH, Sights, best_views
 from roadscan.tables.manifest import OutputRecord, read_recorded
 from roadscan.tables.store import bytes_digest
 from roadscan.tiles.grid import Bounds
@@ -141,7 +141,9 @@ class _Search:
         cut: list[CutOut] = []
         for view, resolution in zip(found.view.tolist(), found.resolution_m.tolist(), strict=True):
             pixels = best_views(worlds, pictures.views.picked(np.array([view])), pictures.rule)
-            if (pixels.view == NO_VIEW).any():
+            lens = pictures.views.lenses[pictures.views.lens[view]]
+            torn = lens.is_around and np.ptp(pixels.pixel[:, 0]) > lens.parameters[WIDTH] / 2  # by the picture's ends
+            if torn or (pixels.view == NO_VIEW).any():
                 continue
             picture = self._source.picture(pictures, view)
             if picture is None:

@@ -146,6 +146,11 @@ def resect_camera(
             expected=f"[sensors.{sensor}.interior]",
             change="find it from chessboard pictures first: `roadscan camera interior`",
         )
+    if stated.interior.model != "perspective":
+        raise ConfigError(
+            f"the camera '{sensor}' takes pictures of 360°", expected="a perspective camera",
+            change="state its mounting in the rig file as its maker or a survey of the vehicle gives it",
+        )  # fmt: skip
     rig_file = _rig_file(survey) if write else None
     if survey.config.map.grids is not None:
         add_grid_folder(survey.resolve(survey.config.map.grids))

@@ -169,7 +169,7 @@ def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[Si
     yield SiteLayer(
         about.name, about.title, about.group, about.geometry, about.order, held.shapes_m, rows,
         schema_columns(table, names), about.styles, about.key, about.label, about.visible, about.arrows,
-        [_tiles_shown(row) for row in rows] if "tiles" in names else (),
+        [list(evidence_of_row(row)) for row in rows],
     )  # fmt: skip
 
 
@@ -185,9 +185,15 @@ def line_of(places_m: npt.NDArray[np.float64]) -> Any:
     return shapely.LineString(places_m if len(places_m) > 1 else np.repeat(places_m, 2, axis=0))
 
 
+def evidence_of_row(row: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Tiles that a row of a table names, and its place on the strips of its road."""
+    for one in str(row.get("tiles") or "").split():
+        yield {"title": f"tile {one}", "kind": "tile", "tile": one}
+    station, road, lane = row.get("station_from_m", row.get("station_m")), row.get("road"), row.get("lane")
+    if road and isinstance(station, float) and math.isfinite(station):
+        title = f"strip of {road}" + (f", lane {lane}," if lane else "") + f" at {station:.2f} m"
+        yield {"title": title, "kind": "station", "road": road, "lane": lane, "station_m": round(station, 3)}
+
+
 def _is_list(column: Any) -> bool:
     return str(column.type).startswith(("list", "fixed_size_list"))
-
-
-def _tiles_shown(row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return [{"title": f"tile {one}", "kind": "tile", "tile": one} for one in str(row["tiles"] or "").split()]

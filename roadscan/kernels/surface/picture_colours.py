@@ -1,7 +1,8 @@
 """The picture that shows a point best, and the point's colour in it.
 
 A picture is a pinhole with Brown–Conrady distortion (Brown 1971; signs and axes of OpenCV: x right, y down, z along
-the optical axis). Points are looked at one by one, so what comes out for one does not depend on the others.
+the optical axis), or equirectangular: longitude to the right and latitude downwards in even steps (Snyder 1987, plate
+carrée). Points are looked at one by one, so what comes out for one does not depend on the others.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import numpy as np
 
 from roadscan.kernels.options import kernel
 
-FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT = range(12)
-"""Places in the parameters of a lens; FOLD: square of the tangent up to which its radius grows."""
+FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT, AROUND = range(13)
+"""Places in the parameters of a lens; FOLD: square of the tangent up to which its radius grows; AROUND: 1 for a picture
+of 360°, whose focal length is in pixels a radian."""
 REACH, SINE, BORDER = range(3)
 """Places in the limits: square of the farthest distance (m²), sine of the least angle, pixels of the border."""
 LEAST_AHEAD_M = 0.1
@@ -31,7 +33,7 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
     eye_m : (3,) where the camera was.
     turn : (3, 3) camera axes (x right, y down, z ahead) from world.
     up : (3,) unit vector.
-    lens : (12,) parameters, see above.
+    lens : (13,) parameters, see above.
     limits : (3,) see above.
     hidden : (height, width) bool, pixels that are not to be taken; (0, 0) where there are none.
     number : what stands for the picture in `chosen`.
@@ -50,17 +52,25 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
             continue
         if -(x * up[0] + y * up[1] + z * up[2]) < limits[SINE] * math.sqrt(square):
             continue
+        a = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+        b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
         ahead = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
-        if ahead < LEAST_AHEAD_M:
-            continue
-        a = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z) / ahead
-        b = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z) / ahead
-        r2 = a * a + b * b
-        if r2 >= lens[FOLD]:
-            continue
-        radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
-        u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a)
-        v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b
+        if lens[AROUND] > 0.0:
+            if square < LEAST_AHEAD_M * LEAST_AHEAD_M:
+                continue
+            u = math.atan2(a, ahead)
+            v = math.atan2(b, math.hypot(a, ahead))
+        else:
+            if ahead < LEAST_AHEAD_M:
+                continue
+            a /= ahead
+            b /= ahead
+            r2 = a * a + b * b
+            if r2 >= lens[FOLD]:
+                continue
+            radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
+            u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a)
+            v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b
         u = lens[FOCAL_X] * u + lens[CENTRE_X]
         v = lens[FOCAL_Y] * v + lens[CENTRE_Y]
         if not (limits[BORDER] <= u <= right and limits[BORDER] <= v <= bottom):

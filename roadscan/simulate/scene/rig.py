@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -224,12 +224,15 @@ class Encoder(Strict):
 
 
 class Camera(Strict):
-    """A camera: pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it)."""
+    """A camera: pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it), or of 360°."""
 
     on: bool = False
     """Whether the rig carries it."""
     every_m: float = Field(default=5.0, gt=0.1)
     """Distance driven from picture to picture (m)."""
+    model: Literal["perspective", "equirectangular"] = "perspective"
+    """`equirectangular` for pictures of 360°: their columns and rows are even steps of longitude and latitude over the
+    whole sphere, so that focal length, principal point and distortion say nothing."""
     width_px: int = Field(default=960, ge=64, le=8192)
     """Width of a picture."""
     height_px: int = Field(default=600, ge=64, le=8192)

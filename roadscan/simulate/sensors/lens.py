@@ -1,4 +1,4 @@
-"""A camera's lens: the pinhole with Brown–Conrady distortion, in the parameters of OpenCV."""
+"""A camera's lens: the pinhole with Brown–Conrady distortion, in the parameters of OpenCV; and the view all around."""
 
 from __future__ import annotations
 
@@ -15,6 +15,20 @@ Float64 = npt.NDArray[np.float64]
 
 _STEPS: Final = 30
 _WITHIN: Final = 1e-10
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A picture of all directions: even steps of longitude to the right and of latitude downwards."""
+
+    width_px: int
+    height_px: int
+
+    def rays(self, column_px: npt.ArrayLike, row_px: npt.ArrayLike) -> Float64:
+        """Unit vectors (n, 3: ahead, right, down) of places (n,) in the picture; its middle looks ahead."""
+        turn = 2.0 * np.pi * ((np.asarray(column_px, np.float64) + 0.5) / self.width_px - 0.5)
+        dip = np.pi * ((np.asarray(row_px, np.float64) + 0.5) / self.height_px - 0.5)
+        return np.stack([np.cos(dip) * np.cos(turn), np.cos(dip) * np.sin(turn), np.sin(dip)], axis=-1)
 
 
 @dataclass(frozen=True)

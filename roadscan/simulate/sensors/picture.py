@@ -15,7 +15,7 @@ from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Camera
 from roadscan.simulate.sensors.colours import SKY, Tints
-from roadscan.simulate.sensors.lens import Lens
+from roadscan.simulate.sensors.lens import Lens, Sphere
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -99,7 +99,9 @@ class _Eye:
         self._tints = tints
         self._drive = drive
         self._camera: Camera = world.scene.camera
-        self._lens = Lens.of(self._camera)
+        around = self._camera.model == "equirectangular"
+        sphere = Sphere(self._camera.width_px, self._camera.height_px)
+        self._lens: Lens | Sphere = sphere if around else Lens.of(self._camera)
         self._epoch = np.full((1, 1, 2), epoch_gps_ns, np.int64)
         self._key = ray_key(world.scene, drive, "camera") + number * _KEYS_A_PICTURE
         at, rotation = drive.poses(np.array([epoch_gps_ns])).sensor(self._camera.mount, EYE)

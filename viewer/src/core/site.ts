@@ -122,10 +122,15 @@ export interface Layer {
 
 export interface Evidence {
   title: string
+  /** `picture` and `cut_out` have a `url`, `tile` a tile, `row` a layer and a row, `station` a road and a station. */
   kind: string
   tile?: string
   url?: string
-  table?: string
+  layer?: string
+  row?: string
+  road?: string
+  lane?: string | null
+  station_m?: number
 }
 
 export interface FeatureDocument {
@@ -194,8 +199,18 @@ export interface StripLane {
   lane: string
   direction: string
   station_m: [number, number]
+  /** Box of its middle. */
+  bounds_m?: Bounds
   url: string
-  cross_sections: { from_m: number; to_m: number; url: string }[]
+  /** Where the values of a long lane lie, whose own file has bins. */
+  pieces?: StripPiece[]
+  cross_sections: StripPiece[]
+}
+
+export interface StripPiece {
+  from_m: number
+  to_m: number
+  url: string
 }
 
 export interface Quantity {
@@ -220,6 +235,9 @@ export interface StripSeries {
   sigma: (number | null)[]
   share: (number | null)[]
   reason: (string | null)[]
+  /** Least and greatest of each bin, where the values are means of bins. */
+  low?: (number | null)[]
+  high?: (number | null)[]
 }
 
 export interface Strip {
@@ -246,8 +264,9 @@ export interface Camera {
   model: 'perspective' | 'equirectangular'
   width_px: number
   height_px: number
-  focal_px: [number, number] | null
-  principal_px: [number, number] | null
+  /** Pixels a unit of the tangent; of an equirectangular picture, a radian. */
+  focal_px: [number, number]
+  principal_px: [number, number]
   distortion: [number, number, number, number, number] | null
 }
 

@@ -8,9 +8,11 @@ import type { Hit } from '../map/map'
 import { geometryOf } from '../map/vectors'
 
 export interface RowActions {
-  openPicture(url: string): void
+  openPicture(url: string, place: Place | null): void
   openPictures(place: Place): void
   openTile(tile: string): void
+  openRow(layer: string, row: string): void
+  openStation(evidence: Evidence): void
   edit: ((selected: Selected) => HTMLElement) | null
 }
 
@@ -45,10 +47,16 @@ export class RowPanel {
       this.#row,
       h('header', {}, h('p', { class: 'over' }, layer.title), h('h2', {}, this.#name(selected))),
       this.#others(selected),
-      h('div', { class: 'actions' }, this.#action('target', 'Look there', () => this.#goTo(selected)), this.#action('copy', 'Copy the row', () => this.#copy(selected))),
+      h(
+        'div',
+        { class: 'actions' },
+        this.#action('target', 'Look there', () => this.#goTo(selected)),
+        this.#action('copy', 'Copy the row', () => this.#copy(selected)),
+        this.desk.survey.pictures ? this.#action('picture', 'Pictures of it', () => this.#withPlace(selected, (place) => this.actions.openPictures(place))) : null,
+      ),
       this.actions.edit?.(selected) ?? null,
       h('dl', { class: 'values' }, ...this.#values(selected)),
-      ...this.#evidence(feature.evidence ?? []),
+      ...this.#evidence(selected, feature.evidence ?? []),
     )
   }
 
@@ -113,14 +121,41 @@ export class RowPanel {
       })
   }
 
-  #evidence(list: Evidence[]): HTMLElement[] {
+  /** The place of a row: the one that it states, else the middle of its shape, with a height where either has one. */
+  #withPlace({ feature }: Selected, then: (place: Place) => void): void {
+    const { easting_m, northing_m, height_m } = feature.properties
+    const middle = middleOf(feature.geometry)
+    if (typeof easting_m === 'number' && typeof northing_m === 'number') then({ easting_m, northing_m, height_m: typeof height_m === 'number' ? height_m : (middle?.[2] ?? null), from: 'row' })
+    else if (middle) then({ easting_m: middle[0]!, northing_m: middle[1]!, height_m: middle[2] ?? null, from: 'row' })
+  }
+
+  #evidence(selected: Selected, list: Evidence[]): HTMLElement[] {
     if (!list.length) return []
+    const link = (name: Parameters<typeof icon>[0], title: string, onclick: () => void): HTMLElement => h('button', { type: 'button', class: 'link', onclick }, icon(name), title)
     const entry = (one: Evidence): HTMLElement => {
-      if (one.kind === 'picture' && one.url) return h('button', { type: 'button', class: 'link', onclick: () => this.actions.openPicture(one.url!) }, icon('picture'), one.title)
-      if (one.kind === 'tile' && one.tile) return h('button', { type: 'button', class: 'link', onclick: () => this.actions.openTile(one.tile!) }, icon('fit'), one.title)
+      const { kind, url, tile, layer, row } = one
+      if (kind === 'picture' && url) return link('picture', one.title, () => this.#withPlace(selected, (place) => this.actions.openPicture(url, place)))
+      if (kind === 'cut_out' && url) return this.#cutOut(one.title, url)
+      if (kind === 'tile' && tile) return link('fit', one.title, () => this.actions.openTile(tile))
+      if (kind === 'row' && layer && row) return link('row', one.title, () => this.actions.openRow(layer, row))
+      if (kind === 'station' && this.desk.survey.strips) return link('strips', one.title, () => this.actions.openStation(one))
       return h('span', {}, one.title)
     }
     return [h('h3', {}, 'Evidence'), h('ul', { class: 'evidence' }, ...list.map((one) => h('li', {}, entry(one))))]
+  }
+
+  /** A small picture, drawn rather than linked: it may lie in the page itself. */
+  #cutOut(title: string, url: string): HTMLElement {
+    const canvas = h('canvas', { class: 'cut-out', role: 'img', 'aria-label': title })
+    this.desk.source
+      .blob(url, 'image/jpeg')
+      .then((blob) => createImageBitmap(blob))
+      .then((picture) => {
+        ;[canvas.width, canvas.height] = [picture.width, picture.height]
+        canvas.getContext('2d')!.drawImage(picture, 0, 0)
+      })
+      .catch((error) => this.desk.complain(error))
+    return canvas
   }
 
   #drawPlace(place: Place | null): void {
@@ -150,6 +185,17 @@ export class RowPanel {
       ),
     )
   }
+}
+
+/** The place that lies in the middle of a shape: of its corners the one that is nearest to their mean. */
+function middleOf(geometry: { type: string; coordinates: any } | null): number[] | null {
+  const corners: number[][] = []
+  const collect = (one: any): void => void (typeof one?.[0] === 'number' ? corners.push(one) : (one ?? []).forEach(collect))
+  collect(geometry?.coordinates)
+  if (!corners.length) return null
+  const mean = [0, 1].map((axis) => corners.reduce((sum, one) => sum + one[axis]!, 0) / corners.length)
+  const apart = (one: number[]): number => Math.hypot(one[0]! - mean[0]!, one[1]! - mean[1]!)
+  return corners.reduce((best, one) => (apart(one) < apart(best) ? one : best))
 }
 
 /** The clipboard needs a secure page; a file or a host without TLS gets the older way. */

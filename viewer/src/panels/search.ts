@@ -12,7 +12,7 @@ export function parseSearch(text: string): Wanted {
   const station = /^@\s*(-?\d+(?:\.\d+)?)$/.exec(trimmed)
   if (station) return { kind: 'station', station_m: Number(station[1]) }
   if (/^-?\d+_-?\d+$/.test(trimmed)) return { kind: 'tile', tile: trimmed }
-  const row = /^([a-z0-9_]+)\/([\w.-]+)$/i.exec(trimmed)
+  const row = /^([a-z0-9_]+)\/(.+)$/i.exec(trimmed)
   if (row) return { kind: 'row', layer: row[1]!, id: row[2]! }
   const numbers = trimmed.replace(/\u202f/g, '').split(/[\s;,]+/).map(Number)
   if ((numbers.length === 2 || numbers.length === 3) && numbers.every(Number.isFinite)) {

@@ -18,26 +18,36 @@ export function pixelOf(camera: Camera, pose: Pose, place: Readonly<Vector>): { 
   const r = pose.camera_from_map
   const d = [0, 3, 6].map((row) => r[row]! * by[0] + r[row + 1]! * by[1] + r[row + 2]! * by[2]) as Vector
   const distance_m = Math.hypot(...d)
-  const pixel = camera.model === 'equirectangular' ? around(camera, d, distance_m) : ahead(camera, d)
+  const pixel = camera.model === 'equirectangular' ? around(camera, d) : ahead(camera, d)
   if (!pixel) return null
   const [u, v] = pixel
   if (u < -0.5 || v < -0.5 || u > camera.width_px - 0.5 || v > camera.height_px - 0.5) return null
   return { u, v, distance_m }
 }
 
-function around(camera: Camera, d: Vector, size: number): [number, number] | null {
-  if (!size) return null
-  return [(Math.atan2(d[0], d[2]) / (2 * Math.PI) + 0.5) * camera.width_px - 0.5, (Math.asin(d[1] / size) / Math.PI + 0.5) * camera.height_px - 0.5]
+function around(camera: Camera, d: Vector): [number, number] | null {
+  const level = Math.hypot(d[0], d[2])
+  return level || d[1] ? pixelAtAngles(camera, Math.atan2(d[0], d[2]), Math.atan2(d[1], level)) : null
+}
+
+/** The pixel of an equirectangular picture at a longitude and a latitude (radians, right and down of ahead). */
+export function pixelAtAngles({ focal_px, principal_px }: Camera, longitude: number, latitude: number): [number, number] {
+  return [principal_px[0] + focal_px[0] * longitude, principal_px[1] + focal_px[1] * latitude]
+}
+
+/** Longitude and latitude that a pixel of an equirectangular picture looks to. */
+export function anglesOf({ focal_px, principal_px }: Camera, u: number, v: number): [number, number] {
+  return [(u - principal_px[0]) / focal_px[0], (v - principal_px[1]) / focal_px[1]]
 }
 
 function ahead(camera: Camera, d: Vector): [number, number] | null {
   if (d[2] <= 1e-6) return null
   const [a, b] = [d[0] / d[2], d[1] / d[2]]
   // Beyond the angle of the lens, the polynomial of the distortion folds back: such a place is not seen.
-  const widest = (Math.hypot(camera.width_px, camera.height_px) / Math.min(...camera.focal_px!)) * 0.9
+  const widest = (Math.hypot(camera.width_px, camera.height_px) / Math.min(...camera.focal_px)) * 0.9
   if (Math.hypot(a, b) > widest) return null
   const [x, y] = distort(camera, a, b)
-  return [camera.principal_px![0] + camera.focal_px![0] * x, camera.principal_px![1] + camera.focal_px![1] * y]
+  return [camera.principal_px[0] + camera.focal_px[0] * x, camera.principal_px[1] + camera.focal_px[1] * y]
 }
 
 /** Brown's distortion of a point of the plane at distance 1 (Brown 1971; OpenCV's order k1, k2, p1, p2, k3). */
@@ -65,13 +75,13 @@ function solve(m: readonly number[], d: Vector): Vector {
 }
 
 function aroundRay(camera: Camera, u: number, v: number): Vector {
-  const [longitude, latitude] = [((u + 0.5) / camera.width_px - 0.5) * 2 * Math.PI, ((v + 0.5) / camera.height_px - 0.5) * Math.PI]
+  const [longitude, latitude] = anglesOf(camera, u, v)
   return [Math.sin(longitude) * Math.cos(latitude), Math.sin(latitude), Math.cos(longitude) * Math.cos(latitude)]
 }
 
 /** Newton's method on the distortion, with its derivatives by differences: six steps leave less than 1e-9. */
 function aheadRay(camera: Camera, u: number, v: number): Vector {
-  const [x, y] = [(u - camera.principal_px![0]) / camera.focal_px![0], (v - camera.principal_px![1]) / camera.focal_px![1]]
+  const [x, y] = [(u - camera.principal_px[0]) / camera.focal_px[0], (v - camera.principal_px[1]) / camera.focal_px[1]]
   let [a, b] = [x, y]
   const step = 1e-6
   for (let turn = 0; turn < 8; turn++) {
@@ -89,5 +99,5 @@ function aheadRay(camera: Camera, u: number, v: number): Vector {
 
 /** Metres on a surface that faces the camera which a pixel covers at a distance. */
 export function pixelSize(camera: Camera, distance_m: number): number {
-  return camera.model === 'equirectangular' ? (distance_m * 2 * Math.PI) / camera.width_px : distance_m / camera.focal_px![0]
+  return distance_m / camera.focal_px[0]
 }

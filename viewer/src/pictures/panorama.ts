@@ -1,5 +1,7 @@
 /** A picture of all directions, drawn as an eye in its middle sees it. */
 
+import type { Camera } from '../core/site'
+
 const VERTEX = `#version 300 es
 in vec2 corner; out vec2 at;
 void main() { at = corner; gl_Position = vec4(corner, 0.0, 1.0); }`
@@ -8,10 +10,11 @@ void main() { at = corner; gl_Position = vec4(corner, 0.0, 1.0); }`
 const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 at; out vec4 drawn;
-uniform sampler2D picture; uniform mat3 turn; uniform vec2 half_size;
+uniform sampler2D picture; uniform mat3 turn; uniform vec2 half_size, middle, scale;
 void main() {
-  vec3 d = normalize(turn * vec3(at.x * half_size.x, -at.y * half_size.y, 1.0));
-  drawn = texture(picture, vec2(atan(d.x, d.z) / 6.283185307 + 0.5, asin(clamp(d.y, -1.0, 1.0)) / 3.141592654 + 0.5));
+  vec3 d = turn * vec3(at.x * half_size.x, -at.y * half_size.y, 1.0);
+  vec2 place = middle + scale * vec2(atan(d.x, d.z), atan(d.y, length(d.xz)));
+  drawn = place.y < 0.0 || place.y > 1.0 ? vec4(0.0, 0.0, 0.0, 1.0) : texture(picture, place);
 }`
 
 export class Panorama {
@@ -46,8 +49,15 @@ export class Panorama {
     }
   }
 
-  load(picture: ImageBitmap): void {
-    this.#gl.texImage2D(this.#gl.TEXTURE_2D, 0, this.#gl.RGB, this.#gl.RGB, this.#gl.UNSIGNED_BYTE, picture)
+  /** Takes a picture, drawn smaller where the graphics hold none that large; and where it has longitude and latitude 0. */
+  async load(picture: ImageBitmap, { width_px, height_px, focal_px, principal_px }: Camera): Promise<void> {
+    const gl = this.#gl
+    const shrunk = Math.min(1, (gl.getParameter(gl.MAX_TEXTURE_SIZE) as number) / Math.max(picture.width, picture.height))
+    const size = { resizeWidth: Math.floor(picture.width * shrunk), resizeHeight: Math.floor(picture.height * shrunk) }
+    const held = shrunk < 1 ? await createImageBitmap(picture, { ...size, resizeQuality: 'high' }) : picture
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, held)
+    gl.uniform2f(gl.getUniformLocation(this.#program, 'middle'), (principal_px[0] + 0.5) / width_px, (principal_px[1] + 0.5) / height_px)
+    gl.uniform2f(gl.getUniformLocation(this.#program, 'scale'), focal_px[0] / width_px, focal_px[1] / height_px)
   }
 
   /** Columns: the view's right, down and ahead in camera axes. */

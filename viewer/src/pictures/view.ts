@@ -3,9 +3,10 @@
 import type { Desk, Place } from '../core/desk'
 import { fill, h, iconButton } from '../core/dom'
 import * as format from '../core/format'
+import type { Camera } from '../core/site'
 import { meet, rayNear } from '../cloud/pick'
 import type { CloudStore } from '../cloud/store'
-import { pixelOf, pixelSize, rayOf } from './geometry'
+import { anglesOf, pixelAtAngles, pixelOf, pixelSize, rayOf } from './geometry'
 import type { Picture, PictureList, View } from './list'
 import { Panorama } from './panorama'
 
@@ -164,8 +165,10 @@ export class PictureView {
     }
   }
 
-  async openUrl(url: string): Promise<void> {
+  /** Open a picture by its path, and mark a place in it. */
+  async openUrl(url: string, place: Place | null): Promise<void> {
     const picture = await this.pictures.byUrl(url)
+    if (place) this.#place = place
     if (picture) await this.open(picture)
     else this.desk.complain(`the picture ${url} is not in the list of pictures`)
   }
@@ -206,7 +209,8 @@ export class PictureView {
     this.#bitmap = bitmap
     this.#flat.hidden = this.#around
     this.#ball.hidden = !this.#around
-    if (this.#around) this.#openBall(bitmap)
+    if (this.#around) await this.#openBall(bitmap, picture.camera)
+    if (this.#picture !== picture) return
     this.#fit()
     this.#lookAtPlace()
     const sigma = picture.sigma_m === null ? '' : `  σ ${format.length(picture.sigma_m)}`
@@ -215,9 +219,9 @@ export class PictureView {
     this.#frame.dataset['state'] = 'shown'
   }
 
-  #openBall(bitmap: ImageBitmap): void {
+  async #openBall(bitmap: ImageBitmap, camera: Camera): Promise<void> {
     this.#panorama ??= new Panorama(this.#ball)
-    this.#panorama.load(bitmap)
+    await this.#panorama.load(bitmap, camera)
   }
 
   #load(url: string): Promise<ImageBitmap> {
@@ -273,9 +277,7 @@ export class PictureView {
   #lookAtPlace(): void {
     const pixel = this.#markedPixel()
     if (!pixel || !this.#picture || !this.#around || !this.#panorama) return
-    const { width_px, height_px } = this.#picture.camera
-    this.#panorama.yaw = ((pixel[0] + 0.5) / width_px - 0.5) * 2 * Math.PI
-    this.#panorama.pitch = ((pixel[1] + 0.5) / height_px - 0.5) * Math.PI
+    ;[this.#panorama.yaw, this.#panorama.pitch] = anglesOf(this.#picture.camera, ...pixel)
     this.#draw()
   }
 
@@ -306,7 +308,7 @@ export class PictureView {
   #screenOf(u: number, v: number): [number, number] | null {
     const { camera } = this.#picture!
     if (this.#around && this.#panorama) {
-      const at = this.#panorama.pointOf(((u + 0.5) / camera.width_px - 0.5) * 2 * Math.PI, ((v + 0.5) / camera.height_px - 0.5) * Math.PI)
+      const at = this.#panorama.pointOf(...anglesOf(camera, u, v))
       return at && [at[0] * this.#frame.clientWidth, at[1] * this.#frame.clientHeight]
     }
     const scale = this.#view.zoom * this.#shrunk
@@ -316,8 +318,7 @@ export class PictureView {
   #pixelAt(x: number, y: number): [number, number] {
     const { camera } = this.#picture!
     if (this.#around && this.#panorama) {
-      const [longitude, latitude] = this.#panorama.directionAt(x / this.#frame.clientWidth, y / this.#frame.clientHeight)
-      return [(longitude / (2 * Math.PI) + 0.5) * camera.width_px - 0.5, (latitude / Math.PI + 0.5) * camera.height_px - 0.5]
+      return pixelAtAngles(camera, ...this.#panorama.directionAt(x / this.#frame.clientWidth, y / this.#frame.clientHeight))
     }
     const scale = this.#view.zoom * this.#shrunk
     return [(x - this.#view.x) / scale - 0.5, (y - this.#view.y) / scale - 0.5]

@@ -4,16 +4,29 @@ import uPlot from 'uplot'
 import type { Desk, Station } from '../core/desk'
 import { fill, h } from '../core/dom'
 import * as format from '../core/format'
-import type { CrossSection, Quantity, Strip, StripIndex, StripLane, StripSeries } from '../core/site'
+import type { CrossSection, Quantity, Strip, StripIndex, StripLane, StripPiece, StripSeries } from '../core/site'
+import { curve, refined, valueAt } from './series'
 
 const COLOURS = { light: ['#0072b2', '#d55e00', '#009e73', '#a6548c', '#9a6a00', '#2b7fb8'], dark: ['#56b4e9', '#f08a4b', '#3cc79b', '#e29cc7', '#f0c04c', '#9ad1f2'] }
 const PANEL_PX = 104
 const CLOSE_M = 8
+/** All values are fetched of no more than this. */
+const REFINED_M = 400
+
+interface Drawn {
+  /** As the lane's own file has it, and with the pieces that are there. */
+  coarse: StripSeries
+  found: StripSeries
+  lane_id: number
+  quantity: Quantity
+  colour: string
+  other: string | null
+}
 
 interface Chart {
   plot: uPlot
   read: HTMLElement
-  series: { found: StripSeries; quantity: Quantity; colour: string; other: string | null }[]
+  series: Drawn[]
 }
 
 export class Strips {
@@ -21,6 +34,9 @@ export class Strips {
   readonly #charts = h('div', { class: 'charts', tabindex: 0, role: 'application', 'aria-label': 'Strips by station. Left and right step by a metre, with Shift by ten.' })
   readonly #told = h('span', { class: 'number', 'aria-live': 'polite' })
   readonly #strips = new Map<number, Promise<Strip>>()
+  /** Pieces that were asked for, by path, and those of each lane that are there. */
+  readonly #asked = new Set<string>()
+  readonly #pieces = new Map<number, (StripPiece & { series: StripSeries[] })[]>()
   #lane: StripLane
   #strip: Strip | null = null
   #drawn: Chart[] = []
@@ -112,9 +128,10 @@ export class Strips {
       for (const [index, quantity] of quantities.entries()) {
         const found = strip.series.find((one) => one.quantity === quantity.name)
         if (!found) continue
-        tables.push(curve(found))
         const colour = colours[index % colours.length]!
-        series.push({ found, quantity, colour, other })
+        const whole = refined(found, this.#pieces.get(strip.lane_id) ?? [])
+        tables.push(curve(whole))
+        series.push({ coarse: found, found: whole, lane_id: strip.lane_id, quantity, colour, other })
         const stepped = found.extent === 'section'
         options.push({
           label: quantity.title,
@@ -148,9 +165,9 @@ export class Strips {
         axes: [{ ...axis, size: 22, gap: 2 }, { ...axis, size: 48, gap: 3 }],
         series: options,
         padding: [6, 10, 0, 0],
-        hooks: { setCursor: [(one) => this.#cursor(one)] },
+        hooks: { setCursor: [(one) => this.#cursor(one)], setScale: [(one, key) => key === 'x' && this.#refine(one)] },
       },
-      tables.length > 1 ? uPlot.join(tables) : tables[0]!,
+      joined(tables),
       holder,
     )
     this.#drawn.push({ plot, read, series })
@@ -160,6 +177,45 @@ export class Strips {
   #zoomed(low: number, high: number): boolean {
     const [from, to] = this.#lane.station_m
     return low !== null && high - low < (to - from) * 0.98
+  }
+
+  /** Fetch the pieces that are seen now, where they are few, and draw their values in place of bins. */
+  #refine(plot: uPlot): void {
+    const { min, max } = plot.scales['x']!
+    if (min == null || max == null || max - min > REFINED_M) return
+    const shown = [this.#strip, ...this.#others].flatMap((strip) => this.index.lanes.find((one) => one.lane_id === strip?.lane_id) ?? [])
+    for (const lane of shown) {
+      const wanted = (lane.pieces ?? []).filter((one) => one.from_m < max && one.to_m > min && !this.#asked.has(one.url))
+      for (const piece of wanted) void this.#fetchPiece(lane, piece)
+    }
+    this.#tellWaiting()
+  }
+
+  async #fetchPiece({ lane_id }: StripLane, piece: StripPiece): Promise<void> {
+    this.#asked.add(piece.url)
+    try {
+      const { series } = await this.desk.source.json<{ series: StripSeries[] }>(piece.url)
+      this.#pieces.set(lane_id, [...(this.#pieces.get(lane_id) ?? []), { ...piece, series }])
+      for (const chart of this.#drawn) this.#redraw(chart, lane_id)
+      this.#follow(this.desk.station.value)
+    } catch (error) {
+      this.#asked.delete(piece.url)
+      this.desk.complain(error)
+    }
+    this.#tellWaiting()
+  }
+
+  /** How many of the pieces that were asked for are not there yet. */
+  #tellWaiting(): void {
+    const there = [...this.#pieces.values()].reduce((sum, list) => sum + list.length, 0)
+    this.element.dataset['waiting'] = String(this.#asked.size - there)
+  }
+
+  #redraw(chart: Chart, lane_id: number): void {
+    const own = chart.series.filter((one) => one.lane_id === lane_id)
+    for (const one of own) one.found = refined(one.coarse, this.#pieces.get(lane_id) ?? [])
+    if (own.length) chart.plot.setData(joined(chart.series.map((one) => curve(one.found))), false)
+    chart.plot.redraw()
   }
 
   #resize(): void {
@@ -196,7 +252,7 @@ export class Strips {
         const at = station_m !== null ? valueAt(one.found, station_m) : null
         const name = h('span', { class: one.other ? 'read-name dashed' : 'read-name' }, one.other ? `${one.quantity.title}, ${one.other}` : one.quantity.title)
         name.style.setProperty('--line', one.colour)
-        const text = at === null ? '' : at.value === null ? (at.reason ?? 'not measured') : `${format.number(at.value)}${at.sigma === null ? '' : ` ± ${format.number(Number(at.sigma.toPrecision(2)))}`}`
+        const text = at === null ? '' : at.value === null ? (at.reason ?? 'not measured') : `${format.number(at.value)}${at.sigma === null ? '' : ` ± ${format.number(Number(at.sigma.toPrecision(2)))}`}${at.range ? ` (${at.range.map(format.number).join(' to ')} in ${format.metres(at.long_m, 1)})` : ''}`
         return h('span', { class: 'read', title: one.quantity.meaning }, name, text && h('span', { class: 'number' }, ` ${text}`))
       }),
     )
@@ -234,7 +290,8 @@ export class Strips {
   /** The station of the open lane that lies beside a place of the map; null where the lane is far. */
   async stationOf(easting_m: number, northing_m: number): Promise<Station | null> {
     let best: { station: Station; apart: number } | null = null
-    for (const lane of this.index.lanes.filter((one) => one.survey === this.#lane.survey)) {
+    const near = ({ bounds_m: b }: StripLane): boolean => !b || (b[0] - CLOSE_M <= easting_m && easting_m <= b[2] + CLOSE_M && b[1] - CLOSE_M <= northing_m && northing_m <= b[3] + CLOSE_M)
+    for (const lane of this.index.lanes.filter((one) => one.survey === this.#lane.survey && near(one))) {
       const { line } = await this.#load(lane)
       for (let index = 1; index < line.station_m.length; index++) {
         const [ae, an] = [line.easting_m[index - 1]!, line.northing_m[index - 1]!]
@@ -271,33 +328,6 @@ export class Strips {
   }
 }
 
-/** Stations and values of a series; sections are steps, with a gap where none follows. */
-function curve(series: StripSeries): uPlot.AlignedData {
-  const [x, y]: [number[], (number | null)[]] = [[], []]
-  const add = (station: number, value: number | null): void => {
-    if (x.length && station <= x.at(-1)! && value === null && y.at(-1) !== null) {
-      x.push(x.at(-1)! + 1e-6)
-      y.push(null)
-    } else if (x.length && station <= x.at(-1)!) y[y.length - 1] = value
-    else {
-      x.push(station)
-      y.push(value)
-    }
-  }
-  for (let index = 0; index < series.from_m.length; index++) {
-    const [from, to, value] = [series.from_m[index]!, series.to_m[index]!, series.value[index] ?? null]
-    if (to > from && x.length && from > x.at(-1)! + 1e-6) add(x.at(-1)! + 1e-6, null)
-    add(from, value)
-    if (to > from) add(to, value)
-  }
-  return [x, y]
-}
-
-function valueAt(series: StripSeries, station_m: number): { value: number | null; sigma: number | null; reason: string | null } | null {
-  let [best, least] = [-1, series.extent === 'section' ? 1e-9 : 2]
-  for (let index = 0; index < series.from_m.length; index++) {
-    const apart = Math.max(0, series.from_m[index]! - station_m, station_m - series.to_m[index]!)
-    if (apart < least) [best, least] = [index, apart]
-  }
-  return best < 0 ? null : { value: series.value[best] ?? null, sigma: series.sigma[best] ?? null, reason: series.reason[best] ?? null }
+function joined(tables: uPlot.AlignedData[]): uPlot.AlignedData {
+  return tables.length > 1 ? uPlot.join(tables) : tables[0]!
 }

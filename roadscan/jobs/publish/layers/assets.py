@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from typing import Any, Final
 
@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 import shapely
 
 from roadscan.inventory.homes.page_edits import LAYER
+from roadscan.jobs.publish import evidence
 from roadscan.jobs.publish.layer import (
     BLUE,
     GREEN,
@@ -25,6 +26,7 @@ from roadscan.jobs.publish.layer import (
     SiteColumn,
     SiteLayer,
     Style,
+    evidence_of_row,
 )
 from roadscan.jobs.publish.material import Material
 from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
@@ -89,7 +91,14 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
         f"{LAYER}{schema.table}", schema.title, "assets", geometry, order, shapes_m, rows.select(names).to_pylist(),
         [site_column(columns[n], names, is_edited=n in edited) for n in names], styles,
         key="asset_id" if is_inventory else "object",
+        evidence=[_evidence(material, row) for row in rows.to_pylist()],
     )  # fmt: skip
+
+
+def _evidence(material: Material, row: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What shows an asset: pictures, the passes of its first and last return, its place on the strips."""
+    epochs = (row.get("first_epoch_gps_ns"), row.get("last_epoch_gps_ns"))
+    return [*evidence.of_pictures(material, row), *evidence.of_passes(material, epochs), *evidence_of_row(row)]
 
 
 def site_column(column: AssetColumn, names: Sequence[str], *, is_edited: bool) -> SiteColumn:

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from roadscan.jobs.publish import evidence
 from roadscan.jobs.publish.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_columns
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.readings import read_groups
@@ -28,7 +29,7 @@ class Control(LayerKind):
         """One layer; none without surveyed points."""
         held = material.table("control_residuals")
         if held is not None and held.rows.num_rows:
-            yield _layer("control_residuals", held.rows, _ARROWS)
+            yield _layer(material, "control_residuals", held.rows, _ARROWS)
             return
         points = [
             read_groups(material.store, file.path, range(len(file.group_rows)))
@@ -36,14 +37,18 @@ class Control(LayerKind):
             for file in record.tables.get("control_points", ())
         ]
         if points and sum(rows.num_rows for rows in points):
-            yield _layer("control_points", pa.concat_tables(points), None)
+            yield _layer(material, "control_points", pa.concat_tables(points), None)
 
 
-def _layer(table: str, rows: pa.Table, arrows: dict[str, Any] | None) -> SiteLayer:
+def _layer(material: Material, table: str, rows: pa.Table, arrows: dict[str, Any] | None) -> SiteLayer:
     east, north = (rows.column(name).to_numpy() for name in ("easting_m", "northing_m"))
     columns = schema_columns(table, rows.column_names)
     shapes = np.asarray(shapely.points(east, north))
     return SiteLayer(
         "control", "Control and check points", "control", "point", 500, shapes, rows.to_pylist(), columns, [_STYLE],
         key="name", label="name", arrows=arrows,
+        evidence=[
+            list(evidence.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []
+            for row in rows.to_pylist()
+        ],
     )  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.jobs.publish import evidence
 from roadscan.jobs.publish.layer import (
     BLUE,
     GREEN,
@@ -73,6 +74,7 @@ class Passes(LayerKind):
         yield SiteLayer(
             about.name, about.title, about.group, about.geometry, about.order, np.array(shapes, object), rows,
             _COLUMNS, about.styles, about.key,
+            evidence=[list(evidence.of_run(material, row["run"])) for row in rows],
         )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from roadscan.jobs.publish import evidence
 from roadscan.jobs.publish.layer import (
     BLUE,
     GREY,
@@ -67,6 +68,7 @@ class Tiles(LayerKind):
                 SiteColumn("passes", "", "Passes that saw it, separated by spaces."),
             ],
             [Style("State", 1, by="state", values=_STATES)], key="tile", visible=False,
+            evidence=[[evidence.of_pass(material, int(one)) for one in row["passes"].split()] for row in rows],
         )  # fmt: skip
 
 

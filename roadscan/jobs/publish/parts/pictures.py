@@ -1,4 +1,4 @@
-"""Pictures of cameras with their poses."""
+"""Pictures of cameras with their poses, and cut-outs of assets."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.code_reach import code_digest
+from roadscan.jobs.assets.picture_work import CUT_OUTS
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.publish.document import Ask, Document, json_document
 from roadscan.jobs.publish.material import Material, sheet_name
 from roadscan.jobs.publish.part import SitePart
+from roadscan.jobs.publish.parts.vectors import site_layers
 from roadscan.jobs.surfaces.pictures import Pictures as PlacedPictures
 from roadscan.jobs.surfaces.pictures import plan_pictures
 from roadscan.jobs.surfaces.taken_pictures import taken_pictures
 from roadscan.model.errors import DamagedError, RoadscanError
 from roadscan.points.picture_axes import camera_from_map
 from roadscan.points.views import HEIGHT, WIDTH, PictureRule
+from roadscan.tables.manifest import OutputRecord, read_recorded
 from roadscan.tiles.grid import Bounds
 
+CUT_OUTS_FOLDER: Final = "pictures/cut_outs"
 _RULE: Final = PictureRule((), 30.0, 0.0, 1)
 """All cameras with an interior orientation."""
 _SHOWN_AS_THEY_ARE: Final = {".jpg": ".jpg", ".jpeg": ".jpg", ".png": ".png", ".webp": ".webp"}
@@ -58,6 +62,11 @@ class Pictures(SitePart):
             yield json_document(f"pictures/{name}.json", _poses(held, numbers, epochs))
         for number in range(len(held)):
             yield Document(_url(held, number), _key(held, number), _copied(held, number))
+        shown = {one.get("url") for layer in site_layers(material)[0] for row in layer.evidence for one in row}
+        for record in cut_out_records(material).values():
+            url = f"{CUT_OUTS_FOLDER}/{record.unit}.jpg"
+            if url in shown:
+                yield Document(url, record.digest, _stored(material, record))
 
 
 @functools.lru_cache(maxsize=2)
@@ -75,6 +84,29 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
     return held if any(held.path(number).is_file() for number in range(len(held))) else None
 
 
+@functools.lru_cache(maxsize=2)
+def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
+    """Where each picture lies in the site, by run, camera and file."""
+    held = placed_pictures(material)
+    logs = () if held is None else (held.logs[number] for number in held.log.tolist())
+    return {(log.run, log.sensor, held.files[k]): _url(held, k) for k, log in enumerate(logs) if held is not None}
+
+
+@functools.lru_cache(maxsize=2)
+def cut_out_records(material: Material) -> Mapping[str, OutputRecord]:
+    """Records of what was cut out of pictures, by path; none where no pictures are shown."""
+    if placed_pictures(material) is None:
+        return {}
+    return {one.path: one for one in material.session.manifest.of(CUT_OUTS).values() if one.path}
+
+
+def _stored(material: Material, record: OutputRecord) -> Any:
+    def write(path: Path, _ask: Ask) -> None:
+        path.write_bytes(read_recorded(material.store, record))
+
+    return write
+
+
 def _bounds(held: PlacedPictures, numbers: list[int]) -> list[float]:
     own = held.place_m[numbers]
     return [round(float(v), 3) for v in (*own.min(axis=0), *own.max(axis=0))]
@@ -90,7 +122,8 @@ def _cameras(held: PlacedPictures) -> list[dict[str, Any]]:
         values = dict(zip(_LENS, lens.parameters.tolist(), strict=False))
         found.append(
             {
-                "camera": number, "run": log.run, "title": log.sensor, "model": "perspective",
+                "camera": number, "run": log.run, "title": log.sensor,
+                "model": "equirectangular" if lens.is_around else "perspective",
                 "width_px": round(float(lens.parameters[WIDTH])), "height_px": round(float(lens.parameters[HEIGHT])),
                 "focal_px": [values["fx"], values["fy"]], "principal_px": [values["cx"], values["cy"]],
                 "distortion": [values[n] for n in _LENS[4:]],

@@ -1,4 +1,4 @@
-"""Rasters: height, hillshade and intensity in levels, as square pictures in the survey's own map."""
+"""Rasters: height, hillshade, intensity and the pavement in levels, as square pictures in the survey's own map."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from typing import Any, Final
 
 from roadscan.code_reach import code_digest
 from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.products import wanted_products
 from roadscan.jobs.publish.document import Ask, Document, json_bytes
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.publish.part import SitePart
+from roadscan.model.strict import Strict
+from roadscan.products.pavement import IntensityOptions
 from roadscan.products.site_rasters import (
     COARSER,
     HEIGHT_STEP_M,
+    PAVEMENT,
     RASTERS,
     Place,
     Pyramid,
@@ -29,7 +33,7 @@ from roadscan.products.site_rasters import (
 )
 
 _CODE: Final = ("roadscan.products.site_rasters", "roadscan.jobs.products:StoredTiles")
-_PATH: Final = re.compile(r"rasters/(height|hillshade|intensity)/(\d+)/(-?\d+)_(-?\d+)\.png")
+_PATH: Final = re.compile(r"rasters/(\w+)/(\d+)/(-?\d+)_(-?\d+)\.png")
 _ABOUT: Final[dict[Raster, dict[str, Any]]] = {
     "height": {
         "title": "Height", "unit": "m", "encoding": "rgb24", "colours": "viridis", "order": 10, "visible": False,
@@ -39,6 +43,14 @@ _ABOUT: Final[dict[Raster, dict[str, Any]]] = {
     },
     "intensity": {
         "title": "Intensity", "unit": "counts", "encoding": "grey8", "colours": "grey", "order": 30, "visible": False,
+    },
+    "pavement_intensity": {
+        "title": "Pavement: brightness", "unit": "counts", "encoding": "grey8", "colours": "grey", "order": 40,
+        "visible": False,
+    },
+    "pavement_shaded": {
+        "title": "Pavement: slanting light", "unit": "", "encoding": "grey8", "colours": "grey", "order": 50,
+        "visible": False,
     },
 }  # fmt: skip
 
@@ -56,7 +68,7 @@ class Rasters(SitePart):
             return {"raster_grid": None, "rasters": []}
         return {
             "raster_grid": {"tile_px": images.pyramid.tile_px, "levels": [images.about(k) for k in images.levels]},
-            "rasters": [images.told(raster) for raster in RASTERS],
+            "rasters": [images.told(raster) for raster in images.rasters],
         }
 
     def documents(self, material: Material) -> Iterator[Document]:
@@ -65,7 +77,7 @@ class Rasters(SitePart):
         images = images_of(material)
         for level in images.levels:
             for column, row in images.pyramid.places(level).tolist():
-                for raster in RASTERS:
+                for raster in images.rasters:
                     yield images.document(raster, Place(level, column, row))
 
     def listed(self, material: Material) -> Iterator[Document]:
@@ -80,8 +92,8 @@ class Rasters(SitePart):
         if found is None or int(found[2]) >= len(images.levels):
             return None
         place = Place(images.levels[int(found[2])], int(found[3]), int(found[4]))
-        named = next(raster for raster in RASTERS if raster == found[1])
-        return images.document(named, place) if images.pyramid.holds(place) else None
+        named = next((raster for raster in images.rasters if raster == found[1]), None)
+        return images.document(named, place) if named is not None and images.pyramid.holds(place) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +114,17 @@ class Images:
         known = range(len(self.pyramid.factors)) if self.material.tiles else range(0)
         always = self.pyramid.stored_levels - 1 if self.material.tiles else 0  # coarser ones are made from it
         return tuple(k for k in known if k >= always or self.pyramid.pixel_m(k) >= finest - 1e-12)
+
+    @cached_property
+    def settings(self) -> Mapping[Raster, Strict]:
+        """Settings of the products of the pavement that the survey makes."""
+        made = {product.name: options for product, options in wanted_products(self.material.session.survey)}
+        return {raster: made[raster] for raster in PAVEMENT if raster in made}
+
+    @property
+    def rasters(self) -> tuple[Raster, ...]:
+        """All rasters of the survey."""
+        return (*RASTERS, *self.settings)
 
     @cached_property
     def scales(self) -> Scales:
@@ -127,12 +150,15 @@ class Images:
         """A raster as the page reads it."""
         held = self.material.summaries.values()
         ends = min(s.height_min_m for s in held), max(s.height_max_m for s in held)
-        scale = {
+        scale: dict[Raster, tuple[float, float, float, float]] = {
             "height": (self.scales.height_offset_m, HEIGHT_STEP_M, *ends),
-            "hillshade": (0, 1, 1, 255),
             "intensity": (0.0, self.scales.intensity_step, 0.0, 255 * self.scales.intensity_step),
-        }[raster]
-        named = dict(zip(("offset", "step", "from", "to"), scale, strict=True))
+        }
+        settings = self.settings.get(raster)
+        if isinstance(settings, IntensityOptions):  # grey 1 is black, 255 white
+            step = (settings.white - settings.black) / 254
+            scale[raster] = settings.black - step, step, settings.black, settings.white
+        named = dict(zip(("offset", "step", "from", "to"), scale.get(raster, (0, 1, 1, 255)), strict=True))
         return {"name": raster, **_ABOUT[raster], **named, "url": f"rasters/{raster}/{{level}}/{{column}}_{{row}}.png"}
 
     def list_of(self, number: int, level: int) -> Document:
@@ -159,7 +185,8 @@ class Images:
     def _write(self, path: Path, ask: Ask, raster: Raster, place: Place) -> None:
         if place.level < self.pyramid.stored_levels:
             window = self._windows.window(place)
-            write_picture(path, raster, window, self.pyramid.pixel_m(place.level), self.scales)
+            pixel_m, settings = self.pyramid.pixel_m(place.level), self.settings.get(raster)
+            write_picture(path, raster, window, pixel_m, self.scales, settings)
             return
 
         def below(finer: Place) -> Path | None:
@@ -177,7 +204,9 @@ class Images:
             west, south = COARSER * place.column, COARSER * place.row
             below = [Place(place.level - 1, west + c, south + r) for r in steps for c in steps]
             parts = [self._held_key(raster, one) for one in below if self.pyramid.holds(one)]
-        return key_of(code_digest(*_CODE), raster, place, parts, self.scales, self.pyramid.pixel_m(place.level))
+        settings = self.settings.get(raster)
+        stated = None if settings is None else settings.model_dump(mode="json")
+        return key_of(code_digest(*_CODE), raster, place, parts, self.scales, self.pyramid.pixel_m(place.level), stated)
 
     @functools.lru_cache(maxsize=200_000)  # noqa: B019  as above
     def _held_key(self, raster: Raster, place: Place) -> str:

@@ -1,4 +1,4 @@
-"""Strips: values along each lane by station, and its cross-sections."""
+"""Strips: values along each lane by station, coarse and in pieces where it is long, and its cross-sections."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import shapely
 from roadscan.code_reach import code_digest
 from roadscan.condition.index import condition_indices
 from roadscan.jobs.engine.fingerprint import key_of
-from roadscan.jobs.publish.document import Ask, Document, json_bytes, json_document
+from roadscan.jobs.publish.document import Ask, Document, json_bytes
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.publish.part import SitePart
 from roadscan.tables.manifest import OutputRecord
@@ -27,6 +27,15 @@ _TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
 _DIGITS: Final = {"sigma": 4, "share": 4}
 """Significant digits that are told of what qualifies a value; values are told whole."""
 _CODE: Final = "roadscan.jobs.publish.parts.strips"
+
+_WHOLE_M: Final = 300.0
+"""The file of a lane that is no longer holds all values."""
+_BINS: Final = 300
+"""The file of a longer lane has so many bins in place of values, where these are more than twice as many."""
+_BEYOND_M: Final = 1.0
+"""The last piece reaches so far beyond the lane's end, where a section may end."""
+_PARTS: Final = 4
+"""Values of a longer lane lie in so many pieces for each file of the table, which holds about a kilometre."""
 
 Float64 = npt.NDArray[np.float64]
 
@@ -57,6 +66,37 @@ class Lane:
         """Id of its survey."""
         return self.material.context.survey_id
 
+    @property
+    def is_long(self) -> bool:
+        """True where its file holds bins, and pieces of it the values."""
+        return float(self.station_m[-1] - self.station_m[0]) > _WHOLE_M
+
+    @functools.cached_property
+    def groups(self) -> dict[str, tuple[OutputRecord, ...]]:
+        """Records of its values by the name that files of one stretch share, in the order of the stretches."""
+        found: dict[str, tuple[OutputRecord, ...]] = {}
+        for record in sorted(self.values, key=lambda r: r.path.rsplit("/", 1)[-1]):
+            name = record.path.rsplit("/", 1)[-1].removesuffix(".parquet")
+            found[name] = (*found.get(name, ()), record)
+        return found
+
+    @functools.cached_property
+    def pieces(self) -> list[dict[str, Any]]:
+        """Where its values lie, piece by piece; none where its own file holds them."""
+        if not self.is_long:
+            return []
+        begins = {name: min(_first_station(self, one) for one in own) for name, own in self.groups.items()}
+        begins = {name: begin for name, begin in begins.items() if np.isfinite(begin)}
+        ends = [*list(begins.values())[1:], float(self.station_m[-1]) + _BEYOND_M]
+        cut = {
+            name: np.linspace(begins[name], end, _PARTS + 1).tolist() for name, end in zip(begins, ends, strict=True)
+        }
+        return [
+            {"from_m": edges[part], "to_m": edges[part + 1], "url": _piece_url(self, name, part)}
+            for name, edges in cut.items()
+            for part in range(_PARTS)
+        ]
+
     def key(self, records: Sequence[OutputRecord]) -> str:
         """Hash of some of its files, and of the lane."""
         return self.material.key(records, self.survey, self.number, self.row, self.middle_m.tolist())
@@ -81,14 +121,17 @@ class Strips(SitePart):
         return {"strips": {"url": "strips/index.json", "lanes": len(lanes)} if lanes else None}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The index, a file a lane, and its cross-sections by the files of the table."""
+        """The index, a file a lane, pieces of a long one, and its cross-sections by the files of the table."""
         lanes = lanes_of(material)
         if not lanes:
             return
-        told = [_about(lane) for lane in lanes]
-        yield json_document("strips/index.json", {"lanes": told, **_quantities()})
+        own = key_of([lane.key([*lane.values, *lane.cross_sections]) for lane in lanes], _quantities())
+        yield _later("strips/index.json", own, lambda: {"lanes": [_about(lane) for lane in lanes], **_quantities()})
         for lane in lanes:
             yield _later(lane.url, lane.key(lane.values), _strip(lane))
+            for name in lane.groups if lane.is_long else ():
+                for part in range(_PARTS):
+                    yield _later(_piece_url(lane, name, part), lane.key(lane.values), _piece(lane, name, part))
             for place, record in enumerate(lane.cross_sections):
                 yield _later(_crossing_url(lane, place), lane.key([record]), _crossings(lane, record))
 
@@ -140,11 +183,23 @@ def _about(lane: Lane) -> dict[str, Any]:
         if stations.size:
             ends = {"from_m": float(stations.min()), "to_m": float(stations.max())}
             spans.append({**ends, "url": _crossing_url(lane, place)})
+    low, high = lane.middle_m.min(axis=0), lane.middle_m.max(axis=0)
     return {
         "lane_id": lane.number, "survey": lane.survey, "road": lane.row["road"], "name": None,
-        "lane": lane.row["lane"], "direction": lane.row["direction"],
-        "station_m": [float(lane.station_m[0]), float(lane.station_m[-1])], "url": lane.url, "cross_sections": spans,
+        "lane": lane.row["lane"], "direction": lane.row["direction"], "bounds_m": np.round([*low, *high], 2),
+        "station_m": [float(lane.station_m[0]), float(lane.station_m[-1])], "url": lane.url, "pieces": lane.pieces,
+        "cross_sections": spans,
     }  # fmt: skip
+
+
+def _first_station(lane: Lane, record: OutputRecord) -> float:
+    """Least station of a file of values; infinite where it holds none."""
+    begins = lane.material.store.read_table(record.path, ["station_from_m"]).column("station_from_m").to_numpy()
+    return float(begins.min(initial=np.inf))
+
+
+def _piece_url(lane: Lane, name: str, part: int) -> str:
+    return f"strips/{lane.number}/{name}_{part}.json"
 
 
 def _crossing_url(lane: Lane, place: int) -> str:
@@ -165,6 +220,8 @@ def _strip(lane: Lane) -> Any:
     def make() -> dict[str, Any]:
         held = lane.material.rows_of(lane.values)
         series = [] if held is None else list(_series(held.rows))
+        if lane.is_long:
+            series = [_binned(one, lane.station_m) if len(one["value"]) > 2 * _BINS else one for one in series]
         east, north = (np.round(lane.middle_m[:, k], 4) for k in (0, 1))
         line = {"station_m": lane.station_m, "easting_m": east, "northing_m": north}
         return {
@@ -184,6 +241,43 @@ def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
         own = ordered.filter(both)
         columns = {told: own.column(name).to_pylist() for name, told in zip(_SERIES, _TOLD, strict=True)}
         yield {**kind, **columns, **{told: [_short(v, n) for v in columns[told]] for told, n in _DIGITS.items()}}
+
+
+def _binned(series: Mapping[str, Any], station_m: Float64) -> dict[str, Any]:
+    """A series with bins of one width along a lane: mean and range of the values whose middle lies in each."""
+    edges = np.linspace(float(station_m[0]), float(station_m[-1]), _BINS + 1)
+    value = np.array(series["value"], np.float64)
+    known = np.flatnonzero(np.isfinite(value))
+    middle = (np.array(series["from_m"], np.float64) + np.array(series["to_m"], np.float64)) / 2
+    bins = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, _BINS - 1)
+    count = np.bincount(bins[known], minlength=_BINS)
+    low, high = np.full(_BINS, np.inf), np.full(_BINS, -np.inf)
+    np.minimum.at(low, bins[known], value[known])
+    np.maximum.at(high, bins[known], value[known])
+    mean = np.bincount(bins[known], value[known], _BINS) / np.maximum(count, 1)
+    reasons = dict(zip(bins[::-1].tolist(), series["reason"][::-1], strict=True))
+    told = {name: [_short(v, 6) if n else None for v, n in zip(of, count, strict=True)] for name, of in
+            (("value", mean), ("low", low), ("high", high))}  # fmt: skip
+    none: list[None] = [None] * _BINS
+    return {
+        "quantity": series["quantity"], "extent": series["extent"], "from_m": np.round(edges[:-1], 3),
+        "to_m": np.round(edges[1:], 3), **told, "sigma": none, "share": none,
+        "reason": [None if n else reasons.get(k) for k, n in enumerate(count.tolist())],
+    }  # fmt: skip
+
+
+def _piece(lane: Lane, name: str, part: int) -> Any:
+    def make() -> dict[str, Any]:
+        empty = {"from_m": np.inf, "to_m": np.inf}
+        own = next((one for one in lane.pieces if one["url"] == _piece_url(lane, name, part)), empty)
+        held = lane.material.rows_of(lane.groups[name])
+        if held is None:
+            return {"lane_id": lane.number, "from_m": own["from_m"], "to_m": own["to_m"], "series": []}
+        begin = held.rows.column("station_from_m")
+        rows = held.rows.filter(pc.and_(pc.greater_equal(begin, own["from_m"]), pc.less(begin, own["to_m"])))
+        return {"lane_id": lane.number, "from_m": own["from_m"], "to_m": own["to_m"], "series": list(_series(rows))}
+
+    return make
 
 
 def _short(value: float | None, digits: int) -> float | None:

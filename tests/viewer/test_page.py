@@ -318,6 +318,11 @@ _UNREACHED = """(place) => {
   for (const one of root.querySelectorAll('button, select, input, a[href], summary, [tabindex="0"], [role="tab"]')) {
     if (!one.checkVisibility({ visibilityProperty: true, opacityProperty: true })) continue
     one.scrollIntoView({ block: 'center', inline: 'center' })
+    for (let above = one; above; above = above.parentElement) {
+      const { overflowX, overflowY } = getComputedStyle(above) // what is hidden there, people cannot scroll to
+      if (overflowY === 'hidden') above.scrollTop = 0
+      if (overflowX === 'hidden') above.scrollLeft = 0
+    }
     const box = one.getBoundingClientRect()
     if (!box.width || !box.height) continue
     const large = box.width > wide * 0.5 && box.height > high * 0.2
@@ -356,7 +361,7 @@ def test_at_200_percent_nothing_is_cut_off_or_out_of_reach(
             found[view] = page.evaluate(_UNREACHED, "body")
             assert page.evaluate("document.documentElement.scrollWidth") <= width
         for sheet, side in (("Layers (L)", ".side.left"), ("Details", ".side.right")):
-            page.locator(f'[aria-label="{sheet}"]').click()
+            page.locator(f'button[aria-label="{sheet}"]').click()
             page.locator(side).wait_for()
             found[sheet] = page.evaluate(_UNREACHED, side)
             page.locator(f"{side} .sheet-close").click()

@@ -100,7 +100,7 @@ def test_a_long_lane_is_fetched_in_full_where_people_look(open_page: Any, long_a
         go_to(page, "lane=0&station=1234.5")
         read = page.locator(".reads .number")
         read.wait_for()
-        assert " to 26." in read.inner_text() and "in 10.0" in read.inner_text()
+        assert f" to {value_at(1234.5):.4f}" in read.inner_text() and "in 10.0" in read.inner_text()
         # Zoom in by dragging over some 240 m around the cursor.
         plot = page.locator(".strips .u-over").bounding_box()
         middle = plot["x"] + plot["width"] * 1234.5 / LONG_M

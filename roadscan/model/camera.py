@@ -51,10 +51,9 @@ class Interior(Strict):
         """What follows from the size of a picture that holds the whole sphere."""
         if not isinstance(values, dict) or values.get("model") != "equirectangular":
             return values
-        size = values.get("width_px"), values.get("height_px")
-        if not all(isinstance(one, int) for one in size):
+        width, height = values.get("width_px"), values.get("height_px")
+        if not isinstance(width, int) or not isinstance(height, int):
             return values
-        width, height = size
         sphere = {
             "focal_px": (width / (2.0 * math.pi), height / math.pi),
             "principal_px": ((width - 1) / 2.0, (height - 1) / 2.0),

@@ -236,9 +236,9 @@ def write_picture(
         grey = shade(window.height_m, pixel_m, light)
         _write_grey(path, grey, grey > 0)
     elif raster == "pavement_intensity" and isinstance(settings, IntensityOptions):
-        inner = window.intensity[1:-1, 1:-1].astype(np.float64)
-        known = ~np.isnan(inner)
-        steps = (np.where(known, inner, 0.0) - settings.black) * (254.0 / (settings.white - settings.black))
+        counts = window.intensity[1:-1, 1:-1].astype(np.float64)
+        known = ~np.isnan(counts)
+        steps = (np.where(known, counts, 0.0) - settings.black) * (254.0 / (settings.white - settings.black))
         _write_grey(path, np.floor(np.clip(steps, 0.0, 254.0) + 1.5).astype(np.uint8), known)
     elif raster == "intensity":
         inner = window.intensity[1:-1, 1:-1]

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from roadscan.jobs.publish.material import Material
-from roadscan.jobs.publish.parts.pictures import CUT_OUTS_FOLDER, cut_out_records, picture_urls
+from roadscan.jobs.publish.site_pictures import cut_out_records, cut_out_url, picture_urls
 from roadscan.model.errors import RoadscanError
 
 Told = dict[str, Any]
@@ -18,7 +18,7 @@ def of_pictures(material: Material, row: Mapping[str, Any]) -> Iterator[Told]:
     """Cut-out of an asset, and the pictures that its column `pictures` names, best first."""
     cut = cut_out_records(material).get(str(row.get("cut_out") or ""))
     if cut is not None:
-        yield {"title": "cut-out", "kind": "cut_out", "url": f"{CUT_OUTS_FOLDER}/{cut.unit}.jpg"}
+        yield {"title": "cut-out", "kind": "cut_out", "url": cut_out_url(cut)}
     urls = picture_urls(material)
     for one in _pictures_named(row.get("pictures")):
         names = str(one.get("run")), str(one.get("camera")), str(one.get("file"))

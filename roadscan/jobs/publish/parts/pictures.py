@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -10,25 +9,25 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.code_reach import code_digest
-from roadscan.jobs.assets.picture_work import CUT_OUTS
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.publish.document import Ask, Document, json_document
 from roadscan.jobs.publish.material import Material, sheet_name
 from roadscan.jobs.publish.part import SitePart
 from roadscan.jobs.publish.parts.vectors import site_layers
+from roadscan.jobs.publish.site_pictures import (
+    SHOWN_AS_THEY_ARE,
+    cut_out_records,
+    cut_out_url,
+    picture_url,
+    placed_pictures,
+)
 from roadscan.jobs.surfaces.pictures import Pictures as PlacedPictures
-from roadscan.jobs.surfaces.pictures import plan_pictures
 from roadscan.jobs.surfaces.taken_pictures import taken_pictures
-from roadscan.model.errors import DamagedError, RoadscanError
+from roadscan.model.errors import DamagedError
 from roadscan.points.picture_axes import camera_from_map
-from roadscan.points.views import HEIGHT, WIDTH, PictureRule
+from roadscan.points.views import HEIGHT, WIDTH
 from roadscan.tables.manifest import OutputRecord, read_recorded
-from roadscan.tiles.grid import Bounds
 
-CUT_OUTS_FOLDER: Final = "pictures/cut_outs"
-_RULE: Final = PictureRule((), 30.0, 0.0, 1)
-"""All cameras with an interior orientation."""
-_SHOWN_AS_THEY_ARE: Final = {".jpg": ".jpg", ".jpeg": ".jpg", ".png": ".png", ".webp": ".webp"}
 _LENS: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _CODE: Final = "roadscan.jobs.publish.parts.pictures"
 
@@ -61,43 +60,11 @@ class Pictures(SitePart):
         for name, numbers in sorted(sheets.items()):
             yield json_document(f"pictures/{name}.json", _poses(held, numbers, epochs))
         for number in range(len(held)):
-            yield Document(_url(held, number), _key(held, number), _copied(held, number))
+            yield Document(picture_url(held, number), _key(held, number), _copied(held, number))
         shown = {one.get("url") for layer in site_layers(material)[0] for row in layer.evidence for one in row}
         for record in cut_out_records(material).values():
-            url = f"{CUT_OUTS_FOLDER}/{record.unit}.jpg"
-            if url in shown:
-                yield Document(url, record.digest, _stored(material, record))
-
-
-@functools.lru_cache(maxsize=2)
-def placed_pictures(material: Material) -> PlacedPictures | None:
-    """Pictures with poses; None where the survey has none, or none is wished for."""
-    if not material.wishes.pictures:
-        return None
-    try:
-        held = plan_pictures(material.plan, _RULE)
-    except RoadscanError:
-        return None  # no camera, no interior orientation, no picture with a pose: the page goes without
-    near = material.wishes.near
-    if near is not None:
-        held = held.near(Bounds(*near))
-    return held if any(held.path(number).is_file() for number in range(len(held))) else None
-
-
-@functools.lru_cache(maxsize=2)
-def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
-    """Where each picture lies in the site, by run, camera and file."""
-    held = placed_pictures(material)
-    logs = () if held is None else (held.logs[number] for number in held.log.tolist())
-    return {(log.run, log.sensor, held.files[k]): _url(held, k) for k, log in enumerate(logs) if held is not None}
-
-
-@functools.lru_cache(maxsize=2)
-def cut_out_records(material: Material) -> Mapping[str, OutputRecord]:
-    """Records of what was cut out of pictures, by path; none where no pictures are shown."""
-    if placed_pictures(material) is None:
-        return {}
-    return {one.path: one for one in material.session.manifest.of(CUT_OUTS).values() if one.path}
+            if cut_out_url(record) in shown:
+                yield Document(cut_out_url(record), record.digest, _stored(material, record))
 
 
 def _stored(material: Material, record: OutputRecord) -> Any:
@@ -143,7 +110,7 @@ def _poses(held: PlacedPictures, numbers: list[int], epochs: list[str]) -> dict[
             )
     return {
         "pictures": len(numbers), "id": numbers, "camera": [int(held.log[k]) for k in numbers],
-        "url": [_url(held, k) for k in numbers], "name": [held.name(k) for k in numbers],
+        "url": [picture_url(held, k) for k in numbers], "name": [held.name(k) for k in numbers],
         "epoch_gps_ns": [epochs[k] for k in numbers],
         "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
         "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9), "sigma_m": [None] * len(numbers),
@@ -159,11 +126,6 @@ def _epochs(material: Material, held: PlacedPictures) -> list[str]:
     return [str(known[held.logs[log].key, file]) for log, file in zip(held.log.tolist(), held.files, strict=True)]
 
 
-def _url(held: PlacedPictures, number: int) -> str:
-    suffix = _SHOWN_AS_THEY_ARE.get(held.path(number).suffix.lower(), ".jpg")
-    return f"pictures/{int(held.log[number])}/{number:06d}{suffix}"
-
-
 def _key(held: PlacedPictures, number: int) -> str:
     return key_of(code_digest(_CODE), held.logs[int(held.log[number])].key, held.files[number])
 
@@ -172,7 +134,7 @@ def _copied(held: PlacedPictures, number: int) -> Any:
     def write(path: Path, _ask: Ask) -> None:
         source = held.path(number)
         try:
-            if source.suffix.lower() in _SHOWN_AS_THEY_ARE:
+            if source.suffix.lower() in SHOWN_AS_THEY_ARE:
                 path.write_bytes(source.read_bytes())
                 return
             from PIL import Image

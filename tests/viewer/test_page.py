@@ -311,6 +311,30 @@ def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     assert page.locator("dialog.help").is_visible()
 
 
+def test_the_keyboard_measures_on_the_map_and_zooms_the_strips(watched: Any, address: str) -> None:
+    page = watched.open(f"{address}#at={EAST_M + 10},{NORTH_M}&zoom=8&views=map,strips")
+    page.wait_for_selector(STILL)
+    page.locator('.map-view ~ .toolbar [aria-label="Distance"]').click()
+    page.locator(".map-target").focus()
+    page.keyboard.press("Enter")
+    for east, north in ((13.0, 0.0), (13.0, 4.0)):
+        go_to(page, f"at={EAST_M + east},{NORTH_M + north}&zoom=8")
+        page.wait_for_selector(STILL)
+        page.locator(".map-target").focus()
+        page.keyboard.press("Enter")
+    page.keyboard.press("Enter")
+    page.locator(".figure").first.wait_for()
+    assert _figure(page, "Length") == pytest.approx(7.0, abs=1e-3)
+    page.locator(".charts").focus()
+    page.keyboard.press("End")
+    page.keyboard.press("+")
+    page.keyboard.press("ArrowLeft")
+    page.locator(".strips-head", has_text="Station 39.00 m").wait_for()
+    # The last 20 m are seen, so the cursor stands at 19 of 20.
+    plot, cursor = (page.locator(f".strips .{one}").first.bounding_box() for one in ("u-over", "u-cursor-x"))
+    assert (cursor["x"] - plot["x"]) / plot["width"] == pytest.approx(0.95, abs=0.01)
+
+
 _UNREACHED = """(place) => {
   const root = document.querySelector(place)
   const wide = document.documentElement.clientWidth, high = document.documentElement.clientHeight

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
+import roadscan as rs
 from roadscan.jobs.publish.live import LiveSite, open_survey
 from roadscan.jobs.publish.server import SiteServer
 from roadscan.simulate import simulate, truth
@@ -113,3 +114,11 @@ def test_place_and_pixel_of_a_panorama_find_one_another(driven: Driven, open_pag
         again = _read(page)
         assert np.hypot(*(driven.pixel(again, found[0]) - mark)) <= 2.0
         assert np.linalg.norm(again - target) <= 0.05
+
+
+def test_pictures_of_a_place_are_named_with_its_pixel(driven: Driven) -> None:
+    target = driven.target(1)
+    found = rs.open_survey(driven.folder / "SURVEY.toml").pictures_of(*target)
+    assert len(found) == len(list((driven.folder / "raw/run-1/camera").glob("*.jpg")))
+    for row in found.itertuples():
+        assert np.hypot(*(driven.pixel(target, row.file.name) - [row.u_px, row.v_px])) < 0.01

@@ -148,8 +148,7 @@ export class CloudView {
   }
 
   #key(event: KeyboardEvent): void {
-    if (event.key === 'Enter' && this.#draft.length > 1) this.finish()
-    else if (event.key === 'Enter') this.#click(this.#size.width / 2, this.#size.height / 2)
+    if (event.key === 'Enter') this.#enter()
     else if (event.key === 't' || event.key === 'T') this.topView()
     else if (event.key === '0') this.fit()
     else return
@@ -421,6 +420,14 @@ export class CloudView {
     this.#draft.push(picked.coordinate)
     if (tool !== 'distance' && tool !== 'profile' && this.#draft.length === 2) this.finish()
     this.#redraw()
+  }
+
+  /** Take the point in the middle; one that was taken last ends the line. */
+  #enter(): void {
+    const [x, y] = [this.#size.width / 2, this.#size.height / 2]
+    const last = this.#draft.at(-1)
+    if (last && this.#draft.length > 1 && this.pickAt(x, y)?.coordinate.every((value, axis) => value === last[axis])) this.finish()
+    else this.#click(x, y)
   }
 
   /** End the line that is being measured. */

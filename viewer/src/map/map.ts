@@ -157,7 +157,8 @@ export class MapView {
     target.addEventListener('keydown', (event) => {
       if (event.key === 'Enter') {
         const centre = map.getView().getCenter()!
-        void this.#click(map.getPixelFromCoordinate(centre), centre)
+        if (this.measuring.busy) this.measuring.corner(centre)
+        else void this.#click(map.getPixelFromCoordinate(centre), centre)
       } else if (event.key === '0') this.fit()
       else return
       event.preventDefault()

@@ -24,6 +24,8 @@ export class Measuring {
   readonly source = new VectorSource()
   readonly layer: VectorLayer<VectorSource>
   #draw: Draw | null = null
+  /** The last corner that came from the keyboard. */
+  #corner: readonly number[] | null = null
 
   constructor(
     private readonly map: OlMap,
@@ -38,6 +40,7 @@ export class Measuring {
   use(tool: MapTool): void {
     if (this.#draw) this.map.removeInteraction(this.#draw)
     this.#draw = null
+    this.#corner = null
     this.doing(null)
     if (tool === 'select') return
     const draw = new Draw({
@@ -57,11 +60,20 @@ export class Measuring {
     this.#draw = draw
   }
 
+  /** Take a corner from the keyboard; a second one at the same place ends what is drawn. */
+  corner(place: readonly number[]): void {
+    const again = this.#corner?.every((value, axis) => value === place[axis])
+    this.#corner = again ? null : place
+    if (again) this.#draw?.finishDrawing()
+    else this.#draw?.appendCoordinates([[...place]])
+  }
+
   get busy(): boolean {
     return this.#draw !== null
   }
 
   abort(): void {
+    this.#corner = null
     this.#draw?.abortDrawing()
     this.doing(null)
   }

@@ -7,11 +7,11 @@ const KEYS: [string, string][] = [
   ['/', 'Go to a place, a row or a station'],
   ['L', 'Layers (on small screens)'],
   ['Tab', 'From part to part; the map and the cloud take keys when they have the focus'],
-  ['Arrows', 'Move the map or the cloud; in the strips, step along the road'],
+  ['Arrows', 'Move the map or the cloud; in the strips, step along the road, with Shift by ten metres'],
   ['+  −  0', 'Nearer, farther, all of it'],
   ['Shift + arrows', 'Turn the cloud'],
   ['T', 'Look straight down on the cloud'],
-  ['Enter', 'Choose what lies in the middle of the map or the cloud; end a line that is measured'],
+  ['Enter', 'Choose what lies in the middle of the map or the cloud; while measuring, take it as a corner, and twice to end'],
   ['Esc', 'Give up a measurement; forget what is chosen'],
 ]
 

@@ -31,7 +31,7 @@ interface Chart {
 
 export class Strips {
   readonly element = h('div', { class: 'strips' })
-  readonly #charts = h('div', { class: 'charts', tabindex: 0, role: 'application', 'aria-label': 'Strips by station. Left and right step by a metre, with Shift by ten.' })
+  readonly #charts = h('div', { class: 'charts', tabindex: 0, role: 'application', 'aria-label': 'Strips by station. Left and right step by a metre, with Shift by ten; plus and minus zoom, zero shows all.' })
   readonly #told = h('span', { class: 'number', 'aria-live': 'polite' })
   readonly #strips = new Map<number, Promise<Strip>>()
   /** Pieces that were asked for, by path, and those of each lane that are there. */
@@ -264,11 +264,23 @@ export class Strips {
     const now = this.desk.station.value?.lane_id === this.#lane.lane_id ? this.desk.station.value.station_m : from
     const next = { ArrowLeft: now - step, ArrowRight: now + step, Home: from, End: to }[event.key]
     if (next === undefined) {
-      if (event.key !== 'Enter') return
-      void this.#cross()
+      if (event.key === 'Enter') void this.#cross()
+      else if (event.key === '+' || event.key === '=') this.#zoom(0.5, now)
+      else if (event.key === '-') this.#zoom(2, now)
+      else if (event.key === '0') this.#zoom(Infinity, now)
+      else return
     } else this.desk.station.value = { lane_id: this.#lane.lane_id, station_m: Math.max(from, Math.min(to, next)) }
     event.preventDefault()
     event.stopPropagation()
+  }
+
+  /** Show so many times the length of road, around a station. */
+  #zoom(factor: number, station_m: number): void {
+    const [from, to] = this.#lane.station_m
+    const { min, max } = this.#drawn[0]?.plot.scales['x'] ?? {}
+    const long = Math.min(((max ?? to) - (min ?? from)) * factor, to - from)
+    const low = Math.max(from, Math.min(station_m - long / 2, to - long))
+    for (const { plot } of this.#drawn) plot.setScale('x', { min: low, max: low + long })
   }
 
   // ---- stations and places ----

@@ -19,6 +19,10 @@ from scipy.spatial.transform import Rotation
 import roadscan
 from roadscan.jobs.assets.picture_work import CUT_OUTS, SEEN
 from roadscan.jobs.engine.compute import Inline
+from roadscan.jobs.publish.evidence import of_pictures as evidence_of_pictures
+from roadscan.jobs.publish.material import Material as SiteMaterial
+from roadscan.jobs.publish.parts.pictures import Pictures
+from roadscan.jobs.publish.parts.vectors import site_layers
 from roadscan.jobs.report.blocks import Picture
 from roadscan.jobs.report.section import Material
 from roadscan.jobs.report.sections.assets import Assets as AssetsSection
@@ -219,6 +223,30 @@ def test_thumbnails_of_the_report_are_the_cut_outs(street: Simulated) -> None:
     for one in pictures:
         drawn = cv2.imdecode(np.frombuffer(one.content, np.uint8), cv2.IMREAD_COLOR)
         assert drawn.shape[0] == 220 and drawn.std() > 5.0
+
+
+def test_a_site_leads_from_a_sign_to_its_pictures_its_cut_out_and_its_pass(street: Simulated, tmp_path: Path) -> None:
+    of = session(street)
+    site = SiteMaterial(of)
+    documents = {one.path: one for one in Pictures().documents(site)}
+    layer = next(one for one in site_layers(site)[0] if one.name == "asset_road_signs")
+    shown = 0
+    for row, evidence in zip(layer.rows, layer.evidence, strict=True):
+        own = [one for one in evidence if one["kind"] in ("picture", "cut_out")]
+        named = [street.survey_file.parent / "raw/run-1/camera" / Path(one["file"]).name
+                 for one in json.loads(row["pictures"] or "[]")]  # fmt: skip
+        cut = [Path(of.store.path(row["cut_out"]))] if row["cut_out"] else []
+        assert len(own) == len(cut) + len(named)
+        for one, file in zip(own, [*cut, *named], strict=True):
+            documents[one["url"]].write(tmp_path / "one.jpg", Path)
+            assert (tmp_path / "one.jpg").read_bytes() == file.read_bytes()
+        assert {"kind": "row", "layer": "passes", "row": "1", "title": "pass 1 of run-1"} in evidence
+        shown += bool(cut and named)
+    assert shown >= 5
+    for text in ("{", "[1]", '{"run": 1}', None, 7):
+        assert list(evidence_of_pictures(site, {"pictures": text})) == []
+    (unknown,) = evidence_of_pictures(site, {"pictures": '[{"run": "<b>", "camera": "c", "file": "../x"}]'})
+    assert unknown == {"title": "picture <b> c ../x", "kind": "picture"}
 
 
 @pytest.mark.parametrize(

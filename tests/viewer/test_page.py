@@ -171,6 +171,8 @@ def test_evidence_leads_to_what_it_names(watched: Any, address: str) -> None:
     page.locator(".details h2", has_text="<script>").wait_for()
     page.locator('.details button:has-text("Pictures of it")').click()
     page.locator(".picture-list button").nth(1).wait_for()
+    page.wait_for_selector('.picture-frame[data-state="shown"]')
+    assert serious(page) == []
     assert page.evaluate("window.hit") is None
 
 

@@ -13,6 +13,8 @@ import { Panorama } from './panorama'
 const OFFERED = 24
 const CHECKED = 8
 const RAY_POINTS = 2_000_000
+/** Decoded pictures that are kept; one of 360° may take half of this. */
+const KEPT_BYTES = 256e6
 /** Least half angle (radian) within which points count as met by a ray: about two pixels of a common camera. */
 const CONE = 1.5e-3
 
@@ -35,7 +37,8 @@ export class PictureView {
   /** Counts what people ask for; an answer to what was asked before changes nothing. */
   #turn = 0
   #drag: { x: number; y: number; moved: boolean } | null = null
-  readonly #urls = new Map<string, Promise<ImageBitmap>>()
+  /** Pictures by their URL, those asked for longest ago first; a size of 0 while one is loading. */
+  readonly #held = new Map<string, { loading: Promise<ImageBitmap>; bytes: number }>()
 
   constructor(
     readonly desk: Desk,
@@ -225,15 +228,31 @@ export class PictureView {
   }
 
   #load(url: string): Promise<ImageBitmap> {
-    let loading = this.#urls.get(url)
-    if (!loading) {
-      const type = url.endsWith('.png') ? 'image/png' : 'image/jpeg'
-      loading = this.desk.source.blob(url, type).then((blob) => createImageBitmap(blob))
-      loading.catch(() => this.#urls.delete(url))
-      this.#urls.set(url, loading)
-      if (this.#urls.size > 12) this.#urls.delete(this.#urls.keys().next().value!)
-    }
+    const known = this.#held.get(url)
+    if (known) return known.loading
+    const type = url.endsWith('.png') ? 'image/png' : 'image/jpeg'
+    const loading = this.desk.source.blob(url, type).then((blob) => createImageBitmap(blob))
+    const one = { loading, bytes: 0 }
+    this.#held.set(url, one)
+    loading.then(
+      (bitmap) => {
+        one.bytes = bitmap.width * bitmap.height * 4
+        this.#forget(url)
+      },
+      () => this.#held.delete(url),
+    )
     return loading
+  }
+
+  /** Let go of the pictures that came first, where all that are held take too much memory beside the newest. */
+  #forget(newest: string): void {
+    let sum = [...this.#held.values()].reduce((all, one) => all + one.bytes, 0)
+    for (const [url, one] of this.#held) {
+      if (sum <= KEPT_BYTES) return
+      if (url === newest || !one.bytes) continue
+      sum -= one.bytes
+      this.#held.delete(url)
+    }
   }
 
   #drawList(): void {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from typing import Any, Final
+from urllib.parse import quote
 
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.publish.layer import SiteLayer, Style
@@ -63,7 +64,7 @@ def _worst(site: Site, layer: SiteLayer) -> Iterator[Picture]:
         caption = f"{layer.title} {named}: {style.title} {_value(row, style):.4g}"
         shape = layer.shapes_m[number]
         picture = thumbnail(site, _around(shape.bounds), _PLACE_PX, shape)
-        yield Picture(picture, caption, _WIDTH_MM, f"#row={layer.name}/{number}")
+        yield Picture(picture, caption, _WIDTH_MM, f"#row={layer.name}/{quote(named, safe='')}")
 
 
 def _value(row: Any, style: Style) -> float:

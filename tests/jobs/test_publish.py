@@ -37,6 +37,7 @@ from roadscan.jobs.publish.live import LiveSite, open_survey
 from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.jobs.publish.parts import strips, vectors
 from roadscan.jobs.publish.parts.edits import Edits
+from roadscan.jobs.publish.parts.features import Features
 from roadscan.jobs.publish.parts.rasters import images_of
 from roadscan.jobs.publish.parts.strips import Strips
 from roadscan.jobs.publish.single import write_single
@@ -470,6 +471,32 @@ def test_a_box_that_is_none_is_refused(text: str) -> None:
         box_from_text(text)
 
 
+def test_layers_open_in_other_programs(survey_file: Path, published: Published, tmp_path: Path) -> None:
+    session, entry = opened(survey_file), read(published, "survey.json")
+    assert len(entry["features"]) == len(entry["layers"]) > 3
+    collection = read(published, "catalog/collection.json")
+    for layer, path in zip(entry["layers"], entry["features"], strict=True):
+        assert collection["assets"][layer["name"]]["href"] == f"../{path}"
+        table = geopandas.read_file(published.folder / path)
+        shown = {f["id"]: f for part in layer["parts"] for f in read(published, part["url"])["features"]}
+        names = [column["name"] for column in layer["columns"]]
+        assert len(table) == len(shown) and set(table.columns) == {*names, "geometry"}
+        assert table.crs == pyproj.CRS(session.plan.ground.map.crs)
+        places = [shapely.geometry.shape(f["geometry"]) for f in shown.values()]
+        nearest = [min(one.hausdorff_distance(place) for place in places) for one in table.geometry]
+        assert max(nearest) <= 1e-5  # the page's documents state 10 µm
+        for name in names:
+            told = sorted(str(f["properties"][name]) for f in shown.values())
+            numbers = [f["properties"][name] for f in shown.values()]
+            if all(isinstance(one, float) for one in numbers):
+                assert sorted(table[name]) == pytest.approx(sorted(numbers))
+            elif all(isinstance(one, str) and not name.endswith("_gps_ns") for one in numbers):
+                assert sorted(table[name]) == told
+    again = next(d for d in Features().documents(Material(session)) if d.path == "features/tiles.fgb")
+    again.write(tmp_path / "again.fgb", Path)
+    assert (tmp_path / "again.fgb").read_bytes() == (published.folder / "features/tiles.fgb").read_bytes()
+
+
 def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
     pystac = pytest.importorskip("pystac", reason="pystac is not installed")
     collection = pystac.Collection.from_file(str(published.folder / "catalog" / "collection.json"))
@@ -553,7 +580,7 @@ def test_a_single_file_holds_all(survey_file: Path, published: Published, with_p
     assert known - set(page.held) <= {
         f.relative_to(published.folder).as_posix()
         for f in published.folder.rglob("*")
-        if f.suffix in (".parquet", ".vpc", ".tif", ".vrt", ".html")
+        if f.suffix in (".parquet", ".vpc", ".tif", ".vrt", ".fgb", ".html")
     }
 
 

@@ -106,7 +106,7 @@ export class App {
   /** What is left out, and files for other programs. */
   #about(): HTMLElement {
     const { survey, source } = this.desk
-    const files = source.single ? [] : [...(survey.cogs ?? []), ...(survey.catalog ? [survey.catalog.collection, survey.catalog.items, survey.catalog.points] : [])].filter((one) => one !== null)
+    const files = source.single ? [] : [...(survey.features ?? []), ...(survey.cogs ?? []), ...(survey.catalog ? [survey.catalog.collection, survey.catalog.items, survey.catalog.points] : [])].filter((one) => one !== null)
     const left = survey.left_out ?? []
     return h(
       'footer',

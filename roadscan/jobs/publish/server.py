@@ -42,7 +42,8 @@ _REPORT_POLICY: Final = (
 """The report has no script; its style and its pictures stand in the page."""
 
 _TYPES: Final = {
-    ".css": "text/css; charset=utf-8", ".glb": "model/gltf-binary", ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8", ".fgb": "application/vnd.flatgeobuf",
+    ".glb": "model/gltf-binary", ".html": "text/html; charset=utf-8",
     ".ico": "image/x-icon", ".jpg": "image/jpeg", ".js": "text/javascript; charset=utf-8",
     ".json": "application/json; charset=utf-8", ".laz": "application/octet-stream",
     ".mjs": "text/javascript; charset=utf-8",

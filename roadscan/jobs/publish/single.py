@@ -19,7 +19,7 @@ LARGEST_MB: Final = 200.0
 """Larger pages take browsers long to open."""
 
 _TEXT: Final = (".json",)
-_NOT_INSIDE: Final = (".parquet", ".vpc", ".tif", ".vrt", ".html")
+_NOT_INSIDE: Final = (".parquet", ".vpc", ".tif", ".vrt", ".fgb", ".html")
 """What is for other programs, or a page of its own."""
 _WEB: Final = ("app/",)
 _BASE64: Final = 4 / 3

@@ -32,7 +32,7 @@ class Layer:
 
     name: str
     geometry: str
-    """Type as the schema names it."""
+    """Type as the schema or GDAL names it."""
     rows: pa.Table
     """Plain columns."""
     shapes_m: npt.NDArray[Any]
@@ -54,6 +54,11 @@ def write_geojson(path: Path, layer: Layer, context: ProductContext) -> None:
     """
     settings: dict[str, Any] = {"RFC7946": "YES"} if context.map.crs is not None else {}
     _write(path, layer, context, "GeoJSON", COORDINATE_PRECISION=_DEGREE_DECIMALS, **settings)
+
+
+def write_flatgeobuf(path: Path, layer: Layer, context: ProductContext) -> None:
+    """Write the features of a layer in the CRS's own unit, with an index by which programs fetch what they show."""
+    _write(path, layer, context, "FlatGeobuf")
 
 
 def write_dxf(path: Path, layers: Sequence[Layer], context: ProductContext) -> None:
@@ -91,8 +96,8 @@ def _write(
     table = layer.rows.replace_schema_metadata(None).append_column("geometry", pa.array(shapes, pa.binary()))
     with _without_crs_warning():
         pyogrio.raw.write_arrow(
-            table, path, layer=layer.name, driver=driver, geometry_name="geometry",
-            geometry_type=GEOMETRIES[layer.geometry], crs=context.map.crs, append=append, **settings,
+            table, path, layer=layer.name, driver=driver, geometry_name="geometry", crs=context.map.crs, append=append,
+            geometry_type=GEOMETRIES.get(layer.geometry, layer.geometry), **settings,
         )  # fmt: skip
 
 

@@ -45,10 +45,27 @@ function append(element: Element, children: Child[]): void {
   }
 }
 
-/** Replace what an element holds. */
+/** Replace what an element holds. What had the focus in it gives it to what takes its place: who uses keys stays there. */
 export function fill(element: Element, ...children: Child[]): void {
+  const focused = document.activeElement
+  const place = focused && focused !== element && element.contains(focused) ? placeIn(element, focused) : null
   element.replaceChildren()
   append(element, children)
+  if (place && !element.contains(document.activeElement)) alike(element, place.name)[place.number]?.focus()
+}
+
+/** By what an element of a kind is told from others. */
+function nameOf(element: Element): string {
+  return `${element.tagName} ${element.getAttribute('aria-label') ?? (element.tagName === 'BUTTON' ? element.textContent : '')}`
+}
+
+function alike(within: Element, name: string): HTMLElement[] {
+  return [...within.querySelectorAll<HTMLElement>(name.split(' ', 1)[0]!)].filter((one) => nameOf(one) === name)
+}
+
+function placeIn(within: Element, element: Element): { name: string; number: number } {
+  const name = nameOf(element)
+  return { name, number: alike(within, name).indexOf(element as HTMLElement) }
 }
 
 /** A drawing of 16 × 16 units from path data of this program. */

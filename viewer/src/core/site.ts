@@ -39,6 +39,7 @@ export interface Survey {
   report: string | null
   left_out?: string[]
   cogs?: string[]
+  features?: string[]
   catalog?: { collection: string; items: string; points: string | null } | null
   edits?: EditRules | null
 }

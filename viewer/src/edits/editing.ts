@@ -3,6 +3,7 @@
 import Feature from 'ol/Feature'
 import { unByKey } from 'ol/Observable'
 import type { EventsKey } from 'ol/events'
+import { getCenter } from 'ol/extent'
 import Point from 'ol/geom/Point'
 import type SimpleGeometry from 'ol/geom/SimpleGeometry'
 import Draw from 'ol/interaction/Draw'
@@ -139,7 +140,13 @@ export class Editing {
       this.#add(selected, 'change', {}, { type: geometry.getType(), coordinates: geometry.getCoordinates() })
     } }, 'Keep the new place')
     modify.on('modifyend', () => { done.disabled = false })
-    fill(body, h('p', { class: 'hint' }, 'Drag it on the map to where it belongs.'), done)
+    const put = h('button', { type: 'button', onclick: () => {
+      const [geometry, to] = [feature.getGeometry()!, this.map.seen.centre]
+      const from = getCenter(geometry.getExtent())
+      geometry.translate(to[0] - from[0]!, to[1] - from[1]!)
+      done.disabled = false
+    } }, 'Put it at the cross')
+    fill(body, h('p', { class: 'hint' }, 'Drag it on the map to where it belongs. Without a mouse, the cross in the middle of the map serves.'), h('div', { class: 'actions' }, put, done))
     this.#stop = () => {
       this.map.map.removeInteraction(modify)
       this.map.drawing = false

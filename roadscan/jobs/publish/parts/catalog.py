@@ -24,6 +24,8 @@ from roadscan.jobs.publish.material import Material
 from roadscan.jobs.publish.part import SitePart
 from roadscan.jobs.publish.parts.clouds import cloud_box_m, cloud_sheets, cloud_url
 from roadscan.jobs.publish.parts.cogs import cog_records, cog_url
+from roadscan.jobs.publish.parts.features import features_url
+from roadscan.jobs.publish.parts.vectors import site_layers
 from roadscan.model.crs import MapFrame, crs_from_text
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.model.ids import TileId
@@ -32,6 +34,7 @@ _STAC: Final = "1.1.0"
 _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 _POINT_CLOUD: Final = "https://stac-extensions.github.io/pointcloud/v2.0.0/schema.json"
 _COPC_TYPE: Final = "application/vnd.laszip+copc"
+_FEATURES_TYPE: Final = "application/vnd.flatgeobuf"
 _COG_TYPE: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _DENSE: Final = 20
 """Points along each edge of a sheet: its border is no straight line in longitude and latitude."""
@@ -171,7 +174,14 @@ def _collection(material: Material, items: Sequence[Mapping[str, Any]]) -> dict[
             "items": {
                 "href": "./items.parquet", "type": "application/vnd.apache.parquet", "roles": ["metadata"],
                 "title": "Items as GeoParquet",
-            }
+            },
+            **{
+                layer.name: {
+                    "href": f"../{features_url(layer)}", "type": _FEATURES_TYPE, "roles": ["data"],
+                    "title": f"{layer.title} (FlatGeobuf)",
+                }
+                for layer in site_layers(material)[0]
+            },
         },
     }  # fmt: skip
 

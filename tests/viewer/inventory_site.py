@@ -73,7 +73,7 @@ class EditedSite:
         state = self.inventory.state()
         material: Any = SimpleNamespace(
             inventory=("street", state), wishes=Wishes(edits="post"),
-            context=SimpleNamespace(map=MapFrame(crs="EPSG:32632")),
+            context=SimpleNamespace(map=MapFrame(crs="EPSG:32632")), plan=SimpleNamespace(passes=()),
         )  # fmt: skip
         return list(Assets().layers(material))
 

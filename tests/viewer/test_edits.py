@@ -189,6 +189,19 @@ def test_what_is_drawn_beside_the_surface_asks_for_its_height(opened: Opened) ->
     assert (shape.x, shape.y, shape.z) == pytest.approx((EAST_M + 15.0, NORTH_M + 30.0, 41.25), abs=1e-5)
 
 
+def test_a_pole_is_moved_by_keys(opened: Opened) -> None:
+    page, site = opened.page, opened.site
+    choose(opened, 1)
+    page.locator(".edit button", has_text="Move").press("Enter")
+    go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 1.0}&zoom=6&views=map")
+    page.wait_for_selector(STILL)
+    page.locator(".edit button", has_text="Put it at the cross").press("Enter")
+    page.locator("button", has_text="Keep the new place").press("Enter")
+    assert [outcome for outcome, _ in send(opened)] == ["accepted"]
+    shape = shapely.from_wkb(site.inventory.state().row(site.id_of(1))["geometry"])
+    assert (shape.x, shape.y, shape.z) == pytest.approx((EAST_M + 15.0, NORTH_M + 1.0, 40.0), abs=1e-5)
+
+
 def test_an_address_without_the_token_is_read_only(open_page: Any, opened: Opened) -> None:
     origin = opened.server.address.partition("#")[0]
     with open_page(origin) as other:

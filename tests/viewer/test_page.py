@@ -313,6 +313,19 @@ def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     assert page.locator("dialog.help").is_visible()
 
 
+def test_the_focus_stays_where_keys_are_used(watched: Any, address: str) -> None:
+    page = watched.open_cloud(address)
+    focused = "document.activeElement.ariaLabel ?? document.activeElement.textContent"
+    for place, key, name in (
+        ('[role="tab"]:has-text("Section")', "Enter", "Section"),
+        ('[aria-label="Rows of Poles"]', "Enter", "Rows of Poles"),
+        ('th button:has-text("Height")', "Enter", "Height m"),
+        ('[aria-label="Colour by"]', "ArrowDown", "Colour by"),
+    ):
+        page.locator(place).first.press(key)
+        assert page.evaluate(focused) == name
+
+
 def test_the_keyboard_measures_on_the_map_and_zooms_the_strips(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#at={EAST_M + 10},{NORTH_M}&zoom=8&views=map,strips")
     page.wait_for_selector(STILL)

@@ -121,7 +121,7 @@ export class App {
     const { survey } = this.desk
     const { crs } = survey
     const about = [crs.authority ?? crs.name ?? 'local frame', crs.height ? `${crs.height} heights` : null].filter(Boolean).join(' · ')
-    const search = h('input', { type: 'search', id: 'search', placeholder: 'Go to: easting northing, layer/row, @station', 'aria-label': 'Go to a place, a row or a station', autocomplete: 'off' })
+    const search = h('input', { type: 'search', id: 'search', placeholder: 'Go to: E N, layer/row, @station', 'aria-label': 'Go to a place, a row or a station', autocomplete: 'off' })
     const form = h('form', { class: 'search', role: 'search', onsubmit: (event: Event) => { event.preventDefault(); void this.#search(search.value) } }, icon('search'), search)
     return h(
       'header',

@@ -16,11 +16,13 @@ Told = dict[str, Any]
 
 def of_pictures(material: Material, row: Mapping[str, Any]) -> Iterator[Told]:
     """Cut-out of an asset, and the pictures that its column `pictures` names, best first."""
-    cut = cut_out_records(material).get(str(row.get("cut_out") or ""))
+    name = row.get("cut_out")
+    cut = cut_out_records(material).get(str(name)) if name else None
     if cut is not None:
         yield {"title": "cut-out", "kind": "cut_out", "url": cut_out_url(cut)}
-    urls = picture_urls(material)
-    for one in _pictures_named(row.get("pictures")):
+    pictures = _pictures_named(row.get("pictures"))
+    urls = picture_urls(material) if pictures else {}
+    for one in pictures:
         names = str(one.get("run")), str(one.get("camera")), str(one.get("file"))
         url, distance = urls.get(names), one.get("distance_m")
         away = f", {distance:g} m away" if isinstance(distance, int | float) else ""
@@ -39,7 +41,7 @@ def _pictures_named(text: Any) -> list[Mapping[str, Any]]:
 def of_passes(material: Material, epochs_gps_ns: Iterable[Any], run: str | None = None) -> Iterator[Told]:
     """Passes at some epochs, of one run where it is named."""
     wanted = [one for one in epochs_gps_ns if isinstance(one, int)]
-    for own in material.plan.passes:
+    for own in material.plan.passes if wanted else ():
         if run in (None, own.run) and any(own.start_gps_ns <= one < own.end_gps_ns for one in wanted):
             yield of_pass(material, own.pass_id)
 

@@ -28,6 +28,8 @@ const BUDGET = 3_000_000
 const REACH_PX = 6
 /** While points come, a picture is drawn no more often than so. */
 const BETWEEN_PICTURES_MS = 300
+/** After so long people are told why they wait. */
+const PATIENCE_MS = 4000
 
 export class CloudView {
   readonly element: HTMLElement
@@ -58,6 +60,8 @@ export class CloudView {
   #stale = true
   #asked = false
   #active = false
+  /** When the first file was asked for. */
+  #openedAt = 0
   #draft: [number, number, number][] = []
   #far = 60
   #meshes: Promise<SurfaceMeshes> | null = null
@@ -242,7 +246,13 @@ export class CloudView {
   #tell(points: number): void {
     const loading = this.store.loading
     const opening = this.store.sheets.some((sheet) => sheet.open && !sheet.copc)
-    this.#status.textContent = opening ? 'Opening the cloud …' : `${format.fixed(points / 1e6, 2)} million points${loading ? ', loading …' : ''}`
+    if (opening && !this.#openedAt) {
+      this.#openedAt = performance.now()
+      window.setTimeout(() => this.#redraw(true), PATIENCE_MS + 100)
+    }
+    const isSlow = performance.now() - this.#openedAt > PATIENCE_MS
+    const waiting = isSlow ? 'Opening the cloud … roadscan view makes its file the first time, which may take a minute.' : 'Opening the cloud …'
+    this.#status.textContent = opening ? waiting : `${format.fixed(points / 1e6, 2)} million points${loading ? ', loading …' : ''}`
     this.element.dataset['loading'] = String(loading + Number(opening))
   }
 

@@ -61,7 +61,7 @@ export class TablePanel {
 
   #told(): string {
     const found = this.#found().length
-    return found > MOST_ROWS ? `the first ${MOST_ROWS} of ${format.fixed(found, 0)} rows` : `${format.fixed(found, 0)} rows`
+    return found > MOST_ROWS ? `the first ${MOST_ROWS} of ${format.fixed(found, 0)} rows` : found === 1 ? '1 row' : `${format.fixed(found, 0)} rows`
   }
 
   #found(): FeatureDocument[] {

@@ -210,6 +210,22 @@ def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: s
     assert np.abs(_read(page) - TARGET).max() <= 0.005
 
 
+@pytest.mark.parametrize(("north", "hidden"), [(3.5, True), (-3.0, False)], ids=["behind the pole", "on the road"])
+def test_a_picture_tells_whether_something_hides_the_place(
+    watched: Any, address: str, north: float, hidden: bool
+) -> None:
+    page = watched.open_cloud(address)
+    east, north_m = EAST_M + 27.6, NORTH_M + north  # 2.7 m behind the pole's foot, as the camera looks, or beside it
+    place = (east, north_m, float(height_m(east, north_m)))
+    _look(page, place, across_m=12)
+    page.locator("#search").fill(" ".join(map(str, place)))
+    page.locator("#search").press("Enter")
+    page.locator('.place button:has-text("Pictures of it")').click()
+    page.wait_for_selector('.picture-frame[data-state="shown"]')
+    flat = page.locator(".picture-list button", has_not_text="ball")
+    assert ("behind something" in flat.inner_text()) == hidden
+
+
 def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     page.locator("#search").fill(f"{TARGET[0]} {TARGET[1]} {TARGET[2]}")

@@ -101,6 +101,7 @@ def test_place_and_pixel_of_a_panorama_find_one_another(driven: Driven, open_pag
         assert np.linalg.norm(read - target) <= 0.03  # the next point of the cloud
         page.locator('.place button:has-text("Pictures of it")').click()
         page.wait_for_selector('.picture-frame[data-state="shown"]:not([data-mark=""])')
+        assert page.locator(".picture-list", has_text="behind something").count() == 0  # nothing stands on the lane
         frame = page.locator(".picture-frame")
         mark = np.array(frame.get_attribute("data-mark").split(), float)
         found = re.search(r"\d{6}\.jpg", page.locator(".picture-caption").inner_text())

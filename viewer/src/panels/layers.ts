@@ -63,7 +63,7 @@ function featureRow(map: MapView, layer: FeatureLayer, openTable: (layer: Featur
 
 function chooser(layer: FeatureLayer): HTMLElement | null {
   const choices = layer.document.choices.length ? layer.document.choices : [layer.document.style]
-  if (choices.length < 2) return null
+  if (choices.length < 2) return layer.style.value.by ? h('p', { class: 'legend-title' }, layer.style.value.title) : null
   const chosen = Math.max(0, choices.findIndex((one) => one.title === layer.style.value.title))
   const select = h(
     'select',

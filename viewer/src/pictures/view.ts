@@ -18,6 +18,17 @@ const KEPT_BYTES = 256e6
 /** Least half angle (radian) within which points count as met by a ray: about two pixels of a common camera. */
 const CONE = 1.5e-3
 
+/** Half angle (radian) within which a point before a place hides it. */
+const HIDING = 4 * CONE
+/** Depth (m) of a hole, or height of a stone, that is no obstacle. */
+const ROUGH_M = 0.1
+
+/** Length of a ray's end (m) that tells nothing: there, the ground about the place lies within the cone of a ray that falls by `slope`. */
+function untold(size_m: number, slope: number): number {
+  const above = slope > 0 ? (ROUGH_M + HIDING * size_m) / (slope + HIDING) : 0
+  return Math.max(0.4, 0.04 * size_m, Math.min(size_m / 4, above))
+}
+
 export class PictureView {
   readonly element: HTMLElement
   readonly #frame = h('div', { class: 'picture-frame', tabindex: 0, role: 'application', 'aria-label': 'Picture. Arrow keys move it, plus and minus zoom, a click on a pixel gives its place.' })
@@ -161,9 +172,10 @@ export class PictureView {
       const from = [picture.easting_m, picture.northing_m, picture.height_m] as const
       const by = [0, 1, 2].map((axis) => at[axis]! - from[axis]!) as [number, number, number]
       const size = Math.hypot(...by)
-      const ray = { from, direction: by.map((one) => one / size) as [number, number, number] }
-      const nodes = store.ready().filter((node) => rayNear(node.box, ray, CONE * 4, size))
-      const met = meet(store, nodes, ray, CONE * 4, 1, size - Math.max(0.4, size * 0.04))
+      const direction = by.map((one) => one / size) as [number, number, number]
+      const ray = { from, direction }
+      const nodes = store.ready().filter((node) => rayNear(node.box, ray, HIDING, size))
+      const met = meet(store, nodes, ray, HIDING, 1, size - untold(size, -direction[2]))
       view.hidden = met !== null
     }
   }

@@ -20,6 +20,7 @@ import pyarrow.compute as pc
 import scipy.special
 import shapely
 
+from roadscan.inventory.identity import outlines, points_along
 from roadscan.inventory.state import live_commits
 from roadscan.inventory.values import SIGMA_LEAST_M, encoded, sigma_of
 from roadscan.model.errors import ConfigError, nearest
@@ -30,8 +31,6 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 _MISSED_BY_A_PASS: Final = 0.1
 _FALSE_SHARE: Final = 0.01
 _MOST_SIGMAS: Final = 38.0
-_SAMPLES: Final = 16
-_POLYGON: Final = 3
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -242,10 +241,9 @@ def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Floats:
     """Horizontal distances of places, of lines and areas the median along them, in the map's own unit."""
     if not len(old) or shapely.get_type_id(old[0]) == 0:
         return np.asarray(shapely.distance(old, new), dtype=float)
-    lines = [np.where(shapely.get_type_id(s) == _POLYGON, shapely.get_exterior_ring(s), s) for s in (old, new)]
-    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    points = shapely.line_interpolate_point(lines[1][:, np.newaxis], along[np.newaxis, :], normalized=True)
-    return np.asarray(np.median(shapely.distance(points, lines[0][:, np.newaxis]), axis=1), dtype=float)
+    lines = outlines(old), outlines(new)
+    away = shapely.distance(points_along(lines[1]), lines[0][:, np.newaxis])
+    return np.asarray(np.median(away, axis=1), dtype=float)
 
 
 def _point(geometry: bytes) -> bytes:

@@ -22,7 +22,6 @@ _FORMULA: Final = re.compile(r"^[=@\t\r]|^[+-](?![\s\d.,])")
 _SAME_PLACE_M: Final = 0.05
 _AROUND_M: Final = 100.0
 _LEAST_HEIGHT_M: Final = 2.0
-_TYPES: Final = {"PointZ": "Point", "LineStringZ": "LineString", "PolygonZ": "Polygon"}
 
 
 def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditFault]:
@@ -58,7 +57,7 @@ def _fault(change: Change, kinds: Mapping[str, str], *, is_new: bool) -> str | N
 
 
 def _geometry_fault(kind: str, content: bytes | None) -> str | None:
-    wanted = _TYPES[asset_schema(kind).geometry]
+    wanted = asset_schema(kind).geometry.removesuffix("Z")
     if content is None:
         return "it has no geometry"
     try:

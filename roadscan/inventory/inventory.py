@@ -243,6 +243,13 @@ class Inventory:
             )
         content = place.read()
         rows = place.made_of if place.made_of is not None else published_rows(base)
+        lost = [asset_schema(kind).table for kind, held in rows.items() if held.num_rows and kind not in content.rows]
+        if lost:
+            raise HomeError(
+                f"the layer '{lost[0]}' is missing",
+                change="undo its deletion, or pull from a copy: an emptied layer would say that all are gone",
+                file=place.name,
+            )
         return mark, compared(content, rows, mark.token or f"commit {mark.commit}"), content
 
     def _write_project(self) -> None:

@@ -298,16 +298,14 @@ def _at_their_places(rows: pa.Table, moved: Sequence[int]) -> pa.Table:
 
 
 def reference_points(shapes: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """(n, 3) reference points: the point itself, the middle of a line, a point within an area at its mean height."""
-    out = np.empty((len(shapes), 3))
-    for at, shape in enumerate(shapes):
-        if shape.geom_type == "LineString":
-            point = shape.interpolate(0.5, normalized=True)
-        else:
-            point = shape if shape.geom_type == "Point" else shapely.force_2d(shape).representative_point()
-        heights = shapely.get_coordinates(shape, include_z=True)[:, 2]
-        out[at] = point.x, point.y, point.z if point.has_z else float(np.mean(heights))
-    return out
+    """(n, 3) reference points: a point itself, the middle of a line, else a point on or in it at its mean height."""
+    is_line = shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING
+    points = shapely.point_on_surface(shapely.force_2d(shapes))
+    points[is_line] = shapely.line_interpolate_point(shapes[is_line], 0.5, normalized=True)
+    xyz, number = shapely.get_coordinates(shapes, include_z=True, return_index=True)
+    mean = np.bincount(number, xyz[:, 2], len(shapes)) / shapely.get_num_coordinates(shapes)
+    heights = np.where(is_line, shapely.get_z(points), mean)
+    return np.column_stack([shapely.get_x(points), shapely.get_y(points), heights])
 
 
 def _is_in(ids: npt.NDArray[Any], edit: Edit) -> bool:

@@ -103,7 +103,9 @@ Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
 @functools.cache
 def sigma_of(kind: str, attribute: str) -> Sigma | None:
     """How σ of a number follows from those of the place; None for texts, and where any difference counts."""
-    unit = next((c.unit for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), "")
+    column = next((c for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), None)
+    if column is None:
+        return None
     of_unit: dict[str, Sigma] = {
         "m": lambda horizontal, height, _: np.hypot(horizontal, height),
         "m²": lambda horizontal, _, area: np.maximum(2.0 * np.sqrt(area) * horizontal, SIGMA_LEAST_M),
@@ -111,4 +113,9 @@ def sigma_of(kind: str, attribute: str) -> Sigma | None:
         "m/m": lambda horizontal, *_: _SIGMA_SLOPE + 0.0 * horizontal,
         "1": lambda horizontal, *_: _SIGMA_RATIO + 0.0 * horizontal,
     }
-    return of_unit.get(unit)
+    of_place, share = of_unit.get(column.unit), column.sigma_share
+    if not share:
+        return of_place
+    return lambda horizontal, height, value: np.maximum(
+        of_place(horizontal, height, value) if of_place else 0.0, np.maximum(share * value, SIGMA_LEAST_M)
+    )

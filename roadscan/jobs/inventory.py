@@ -1,4 +1,4 @@
-"""The inventory of a survey: its store, its home, and what the stage `assets` found."""
+"""The inventory of a survey: its store, its home, and what was found of assets and distresses."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
 from roadscan.jobs.assets.evidence import VISIBILITY
 from roadscan.jobs.assets.plan import asset_grid
+from roadscan.jobs.found_distresses import SeenByCells, found_distresses
 from roadscan.jobs.session import Session
 from roadscan.model.crs import crs_from_text
 from roadscan.model.ids import TileId
@@ -54,7 +55,7 @@ def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
     name = settings.name or survey.config.id
     frame = survey.config.map.frame()
-    rules = Rules(_visibility(session), settings.matching, frame.horizontal_unit_m)
+    rules = Rules(SeenByCells(session, _visibility(session)), settings.matching, frame.horizontal_unit_m)
     return Inventory(
         _truth(survey), home, name, rules, lambda: found_assets(session), frame.crs,
         lambda folder: _rasters(session, folder),
@@ -116,7 +117,7 @@ def edits_of_file(file: Path) -> bytes:
 
 
 def found_assets(session: Session) -> Found | None:
-    """What the newest run found; None before the stage `assets` has run."""
+    """What the newest run found; None before there is a table of assets or distresses."""
     store = session.store
     tables: dict[str, pa.Table] = {}
     digests: list[str] = []
@@ -126,6 +127,9 @@ def found_assets(session: Session) -> Found | None:
             content = store.read_bytes(file)
             tables[kind] = store.parse_table(content, file)
             digests.append(f"{kind}:{bytes_digest(content)}")
+    for one in found_distresses(session):
+        tables[one.kind] = one.rows
+        digests += [f"{one.kind}:{r.unit}:{r.digest}" for r in one.records]
     if not tables:
         return None
     key = bytes_digest("\n".join(digests).encode())

@@ -46,7 +46,8 @@ def asset(kind: str, *places: tuple[float, float, float], when: dt.datetime = SP
     points = [(EAST + x, NORTH + y, z) for x, y, z in places]
     geometry = asset_schema(kind).geometry
     shape = {"PointZ": lambda: shapely.Point(points[0]), "LineStringZ": lambda: shapely.LineString(points),
-             "PolygonZ": lambda: shapely.Polygon(points)}[geometry]()  # fmt: skip
+             "PolygonZ": lambda: shapely.Polygon(points), "MultiLineStringZ": lambda: shapely.MultiLineString([points]),
+             "MultiPolygonZ": lambda: shapely.MultiPolygon([shapely.Polygon(points)])}[geometry]()  # fmt: skip
     row: dict[str, Any] = {c.name: None for c in asset_schema(kind).columns}
     first = gps_ns_from_utc(when)
     row |= {

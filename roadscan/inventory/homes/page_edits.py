@@ -201,12 +201,15 @@ class PageEdits(Home):
             return {"status": "confirmed" if given.action == "confirm" else "rejected"}
         values = {name: _value(kind, name, raw) for name, raw in given.attributes.items()}
         if feature.geometry is not None:
-            values[GEOMETRY] = self._geometry(feature.geometry)
+            values[GEOMETRY] = self._geometry(kind, feature.geometry)
         return values
 
-    def _geometry(self, raw: Mapping[str, Any]) -> bytes | None:
+    def _geometry(self, kind: str, raw: Mapping[str, Any]) -> bytes | None:
+        """A geometry as WKB; of a kind whose shapes have several parts a single line or area becomes the only part."""
         try:
             shape = shapely.geometry.shape(raw)
+            if asset_schema(kind).geometry == f"Multi{shape.geom_type}Z":
+                shape = shapely.geometry.shape({"type": f"Multi{shape.geom_type}", "coordinates": [raw["coordinates"]]})
             turned = shapely.transform(
                 shape, lambda places: places / self.document.units_m[: places.shape[1]], include_z=bool(shape.has_z)
             )
@@ -245,7 +248,7 @@ class PageEdits(Home):
             return False
         if feature.properties.action != "add":
             return edit.asset_id == record[1]
-        drawn = None if feature.geometry is None else self._geometry(feature.geometry)
+        drawn = None if feature.geometry is None else self._geometry(edit.kind, feature.geometry)
         return edit.action == "create" and drawn is not None and edit.new == encoded(drawn)
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:

@@ -35,14 +35,18 @@ CREATE TABLE {s}.roadscan_inventory (
 """
 
 
-def statements(schema: str, srid: int, kinds: Sequence[str]) -> Iterator[str]:
-    """Statements that make all tables in a new schema. Its name and the kinds' are checked: letters, digits, `_`."""
-    yield "CREATE EXTENSION IF NOT EXISTS postgis"
-    yield f"CREATE SCHEMA {schema}"
-    yield _HISTORY.format(s=schema)
+def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = True) -> Iterator[str]:
+    """Statements that make tables in a new schema, or further ones in one that is there.
+
+    Names of the schema and of the kinds are checked: letters, digits, `_`.
+    """
+    if is_new:
+        yield "CREATE EXTENSION IF NOT EXISTS postgis"
+        yield f"CREATE SCHEMA {schema}"
+        yield _HISTORY.format(s=schema)
     for kind in kinds:
         yield from _kind(schema, kind, srid)
-    for role in ROLES:
+    for role in ROLES if is_new else ():
         yield (
             f"DO $$ BEGIN IF NOT EXISTS (SELECT FROM pg_roles WHERE rolname = '{schema}_{role}') THEN "
             f"CREATE ROLE {schema}_{role} NOLOGIN; END IF; END $$"

@@ -1,4 +1,4 @@
-"""Layers of the assets, one a kind: those of the inventory, or what the newest run found where there is none."""
+"""Layers of the inventory, one a kind, or of the assets that the newest run found where there is none."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import shapely
 from roadscan.inventory.homes.page_edits import LAYER
 from roadscan.jobs.publish.layer import (
     BLUE,
+    GOOD_TO_POOR,
     GREEN,
     GREY,
     ORANGE,
@@ -27,21 +28,25 @@ from roadscan.jobs.publish.layer import (
     Style,
 )
 from roadscan.jobs.publish.material import Material
-from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
+from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 FOLDER: Final = "products/assets"
-GEOMETRY_OF: Final[dict[str, Geometry]] = {"PointZ": "point", "LineStringZ": "line", "PolygonZ": "polygon"}
+GEOMETRY_OF: Final[dict[str, Geometry]] = {
+    "PointZ": "point", "LineStringZ": "line", "MultiLineStringZ": "line", "PolygonZ": "polygon",
+    "MultiPolygonZ": "polygon",
+}  # fmt: skip
 """How a layer calls the geometry of a schema."""
 _WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}
 _COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+_GRADES: Final = (GOOD_TO_POOR[0], GOOD_TO_POOR[2], GOOD_TO_POOR[4])
 _STATES: Final = {"found": BLUE, "confirmed": GREEN, "missing": RED, "rejected": GREY}
 
 _Rows = tuple[pa.Table, npt.NDArray[Any]]
 
 
 class Assets(LayerKind):
-    """What stands beside, on and over the road."""
+    """What stands beside, on and over the road, and of an inventory the distresses of the pavement."""
 
     name = "assets"
 
@@ -51,7 +56,8 @@ class Assets(LayerKind):
         for place, (kind, colour) in enumerate(zip(asset_kind_names(), cycle(_COLOURS), strict=False)):
             held = _of_inventory(material, kind) if is_inventory else _found(material, kind)
             if held is not None and held[0].num_rows:
-                yield _layer(material, kind, held, 600 + place, colour)
+                order = (400 if asset_schema(kind).found_in else 600) + place
+                yield _layer(material, kind, held, order, colour)
 
 
 def _found(material: Material, kind: str) -> _Rows | None:
@@ -82,14 +88,27 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
     columns = {c.name: c for c in (asset_columns(kind) if is_inventory else schema.columns)}
     names = [n for n in rows.column_names if n in columns]
     edited = editable_columns(kind) if is_inventory and material.wishes.edits else frozenset()
-    styles = [Style("one colour", _WIDTH_PX[geometry], colour)]
+    width_px = 2 if schema.found_in else _WIDTH_PX[geometry]
+    styles = list(_styles(schema, width_px)) or [Style("one colour", width_px, colour)]
     if is_inventory:
-        styles.append(Style("Status", _WIDTH_PX[geometry], by="status", values=_STATES))
+        styles.append(Style("Status", width_px, by="status", values=_STATES))
     return SiteLayer(
-        f"{LAYER}{schema.table}", schema.title, "assets", geometry, order, shapes_m, rows.select(names).to_pylist(),
+        f"{LAYER}{schema.table}", schema.title, "distress" if schema.found_in else "assets", geometry, order, shapes_m,
+        rows.select(names).to_pylist(),
         [site_column(columns[n], names, is_edited=n in edited) for n in names], styles,
         key="asset_id" if is_inventory else "object",
     )  # fmt: skip
+
+
+def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:
+    """Styles of a distress: by its type and severity, and by the figures that its severity follows from."""
+    for column in schema.own if schema.found_in else ():
+        if column.values:
+            colours = _GRADES if column.name == "severity" else _COLOURS
+            yield Style(column.title, width_px, by=column.name, values=dict(zip(column.values, colours, strict=False)))
+        if column.class_of:
+            figure = next(c for c in schema.own if c.name == column.class_of)
+            yield Style(f"{figure.title} ({figure.unit})", width_px, by=figure.name, limits=column.up_to)
 
 
 def site_column(column: AssetColumn, names: Sequence[str], *, is_edited: bool) -> SiteColumn:

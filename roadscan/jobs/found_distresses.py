@@ -142,7 +142,8 @@ class Ground:
         places = shapely.get_coordinates(shapes_m)
         if not len(places):
             return shapes_m
-        return np.asarray(shapely.set_coordinates(shapes_m.copy(), np.column_stack([places, self.heights_m(places)])))
+        raised = np.column_stack([places, self.heights_m(places)])
+        return np.asarray(shapely.set_coordinates(shapely.force_3d(shapes_m), raised))
 
     def _by_tile(self, places_m: Floats) -> Iterator[tuple[TileId, Ints, Ints]]:
         """Each tile with the numbers of its places, and their pixels (n, 2), column and row."""

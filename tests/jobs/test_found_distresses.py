@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 import shapely
 
-from roadscan.jobs.found_distresses import found_distresses
+from roadscan.jobs.found_distresses import Ground, found_distresses
 from roadscan.jobs.inventory import found_assets, open_inventory
 from roadscan.jobs.products import product_context
 from roadscan.jobs.publish.material import Material
@@ -31,10 +31,13 @@ from tests.jobs.conftest import Simulated
 def session(finished: Simulated, tmp_path: Path) -> Session:
     """A survey of 14 m of road with two cracks and a pothole; it was searched for ravelling in vain."""
     made = Session.open(finished.copy_with_store_to(tmp_path / "survey").survey_file)
-    tile = next(t for t in made.manifest.of("tile").values() if t.path and t.figures()["cells"] > 1000)
-    column, row = map(int, tile.unit.split("_"))
-    size = product_context(made.plan).grid.size_m
-    x, y = (column + 0.5) * size, (row + 0.5) * size
+    ground, size = Ground(made), product_context(made.plan).grid.size_m
+    tiles = [map(int, r.unit.split("_")) for r in made.manifest.of("tile").values() if r.path]
+    places = [(c * size + e, r * size + n) for c, r in tiles for e in (2.0, 5.0, 8.0) for n in (2.0, 5.0, 8.0)]
+    around = np.array([(0.0, 0.0), (0.5, 0.0), (0.4, 0.8)])
+    middle = np.mean(places, axis=0)
+    places.sort(key=lambda one: np.hypot(*(one - middle)))
+    x, y = next(one for one in places if ground.is_surveyed(around + one).all())
     cracks = [shapely.MultiLineString([[(x + 0.3 * k + s, y) for s in (0.0, 0.1, 0.2)]]) for k in range(2)]
     rows = [{f.name: "" if f.type == "string" else 0 for f in CRACKS} | {"type": "transverse"} for _ in cracks]
     rows[0] |= {"width_mean_m": 0.004, "length_m": 0.2}

@@ -137,7 +137,7 @@ export class Editing {
       const geometry = feature.getGeometry()!
       this.#end()
       fill(body)
-      const before = placesOf(selected.feature.geometry!.coordinates) as Raised[]
+      const before = placesOf(selected.feature.geometry!.coordinates)
       this.#add(selected, 'change', {}, { type: geometry.getType(), coordinates: settled(geometry.getCoordinates(), before) })
     } }, 'Keep the new place')
     modify.on('modifyend', () => { done.disabled = false })
@@ -155,7 +155,7 @@ export class Editing {
     this.#drawShape(layer, body, async (drawn) => {
       const { type, coordinates } = shapeOf(drawn)
       const heights = await this.#heightsOf(coordinates)
-      const known = heights.some(([, , height]) => height !== null) ? heights : (placesOf(feature.geometry!.coordinates) as Raised[])
+      const known = heights.some(([, , height]) => height !== null) ? heights : placesOf(feature.geometry!.coordinates)
       this.#end()
       fill(body)
       this.#add(selected, 'change', {}, { type, coordinates: raised(coordinates, known, 0) })
@@ -240,7 +240,7 @@ export class Editing {
 
   /** Places of a shape with the height of the surface there; null where no raster knows it. */
   #heightsOf(coordinates: unknown): Promise<Raised[]> {
-    return Promise.all(placesOf(coordinates).map(async ([e, n]): Promise<Raised> => [e!, n!, await this.map.heightAt(e!, n!)]))
+    return Promise.all(placesOf(coordinates).map(async ([e, n]): Promise<Raised> => [e, n, await this.map.heightAt(e, n)]))
   }
 
   /** Give up what is being drawn or moved. */
@@ -373,8 +373,8 @@ function shapeOf(feature: Feature): { type: string; coordinates: any } {
   return { type: geometry.getType(), coordinates: geometry.getCoordinates() }
 }
 
-/** All places of a shape's coordinates, however these are nested. */
-function placesOf(coordinates: any): number[][] {
+/** All places of a shape's coordinates, however these are nested; what was just drawn has no heights. */
+function placesOf(coordinates: any): Raised[] {
   return typeof coordinates[0] === 'number' ? [coordinates] : coordinates.flatMap(placesOf)
 }
 

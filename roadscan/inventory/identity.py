@@ -158,20 +158,25 @@ def outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Lines as they are, of polygons the outer ring; of façades that is the line on the ground, there and back."""
     flat = shapely.force_2d(shapes)
     rings = shapely.get_exterior_ring(flat)
+    lines: npt.NDArray[Any] = np.where(shapely.is_missing(rings), flat, rings)
     several = shapely.get_type_id(flat) == shapely.GeometryType.MULTIPOLYGON
-    return np.asarray(np.where(several, shapely.boundary(flat), np.where(shapely.is_missing(rings), flat, rings)))
+    lines[several] = shapely.boundary(flat[several])
+    return lines
 
 
 def points_along(lines: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """(n, 16) points evenly along lines, of several parts one part after another."""
+    if not len(lines):
+        return np.empty((0, _SAMPLES), object)
     parts, number = shapely.get_parts(lines, return_index=True)
-    length = shapely.length(parts)
-    ends = np.cumsum(length)
-    total = np.bincount(number, length, len(lines))
-    at = (np.cumsum(total) - total)[:, np.newaxis] + total[:, np.newaxis] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    first, last = (np.searchsorted(number, np.arange(len(lines)), side) for side in ("left", "right"))
-    part = np.clip(np.searchsorted(ends, at), first[:, np.newaxis], last[:, np.newaxis] - 1)
-    return np.asarray(shapely.line_interpolate_point(parts[part], at - (ends - length)[part]))
+    places, part = shapely.get_coordinates(parts, return_index=True)
+    step = np.where(np.diff(part) == 0, np.hypot(*np.diff(places, axis=0).T), 0.0)
+    length = np.concatenate([[0.0], np.cumsum(step)])
+    ends = np.searchsorted(number[part], np.arange(len(lines)), "right") - 1
+    first = np.concatenate([[0.0], length[ends][:-1]])
+    share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    at = first[:, np.newaxis] + (length[ends] - first)[:, np.newaxis] * share
+    return np.asarray(shapely.points(*(np.interp(at, length, column) for column in places.T)))
 
 
 def _along(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: Floats) -> tuple[Floats, Floats]:

@@ -141,6 +141,22 @@ def test_readers_may_look_and_editors_may_not_change_the_history(street: Invento
         execute(address, "UPDATE street.poles SET condition = 11", role="street_editor")
 
 
+def test_every_administrator_publishes_and_no_editor_hides_a_change(street: Inventory, address: str) -> None:
+    execute(address, "CREATE ROLE ada LOGIN IN ROLE street_admin; CREATE ROLE eva LOGIN IN ROLE street_editor")
+    try:
+        hidden = "SET roadscan.publishing = 'yes'; UPDATE street.poles SET condition = 3 WHERE fid = 1"
+        execute(address.replace("admin:secret", "eva"), hidden)
+        assert [e.who for e in street.pull().edits] == ["eva"]
+        for user in ("ada", "admin:secret"):
+            street.home = PostGis(address.replace("admin:secret", user), "street", 32632)
+            assert street.publish().assets == 7
+        street.home = PostGis(address.replace("admin:secret", "eva"), "street", 32632)
+        with pytest.raises(HomeError, match="permission denied"):
+            street.publish()
+    finally:
+        execute(address, "DROP ROLE ada; DROP ROLE eva")
+
+
 def test_a_faulty_row_is_named(street: Inventory, address: str) -> None:
     one = execute(address, "SELECT asset_id FROM street.poles LIMIT 1")[0][0]
     execute(address, f"UPDATE street.poles SET parent = 'pole-x' WHERE asset_id = '{one}'")

@@ -17,8 +17,10 @@ from roadscan.inventory.state import State
 from roadscan.tables.asset_schema import AssetColumn, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
-_FORMULA: Final = re.compile(r"^[=@\t\r]|^[+-](?![\s\d.,])")
-"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none."""
+_FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*(\w\(|\||![$A-Za-z])", re.DOTALL)
+"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none, calls and links to others are."""
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
+"""Characters that no text has, and some homes cut a text at."""
 _SAME_PLACE_M: Final = 0.05
 _AROUND_M: Final = 100.0
 _LEAST_HEIGHT_M: Final = 2.0
@@ -89,6 +91,8 @@ def _value_fault(column: AssetColumn, value: Any) -> str | None:
         return f"{column.name} is {value:g}, above {column.max:g}"
     if isinstance(value, float) and not np.isfinite(value):
         return f"{column.name} is no finite number"
+    if isinstance(value, str) and (odd := _CONTROL.search(value)):
+        return f"{column.name} holds the control character {odd[0]!r}: remove it"
     if isinstance(value, str) and _FORMULA.match(value):
         return f"{column.name} begins as a spreadsheet's formula does ({value[:20]!r}): write it otherwise"
     return None
@@ -132,21 +136,21 @@ def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
         points = shapely.get_coordinates(shapely.from_wkb(change.new), include_z=True)
         if points[:, 2].any():
             continue
-        around = _heights_around(state, points[0, :2], _AROUND_M / unit_m)
+        around = _heights_around(state, points[0, :2] * unit_m)
         if around.size and abs(float(np.median(around))) > _LEAST_HEIGHT_M:
             reason = f"its height is 0, and assets around it stand at {np.median(around):.1f}: give each point its Z"
             yield EditFault(asset_schema(change.kind).table, change.record, reason)
 
 
-def _heights_around(state: State, place: npt.NDArray[np.float64], reach: float) -> npt.NDArray[np.float64]:
-    """Heights (n,) of the assets within a distance of a place, in the map's own unit."""
+def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Heights (n,) of the assets within 100 m of a place (m)."""
     found = [np.empty(0)]
     for assets in state.assets.values():
         x, y, z = (
             np.asarray(assets.rows[name].to_numpy(zero_copy_only=False), dtype=float)
             for name in ("easting_m", "northing_m", "height_m")
         )
-        found.append(z[(np.hypot(x - place[0], y - place[1]) <= reach) & np.isfinite(z)])
+        found.append(z[(np.hypot(x - place_m[0], y - place_m[1]) <= _AROUND_M) & np.isfinite(z)])
     return np.concatenate(found)
 
 

@@ -78,8 +78,8 @@ def _with_evidence(state: State, edit: Edit) -> Conflict | None:
     )
     if now is None or (edit.attribute == "status" and (given, now) == ("rejected", "missing")):
         return None
-    away = sigmas_apart(edit.kind, edit.attribute, now, given, row)
-    if away <= SIGNIFICANT or sigmas_apart(edit.kind, edit.attribute, now, base, row) <= SIGNIFICANT:
+    away, moved = (sigmas_apart(edit.kind, edit.attribute, now, one, row, state.units_m) for one in (given, base))
+    if away <= SIGNIFICANT or moved <= SIGNIFICANT:
         return None
     sigmas = away if math.isfinite(away) else None
     return Conflict(

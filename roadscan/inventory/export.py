@@ -21,7 +21,7 @@ from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.csv import write_csv
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 
-_FORMULA: Final = re.compile(r"^[=@+\-\t\r]")
+_FORMULA: Final = re.compile(r"^[=@+\-\t\r\n＝＋－＠]")
 """Texts that a spreadsheet may run: all that OWASP names (CSV Injection); a quote before them makes them text."""
 
 

@@ -128,15 +128,16 @@ class Inventory:
             conflicts = conflicts_of(state)
             content = shown_content(state)
             at = self.truth.commits[-1].at if self.truth.commits else "1980-01-06T00:00:00Z"
-            token = self._token(state.commit, mark)
+            token = self._token("publish", state.commit, mark)
             self.truth.keep_published(token, published_table(content))
             self.home.write(content, self._sheets(state, conflicts), Mark(self.name, token, "", state.commit, at))
             self._write_project()
         assets = sum(rows.num_rows for rows in content.rows.values())
         return Published(self.home.name, state.commit, assets, len(conflicts), recorded)
 
-    def _token(self, commit: int, mark: Mark | None) -> str:
-        said = f"{self.name}/{self.home.name}/{commit}/{mark.token if mark else ''}"
+    def _token(self, step: str, commit: int, mark: Mark | None) -> str:
+        """Name of the rows that a home holds after a step: those of a pull that was cut off stay beside others."""
+        said = f"{step}/{self.name}/{self.home.name}/{commit}/{mark.token if mark else ''}"
         return f"{commit:06d}-{bytes_digest(said.encode()).rpartition(':')[2][:16]}"
 
     def _sheets(self, state: State, conflicts: list[Conflict]) -> list[Sheet]:
@@ -216,7 +217,7 @@ class Inventory:
         if not edits:
             return None
         number = len(self.truth.commits) + 1
-        token = self._token(number, mark)
+        token = self._token("pull", number, mark)
         place.note(mark._replace(pending=token))
         if place.made_of is None:
             self.truth.keep_published(token, published_table(rows))

@@ -66,6 +66,8 @@ class State:
     edits: Folded
     orphans: frozenset[str]
     """Edited assets whose evidence was undone; they keep it, and are said to be missing."""
+    units_m: tuple[float, float] = (1.0, 1.0)
+    """Metres of a unit of the map: of its coordinates, and of its heights."""
 
     @cached_property
     def kind_of(self) -> dict[str, str]:
@@ -115,7 +117,8 @@ def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool 
         lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
         found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
         status |= dict.fromkeys(orphans, ("missing", None))
-    return State(len(commits), _by_kind(found, status, edits), edits, frozenset(orphans))
+    assets = _by_kind(found, status, edits, truth.units_m)
+    return State(len(commits), assets, edits, frozenset(orphans), truth.units_m)
 
 
 def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
@@ -182,7 +185,9 @@ def _fresh(truth: AssetTruth, commit: Commit, parts: Sequence[pa.Table]) -> bool
 
 
 def _id_array(parts: Sequence[pa.Table]) -> pa.Array:
-    return pa.concat_arrays([chunk for part in parts for chunk in part["asset_id"].chunks])
+    return pa.concat_arrays(
+        [pa.array([], pa.string()), *(chunk for part in parts for chunk in part["asset_id"].chunks)]
+    )
 
 
 def _ids(parts: Sequence[pa.Table]) -> set[str]:
@@ -207,7 +212,9 @@ def _with_lost(
     return found, kept
 
 
-def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded) -> dict[str, Assets]:
+def _by_kind(
+    found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded, units_m: tuple[float, float]
+) -> dict[str, Assets]:
     changes: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits.in_force.values():
         changes[edit.kind].append(edit)
@@ -230,7 +237,7 @@ def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]
         evidence = _with_status(evidence, status)
         own_edits = changes.get(kind, []) + _drawn_again(evidence, edits, drawn.get(kind, ()))
         rows = _as_drawn(
-            _edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
+            _edited(kind, evidence, own_edits, units_m), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
         )
         assets[kind] = Assets(kind, rows, evidence)
     return assets
@@ -245,7 +252,7 @@ def _with_status(rows: pa.Table, status: Mapping[str, tuple[str, int | None]]) -
     return _replaced(rows, "passes_expected", places, [status[ids[at]][1] for at in places])
 
 
-def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
+def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit], units_m: tuple[float, float]) -> pa.Table:
     """Rows with the values that people gave."""
     by_attribute: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits:
@@ -261,7 +268,7 @@ def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
         own = sorted(by_attribute[attribute], key=lambda e: e.asset_id)
         places = _places(ids, own)
         rows = _replaced(rows, attribute, places, [decoded(kind, attribute, e.new) for e in own if _is_in(ids, e)])
-    return _at_their_places(rows, moved)
+    return _at_their_places(rows, moved, units_m)
 
 
 def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> list[Edit]:
@@ -286,12 +293,12 @@ def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
     return rows
 
 
-def _at_their_places(rows: pa.Table, moved: Sequence[int]) -> pa.Table:
+def _at_their_places(rows: pa.Table, moved: Sequence[int], units_m: tuple[float, float]) -> pa.Table:
     """Reference points of moved assets, from their geometry."""
     if not moved:
         return rows
     shapes = shapely.from_wkb(rows[GEOMETRY].take(pa.array(moved)).to_numpy(zero_copy_only=False))
-    points = reference_points(np.asarray(shapes))
+    points = reference_points(np.asarray(shapes)) * (units_m[0], *units_m)
     for column, name in enumerate(("easting_m", "northing_m", "height_m")):
         rows = _replaced(rows, name, moved, points[:, column].tolist())
     return rows

@@ -67,7 +67,8 @@ def _truth(survey: Survey) -> AssetTruth:
     settings, url = survey.config.inventory, survey.store_url
     if settings.store is not None:
         url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
-    return AssetTruth(Store(url, settings.name or survey.config.id))
+    frame = survey.config.map.frame()
+    return AssetTruth(Store(url, settings.name or survey.config.id), (frame.horizontal_unit_m, frame.vertical_unit_m))
 
 
 def inventory_faults(survey: Survey) -> list[str]:
@@ -133,7 +134,9 @@ def found_assets(session: Session) -> Found | None:
     if not tables:
         return None
     key = bytes_digest("\n".join(digests).encode())
-    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch)
+    nothing = not any(rows.num_rows for rows in tables.values())
+    began = min((p.start_gps_ns for p in session.plan.passes), default=0) if nothing else 0
+    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch, began)
 
 
 def _visibility(session: Session) -> Visibility:

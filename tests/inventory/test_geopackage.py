@@ -185,6 +185,29 @@ def test_publishing_over_changes_that_were_not_pulled_is_refused(street: Invento
     assert person.layer(file_of(street), "poles")["condition"].isna().all()
 
 
+def test_a_pull_and_a_publication_that_die_one_after_the_other(
+    street: Inventory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = file_of(street)
+    person.delete(file, "poles", ids_by_station(street)[0])
+    person.draw(file, "poles", shapely.Point(EAST + 70, NORTH + 4, 103.0), comments="drawn")
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    note = street.home.note
+    monkeypatch.setattr(street.home, "note", lambda mark: note(mark) if mark.pending else end())
+    with pytest.raises(KeyboardInterrupt):
+        street.pull()
+    other = inventory(tmp_path, Everywhere())
+    monkeypatch.setattr(other.home, "write", end)
+    with pytest.raises(KeyboardInterrupt):
+        other.publish()
+    again = inventory(tmp_path, Everywhere())
+    assert again.pull().commit is None  # the file is still told from what the pull read
+    assert again.publish().assets == 7
+
+
 def test_what_is_saved_while_a_publication_is_written_is_not_overwritten(
     street: Inventory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,6 +233,7 @@ INVALID = shapely.Polygon([(EAST, NORTH, 1), (EAST + 2, NORTH + 2, 1), (EAST + 2
     [
         ("poles", {"condition": 11}, "condition is 11, above 10"),
         ("poles", {"comments": "=HYPERLINK(1)"}, "begins as a spreadsheet's formula does"),
+        ("poles", {"comments": "+1+SUM(A1)"}, "begins as a spreadsheet's formula does"),
         ("poles", {"parent": "pole-00000000"}, "its parent 'pole-00000000' is not known"),
         ("poles", {"status": "gone"}, "status is 'gone', expected one of found, missing, confirmed, rejected"),
         ("poles", {"returns": 7}, "returns was measured and is not edited"),

@@ -111,6 +111,10 @@ class PageDocument:
         if not isinstance(values, dict):
             raise HomeError("the edits are not a collection of features", change=change, file=name)
         try:
+            json.dumps(values, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise HomeError(f"the edits hold half a character: {error}", change=change, file=name) from error
+        try:
             return cls(name, EditDocument.parse(values), units_m)
         except ConfigError as error:
             raise HomeError(f"the edits cannot be read: {error}", change=change, file=name) from error
@@ -300,7 +304,7 @@ def _value(kind: str, name: str, raw: Any) -> Any:
     wanted = schema.field(name).type
     if raw is None:
         return None
-    is_number = isinstance(raw, int | float) and not isinstance(raw, bool)
+    is_number = isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) < _MOST
     if pa.types.is_floating(wanted) and is_number:
         return float(raw)
     if pa.types.is_integer(wanted) and is_number and float(raw).is_integer():
@@ -317,6 +321,8 @@ def _value(kind: str, name: str, raw: Any) -> Any:
     raise ValueError(f"{name} is {json.dumps(raw)}, expected {_IN_WORDS.get(str(wanted), str(wanted))}")
 
 
+_MOST: Final = 2**31
+"""Numbers of assets are less, also where a column could hold more."""
 _IN_WORDS: Final = {
     "double": "a number", "int32": "a whole number", "int64": "a whole number", "string": "a text",
     "bool": "true or false", "date32[day]": "a date such as 2026-05-04",

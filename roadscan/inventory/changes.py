@@ -87,7 +87,8 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
     """
     newest: dict[str, Commit] = {}
     began: dict[str, int] = {}
-    for commit in live_commits(truth.commits):
+    live = live_commits(truth.commits)
+    for commit in live:
         if commit.kind == "found":
             newest[commit.epoch] = commit
             began.setdefault(commit.epoch, commit.epoch_gps_ns)
@@ -101,16 +102,27 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
         return None
     second = after or names[-1]
     first = before or names[max(names.index(second) - 1, 0)]
-    return _between(truth, newest[first], newest[second], unit_m)
+    earlier = {*names[: names.index(first) + 1]} - {second}
+    came = min(c.number for c in live if c.kind == "found" and c.epoch == second)
+    told = [c for c in live if (c.epoch in earlier if c.kind == "found" else c.number < came)]
+    known = pa.chunked_array([_told_of(truth, c) for c in told], pa.string())
+    return _between(truth, newest[first], newest[second], known, unit_m)
 
 
-def _between(truth: AssetTruth, before: Commit, after: Commit, unit_m: float) -> EpochChanges:
+def _told_of(truth: AssetTruth, commit: Commit) -> pa.Array:
+    """Ids of the assets that a commit saw, or that people drew in it."""
+    name, told = ("seen", 1) if commit.kind == "found" else ("action", "create")
+    rows = truth.rows(commit, ["asset_id", name])
+    return rows.filter(pc.equal(rows[name], told))["asset_id"].combine_chunks()
+
+
+def _between(truth: AssetTruth, before: Commit, after: Commit, known: pa.ChunkedArray, unit_m: float) -> EpochChanges:
     one, other = truth.rows(before), truth.rows(after)
     found: list[Change] = []
     moved, changed = _Compared(), _Compared()
     unseen = 0
     for kind in pc.unique(other["kind"]).to_pylist():
-        pair = _pair(kind, one, other)
+        pair = _pair(kind, one, other, known)
         found += [_plain("appeared", row, None, None) for row in pair.appeared.to_pylist()]
         missing = pair.unseen.filter(pc.equal(pair.unseen["status"], "missing"))
         passes = dict(zip(missing["asset_id"].to_pylist(), missing["passes_expected"].to_pylist(), strict=True))
@@ -140,7 +152,7 @@ class _Pair(NamedTuple):
     sigma_height_m: Floats
 
 
-def _pair(kind: str, one: pa.Table, other: pa.Table) -> _Pair:
+def _pair(kind: str, one: pa.Table, other: pa.Table, known: pa.ChunkedArray) -> _Pair:
     names = ["asset_id", "seen", *asset_table(kind).names]
     names = ["kind", *dict.fromkeys(names)]
     one, other = (t.filter(pc.equal(t["kind"], kind)).select(names) for t in (one, other))
@@ -148,7 +160,7 @@ def _pair(kind: str, one: pa.Table, other: pa.Table) -> _Pair:
     ids = [np.asarray(t["asset_id"].to_numpy(zero_copy_only=False), dtype=str) for t in (then, now)]
     _, at_then, at_now = np.intersect1d(ids[0], ids[1], assume_unique=True, return_indices=True)
     alone = then.take(pa.array(np.setdiff1d(np.arange(ids[0].size), at_then)))
-    is_known = pc.is_in(now["asset_id"], value_set=one["asset_id"].combine_chunks())
+    is_known = pc.is_in(now["asset_id"], value_set=known)
     both = then.take(pa.array(at_then)), now.take(pa.array(at_now))
     horizontal, height = (
         np.maximum(np.hypot(_numbers(both[0][name], 0.0), _numbers(both[1][name], 0.0)), SIGMA_LEAST_M)

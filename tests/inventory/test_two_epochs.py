@@ -177,6 +177,19 @@ def test_squares_are_read_once_and_only_where_places_lie() -> None:
     assert len(asked) == len(set(asked)) == 3
 
 
+def test_the_older_survey_is_processed_again_and_what_appeared_has_appeared_all_the_same(tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(poles(3), "spring"))
+    street.publish()
+    person.draw(tmp_path / "inventory.gpkg", "poles", shapely.Point(EAST + 100, NORTH + 4, 105.0))
+    street.pull()  # a person knew the sixth, so it did not appear
+    street.record(found([*poles(4, when=AUTUMN), *poles(6, when=AUTUMN)[5:]], "autumn"))
+    for diameter_m in (0.1, 0.11):
+        street.record(found(poles(3, diameter_m=diameter_m), "spring"))
+        (change,) = [c for c in street.changes().changes if c.change != "changed"]
+        assert (change.change, shapely.from_wkb(change.geometry).x) == ("appeared", EAST + 60)
+
+
 @pytest.mark.parametrize("epoch", ["spring", "autumn"])
 def test_a_run_that_finds_nothing_at_all_says_that_all_are_missing(epoch: str, tmp_path: Path) -> None:
     street = inventory(tmp_path, Everywhere())

@@ -37,7 +37,7 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
     drawn = {change.asset_id for change in changes.drawn}
     kinds = state.kind_of | {change.asset_id: change.kind for change in changes.drawn}
     for change in (*changes.drawn, *changes.changed):
-        reason = _fault(change, kinds, is_new=change.asset_id in drawn)
+        reason = _fault(change, kinds, state, is_new=change.asset_id in drawn)
         if reason is not None:
             found.append(EditFault(asset_schema(change.kind).table, change.record, reason))
     found += _doubles(changes, state, unit_m)
@@ -47,13 +47,13 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
     return found
 
 
-def _fault(change: Change, kinds: Mapping[str, str], *, is_new: bool) -> str | None:
+def _fault(change: Change, kinds: Mapping[str, str], state: State, *, is_new: bool) -> str | None:
     if change.attribute == GEOMETRY:
         return _geometry_fault(change.kind, change.new)
     if change.attribute not in editable_columns(change.kind):
         return None if is_new else f"{change.attribute} was measured and is not edited: give it back {change.old!r}"
     if change.attribute == "parent":
-        return _parent_fault(change, kinds)
+        return _parent_fault(change, kinds, state)
     column = next(c for c in asset_columns(change.kind) if c.name == change.attribute)
     return _value_fault(column, change.new)
 
@@ -98,13 +98,16 @@ def _value_fault(column: AssetColumn, value: Any) -> str | None:
     return None
 
 
-def _parent_fault(change: Change, kinds: Mapping[str, str]) -> str | None:
+def _parent_fault(change: Change, kinds: Mapping[str, str], state: State) -> str | None:
     if change.new is None:
         return None
     kind = kinds.get(change.new)
+    row = None if kind is None else state.row(change.new)
     allowed = asset_schema(change.kind).parents
     if kind is None:
         return f"its parent '{change.new}' is not known"
+    if row is not None and row["status"] == "rejected":
+        return f"its parent '{change.new}' was rejected"
     if kind not in allowed:
         return f"its parent '{change.new}' is a {kind}, expected {' or '.join(allowed) or 'none'}"
     return None

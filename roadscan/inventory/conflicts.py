@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.inventory.edits import Edit
+from roadscan.inventory.edits import REJECTED, Edit
 from roadscan.inventory.state import State, reference_points
 from roadscan.inventory.values import decoded, encoded, sigmas_apart
 from roadscan.tables.asset_schema import asset_schema
@@ -37,7 +37,8 @@ class Conflict(NamedTuple):
     attribute: str
     reason: str
     """`evidence`: what was found has changed since the edit; `edit`: another person's edit waits; `rejected`: one
-    rejected the asset while another edited it; `undone`: the run that found the edited asset was undone."""
+    rejected the asset while another edited it; `undone`: the run that found the edited asset was undone, or the pull
+    that drew it."""
     edit: str
     """Name of the edit that waits, or of the one in force."""
     in_force: str | None
@@ -61,7 +62,7 @@ def conflicts_of(state: State) -> list[Conflict]:
     found += [
         Conflict(e.asset_id, e.kind, e.attribute, "undone", e.edit, e.new, None, e.evidence, None, e.who)
         for e in state.edits.in_force.values()
-        if e.asset_id in state.orphans
+        if e.asset_id in state.orphans and not e.settles and (e.attribute, e.new) != ("status", REJECTED)
     ]
     return sorted(found, key=lambda c: (c.asset_id, c.attribute, c.reason, c.edit))
 
@@ -98,9 +99,7 @@ def _with_edit(state: State, waiting: Edit, known: Edit | None) -> Conflict:
 
 def _rejected_while_edited(state: State) -> list[Conflict]:
     """Edits of rejected assets, where neither person had seen what the other did."""
-    rejected = {
-        e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == encoded("rejected")
-    }
+    rejected = {e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == REJECTED}
     if not rejected:
         return []
     return [

@@ -118,8 +118,10 @@ class _Recording:
             left = left[[str(one) not in self.state.orphans for one in assets.ids[left]]] if left.size else left
             unseen.append(_unseen(kind, assets.ids[left], expected[left]))
         placed = self._placed(seen)
+        rejected = self.state.edits.rejected
+        standing = {kind: one.without(rejected) for kind, one in placed.items()} if rejected else placed
         for kind, rows in list(seen.items()):
-            parents = pa.array(parents_of(kind, placed)[: rows.num_rows], pa.string())
+            parents = pa.array(parents_of(kind, {**standing, kind: placed[kind]})[: rows.num_rows], pa.string())
             at = rows.schema.get_field_index("parent")
             seen[kind] = rows.set_column(at, rows.schema.field(at), parents)
         parts = [_wide(kind, rows, 1) for kind, rows in seen.items()] + unseen

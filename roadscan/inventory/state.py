@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime as dt
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -65,7 +65,7 @@ class State:
     """By kind; only kinds that have any."""
     edits: Folded
     orphans: frozenset[str]
-    """Edited assets whose evidence was undone; they keep it, and are said to be missing."""
+    """Edited assets whose evidence or drawing was undone; they keep it, and are said to be missing."""
     units_m: tuple[float, float] = (1.0, 1.0)
     """Metres of a unit of the map: of its coordinates, and of its heights."""
 
@@ -111,11 +111,16 @@ def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool 
     edits = folded(read_edits(truth, live))
     found, status = _evidence(truth, _newest_first([c for c in live if c.kind == "found"]))
     edited = {asset for asset, _ in edits.in_force} - edits.created.keys()
-    undone = [c for c in commits if c.kind == "found" and c not in live]
+    counted = {c.number for c in live}
+    undone = [c for c in commits if c.kind != "undo" and c.number not in counted]
     orphans: set[str] = set()
     if undone:
         lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
-        found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
+        runs = _newest_first([c for c in undone if c.kind == "found"])
+        found, orphans = _with_lost(truth, runs, found, None if with_undone else lost)
+        drawn = {e.asset_id: e for e in read_edits(truth, undone) if e.action == "create"}
+        edits.created.update({one: drawn[one] for one in drawn.keys() & (lost - orphans)})
+        orphans |= drawn.keys() & lost
         status |= dict.fromkeys(orphans, ("missing", None))
     assets = _by_kind(found, status, edits, truth.units_m)
     return State(len(commits), assets, edits, frozenset(orphans), truth.units_m)
@@ -240,6 +245,18 @@ def _by_kind(
             _edited(kind, evidence, own_edits, units_m), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
         )
         assets[kind] = Assets(kind, rows, evidence)
+    return _without_rejected_parents(assets, edits)
+
+
+def _without_rejected_parents(assets: dict[str, Assets], edits: Folded) -> dict[str, Assets]:
+    """Assets whose parents are not those that people rejected; a parent that a person gave stays."""
+    rejected = pa.array(edits.rejected, pa.string())
+    if not len(rejected):
+        return assets
+    for kind, own in assets.items():
+        lost = np.flatnonzero(np.asarray(pc.is_in(own.rows["parent"], value_set=rejected)))
+        places = [int(at) for at in lost if (str(own.ids[at]), "parent") not in edits.in_force]
+        assets[kind] = replace(own, rows=_replaced(own.rows, "parent", places, [None] * len(places)))
     return assets
 
 

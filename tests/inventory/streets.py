@@ -94,3 +94,14 @@ def inventory(
     truth = AssetTruth(Store(str(folder / "store"), "street"))
     rules = Rules(visibility or Unknown(), Matching())
     return Inventory(truth, GeoPackage(folder / file, CRS, kinds), "street", rules, crs=CRS)
+
+
+def file_of(street: Inventory) -> Path:
+    """The GeoPackage of a street."""
+    assert isinstance(street.home, GeoPackage)
+    return street.home.file
+
+
+def ids_by_station(street: Inventory, kind: str = "pole") -> list[str]:
+    """Ids along the road."""
+    return list(street.assets(kind).sort_values("station_m")["asset_id"])

@@ -19,7 +19,19 @@ from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from tests.inventory import qgis_edits as person
-from tests.inventory.streets import AUTUMN, CRS, EAST, NORTH, Everywhere, asset, found, inventory, poles
+from tests.inventory.streets import (
+    AUTUMN,
+    CRS,
+    EAST,
+    NORTH,
+    Everywhere,
+    asset,
+    file_of,
+    found,
+    ids_by_station,
+    inventory,
+    poles,
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -29,15 +41,6 @@ def street(tmp_path: Path) -> Inventory:
     made.record(found([*poles(), asset("sign", (20.1, 4.0, 103.0), message="STOP", width_m=0.6)]))
     made.publish()
     return made
-
-
-def file_of(street: Inventory) -> Path:
-    assert isinstance(street.home, GeoPackage)
-    return street.home.file
-
-
-def ids_by_station(street: Inventory, kind: str = "pole") -> list[str]:
-    return list(street.assets(kind).sort_values("station_m")["asset_id"])
 
 
 def test_table_1_is_there_with_its_attributes_and_types(tmp_path: Path) -> None:
@@ -142,37 +145,6 @@ def test_a_rejected_asset_does_not_come_again(street: Inventory) -> None:
     street.publish()
     assert first not in person.ids(file_of(street), "poles")
     assert len(person.ids(file_of(street), "poles")) == 5
-
-
-def test_two_editors_on_two_copies(street: Inventory, tmp_path: Path) -> None:
-    copy = tmp_path / "copy.gpkg"
-    shutil.copy(file_of(street), copy)
-    first, second, *_ = ids_by_station(street)
-    person.edit(file_of(street), "poles", first, condition=3, comments="eva")
-    person.edit(copy, "poles", first, condition=8)
-    person.edit(copy, "poles", second, comments="max")
-    street.pull(who="eva")
-    done = street.pull(home=GeoPackage(copy, CRS, street.home.kinds), who="max")
-    assert (street.state().row(first)["comments"], street.state().row(second)["comments"]) == ("eva", "max")
-    (conflict,) = street.conflicts()
-    assert (conflict.asset_id, conflict.attribute, conflict.reason) == (first, "condition", "edit")
-    assert (conflict.in_force, conflict.other, conflict.who, done.conflicts) == ("3", "8", "max", 1)
-
-
-@pytest.mark.parametrize(("choice", "value"), [("edit", 3), ("other", 8), ("evidence", None)])
-def test_a_person_settles_a_conflict_in_its_layer(
-    street: Inventory, tmp_path: Path, choice: str, value: object
-) -> None:
-    test_two_editors_on_two_copies(street, tmp_path)
-    street.publish()
-    layer = pyogrio.read_dataframe(file_of(street), layer="conflicts")
-    assert list(layer["attribute"]) == ["condition"]
-    layer["decision"] = [choice]
-    person.replace(file_of(street), "conflicts", layer)
-    street.pull(who="boss")
-    assert street.conflicts() == []
-    held = street.state().row(layer["asset_id"][0])["condition"]
-    assert held == value
 
 
 def test_publishing_over_changes_that_were_not_pulled_is_refused(street: Inventory) -> None:

@@ -130,7 +130,7 @@ class PageEdits(Home):
         self.records: list[tuple[str, str]] = []
         """Table and record of each edit, once it was read."""
         self._faults: list[EditFault] = []
-        self._authors: dict[tuple[str, str], Author] = {}
+        self._authors: dict[tuple[str, str, str], Author] = {}
 
     @property
     def name(self) -> str:
@@ -186,7 +186,8 @@ class PageEdits(Home):
                 self._faults.append(EditFault(table, record, str(error)))
                 continue
             at_utc = "" if given.edited_utc is None else given.edited_utc.isoformat(timespec="seconds")
-            self._authors[kind, record] = Author(given.author, at_utc.replace("+00:00", "Z"), given.comment)
+            author = Author(given.author, at_utc.replace("+00:00", "Z"), given.comment)
+            self._authors |= {(kind, record, name): author for name in values}
             if is_new:
                 drawn.append({FID: fid, **values})
             else:

@@ -211,17 +211,21 @@ class PostGis(Home):
                                 file=self.name)  # fmt: skip
         return found
 
-    def _authors(self, cursor: Any) -> dict[tuple[str, str], Author]:
+    def _authors(self, cursor: Any) -> dict[tuple[str, str, str], Author]:
         cursor.execute(
-            f"SELECT layer, fid, asset_id, who, at FROM {self.schema}.history "
+            "SELECT layer, fid, asset_id, who, at, CASE WHEN action = 'DELETE' THEN ARRAY['status'] ELSE "
+            "ARRAY(SELECT key FROM jsonb_each(new) WHERE old IS NULL OR old -> key IS DISTINCT FROM value) END "
+            f"FROM {self.schema}.history "
             f"WHERE id > (SELECT coalesce(max(history_id), 0) FROM {self.schema}.{MARKS}) ORDER BY id"
         )
-        found: dict[tuple[str, str], Author] = {}
-        for layer, fid, asset_id, who, at in cursor.fetchall():
+        found: dict[tuple[str, str, str], Author] = {}
+        for layer, fid, asset_id, who, at, names in cursor.fetchall():
             kind = kinds_by_table().get(layer)
             if kind is not None:
                 moment = at.astimezone(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-                found[kind, asset_id or f"fid {fid}"] = Author(who, moment)
+                author = Author(who, moment)
+                for name in names:
+                    found[kind, asset_id or f"fid {fid}", GEOMETRY if name == "geom" else name] = author
         return found
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:

@@ -37,8 +37,8 @@ class Conflict(NamedTuple):
     attribute: str
     reason: str
     """`evidence`: what was found has changed since the edit; `edit`: another person's edit waits; `rejected`: one
-    rejected the asset while another edited it; `undone`: the run that found the edited asset was undone, or the pull
-    that drew it."""
+    rejected the asset, or its parent, while another edited it; `undone`: the run that found the edited asset, or the
+    pull that drew it, was undone."""
     edit: str
     """Name of the edit that waits, or of the one in force."""
     in_force: str | None
@@ -58,7 +58,7 @@ def conflicts_of(state: State) -> list[Conflict]:
     for key, waiting in state.edits.waiting.items():
         known = state.edits.in_force.get(key)
         found += [_with_edit(state, edit, known) for edit in waiting]
-    found += _rejected_while_edited(state)
+    found += _rejected_while_edited(state) + _on_rejected_parents(state)
     found += [
         Conflict(e.asset_id, e.kind, e.attribute, "undone", e.edit, e.new, None, e.evidence, None, e.who)
         for e in state.edits.in_force.values()
@@ -111,6 +111,17 @@ def _rejected_while_edited(state: State) -> list[Conflict]:
         and (r := rejected.get(e.asset_id)) is not None
         and e.commit != r.commit
         and max(e.commit, r.commit) > min(e.commit, r.commit) > max(e.base_commit, r.base_commit)
+    ]
+
+
+def _on_rejected_parents(state: State) -> list[Conflict]:
+    """Parents that people gave and that people rejected, until that is decided."""
+    rejected = set(state.edits.rejected)
+    return [
+        Conflict(e.asset_id, e.kind, e.attribute, "rejected", e.edit, e.new, None, e.evidence, None, e.who)
+        for e in state.edits.in_force.values()
+        if e.attribute == "parent" and not e.settles and e.asset_id not in rejected
+        if decoded(e.kind, e.attribute, e.new) in rejected
     ]
 
 

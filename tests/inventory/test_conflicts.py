@@ -150,6 +150,14 @@ def test_nothing_hangs_on_what_was_rejected(tmp_path: Path) -> None:
     street.publish()
     sign, file = street.assets("sign")["asset_id"][0], file_of(street)
     false_one = street.assets("sign")["parent"][0]
+    other_one = next(one for one in ids_by_station(street) if one != false_one)
+    person.delete(file, "poles", other_one)
+    person.edit(file, "road_signs", sign, parent=other_one)  # in one pull; neither is lost
+    street.pull()
+    assert [(c.asset_id, c.attribute, c.reason) for c in street.conflicts()] == [(sign, "parent", "rejected")]
+    street.undo(len(street.truth.commits))
+    street.publish()
+    assert street.conflicts() == []
     person.delete(file, "poles", false_one)
     street.pull()
     assert street.assets("sign")["parent"].isna().all()

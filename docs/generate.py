@@ -31,7 +31,7 @@ from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.model.strict import meanings
 from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
-from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
+from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.tables.schema import TableSchema, schema_folder, schema_names, table_schema
 
 DOCS: Final = Path(__file__).resolve().parent
@@ -250,13 +250,25 @@ def asset_columns(_: str) -> str:
 def asset_list(_: str) -> str:
     """A section for each kind of assets: its table, its own columns, how it is found, its settings."""
     known = _own(asset_kinds(), "roadscan.asset_kinds")
-    names = [name for name in asset_kind_names() if (schema_folder() / "assets" / f"{name}.toml").is_file()]
+    names = [one.kind for one in _own_schemas() if not one.found_in]
     return "\n\n".join(part for name in names for part in _asset_section(name, known.get(name)))
+
+
+def distress_list(_: str) -> str:
+    """A section for each kind of distress that the inventory holds: its table and its own columns."""
+    return "\n\n".join(part for one in _own_schemas() if one.found_in for part in _asset_section(one.kind, None))
+
+
+def _own_schemas() -> list[AssetSchema]:
+    """Schemas of the kinds that roadscan itself knows."""
+    folder = schema_folder() / "assets"
+    return [asset_schema(name) for name in asset_kind_names() if (folder / f"{name}.toml").is_file()]
 
 
 def _asset_section(name: str, kind: AssetKind | None) -> Iterable[str]:
     schema = asset_schema(name)
-    shapes = {"PointZ": "points", "LineStringZ": "lines", "PolygonZ": "polygons"}
+    shapes = {"PointZ": "points", "LineStringZ": "lines", "PolygonZ": "polygons",
+              "MultiLineStringZ": "lines of several parts", "MultiPolygonZ": "polygons of several parts"}  # fmt: skip
     yield f"### `{name}`\n\n{schema.meaning} Table `{schema.table}`, {shapes[schema.geometry]}."
     if kind is not None:
         yield from manual(type(kind))
@@ -440,6 +452,7 @@ DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "include": include,
     "asset_columns": asset_columns,
     "asset_list": asset_list,
+    "distress_list": distress_list,
 }
 
 if __name__ == "__main__":

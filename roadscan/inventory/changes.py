@@ -20,6 +20,7 @@ import pyarrow.compute as pc
 import scipy.special
 import shapely
 
+from roadscan.inventory.identity import outlines, points_along
 from roadscan.inventory.state import live_commits
 from roadscan.inventory.values import SIGMA_LEAST_M, encoded, sigma_of
 from roadscan.model.errors import ConfigError, nearest
@@ -30,8 +31,6 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 _MISSED_BY_A_PASS: Final = 0.1
 _FALSE_SHARE: Final = 0.01
 _MOST_SIGMAS: Final = 38.0
-_SAMPLES: Final = 16
-_POLYGON: Final = 3
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -88,7 +87,8 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
     """
     newest: dict[str, Commit] = {}
     began: dict[str, int] = {}
-    for commit in live_commits(truth.commits):
+    live = live_commits(truth.commits)
+    for commit in live:
         if commit.kind == "found":
             newest[commit.epoch] = commit
             began.setdefault(commit.epoch, commit.epoch_gps_ns)
@@ -102,16 +102,27 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
         return None
     second = after or names[-1]
     first = before or names[max(names.index(second) - 1, 0)]
-    return _between(truth, newest[first], newest[second], unit_m)
+    earlier = {*names[: names.index(first) + 1]} - {second}
+    came = min(c.number for c in live if c.kind == "found" and c.epoch == second)
+    told = [c for c in live if (c.epoch in earlier if c.kind == "found" else c.number < came)]
+    known = pa.chunked_array([_told_of(truth, c) for c in told], pa.string())
+    return _between(truth, newest[first], newest[second], known, unit_m)
 
 
-def _between(truth: AssetTruth, before: Commit, after: Commit, unit_m: float) -> EpochChanges:
+def _told_of(truth: AssetTruth, commit: Commit) -> pa.Array:
+    """Ids of the assets that a commit saw, or that people drew in it."""
+    name, told = ("seen", 1) if commit.kind == "found" else ("action", "create")
+    rows = truth.rows(commit, ["asset_id", name])
+    return rows.filter(pc.equal(rows[name], told))["asset_id"].combine_chunks()
+
+
+def _between(truth: AssetTruth, before: Commit, after: Commit, known: pa.ChunkedArray, unit_m: float) -> EpochChanges:
     one, other = truth.rows(before), truth.rows(after)
     found: list[Change] = []
     moved, changed = _Compared(), _Compared()
     unseen = 0
     for kind in pc.unique(other["kind"]).to_pylist():
-        pair = _pair(kind, one, other)
+        pair = _pair(kind, one, other, known)
         found += [_plain("appeared", row, None, None) for row in pair.appeared.to_pylist()]
         missing = pair.unseen.filter(pc.equal(pair.unseen["status"], "missing"))
         passes = dict(zip(missing["asset_id"].to_pylist(), missing["passes_expected"].to_pylist(), strict=True))
@@ -141,7 +152,7 @@ class _Pair(NamedTuple):
     sigma_height_m: Floats
 
 
-def _pair(kind: str, one: pa.Table, other: pa.Table) -> _Pair:
+def _pair(kind: str, one: pa.Table, other: pa.Table, known: pa.ChunkedArray) -> _Pair:
     names = ["asset_id", "seen", *asset_table(kind).names]
     names = ["kind", *dict.fromkeys(names)]
     one, other = (t.filter(pc.equal(t["kind"], kind)).select(names) for t in (one, other))
@@ -149,7 +160,7 @@ def _pair(kind: str, one: pa.Table, other: pa.Table) -> _Pair:
     ids = [np.asarray(t["asset_id"].to_numpy(zero_copy_only=False), dtype=str) for t in (then, now)]
     _, at_then, at_now = np.intersect1d(ids[0], ids[1], assume_unique=True, return_indices=True)
     alone = then.take(pa.array(np.setdiff1d(np.arange(ids[0].size), at_then)))
-    is_known = pc.is_in(now["asset_id"], value_set=one["asset_id"].combine_chunks())
+    is_known = pc.is_in(now["asset_id"], value_set=known)
     both = then.take(pa.array(at_then)), now.take(pa.array(at_now))
     horizontal, height = (
         np.maximum(np.hypot(_numbers(both[0][name], 0.0), _numbers(both[1][name], 0.0)), SIGMA_LEAST_M)
@@ -242,10 +253,9 @@ def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Floats:
     """Horizontal distances of places, of lines and areas the median along them, in the map's own unit."""
     if not len(old) or shapely.get_type_id(old[0]) == 0:
         return np.asarray(shapely.distance(old, new), dtype=float)
-    lines = [np.where(shapely.get_type_id(s) == _POLYGON, shapely.get_exterior_ring(s), s) for s in (old, new)]
-    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    points = shapely.line_interpolate_point(lines[1][:, np.newaxis], along[np.newaxis, :], normalized=True)
-    return np.asarray(np.median(shapely.distance(points, lines[0][:, np.newaxis]), axis=1), dtype=float)
+    lines = outlines(old), outlines(new)
+    away = shapely.distance(points_along(lines[1]), lines[0][:, np.newaxis])
+    return np.asarray(np.median(away, axis=1), dtype=float)
 
 
 def _point(geometry: bytes) -> bytes:

@@ -17,12 +17,13 @@ from roadscan.inventory.state import State
 from roadscan.tables.asset_schema import AssetColumn, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
-_FORMULA: Final = re.compile(r"^[=@\t\r]|^[+-](?![\s\d.,])")
-"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none."""
+_FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*(\w\(|\||![$A-Za-z])", re.DOTALL)
+"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none, calls and links to others are."""
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
+"""Characters that no text has, and some homes cut a text at."""
 _SAME_PLACE_M: Final = 0.05
 _AROUND_M: Final = 100.0
 _LEAST_HEIGHT_M: Final = 2.0
-_TYPES: Final = {"PointZ": "Point", "LineStringZ": "LineString", "PolygonZ": "Polygon"}
 
 
 def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditFault]:
@@ -36,7 +37,7 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
     drawn = {change.asset_id for change in changes.drawn}
     kinds = state.kind_of | {change.asset_id: change.kind for change in changes.drawn}
     for change in (*changes.drawn, *changes.changed):
-        reason = _fault(change, kinds, is_new=change.asset_id in drawn)
+        reason = _fault(change, kinds, state, is_new=change.asset_id in drawn)
         if reason is not None:
             found.append(EditFault(asset_schema(change.kind).table, change.record, reason))
     found += _doubles(changes, state, unit_m)
@@ -46,19 +47,19 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
     return found
 
 
-def _fault(change: Change, kinds: Mapping[str, str], *, is_new: bool) -> str | None:
+def _fault(change: Change, kinds: Mapping[str, str], state: State, *, is_new: bool) -> str | None:
     if change.attribute == GEOMETRY:
         return _geometry_fault(change.kind, change.new)
     if change.attribute not in editable_columns(change.kind):
         return None if is_new else f"{change.attribute} was measured and is not edited: give it back {change.old!r}"
     if change.attribute == "parent":
-        return _parent_fault(change, kinds)
+        return _parent_fault(change, kinds, state)
     column = next(c for c in asset_columns(change.kind) if c.name == change.attribute)
     return _value_fault(column, change.new)
 
 
 def _geometry_fault(kind: str, content: bytes | None) -> str | None:
-    wanted = _TYPES[asset_schema(kind).geometry]
+    wanted = asset_schema(kind).geometry.removesuffix("Z")
     if content is None:
         return "it has no geometry"
     try:
@@ -90,18 +91,23 @@ def _value_fault(column: AssetColumn, value: Any) -> str | None:
         return f"{column.name} is {value:g}, above {column.max:g}"
     if isinstance(value, float) and not np.isfinite(value):
         return f"{column.name} is no finite number"
+    if isinstance(value, str) and (odd := _CONTROL.search(value)):
+        return f"{column.name} holds the control character {odd[0]!r}: remove it"
     if isinstance(value, str) and _FORMULA.match(value):
         return f"{column.name} begins as a spreadsheet's formula does ({value[:20]!r}): write it otherwise"
     return None
 
 
-def _parent_fault(change: Change, kinds: Mapping[str, str]) -> str | None:
+def _parent_fault(change: Change, kinds: Mapping[str, str], state: State) -> str | None:
     if change.new is None:
         return None
     kind = kinds.get(change.new)
+    row = None if kind is None else state.row(change.new)
     allowed = asset_schema(change.kind).parents
     if kind is None:
         return f"its parent '{change.new}' is not known"
+    if row is not None and row["status"] == "rejected":
+        return f"its parent '{change.new}' was rejected"
     if kind not in allowed:
         return f"its parent '{change.new}' is a {kind}, expected {' or '.join(allowed) or 'none'}"
     return None
@@ -133,21 +139,21 @@ def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
         points = shapely.get_coordinates(shapely.from_wkb(change.new), include_z=True)
         if points[:, 2].any():
             continue
-        around = _heights_around(state, points[0, :2], _AROUND_M / unit_m)
+        around = _heights_around(state, points[0, :2] * unit_m)
         if around.size and abs(float(np.median(around))) > _LEAST_HEIGHT_M:
             reason = f"its height is 0, and assets around it stand at {np.median(around):.1f}: give each point its Z"
             yield EditFault(asset_schema(change.kind).table, change.record, reason)
 
 
-def _heights_around(state: State, place: npt.NDArray[np.float64], reach: float) -> npt.NDArray[np.float64]:
-    """Heights (n,) of the assets within a distance of a place, in the map's own unit."""
+def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Heights (n,) of the assets within 100 m of a place (m)."""
     found = [np.empty(0)]
     for assets in state.assets.values():
         x, y, z = (
             np.asarray(assets.rows[name].to_numpy(zero_copy_only=False), dtype=float)
             for name in ("easting_m", "northing_m", "height_m")
         )
-        found.append(z[(np.hypot(x - place[0], y - place[1]) <= reach) & np.isfinite(z)])
+        found.append(z[(np.hypot(x - place_m[0], y - place_m[1]) <= _AROUND_M) & np.isfinite(z)])
     return np.concatenate(found)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.inventory.edits import Edit
+from roadscan.inventory.edits import REJECTED, Edit
 from roadscan.inventory.state import State, reference_points
 from roadscan.inventory.values import decoded, encoded, sigmas_apart
 from roadscan.tables.asset_schema import asset_schema
@@ -37,7 +37,8 @@ class Conflict(NamedTuple):
     attribute: str
     reason: str
     """`evidence`: what was found has changed since the edit; `edit`: another person's edit waits; `rejected`: one
-    rejected the asset while another edited it; `undone`: the run that found the edited asset was undone."""
+    rejected the asset, or its parent, while another edited it; `undone`: the run that found the edited asset, or the
+    pull that drew it, was undone."""
     edit: str
     """Name of the edit that waits, or of the one in force."""
     in_force: str | None
@@ -57,11 +58,11 @@ def conflicts_of(state: State) -> list[Conflict]:
     for key, waiting in state.edits.waiting.items():
         known = state.edits.in_force.get(key)
         found += [_with_edit(state, edit, known) for edit in waiting]
-    found += _rejected_while_edited(state)
+    found += _rejected_while_edited(state) + _on_rejected_parents(state)
     found += [
         Conflict(e.asset_id, e.kind, e.attribute, "undone", e.edit, e.new, None, e.evidence, None, e.who)
         for e in state.edits.in_force.values()
-        if e.asset_id in state.orphans
+        if e.asset_id in state.orphans and not e.settles and (e.attribute, e.new) != ("status", REJECTED)
     ]
     return sorted(found, key=lambda c: (c.asset_id, c.attribute, c.reason, c.edit))
 
@@ -78,8 +79,8 @@ def _with_evidence(state: State, edit: Edit) -> Conflict | None:
     )
     if now is None or (edit.attribute == "status" and (given, now) == ("rejected", "missing")):
         return None
-    away = sigmas_apart(edit.kind, edit.attribute, now, given, row)
-    if away <= SIGNIFICANT or sigmas_apart(edit.kind, edit.attribute, now, base, row) <= SIGNIFICANT:
+    away, moved = (sigmas_apart(edit.kind, edit.attribute, now, one, row, state.units_m) for one in (given, base))
+    if away <= SIGNIFICANT or moved <= SIGNIFICANT:
         return None
     sigmas = away if math.isfinite(away) else None
     return Conflict(
@@ -98,9 +99,7 @@ def _with_edit(state: State, waiting: Edit, known: Edit | None) -> Conflict:
 
 def _rejected_while_edited(state: State) -> list[Conflict]:
     """Edits of rejected assets, where neither person had seen what the other did."""
-    rejected = {
-        e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == encoded("rejected")
-    }
+    rejected = {e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == REJECTED}
     if not rejected:
         return []
     return [
@@ -112,6 +111,17 @@ def _rejected_while_edited(state: State) -> list[Conflict]:
         and (r := rejected.get(e.asset_id)) is not None
         and e.commit != r.commit
         and max(e.commit, r.commit) > min(e.commit, r.commit) > max(e.base_commit, r.base_commit)
+    ]
+
+
+def _on_rejected_parents(state: State) -> list[Conflict]:
+    """Parents that people gave and that people rejected, until that is decided."""
+    rejected = set(state.edits.rejected)
+    return [
+        Conflict(e.asset_id, e.kind, e.attribute, "rejected", e.edit, e.new, None, e.evidence, None, e.who)
+        for e in state.edits.in_force.values()
+        if e.attribute == "parent" and not e.settles and e.asset_id not in rejected
+        if decoded(e.kind, e.attribute, e.new) in rejected
     ]
 
 

@@ -10,13 +10,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pyarrow as pa
 
+from roadscan.inventory.values import encoded
 from roadscan.tables.asset_truth import AssetTruth, Commit
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import bytes_digest
+
+REJECTED: Final = encoded("rejected")
+"""The status of an asset that a person rejected, as edits say it."""
 
 
 class Edit(NamedTuple):
@@ -36,6 +40,7 @@ class Edit(NamedTuple):
     made_at: str
     why: str
     source: str
+    settles: str | None = None
 
     @property
     def key(self) -> tuple[str, str]:
@@ -45,7 +50,10 @@ class Edit(NamedTuple):
 
 def named(edit: Edit) -> Edit:
     """The same edit with its name: a digest of what it says, of the state that it was made on and of its place."""
-    said = (edit.asset_id, edit.attribute, edit.action, edit.old, edit.new, edit.base_commit, edit.who, edit.made_at)
+    said = (
+        edit.asset_id, edit.attribute, edit.action, edit.old, edit.new, edit.base_commit, edit.who, edit.made_at,
+        *([edit.settles] if edit.settles else []),
+    )  # fmt: skip
     return edit._replace(edit=bytes_digest(repr(said).encode()).rpartition(":")[2][:16])
 
 
@@ -71,7 +79,7 @@ class Folded:
 
     in_force: dict[tuple[str, str], Edit] = field(default_factory=dict)
     waiting: dict[tuple[str, str], list[Edit]] = field(default_factory=lambda: defaultdict(list))
-    """Edits that met one in force which their maker had not seen."""
+    """Edits that met one in force which their maker had not seen, until a decision settles them."""
     created: dict[str, Edit] = field(default_factory=dict)
     """By asset: the edit that drew it, whatever was done to it since."""
 
@@ -88,9 +96,15 @@ class Folded:
             self.in_force.pop(edit.key, None)
         else:
             self.in_force[edit.key] = edit
-        seen = [e for e in self.waiting.pop(edit.key, []) if e.commit > edit.base_commit]
-        if seen:
-            self.waiting[edit.key] = seen
+        settled = (edit.settles or "").split(",")
+        left = [e for e in self.waiting.pop(edit.key, []) if e.edit not in settled and e.new != edit.new]
+        if left:
+            self.waiting[edit.key] = left
+
+    @property
+    def rejected(self) -> list[str]:
+        """Ids of the assets that people rejected."""
+        return [asset for (asset, name), edit in self.in_force.items() if (name, edit.new) == ("status", REJECTED)]
 
     def holds(self, edit: Edit) -> bool:
         """True if it says nothing new: the value is in force, or waits already."""

@@ -21,9 +21,8 @@ from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.csv import write_csv
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 
-_FORMULA: Final = re.compile(r"^[=@+\-\t\r]")
+_FORMULA: Final = re.compile(r"^[=@+\-\t\r\n＝＋－＠]")
 """Texts that a spreadsheet may run: all that OWASP names (CSV Injection); a quote before them makes them text."""
-_WKB_NAMES: Final = {"PointZ": "Point Z", "LineStringZ": "LineString Z", "PolygonZ": "Polygon Z"}
 
 
 def export(state: State, file: Path, form: str, crs: str | None) -> int:
@@ -62,7 +61,7 @@ def _gpkg(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
         schema = asset_schema(kind)
         pyogrio.write_arrow(
             kinds.get(kind, asset_table(kind).empty_table()), file, layer=schema.table, driver="GPKG", append=False,
-            geometry_name=GEOMETRY, geometry_type=_WKB_NAMES[schema.geometry], crs=crs,
+            geometry_name=GEOMETRY, geometry_type=schema.geometry_words, crs=crs,
         )  # fmt: skip
 
 

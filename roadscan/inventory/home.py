@@ -80,8 +80,8 @@ class Content:
     rows: Mapping[str, pa.Table]
     """By kind: `fid` (int64), then the columns of `asset_table(kind)`."""
     decisions: Sequence[Decision] = ()
-    authors: Mapping[tuple[str, str], Author] = field(default_factory=dict)
-    """Who changed rows last since they were read, by kind and id, or kind and `fid N`; empty where it is not told."""
+    authors: Mapping[tuple[str, str, str], Author] = field(default_factory=dict)
+    """Who changed values last since they were read, by kind, id (or `fid N`) and attribute; without one, of the row."""
     faults: Sequence[EditFault] = ()
     """What people wrote that no row can hold."""
 

@@ -27,6 +27,8 @@ _SAMPLES: Final = 16
 """Points along a line or outline that tell how much of it another one covers."""
 _LEAST_SHARE: Final = 0.35
 """Share, the mean of both ways, from which on two lines or outlines are one asset."""
+_SIDE_WEIGHT: Final = 0.5
+"""Cost of running beside at the gate all along: of two that run beside one, the nearer one is it."""
 _SIZE_WEIGHT: Final = 0.5
 """Cost of wholly different sizes, where 1 is a distance at the gate."""
 _SIZE_OF_MOVED: Final = 0.25
@@ -77,11 +79,12 @@ def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m
         if not (free_known.size and free_found.size):
             continue
         ends = here[free_known], there[free_found]
+        sigma = _sigmas(known.evidence)[free_known], _sigmas(found)[free_found]
         if is_point:
-            sigma = _sigmas(known.evidence)[free_known], _sigmas(found)[free_found]
             pairs = _near_points(*ends, *sigma, settings.distance_m)
         else:
-            pairs = _overlapping(*ends, settings.distance_m)
+            least_m = min(asset_schema(kind).known_within_m or settings.distance_m, settings.distance_m)
+            pairs = _overlapping(*ends, *sigma, (least_m, settings.distance_m))
         pairs = Pairs(free_known[pairs.known], free_found[pairs.found], pairs.cost)
         cost = pairs.cost + _SIZE_WEIGHT * _size_difference(*sizes, pairs)
         _assign(pairs._replace(cost=cost), result)
@@ -137,27 +140,49 @@ def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigm
     return Pairs(left[keep], right[keep], ratio[keep])
 
 
-def _overlapping(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Pairs:
-    lines_a, lines_b = _outlines(a), _outlines(b)
-    left, right = shapely.STRtree(lines_b).query(lines_a, predicate="dwithin", distance=within_m)
-    share = 0.5 * (_share(lines_a[left], lines_b[right], within_m) + _share(lines_b[right], lines_a[left], within_m))
+def _overlapping(
+    a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, limits_m: tuple[float, float]
+) -> Pairs:
+    """Lines and outlines that run along one another, within four σ but at least and at most `limits_m`."""
+    lines_a, lines_b = outlines(a), outlines(b)
+    widest = np.clip(_SIGMAS * np.hypot(sigma_a[:, 0], sigma_b[:, 0].max()), *limits_m)
+    left, right = shapely.STRtree(lines_b).query(lines_a, predicate="dwithin", distance=widest)
+    gate = np.clip(_SIGMAS * np.hypot(sigma_a[left, 0], sigma_b[right, 0]), *limits_m)
+    ways = (lines_a[left], lines_b[right], gate), (lines_b[right], lines_a[left], gate)
+    share, nearness = (0.5 * (one + other) for one, other in zip(*(_along(*way) for way in ways), strict=True))
     keep = share >= _LEAST_SHARE
-    return Pairs(left[keep], right[keep], 1.0 - share[keep])
+    return Pairs(left[keep], right[keep], (1.0 - share + _SIDE_WEIGHT * (1.0 - nearness))[keep])
 
 
-def _outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Lines as they are, of polygons the outer ring; of façades that is the line on the ground, there and back."""
     flat = shapely.force_2d(shapes)
     rings = shapely.get_exterior_ring(flat)
-    return np.asarray(np.where(shapely.is_missing(rings), flat, rings))
+    lines: npt.NDArray[Any] = np.where(shapely.is_missing(rings), flat, rings)
+    several = shapely.get_type_id(flat) == shapely.GeometryType.MULTIPOLYGON
+    lines[several] = shapely.boundary(flat[several])
+    return lines
 
 
-def _share(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: float) -> Floats:
-    """Share of points along `a` that lie within a distance of `b`."""
-    along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    points = shapely.line_interpolate_point(a[:, np.newaxis], along[np.newaxis, :], normalized=True)
-    near = shapely.distance(points, b[:, np.newaxis]) <= within_m
-    return np.asarray(near.mean(axis=1), dtype=float) if len(a) else np.empty(0)
+def points_along(lines: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(n, 16) points evenly along lines, of several parts one part after another."""
+    if not len(lines):
+        return np.empty((0, _SAMPLES), object)
+    parts, number = shapely.get_parts(lines, return_index=True)
+    places, part = shapely.get_coordinates(parts, return_index=True)
+    step = np.where(np.diff(part) == 0, np.hypot(*np.diff(places, axis=0).T), 0.0)
+    length = np.concatenate([[0.0], np.cumsum(step)])
+    ends = np.searchsorted(number[part], np.arange(len(lines)), "right") - 1
+    first = np.concatenate([[0.0], length[ends][:-1]])
+    share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    at = first[:, np.newaxis] + (length[ends] - first)[:, np.newaxis] * share
+    return np.asarray(shapely.points(*(np.interp(at, length, column) for column in places.T)))
+
+
+def _along(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: Floats) -> tuple[Floats, Floats]:
+    """Share of points along `a` within a distance of `b`, and how near they are: 1 on it, 0 from the distance on."""
+    ratio = shapely.distance(points_along(a), b[:, np.newaxis]) / within_m[:, np.newaxis]
+    return (ratio <= 1.0).sum(axis=1) / _SAMPLES, np.maximum(1.0 - ratio, 0.0).sum(axis=1) / _SAMPLES
 
 
 def _sizes(kind: str, table: pa.Table) -> Floats:

@@ -128,15 +128,16 @@ class Inventory:
             conflicts = conflicts_of(state)
             content = shown_content(state)
             at = self.truth.commits[-1].at if self.truth.commits else "1980-01-06T00:00:00Z"
-            token = self._token(state.commit, mark)
+            token = self._token("publish", state.commit, mark)
             self.truth.keep_published(token, published_table(content))
             self.home.write(content, self._sheets(state, conflicts), Mark(self.name, token, "", state.commit, at))
             self._write_project()
         assets = sum(rows.num_rows for rows in content.rows.values())
         return Published(self.home.name, state.commit, assets, len(conflicts), recorded)
 
-    def _token(self, commit: int, mark: Mark | None) -> str:
-        said = f"{self.name}/{self.home.name}/{commit}/{mark.token if mark else ''}"
+    def _token(self, step: str, commit: int, mark: Mark | None) -> str:
+        """Name of the rows that a home holds after a step: those of a pull that was cut off stay beside others."""
+        said = f"{step}/{self.name}/{self.home.name}/{commit}/{mark.token if mark else ''}"
         return f"{commit:06d}-{bytes_digest(said.encode()).rpartition(':')[2][:16]}"
 
     def _sheets(self, state: State, conflicts: list[Conflict]) -> list[Sheet]:
@@ -172,8 +173,7 @@ class Inventory:
                 raise refuse(faults, place.name)
             taken = _without(changes, faults)
             base = now if mark.commit == now.commit else state_at(self.truth, mark.commit)
-            authors = dict(content.authors)
-            pulling = Pulling(base, now, who or getpass.getuser(), why, place.name, authors, now_utc())
+            pulling = Pulling(base, now, who or getpass.getuser(), why, place.name, content.authors, now_utc())
             edits = new_edits(taken, content.decisions, pulling)
             commit = self._append(place, mark, edits, _as_read(changes, faults), why)
         waiting = len(conflicts_of(state_at(self.truth))) if commit is not None else len(conflicts_of(now))
@@ -216,7 +216,7 @@ class Inventory:
         if not edits:
             return None
         number = len(self.truth.commits) + 1
-        token = self._token(number, mark)
+        token = self._token("pull", number, mark)
         place.note(mark._replace(pending=token))
         if place.made_of is None:
             self.truth.keep_published(token, published_table(rows))
@@ -243,6 +243,13 @@ class Inventory:
             )
         content = place.read()
         rows = place.made_of if place.made_of is not None else published_rows(base)
+        lost = [asset_schema(kind).table for kind, held in rows.items() if held.num_rows and kind not in content.rows]
+        if lost:
+            raise HomeError(
+                f"the layer '{lost[0]}' is missing",
+                change="undo its deletion, or pull from a copy: an emptied layer would say that all are gone",
+                file=place.name,
+            )
         return mark, compared(content, rows, mark.token or f"commit {mark.commit}"), content
 
     def _write_project(self) -> None:

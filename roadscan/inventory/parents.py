@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,6 +20,11 @@ class Placed(NamedTuple):
 
     ids: npt.NDArray[Any]
     shapes: npt.NDArray[Any]
+
+    def without(self, ids: Sequence[str]) -> Placed:
+        """The same without some of them."""
+        keep = ~np.isin(self.ids, ids)
+        return Placed(self.ids[keep], self.shapes[keep])
 
 
 def parents_of(kind: str, placed: Mapping[str, Placed]) -> list[str | None]:

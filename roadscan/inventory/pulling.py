@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from roadscan.inventory.comparing import Changes
-from roadscan.inventory.edits import Edit, Folded, named
+from roadscan.inventory.edits import REJECTED, Edit, Folded, named
 from roadscan.inventory.home import Author, Decision, FaultyEditsError
 from roadscan.inventory.state import State
 from roadscan.inventory.values import encoded
 from roadscan.model.errors import ConfigError
 from roadscan.tables.inventory_schema import GEOMETRY
-
-_REJECTED: Final = encoded("rejected")
 
 
 @dataclass(frozen=True)
@@ -28,17 +26,23 @@ class Pulling:
     who: str
     why: str
     source: str
-    authors: dict[tuple[str, str], Author]
+    authors: Mapping[tuple[str, str, str], Author]
     at: str
 
 
 def new_edits(changes: Changes, decisions: Sequence[Decision], pulling: Pulling) -> list[Edit]:
-    """Edits that the truth does not hold yet, one a value."""
-    decided = list(_decided(decisions, pulling))
-    settled = {edit.key for edit in decided}
-    made = decided + [e for e in _changed(changes, pulling) if e.key not in settled and not _is_held(e, pulling)]
-    unique = {edit.key: named(edit) for edit in made}
-    return list(unique.values())
+    """Edits that the truth does not hold yet, one a value.
+
+    Raises
+    ------
+    ConfigError
+        where decisions on a value contradict one another, or a value that was written meanwhile.
+    """
+    made = {e.key: e for e in _changed(changes, pulling) if not _is_held(e, pulling)}
+    for key, own in _open(decisions, pulling).items():
+        edit = _decided(key, own, made.get(key), pulling)
+        made[edit.key] = edit
+    return [named(edit) for edit in made.values()]
 
 
 def _is_held(edit: Edit, pulling: Pulling) -> bool:
@@ -63,7 +67,8 @@ def _edit(
     pulling: Pulling, kind: str, asset_id: str, attribute: str, change: tuple[str, Any, Any], fid: int | None
 ) -> Edit:
     action, old, new = change
-    author = pulling.authors.get((kind, asset_id)) or pulling.authors.get((kind, f"fid {fid}"))
+    names = [(*row, name) for row in ((kind, asset_id), (kind, f"fid {fid}")) for name in (attribute, "")]
+    author = next((pulling.authors[name] for name in names if name in pulling.authors), None)
     who, at, why = author if author is not None else ("", "", "")
     evidence = (pulling.base.row(asset_id, evidence=True) or {}).get(attribute)
     return Edit(
@@ -73,35 +78,58 @@ def _edit(
     )  # fmt: skip
 
 
-def _decided(decisions: Sequence[Decision], pulling: Pulling) -> Iterator[Edit]:
-    """Edits that settle conflicts; they know all that is in the truth today."""
+def _open(decisions: Sequence[Decision], pulling: Pulling) -> dict[tuple[str, str], list[Decision]]:
+    """Decisions by asset and attribute; those that were settled since are left out."""
+    found: dict[tuple[str, str], list[Decision]] = {}
     for one in decisions:
         key = (one.asset_id, one.attribute)
         known = pulling.now.edits.in_force.get(key)
-        waiting = {e.edit: e for e in pulling.now.edits.waiting.get(key, ())}
-        if one.edit not in waiting and (known is None or known.edit != one.edit):
-            continue  # it was settled since
-        kind = pulling.now.kind_of.get(one.asset_id)
-        if kind is None:
-            continue
-        evidence = (pulling.now.row(one.asset_id, evidence=True) or {}).get(one.attribute)
-        if one.choice == "other" and one.edit not in waiting:
-            raise ConfigError(
-                "the decision is 'other', and no other edit waits",
-                expected="edit or evidence",
-                record=f"conflicts, {one.asset_id}, {one.attribute}",
-            )
-        old = known.new if known is not None else None
-        if one.choice == "other":
-            new: str | None = waiting[one.edit].new
-        else:
-            new = old if one.choice == "edit" and known is not None else encoded(evidence)
-        action = "withdraw" if one.choice == "evidence" or (known is None and one.choice == "edit") else "set"
-        yield Edit(
-            "", 0, one.asset_id, kind, one.attribute, action, old, new, None if evidence is None else encoded(evidence),
-            pulling.now.commit, pulling.who, pulling.at, pulling.why or f"conflict settled: {one.choice}",
-            pulling.source,
-        )  # fmt: skip
+        names = [e.edit for e in (*pulling.now.edits.waiting.get(key, ()), *([known] if known else []))]
+        if one.edit in names and one.asset_id in pulling.now.kind_of:
+            found.setdefault(key, []).append(one)
+    return found
+
+
+def _decided(key: tuple[str, str], decisions: Sequence[Decision], written: Edit | None, pulling: Pulling) -> Edit:
+    """The edit that settles conflicts of a value; it knows all that is in the truth today.
+
+    Parameters
+    ----------
+    written : a value that the person wrote beside the decisions.
+    """
+    known = pulling.now.edits.in_force.get(key)
+    waiting = {e.edit: e for e in pulling.now.edits.waiting.get(key, ())}
+    record = f"conflicts, {key[0]}, {key[1]}"
+    settles = ",".join(sorted(one.edit for one in decisions))
+    ruling = {(one.choice, one.edit if one.choice == "other" else "") for one in decisions if one.choice != "edit"}
+    if len(ruling) > 1 or (ruling and written is not None):
+        raise ConfigError(
+            "the decisions contradict one another" if written is None else "a decision contradicts the value written",
+            expected="one value: `edit` for what the row of the asset says",
+            record=record,
+        )
+    if written is not None:
+        return written._replace(settles=settles)
+    choice, edit = ruling.pop() if ruling else ("edit", decisions[0].edit)
+    rejection = pulling.now.edits.in_force.get((key[0], "status"))
+    if choice == "other" and edit not in waiting and rejection is not None and rejection.new == REJECTED:
+        key, known, choice = rejection.key, rejection, "evidence"  # whoever edited it holds: the asset is back
+    if choice == "other" and edit not in waiting:
+        raise ConfigError(
+            "the decision is 'other', and no other edit waits", expected="edit or evidence", record=record
+        )
+    evidence = (pulling.now.row(key[0], evidence=True) or {}).get(key[1])
+    old = known.new if known is not None else None
+    if choice == "other":
+        new: str | None = waiting[edit].new
+    else:
+        new = old if choice == "edit" and known is not None else encoded(evidence)
+    action = "withdraw" if choice == "evidence" or (known is None and choice == "edit") else "set"
+    return Edit(
+        "", 0, key[0], pulling.now.kind_of[key[0]], key[1], action, old, new,
+        None if evidence is None else encoded(evidence), pulling.now.commit, pulling.who, pulling.at,
+        pulling.why or f"conflict settled: {choice}", pulling.source, settles,
+    )  # fmt: skip
 
 
 def now_utc() -> str:

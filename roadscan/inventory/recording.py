@@ -39,6 +39,8 @@ class Found:
     """Survey and stage."""
     epoch: str | None = None
     """Name of the survey's epoch; the day (UTC) of the first return where it is None."""
+    began_gps_ns: int = 0
+    """GPS time at which the survey began, which counts where it found nothing at all; 0 where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def record(truth: AssetTruth, found: Found, rules: Rules, who: str = "roadscan",
         where a table is not that of its kind.
     """
     tables = {kind: _checked(kind, found.tables[kind]) for kind in asset_kind_names() if kind in found.tables}
-    began = min((int(np.min(t[_EPOCH].to_numpy())) for t in tables.values() if t.num_rows), default=0)
+    began = min((int(np.min(t[_EPOCH].to_numpy())) for t in tables.values() if t.num_rows), default=found.began_gps_ns)
     epoch = found.epoch or (utc_from_gps_ns(began).date().isoformat() if began else "no returns")
     known = [c for c in live_commits(truth.commits) if c.kind == "found" and c.epoch == epoch]
     if known and known[-1].run == found.key:
@@ -116,8 +118,10 @@ class _Recording:
             left = left[[str(one) not in self.state.orphans for one in assets.ids[left]]] if left.size else left
             unseen.append(_unseen(kind, assets.ids[left], expected[left]))
         placed = self._placed(seen)
+        rejected = self.state.edits.rejected
+        standing = {kind: one.without(rejected) for kind, one in placed.items()} if rejected else placed
         for kind, rows in list(seen.items()):
-            parents = pa.array(parents_of(kind, placed)[: rows.num_rows], pa.string())
+            parents = pa.array(parents_of(kind, {**standing, kind: placed[kind]})[: rows.num_rows], pa.string())
             at = rows.schema.get_field_index("parent")
             seen[kind] = rows.set_column(at, rows.schema.field(at), parents)
         parts = [_wide(kind, rows, 1) for kind, rows in seen.items()] + unseen

@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime as dt
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -65,7 +65,9 @@ class State:
     """By kind; only kinds that have any."""
     edits: Folded
     orphans: frozenset[str]
-    """Edited assets whose evidence was undone; they keep it, and are said to be missing."""
+    """Edited assets whose evidence or drawing was undone; they keep it, and are said to be missing."""
+    units_m: tuple[float, float] = (1.0, 1.0)
+    """Metres of a unit of the map: of its coordinates, and of its heights."""
 
     @cached_property
     def kind_of(self) -> dict[str, str]:
@@ -109,13 +111,19 @@ def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool 
     edits = folded(read_edits(truth, live))
     found, status = _evidence(truth, _newest_first([c for c in live if c.kind == "found"]))
     edited = {asset for asset, _ in edits.in_force} - edits.created.keys()
-    undone = [c for c in commits if c.kind == "found" and c not in live]
+    counted = {c.number for c in live}
+    undone = [c for c in commits if c.kind != "undo" and c.number not in counted]
     orphans: set[str] = set()
     if undone:
         lost = edited - (set() if found is None else set(found["asset_id"].to_pylist()))
-        found, orphans = _with_lost(truth, _newest_first(undone), found, None if with_undone else lost)
+        runs = _newest_first([c for c in undone if c.kind == "found"])
+        found, orphans = _with_lost(truth, runs, found, None if with_undone else lost)
+        drawn = {e.asset_id: e for e in read_edits(truth, undone) if e.action == "create"}
+        edits.created.update({one: drawn[one] for one in drawn.keys() & (lost - orphans)})
+        orphans |= drawn.keys() & lost
         status |= dict.fromkeys(orphans, ("missing", None))
-    return State(len(commits), _by_kind(found, status, edits), edits, frozenset(orphans))
+    assets = _by_kind(found, status, edits, truth.units_m)
+    return State(len(commits), assets, edits, frozenset(orphans), truth.units_m)
 
 
 def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
@@ -182,7 +190,9 @@ def _fresh(truth: AssetTruth, commit: Commit, parts: Sequence[pa.Table]) -> bool
 
 
 def _id_array(parts: Sequence[pa.Table]) -> pa.Array:
-    return pa.concat_arrays([chunk for part in parts for chunk in part["asset_id"].chunks])
+    return pa.concat_arrays(
+        [pa.array([], pa.string()), *(chunk for part in parts for chunk in part["asset_id"].chunks)]
+    )
 
 
 def _ids(parts: Sequence[pa.Table]) -> set[str]:
@@ -207,7 +217,9 @@ def _with_lost(
     return found, kept
 
 
-def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded) -> dict[str, Assets]:
+def _by_kind(
+    found: pa.Table | None, status: Mapping[str, tuple[str, int | None]], edits: Folded, units_m: tuple[float, float]
+) -> dict[str, Assets]:
     changes: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits.in_force.values():
         changes[edit.kind].append(edit)
@@ -230,9 +242,21 @@ def _by_kind(found: pa.Table | None, status: Mapping[str, tuple[str, int | None]
         evidence = _with_status(evidence, status)
         own_edits = changes.get(kind, []) + _drawn_again(evidence, edits, drawn.get(kind, ()))
         rows = _as_drawn(
-            _edited(kind, evidence, own_edits), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
+            _edited(kind, evidence, own_edits, units_m), [edits.created[one] for one in sorted(drawn.get(kind, ()))]
         )
         assets[kind] = Assets(kind, rows, evidence)
+    return _without_rejected_parents(assets, edits)
+
+
+def _without_rejected_parents(assets: dict[str, Assets], edits: Folded) -> dict[str, Assets]:
+    """Assets whose parents are not those that people rejected; a parent that a person gave stays."""
+    rejected = pa.array(edits.rejected, pa.string())
+    if not len(rejected):
+        return assets
+    for kind, own in assets.items():
+        lost = np.flatnonzero(np.asarray(pc.is_in(own.rows["parent"], value_set=rejected)))
+        places = [int(at) for at in lost if (str(own.ids[at]), "parent") not in edits.in_force]
+        assets[kind] = replace(own, rows=_replaced(own.rows, "parent", places, [None] * len(places)))
     return assets
 
 
@@ -245,7 +269,7 @@ def _with_status(rows: pa.Table, status: Mapping[str, tuple[str, int | None]]) -
     return _replaced(rows, "passes_expected", places, [status[ids[at]][1] for at in places])
 
 
-def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
+def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit], units_m: tuple[float, float]) -> pa.Table:
     """Rows with the values that people gave."""
     by_attribute: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits:
@@ -261,7 +285,7 @@ def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit]) -> pa.Table:
         own = sorted(by_attribute[attribute], key=lambda e: e.asset_id)
         places = _places(ids, own)
         rows = _replaced(rows, attribute, places, [decoded(kind, attribute, e.new) for e in own if _is_in(ids, e)])
-    return _at_their_places(rows, moved)
+    return _at_their_places(rows, moved, units_m)
 
 
 def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> list[Edit]:
@@ -286,28 +310,26 @@ def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
     return rows
 
 
-def _at_their_places(rows: pa.Table, moved: Sequence[int]) -> pa.Table:
+def _at_their_places(rows: pa.Table, moved: Sequence[int], units_m: tuple[float, float]) -> pa.Table:
     """Reference points of moved assets, from their geometry."""
     if not moved:
         return rows
     shapes = shapely.from_wkb(rows[GEOMETRY].take(pa.array(moved)).to_numpy(zero_copy_only=False))
-    points = reference_points(np.asarray(shapes))
+    points = reference_points(np.asarray(shapes)) * (units_m[0], *units_m)
     for column, name in enumerate(("easting_m", "northing_m", "height_m")):
         rows = _replaced(rows, name, moved, points[:, column].tolist())
     return rows
 
 
 def reference_points(shapes: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """(n, 3) reference points: the point itself, the middle of a line, a point within an area at its mean height."""
-    out = np.empty((len(shapes), 3))
-    for at, shape in enumerate(shapes):
-        if shape.geom_type == "LineString":
-            point = shape.interpolate(0.5, normalized=True)
-        else:
-            point = shape if shape.geom_type == "Point" else shapely.force_2d(shape).representative_point()
-        heights = shapely.get_coordinates(shape, include_z=True)[:, 2]
-        out[at] = point.x, point.y, point.z if point.has_z else float(np.mean(heights))
-    return out
+    """(n, 3) reference points: a point itself, the middle of a line, else a point on or in it at its mean height."""
+    is_line = shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING
+    points = shapely.point_on_surface(shapely.force_2d(shapes))
+    points[is_line] = shapely.line_interpolate_point(shapes[is_line], 0.5, normalized=True)
+    xyz, number = shapely.get_coordinates(shapes, include_z=True, return_index=True)
+    mean = np.bincount(number, xyz[:, 2], len(shapes)) / shapely.get_num_coordinates(shapes)
+    heights = np.where(is_line, shapely.get_z(points), mean)
+    return np.column_stack([shapely.get_x(points), shapely.get_y(points), heights])
 
 
 def _is_in(ids: npt.NDArray[Any], edit: Edit) -> bool:

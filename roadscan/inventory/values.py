@@ -65,13 +65,16 @@ def iso_column(column: pa.ChunkedArray) -> pa.Array:
     return pa.array(iso_wkb(shapely.from_wkb(column.to_numpy(zero_copy_only=False))), pa.binary())
 
 
-def sigmas_apart(kind: str, attribute: str, one: Any, other: Any, row: Mapping[str, Any]) -> float:
+def sigmas_apart(
+    kind: str, attribute: str, one: Any, other: Any, row: Mapping[str, Any], units_m: tuple[float, float] = (1.0, 1.0)
+) -> float:
     """By how many σ two values of an attribute differ; infinity where they differ and have no σ.
 
     Parameters
     ----------
     row : the asset, whose `sigma_horizontal_m` and `sigma_height_m` are those of its evidence. Lengths are differences
         of two of its points; of angles, slopes and ratios the σ is that of the method (2°, 0.005, 0.1).
+    units_m : metres of a unit of geometries, horizontally and in height.
     """
     if one == other:
         return 0.0
@@ -80,20 +83,20 @@ def sigmas_apart(kind: str, attribute: str, one: Any, other: Any, row: Mapping[s
     horizontal = max(row.get("sigma_horizontal_m") or 0.0, SIGMA_LEAST_M)
     height = max(row.get("sigma_height_m") or 0.0, SIGMA_LEAST_M)
     if attribute == GEOMETRY:
-        return geometries_apart(one, other, horizontal, height)
+        return geometries_apart(one, other, horizontal / units_m[0], height / units_m[1])
     sigma = sigma_of(kind, attribute)
     if sigma is None or isinstance(one, str):
         return math.inf
     return float(abs(one - other) / sigma(horizontal, height, max(abs(one), abs(other))))
 
 
-def geometries_apart(one: bytes, other: bytes, horizontal_m: float, height_m: float) -> float:
-    """By how many σ two places differ: of points horizontally and in height, of others by their Hausdorff distance."""
+def geometries_apart(one: bytes, other: bytes, horizontal: float, height: float) -> float:
+    """By how many σ, in units of the map, two places differ: of points in both ways, else by Hausdorff distance."""
     first, second = shapely.from_wkb(one), shapely.from_wkb(other)
     if first.geom_type == second.geom_type == "Point":
         rise = abs(first.z - second.z) if first.has_z and second.has_z else 0.0
-        return max(math.hypot(first.x - second.x, first.y - second.y) / horizontal_m, rise / height_m)
-    return float(shapely.hausdorff_distance(first, second)) / horizontal_m
+        return max(math.hypot(first.x - second.x, first.y - second.y) / horizontal, rise / height)
+    return float(shapely.hausdorff_distance(first, second)) / horizontal
 
 
 Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
@@ -103,7 +106,9 @@ Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
 @functools.cache
 def sigma_of(kind: str, attribute: str) -> Sigma | None:
     """How σ of a number follows from those of the place; None for texts, and where any difference counts."""
-    unit = next((c.unit for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), "")
+    column = next((c for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), None)
+    if column is None:
+        return None
     of_unit: dict[str, Sigma] = {
         "m": lambda horizontal, height, _: np.hypot(horizontal, height),
         "m²": lambda horizontal, _, area: np.maximum(2.0 * np.sqrt(area) * horizontal, SIGMA_LEAST_M),
@@ -111,4 +116,9 @@ def sigma_of(kind: str, attribute: str) -> Sigma | None:
         "m/m": lambda horizontal, *_: _SIGMA_SLOPE + 0.0 * horizontal,
         "1": lambda horizontal, *_: _SIGMA_RATIO + 0.0 * horizontal,
     }
-    return of_unit.get(unit)
+    of_place, share = of_unit.get(column.unit), column.sigma_share
+    if not share:
+        return of_place
+    return lambda horizontal, height, value: np.maximum(
+        of_place(horizontal, height, value) if of_place else 0.0, np.maximum(share * value, SIGMA_LEAST_M)
+    )

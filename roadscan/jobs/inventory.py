@@ -1,4 +1,4 @@
-"""The inventory of a survey: its store, its home, and what the stage `assets` found."""
+"""The inventory of a survey: its store, its home, and what was found of assets and distresses."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
 from roadscan.jobs.assets.evidence import VISIBILITY
 from roadscan.jobs.assets.plan import asset_grid
+from roadscan.jobs.found_distresses import SeenByCells, found_distresses
 from roadscan.jobs.session import Session
 from roadscan.model.crs import crs_from_text
 from roadscan.model.ids import TileId
@@ -54,7 +55,7 @@ def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
     name = settings.name or survey.config.id
     frame = survey.config.map.frame()
-    rules = Rules(_visibility(session), settings.matching, frame.horizontal_unit_m)
+    rules = Rules(SeenByCells(session, _visibility(session)), settings.matching, frame.horizontal_unit_m)
     return Inventory(
         _truth(survey), home, name, rules, lambda: found_assets(session), frame.crs,
         lambda folder: _rasters(session, folder),
@@ -66,7 +67,8 @@ def _truth(survey: Survey) -> AssetTruth:
     settings, url = survey.config.inventory, survey.store_url
     if settings.store is not None:
         url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
-    return AssetTruth(Store(url, settings.name or survey.config.id))
+    frame = survey.config.map.frame()
+    return AssetTruth(Store(url, settings.name or survey.config.id), (frame.horizontal_unit_m, frame.vertical_unit_m))
 
 
 def inventory_faults(survey: Survey) -> list[str]:
@@ -116,7 +118,7 @@ def edits_of_file(file: Path) -> bytes:
 
 
 def found_assets(session: Session) -> Found | None:
-    """What the newest run found; None before the stage `assets` has run."""
+    """What the newest run found; None before there is a table of assets or distresses."""
     store = session.store
     tables: dict[str, pa.Table] = {}
     digests: list[str] = []
@@ -126,10 +128,15 @@ def found_assets(session: Session) -> Found | None:
             content = store.read_bytes(file)
             tables[kind] = store.parse_table(content, file)
             digests.append(f"{kind}:{bytes_digest(content)}")
+    for one in found_distresses(session):
+        tables[one.kind] = one.rows
+        digests += [f"{one.kind}:{r.unit}:{r.digest}" for r in one.records]
     if not tables:
         return None
     key = bytes_digest("\n".join(digests).encode())
-    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch)
+    nothing = not any(rows.num_rows for rows in tables.values())
+    began = min((p.start_gps_ns for p in session.plan.passes), default=0) if nothing else 0
+    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch, began)
 
 
 def _visibility(session: Session) -> Visibility:

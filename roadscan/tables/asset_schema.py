@@ -1,4 +1,4 @@
-"""Schemas of the tables of assets, read from ``schemas/assets/``: one file a kind, and the columns that all have."""
+"""Schemas of the tables of assets and distresses, read from ``schemas/assets/``: a file a kind, and common columns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pyarrow as pa
 from roadscan.model.errors import SchemaError, nearest
 from roadscan.tables.schema import schema_folders
 
-GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ"]
+GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ", "MultiLineStringZ", "MultiPolygonZ"]
 
 _TYPES: Final = {
     "bool": pa.bool_(),
@@ -46,6 +46,12 @@ class AssetColumn:
     values: tuple[str, ...] = ()
     is_evidence: bool = False
     """It tells of what was seen, not of the asset: people do not change it, and its changes are none of the asset."""
+    sigma_share: float = 0.0
+    """1 σ of a measured value as a share of it, where that is more than what follows from σ of the place."""
+    class_of: str = ""
+    """Column whose value decides which of `values` is found: the first one whose limit in `up_to` is not exceeded."""
+    up_to: tuple[float, ...] = ()
+    """Limits of all values but the last, ascending."""
 
     def field(self) -> pa.Field:
         """The column as Arrow has it, with unit, frame and meaning as metadata."""
@@ -65,8 +71,17 @@ class AssetSchema:
     meaning: str
     parents: tuple[str, ...]
     """Kinds that it may stand on or hang from."""
+    found_in: str
+    """Table of the store that holds what was found of a kind of distress; empty of what the stage `assets` finds."""
+    known_within_m: float | None
+    """Distance up to which outlines are one where four σ are less; None: that of the inventory's settings."""
     own: tuple[AssetColumn, ...]
     common: tuple[AssetColumn, ...]
+
+    @property
+    def geometry_words(self) -> str:
+        """Type of its geometries as GeoParquet and GDAL call it, such as ``Point Z``."""
+        return f"{self.geometry.removesuffix('Z')} Z"
 
     @property
     def columns(self) -> tuple[AssetColumn, ...]:
@@ -80,8 +95,8 @@ class AssetSchema:
 
 
 def asset_kind_names() -> list[str]:
-    """Names of all kinds of assets."""
-    return sorted(set(_files()) - {_COMMON, _INVENTORY})
+    """Names of all kinds: those that the stage `assets` finds, then distresses of the pavement."""
+    return sorted(set(_files()) - {_COMMON, _INVENTORY}, key=lambda name: ("found_in" in _read(name), name))
 
 
 @functools.cache
@@ -93,8 +108,9 @@ def _files() -> dict[str, Path]:
 
 @functools.cache
 def asset_tables() -> dict[str, str]:
-    """Kind of assets by the name of its table, in the order of these."""
-    return dict(sorted((asset_schema(kind).table, kind) for kind in asset_kind_names()))
+    """Kind by the name of its table, in the order of these, of what the stage `assets` finds."""
+    schemas = [asset_schema(kind) for kind in asset_kind_names()]
+    return dict(sorted((one.table, one.kind) for one in schemas if not one.found_in))
 
 
 @functools.cache
@@ -112,6 +128,7 @@ def asset_schema(kind: str) -> AssetSchema:
     raw = _read(kind)
     return AssetSchema(
         kind, raw["table"], raw["title"], raw["geometry"], raw["meaning"], tuple(raw["parents"]),
+        found_in=raw.get("found_in", ""), known_within_m=raw.get("known_within_m"),
         own=_columns(raw), common=_columns(_read(_COMMON)),
     )  # fmt: skip
 
@@ -123,9 +140,17 @@ def inventory_columns() -> tuple[AssetColumn, ...]:
 
 
 def _read(name: str) -> dict[str, Any]:
-    with _files()[name].open("rb") as stream:
+    return _parsed(_files()[name])
+
+
+@functools.cache
+def _parsed(file: Path) -> dict[str, Any]:
+    with file.open("rb") as stream:
         return tomllib.load(stream)
 
 
 def _columns(raw: dict[str, Any]) -> tuple[AssetColumn, ...]:
-    return tuple(AssetColumn(**{**c, "values": tuple(c.get("values", ()))}) for c in raw.get("columns", ()))
+    lists = ("values", "up_to")
+    return tuple(
+        AssetColumn(**c | {name: tuple(c[name]) for name in lists if name in c}) for c in raw.get("columns", ())
+    )

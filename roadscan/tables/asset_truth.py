@@ -80,8 +80,10 @@ class Draft:
 class AssetTruth:
     """The inventory's commits in a store; a program reads them as they were when it asked first, or appended."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, units_m: tuple[float, float] = (1.0, 1.0)) -> None:
+        """Take metres of a unit of the map: of its coordinates, and of its heights."""
         self.store = store
+        self.units_m = units_m
         self._commits: tuple[Commit, ...] | None = None
 
     @property

@@ -82,12 +82,12 @@ class InFile(GeoPackage):
                 column = frame[name].astype(object)
                 column.iloc[at] = value
                 frame[name] = column if isinstance(value, str) else pd.to_numeric(column)
-        person.replace(self.file, table, frame)
+        person.replace(self.file, table, frame, asset_schema(kind).geometry_words)
 
     def delete(self, kind: str, at: int) -> None:
         table = asset_schema(kind).table
         frame = person.layer(self.file, table)
-        person.replace(self.file, table, frame.drop(frame.index[at]))
+        person.replace(self.file, table, frame.drop(frame.index[at]), asset_schema(kind).geometry_words)
 
     def draw(self, kind: str, geometry: bytes, **values: Any) -> None:
         person.draw(self.file, asset_schema(kind).table, shapely.from_wkb(geometry), **values)

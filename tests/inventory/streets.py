@@ -46,7 +46,8 @@ def asset(kind: str, *places: tuple[float, float, float], when: dt.datetime = SP
     points = [(EAST + x, NORTH + y, z) for x, y, z in places]
     geometry = asset_schema(kind).geometry
     shape = {"PointZ": lambda: shapely.Point(points[0]), "LineStringZ": lambda: shapely.LineString(points),
-             "PolygonZ": lambda: shapely.Polygon(points)}[geometry]()  # fmt: skip
+             "PolygonZ": lambda: shapely.Polygon(points), "MultiLineStringZ": lambda: shapely.MultiLineString([points]),
+             "MultiPolygonZ": lambda: shapely.MultiPolygon([shapely.Polygon(points)])}[geometry]()  # fmt: skip
     row: dict[str, Any] = {c.name: None for c in asset_schema(kind).columns}
     first = gps_ns_from_utc(when)
     row |= {
@@ -93,3 +94,14 @@ def inventory(
     truth = AssetTruth(Store(str(folder / "store"), "street"))
     rules = Rules(visibility or Unknown(), Matching())
     return Inventory(truth, GeoPackage(folder / file, CRS, kinds), "street", rules, crs=CRS)
+
+
+def file_of(street: Inventory) -> Path:
+    """The GeoPackage of a street."""
+    assert isinstance(street.home, GeoPackage)
+    return street.home.file
+
+
+def ids_by_station(street: Inventory, kind: str = "pole") -> list[str]:
+    """Ids along the road."""
+    return list(street.assets(kind).sort_values("station_m")["asset_id"])

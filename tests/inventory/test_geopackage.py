@@ -19,7 +19,19 @@ from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from tests.inventory import qgis_edits as person
-from tests.inventory.streets import AUTUMN, CRS, EAST, NORTH, Everywhere, asset, found, inventory, poles
+from tests.inventory.streets import (
+    AUTUMN,
+    CRS,
+    EAST,
+    NORTH,
+    Everywhere,
+    asset,
+    file_of,
+    found,
+    ids_by_station,
+    inventory,
+    poles,
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -29,15 +41,6 @@ def street(tmp_path: Path) -> Inventory:
     made.record(found([*poles(), asset("sign", (20.1, 4.0, 103.0), message="STOP", width_m=0.6)]))
     made.publish()
     return made
-
-
-def file_of(street: Inventory) -> Path:
-    assert isinstance(street.home, GeoPackage)
-    return street.home.file
-
-
-def ids_by_station(street: Inventory, kind: str = "pole") -> list[str]:
-    return list(street.assets(kind).sort_values("station_m")["asset_id"])
 
 
 def test_table_1_is_there_with_its_attributes_and_types(tmp_path: Path) -> None:
@@ -144,37 +147,6 @@ def test_a_rejected_asset_does_not_come_again(street: Inventory) -> None:
     assert len(person.ids(file_of(street), "poles")) == 5
 
 
-def test_two_editors_on_two_copies(street: Inventory, tmp_path: Path) -> None:
-    copy = tmp_path / "copy.gpkg"
-    shutil.copy(file_of(street), copy)
-    first, second, *_ = ids_by_station(street)
-    person.edit(file_of(street), "poles", first, condition=3, comments="eva")
-    person.edit(copy, "poles", first, condition=8)
-    person.edit(copy, "poles", second, comments="max")
-    street.pull(who="eva")
-    done = street.pull(home=GeoPackage(copy, CRS, street.home.kinds), who="max")
-    assert (street.state().row(first)["comments"], street.state().row(second)["comments"]) == ("eva", "max")
-    (conflict,) = street.conflicts()
-    assert (conflict.asset_id, conflict.attribute, conflict.reason) == (first, "condition", "edit")
-    assert (conflict.in_force, conflict.other, conflict.who, done.conflicts) == ("3", "8", "max", 1)
-
-
-@pytest.mark.parametrize(("choice", "value"), [("edit", 3), ("other", 8), ("evidence", None)])
-def test_a_person_settles_a_conflict_in_its_layer(
-    street: Inventory, tmp_path: Path, choice: str, value: object
-) -> None:
-    test_two_editors_on_two_copies(street, tmp_path)
-    street.publish()
-    layer = pyogrio.read_dataframe(file_of(street), layer="conflicts")
-    assert list(layer["attribute"]) == ["condition"]
-    layer["decision"] = [choice]
-    person.replace(file_of(street), "conflicts", layer)
-    street.pull(who="boss")
-    assert street.conflicts() == []
-    held = street.state().row(layer["asset_id"][0])["condition"]
-    assert held == value
-
-
 def test_publishing_over_changes_that_were_not_pulled_is_refused(street: Inventory) -> None:
     person.edit(file_of(street), "poles", ids_by_station(street)[0], condition=3)
     before = file_of(street).read_bytes()
@@ -183,6 +155,29 @@ def test_publishing_over_changes_that_were_not_pulled_is_refused(street: Invento
     assert file_of(street).read_bytes() == before
     street.publish(discard=True)
     assert person.layer(file_of(street), "poles")["condition"].isna().all()
+
+
+def test_a_pull_and_a_publication_that_die_one_after_the_other(
+    street: Inventory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = file_of(street)
+    person.delete(file, "poles", ids_by_station(street)[0])
+    person.draw(file, "poles", shapely.Point(EAST + 70, NORTH + 4, 103.0), comments="drawn")
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    note = street.home.note
+    monkeypatch.setattr(street.home, "note", lambda mark: note(mark) if mark.pending else end())
+    with pytest.raises(KeyboardInterrupt):
+        street.pull()
+    other = inventory(tmp_path, Everywhere())
+    monkeypatch.setattr(other.home, "write", end)
+    with pytest.raises(KeyboardInterrupt):
+        other.publish()
+    again = inventory(tmp_path, Everywhere())
+    assert again.pull().commit is None  # the file is still told from what the pull read
+    assert again.publish().assets == 7
 
 
 def test_what_is_saved_while_a_publication_is_written_is_not_overwritten(
@@ -210,6 +205,7 @@ INVALID = shapely.Polygon([(EAST, NORTH, 1), (EAST + 2, NORTH + 2, 1), (EAST + 2
     [
         ("poles", {"condition": 11}, "condition is 11, above 10"),
         ("poles", {"comments": "=HYPERLINK(1)"}, "begins as a spreadsheet's formula does"),
+        ("poles", {"comments": "+1+SUM(A1)"}, "begins as a spreadsheet's formula does"),
         ("poles", {"parent": "pole-00000000"}, "its parent 'pole-00000000' is not known"),
         ("poles", {"status": "gone"}, "status is 'gone', expected one of found, missing, confirmed, rejected"),
         ("poles", {"returns": 7}, "returns was measured and is not edited"),

@@ -111,6 +111,10 @@ def test_an_edit_that_another_person_did_not_see_waits(street: Inventory) -> Non
         (edit("change", "P", attributes={"asset_id": "pole-1"}), "there is no column 'asset_id'"),
         (edit("change", "P", attributes={"valid_to": "tomorrow"}), "expected a date"),
         (edit("change", "P", attributes={"comments": "=1+1"}), "spreadsheet"),
+        (edit("change", "P", attributes={"comments": "-1+cmd|' /C calc'!A0"}), "spreadsheet"),
+        (edit("change", "P", attributes={"comments": "bent\0"}), "control character"),
+        (edit("change", "P", attributes={"condition": 1e30}), "condition is 1e+30, expected a whole number"),
+        (edit("change", "P", attributes={"diameter_m": 10**400}), "expected a number"),
         (edit("change", "P", geometry={"type": "Point", "coordinates": [EAST, NORTH]}), "no height"),
         (edit("change", "P", geometry={"type": "Point", "coordinates": "here"}), "cannot be read"),
         (edit("change", "P", geometry={"type": "Blob"}), "cannot be read"),
@@ -159,7 +163,9 @@ def test_a_document_that_is_none_of_this_inventory(street: Inventory, said: dict
         street.pull_page(document(edit("confirm", pole(street)), **said))
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[1]", b"{", b'{"type": "FeatureCollection"}'])
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xfe", b"[1]", b"{", b'{"type": "FeatureCollection"}', b'{"a": "\\ud800"}']
+)
 def test_what_is_no_document(content: bytes) -> None:
     with pytest.raises(HomeError, match="edits"):
         PageDocument.parse("edits.geojson", content, (1.0, 1.0, 1.0))

@@ -76,6 +76,7 @@ def test_edits_of_several_people_are_taken_in_with_their_names(street: Inventory
         execute(eva, f"UPDATE street.poles SET condition = 3, comments = 'é, \"bent\"' WHERE asset_id = '{ids[0]}'")
         execute(eva, f"DELETE FROM street.poles WHERE asset_id = '{ids[1]}'")
         execute(max_, f"UPDATE street.poles_current SET condition = 8 WHERE asset_id = '{ids[2]}'")
+        execute(max_, f"UPDATE street.poles SET diameter_m = 0.2 WHERE asset_id = '{ids[0]}'")
         point = f"ST_SetSRID(ST_MakePoint({EAST + 3}, {NORTH - 6}, 100), 32632)"
         execute(max_, f"INSERT INTO street.poles (comments, geom) VALUES ('new', {point})")
         done = street.pull(who="office")
@@ -84,13 +85,14 @@ def test_edits_of_several_people_are_taken_in_with_their_names(street: Inventory
         wkb = shapely.to_wkb(shapely.Point(EAST + 3, NORTH - 6, 100.0), flavor="iso").hex()
         assert told == {
             (ids[0], "condition", "3", "eva"), (ids[0], "comments", '"é, \\"bent\\""', "eva"),
-            (ids[1], "status", '"rejected"', "eva"), (ids[2], "condition", "8", "max"),
+            (ids[0], "diameter_m", "0.2", "max"), (ids[1], "status", '"rejected"', "eva"),
+            (ids[2], "condition", "8", "max"),
             ("new", "geometry", f'"{wkb}"', "max"), (drawn, "comments", '"new"', "max"),
         }  # fmt: skip
         assert street.pull().commit is None
         street.publish()
         assert execute(address, "SELECT count(*) FROM street.poles") == [(6,)]
-        assert execute(address, "SELECT count(*) FROM street.history") == [(4,)]  # a publication is none
+        assert execute(address, "SELECT count(*) FROM street.history") == [(5,)]  # a publication is none
     finally:
         execute(address, "DROP OWNED BY eva, max; DROP ROLE eva, max")
 
@@ -139,6 +141,22 @@ def test_readers_may_look_and_editors_may_not_change_the_history(street: Invento
             execute(address, statement, role=role)
     with pytest.raises(psycopg.errors.CheckViolation):
         execute(address, "UPDATE street.poles SET condition = 11", role="street_editor")
+
+
+def test_every_administrator_publishes_and_no_editor_hides_a_change(street: Inventory, address: str) -> None:
+    execute(address, "CREATE ROLE ada LOGIN IN ROLE street_admin; CREATE ROLE eva LOGIN IN ROLE street_editor")
+    try:
+        hidden = "SET roadscan.publishing = 'yes'; UPDATE street.poles SET condition = 3 WHERE fid = 1"
+        execute(address.replace("admin:secret", "eva"), hidden)
+        assert [e.who for e in street.pull().edits] == ["eva"]
+        for user in ("ada", "admin:secret"):
+            street.home = PostGis(address.replace("admin:secret", user), "street", 32632)
+            assert street.publish().assets == 7
+        street.home = PostGis(address.replace("admin:secret", "eva"), "street", 32632)
+        with pytest.raises(HomeError, match="permission denied"):
+            street.publish()
+    finally:
+        execute(address, "DROP ROLE ada; DROP ROLE eva")
 
 
 def test_a_faulty_row_is_named(street: Inventory, address: str) -> None:

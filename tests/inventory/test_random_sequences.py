@@ -1,4 +1,4 @@
-"""Random sequences of edits, reprocessings, new epochs, undone runs and killed programs: no edit is ever lost.
+"""Random sequences of edits by two persons, reprocessings, new epochs, undone runs and killed programs: none is lost.
 
 In the nightly tests on a GeoPackage and on PostGIS programs die by kill −9; in memory they stop at one of their writes.
 """
@@ -30,6 +30,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from roadscan.inventory.conflicts import conflicts_of
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
 from tests.inventory.dying import Death, Job, Killed, Programs, Work, inventory_of, programs
@@ -63,6 +64,10 @@ class Street(RuleBasedStateMachine):
         self.names: dict[int, str] = {}
         self.pulled: dict[tuple[str, str], Any] = {}
         """Values that a pull took in, by asset and attribute."""
+        self.copy: Any = None
+        """Copy of the home that another person has."""
+        self.waits: set[tuple[tuple[str, str], Any]] = set()
+        """Values that met others which were in force, until they are in force themselves."""
         self.drawn_at: list[tuple[float, float]] = []
         self.days: list[tuple[int, dict[str, Any]]] = []
         self.checked = 0
@@ -77,6 +82,10 @@ class Street(RuleBasedStateMachine):
     def opened(self) -> Any:
         """The home as another program opens it."""
         return self.home
+
+    def copied(self) -> Any:
+        """A copy of the home, which another person takes along; None where it has none."""
+        return copy.deepcopy(self.home)
 
     def teardown(self) -> None:
         """At the end of a sequence all is taken in, and each remembered day is asked for."""
@@ -145,6 +154,7 @@ class Street(RuleBasedStateMachine):
     def begin(self) -> None:
         self.process(seen=set(range(COUNT)), noise=0.02, height=5.0, dies=None)
         self.publish(dies=None)
+        self.take_a_copy()
 
     @rule(
         seen=st.sets(st.integers(0, COUNT - 1), min_size=COUNT - 3, max_size=COUNT),
@@ -242,6 +252,30 @@ class Street(RuleBasedStateMachine):
             self.home.draw("pole", shapely.to_wkb(point, flavor="iso"), comments=f"drawn {n}")
             self.is_edited = True
 
+    # --- what another person does with a copy
+
+    @rule()
+    def take_a_copy(self) -> None:
+        self.copy = self.copied()
+
+    @precondition(lambda self: self.copy is not None)
+    @rule(at=st.integers(0, 50), height=st.sampled_from([2.0, 4.0, 8.0]))
+    def edit_the_copy(self, at: int, height: float) -> None:
+        rows = self.copy.shown("pole").to_pylist()
+        at %= len(rows)
+        if rows[at]["asset_id"] is None or rows[at]["asset_height_m"] == height:
+            return
+        key = rows[at]["asset_id"], "asset_height_m"
+        self.copy.edit("pole", at, asset_height_m=height)
+        edits = self.inventory().pull(home=self.copy, who="max").edits
+        self.tally["copied"] += len(edits)
+        row = state_at(self.inventory().truth).row(key[0])
+        assert row is not None, key
+        if row["asset_height_m"] == height:
+            self.pulled[key] = height
+        else:
+            self.waits.add((key, height))
+
     # --- what has to hold
 
     def home_rows(self, kind: str) -> list[dict[str, Any]]:
@@ -290,6 +324,18 @@ class Street(RuleBasedStateMachine):
             assert row is not None, asset_id
             shown = value.hex() if isinstance(value, bytes) else value
             assert row[name] == value or ((asset_id, name), shown) in waiting, (asset_id, name, value, row[name])
+        conflicts = {
+            ((c.asset_id, c.attribute), json.loads(c.other or "null"))
+            for c in conflicts_of(state)
+            if c.reason == "edit"
+        }
+        for (asset_id, name), value in set(self.waits):
+            row = state.row(asset_id)
+            assert row is not None, asset_id
+            if row[name] == value:
+                self.waits.remove(((asset_id, name), value))
+            else:
+                assert ((asset_id, name), value) in conflicts, (asset_id, name, value, row[name])
 
     def each_asset_is_there_once(self, state: State) -> None:
         for kind, assets in state.assets.items():
@@ -366,8 +412,12 @@ class StreetInFile(StreetOfPrograms):
     def new_home(self) -> InFile:
         return InFile(self.folder / "inventory.gpkg", CRS, KINDS)
 
+    def copied(self) -> InFile:
+        shutil.copy(self.home.file, self.folder / "copy.gpkg")
+        return InFile(self.folder / "copy.gpkg", CRS, KINDS)
+
     def close(self) -> None:
-        assert {f.name for f in self.folder.iterdir()} <= {"store", "inventory.gpkg", "inventory.qgs"}
+        assert {f.name for f in self.folder.iterdir()} <= {"store", "inventory.gpkg", "inventory.qgs", "copy.gpkg"}
 
 
 class StreetInDatabase(StreetOfPrograms):
@@ -377,6 +427,9 @@ class StreetInDatabase(StreetOfPrograms):
 
     def new_home(self) -> InDatabase:
         return InDatabase(self.address, f"s{self.folder.name.lower().replace('-', '_')}", 32632, KINDS)
+
+    def copied(self) -> None:
+        return None
 
     def close(self) -> None:
         self.home.drop()

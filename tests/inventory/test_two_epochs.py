@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,17 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+import shapely
 
 from roadscan.assets.visibility import PASSES
+from roadscan.inventory.home import FaultyEditsError
 from roadscan.inventory.identity import new_ids
 from roadscan.inventory.recording import Found
 from roadscan.inventory.visibility import VisibilityGrid, VisibilityOfSquares
 from roadscan.model.errors import ConfigError, SchemaError
+from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.ids import TileId
+from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, SPRING, Everywhere, asset, found, inventory, poles
 
 COUNT = 400
@@ -170,6 +175,57 @@ def test_squares_are_read_once_and_only_where_places_lie() -> None:
     assert first.tolist() == [0, 0, 3]  # the second square is none, though a table of the first names its cell
     assert np.array_equal(town.expected_passes("pole", places[::-1]), first[::-1])
     assert len(asked) == len(set(asked)) == 3
+
+
+def test_the_older_survey_is_processed_again_and_what_appeared_has_appeared_all_the_same(tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(poles(3), "spring"))
+    street.publish()
+    person.draw(tmp_path / "inventory.gpkg", "poles", shapely.Point(EAST + 100, NORTH + 4, 105.0))
+    street.pull()  # a person knew the sixth, so it did not appear
+    street.record(found([*poles(4, when=AUTUMN), *poles(6, when=AUTUMN)[5:]], "autumn"))
+    for diameter_m in (0.1, 0.11):
+        street.record(found(poles(3, diameter_m=diameter_m), "spring"))
+        (change,) = [c for c in street.changes().changes if c.change != "changed"]
+        assert (change.change, shapely.from_wkb(change.geometry).x) == ("appeared", EAST + 60)
+
+
+@pytest.mark.parametrize("epoch", ["spring", "autumn"])
+def test_a_run_that_finds_nothing_at_all_says_that_all_are_missing(epoch: str, tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    street.record(found(poles(), "spring"))
+    street.record(replace(found([], epoch), began_gps_ns=gps_ns_from_utc(AUTUMN)))
+    assert set(street.assets("pole")["status"]) == {"missing"}
+    if epoch == "autumn":
+        assert Counter(c.change for c in street.changes().changes) == {"gone": 6}
+
+
+def test_a_map_in_feet(tmp_path: Path) -> None:
+    foot_m = 1200 / 3937
+    street = inventory(tmp_path, Everywhere())
+    street.truth.units_m, street.rules = (foot_m, foot_m), replace(street.rules, unit_m=foot_m)
+
+    def in_feet(shift_m: float) -> list[dict[str, Any]]:
+        rows = [asset("pole", (20.0 * n + shift_m, 4.0, 100.0)) for n in range(3)]
+        shapes = shapely.transform(
+            shapely.from_wkb([r["geometry"] for r in rows]), lambda p: p / foot_m, include_z=True
+        )
+        return [row | {"geometry": one} for row, one in zip(rows, shapely.to_wkb(shapes), strict=True)]
+
+    street.record(found(in_feet(0.0)))
+    street.publish()
+    file, first = tmp_path / "inventory.gpkg", street.assets("pole").iloc[0]
+    place = first["geometry"]
+    person.edit(file, "poles", first["asset_id"], geometry=shapely.Point(place.x + 1.0, place.y, place.z))
+    person.draw(file, "poles", shapely.Point(place.x + 40.0, place.y + 40.0, 0.0))
+    with pytest.raises(FaultyEditsError, match=r"its height is 0, and assets around it stand at 100\.0"):
+        street.pull()
+    street.pull(sound=True)
+    row = street.state().row(first["asset_id"])
+    assert row is not None and row["easting_m"] == pytest.approx(first["easting_m"] + foot_m, abs=1e-6)
+    street.record(found(in_feet(0.5)))
+    (conflict,) = street.conflicts()
+    assert conflict.sigmas == pytest.approx((0.5 - foot_m) / 0.02, rel=1e-3)
 
 
 def test_a_bad_run_is_undone_and_each_day_is_as_it_was(tmp_path: Path) -> None:

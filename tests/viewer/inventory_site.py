@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 from roadscan.inventory.homes.page_edits import PageDocument
 from roadscan.jobs.publish.document import json_bytes
@@ -18,8 +18,10 @@ from roadscan.model.crs import MapFrame
 from tests.inventory.streets import EAST, NORTH, asset, found, inventory
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
 
-POLES = ((10.0, 3.0), (20.0, 3.0), (30.0, 3.0))
+POLES: Final = ((10.0, 3.0), (20.0, 3.0), (30.0, 3.0))
 """Metres from the street's beginning, and to the left of its middle."""
+CRACK: Final = ((14.0, -1.0, 40.0), (14.5, -1.0, 40.0), (16.0, -1.0, 40.0))
+"""The same with heights."""
 
 
 class EditedSite:
@@ -30,7 +32,8 @@ class EditedSite:
         self.inventory = inventory(folder)
         shift = EAST_M - EAST, NORTH_M - NORTH
         rows = [asset("pole", (shift[0] + x, shift[1] + y, 40.0), object=f"p{n}") for n, (x, y) in enumerate(POLES)]
-        self.inventory.record(found(rows))
+        crack = asset("crack", *((shift[0] + x, shift[1] + y, z) for x, y, z in CRACK), severity="low")
+        self.inventory.record(found([*rows, crack]))
         self.taken = 0
 
     def document(self, path: str) -> Served | None:
@@ -39,7 +42,7 @@ class EditedSite:
             own = [vectors.about(layer) for layer in self._layers()]
             names = [one["name"] for one in own]
             survey = json.loads((self._street / path).read_text())
-            survey["layers"] = [*own, *(one for one in survey["layers"] if one["name"] not in names)]
+            survey["layers"] = [*own, *(one for one in survey["layers"] if one["name"] not in (*names, "cracks"))]
             commit = self.inventory.state().commit
             survey["edits"] |= {"layers": names, "post": "edits", "inventory": "street", "commit": commit}
             return self._made(path, survey)

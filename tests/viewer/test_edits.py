@@ -13,7 +13,7 @@ import shapely
 from roadscan.jobs.publish.server import SiteServer
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from tests.viewer.conftest import go_to, serious
-from tests.viewer.inventory_site import POLES, EditedSite
+from tests.viewer.inventory_site import CRACK, POLES, EditedSite
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
 
 STILL = '.map-view[data-drawn="true"]'
@@ -139,6 +139,46 @@ def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
     assert moved.z == 40.0
     assert len(shapes) == len(POLES) + 1
     assert 0.12 in state.assets["pole"].rows["diameter_m"].to_pylist()
+
+
+def test_a_crack_is_corrected_and_reshaped_and_a_pothole_is_drawn(opened: Opened) -> None:
+    page, site = opened.page, opened.site
+    (crack,) = site.inventory.state().assets["crack"].ids
+    go_to(page, f"row=asset_cracks/{crack}&views=map")
+    page.locator(".details h2", has_text=crack).wait_for()
+    page.locator(".edit button", has_text="Correct").click()
+    page.locator('.edit-form [aria-label="Severity"]').select_option("high")
+    page.locator('.edit-form [aria-label="Comments"]').fill(HOSTILE)
+    page.locator('.edit-form button:has-text("Keep")').click()
+    page.locator(".edit button", has_text="Move").click()
+    page.wait_for_selector(STILL)
+    x, y = middle_of_map(page)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x, y - 40, steps=4)
+    page.mouse.up()
+    page.locator("button", has_text="Keep the new place").click()
+    draw(page, "Potholes", [(x - 40, y + 60), (x + 40, y + 60), (x, y + 100)], Condition="2")
+    assert [outcome for outcome, _ in send(opened)] == ["accepted", "accepted"]
+    state = site.inventory.state()
+    (row,) = state.assets["crack"].rows.to_pylist()
+    assert (row["severity"], row["comments"], row["sigma_horizontal_m"]) == ("high", HOSTILE, 0.02)
+    corners = shapely.get_coordinates(shapely.from_wkb(row["geometry"]), include_z=True)
+    assert len(corners) == len(CRACK) + 1 and (corners[:, 2] == 40.0).all()  # also the one that was added
+    assert 0.05 < corners[:, 1].max() - corners[:, 1].min() < 3.0
+    (hole,) = state.assets["pothole"].rows.to_pylist()
+    assert hole["condition"] == 2 and shapely.from_wkb(hole["geometry"]).geom_type == "Polygon"
+    page.locator(".edit button", has_text="Draw anew").click()
+    for corner in ((x - 60, y), (x + 60, y), (x + 60, y)):
+        page.mouse.click(*corner)
+    page.locator(".edit-list li").wait_for()
+    page.locator(".edits button", has_text="Send the edits").click()
+    page.locator(".edit-list li").wait_for(state="detached")
+    (row,) = site.inventory.state().assets["crack"].rows.to_pylist()
+    shape = shapely.from_wkb(row["geometry"])
+    assert (shape.geom_type, shapely.get_num_coordinates(shape)) == ("MultiLineString", 2)
+    assert abs(shapely.get_coordinates(shape, include_z=True)[:, 2] - 40.0).max() < 0.1
+    assert page.evaluate("window.hit") is None and serious(page) == []
 
 
 @pytest.mark.parametrize(

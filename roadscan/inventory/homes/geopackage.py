@@ -29,7 +29,6 @@ from roadscan.tables.store import process_lives
 
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"
-_WKB_NAMES: Final = {"PointZ": "Point Z", "LineStringZ": "LineString Z", "PolygonZ": "Polygon Z"}
 _VERSION: Final = {"VERSION": "1.3"}
 """Of the standard; programs of today's stable Linux systems warn of newer ones."""
 _FOREIGN: Final = "name another file, or move this one away"
@@ -95,13 +94,8 @@ class GeoPackage(Home):
         rows: dict[str, pa.Table] = {}
         for kind in self.kinds:
             table = asset_schema(kind).table
-            if table not in layers:
-                raise HomeError(
-                    f"the layer '{table}' is missing",
-                    change="undo its deletion, or pull from a copy: an emptied layer would say that all are gone",
-                    file=self.file,
-                )
-            rows[kind] = self._read_layer(kind, table)
+            if table in layers:
+                rows[kind] = self._read_layer(kind, table)
         content = Content(rows, self._decisions(layers))
         self._as_read = self._stamp()
         return content
@@ -198,7 +192,7 @@ class GeoPackage(Home):
             schema = asset_schema(kind)
             own = rows.get(kind, asset_table(kind).empty_table())
             table = own.select(asset_table(kind).names).cast(_told(kind))
-            self._layer(file, Sheet(schema.table, schema.title, table), _WKB_NAMES[schema.geometry], schema.meaning)
+            self._layer(file, Sheet(schema.table, schema.title, table), schema.geometry_words, schema.meaning)
         for sheet in sheets:
             self._layer(file, sheet, "Point Z" if GEOMETRY in sheet.rows.column_names else None)
         self._layer(file, Sheet(MARKS, MARKS, _mark_rows(mark)), None, "Not to be edited: what this file was made of.")

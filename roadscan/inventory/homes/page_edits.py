@@ -111,6 +111,10 @@ class PageDocument:
         if not isinstance(values, dict):
             raise HomeError("the edits are not a collection of features", change=change, file=name)
         try:
+            json.dumps(values, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise HomeError(f"the edits hold half a character: {error}", change=change, file=name) from error
+        try:
             return cls(name, EditDocument.parse(values), units_m)
         except ConfigError as error:
             raise HomeError(f"the edits cannot be read: {error}", change=change, file=name) from error
@@ -126,7 +130,7 @@ class PageEdits(Home):
         self.records: list[tuple[str, str]] = []
         """Table and record of each edit, once it was read."""
         self._faults: list[EditFault] = []
-        self._authors: dict[tuple[str, str], Author] = {}
+        self._authors: dict[tuple[str, str, str], Author] = {}
 
     @property
     def name(self) -> str:
@@ -182,7 +186,8 @@ class PageEdits(Home):
                 self._faults.append(EditFault(table, record, str(error)))
                 continue
             at_utc = "" if given.edited_utc is None else given.edited_utc.isoformat(timespec="seconds")
-            self._authors[kind, record] = Author(given.author, at_utc.replace("+00:00", "Z"), given.comment)
+            author = Author(given.author, at_utc.replace("+00:00", "Z"), given.comment)
+            self._authors |= {(kind, record, name): author for name in values}
             if is_new:
                 drawn.append({FID: fid, **values})
             else:
@@ -201,12 +206,15 @@ class PageEdits(Home):
             return {"status": "confirmed" if given.action == "confirm" else "rejected"}
         values = {name: _value(kind, name, raw) for name, raw in given.attributes.items()}
         if feature.geometry is not None:
-            values[GEOMETRY] = self._geometry(feature.geometry)
+            values[GEOMETRY] = self._geometry(kind, feature.geometry)
         return values
 
-    def _geometry(self, raw: Mapping[str, Any]) -> bytes | None:
+    def _geometry(self, kind: str, raw: Mapping[str, Any]) -> bytes | None:
+        """A geometry as WKB; of a kind whose shapes have several parts a single line or area becomes the only part."""
         try:
             shape = shapely.geometry.shape(raw)
+            if asset_schema(kind).geometry == f"Multi{shape.geom_type}Z":
+                shape = shapely.geometry.shape({"type": f"Multi{shape.geom_type}", "coordinates": [raw["coordinates"]]})
             turned = shapely.transform(
                 shape, lambda places: places / self.document.units_m[: places.shape[1]], include_z=bool(shape.has_z)
             )
@@ -245,7 +253,7 @@ class PageEdits(Home):
             return False
         if feature.properties.action != "add":
             return edit.asset_id == record[1]
-        drawn = None if feature.geometry is None else self._geometry(feature.geometry)
+        drawn = None if feature.geometry is None else self._geometry(edit.kind, feature.geometry)
         return edit.action == "create" and drawn is not None and edit.new == encoded(drawn)
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
@@ -297,7 +305,7 @@ def _value(kind: str, name: str, raw: Any) -> Any:
     wanted = schema.field(name).type
     if raw is None:
         return None
-    is_number = isinstance(raw, int | float) and not isinstance(raw, bool)
+    is_number = isinstance(raw, int | float) and not isinstance(raw, bool) and abs(raw) < _MOST
     if pa.types.is_floating(wanted) and is_number:
         return float(raw)
     if pa.types.is_integer(wanted) and is_number and float(raw).is_integer():
@@ -314,6 +322,8 @@ def _value(kind: str, name: str, raw: Any) -> Any:
     raise ValueError(f"{name} is {json.dumps(raw)}, expected {_IN_WORDS.get(str(wanted), str(wanted))}")
 
 
+_MOST: Final = 2**31
+"""Numbers of assets are less, also where a column could hold more."""
 _IN_WORDS: Final = {
     "double": "a number", "int32": "a whole number", "int64": "a whole number", "string": "a text",
     "bool": "true or false", "date32[day]": "a date such as 2026-05-04",

@@ -138,7 +138,8 @@ class PostGis(Home):
     def read(self) -> Content:
         """Rows of all tables at one instant, and who changed them since they were read last."""
         with self._transaction() as cursor:
-            rows = {kind: self._read_table(cursor, kind) for kind in self.kinds}
+            held = self._held(cursor)
+            rows = {kind: self._read_table(cursor, kind) for kind in self.kinds if kind in held}
             cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")
             self._seen = int(cursor.fetchone()[0])
             return Content(rows, self._decisions(cursor), self._authors(cursor))
@@ -174,14 +175,22 @@ class PostGis(Home):
             | {GEOMETRY: pa.array(iso_wkb(shapes), pa.binary())}
         )
 
+    def _as_owner(self, cursor: Any) -> None:
+        """Go on as the owner of the schema, which all administrators are: tables are replaced by nobody else."""
+        cursor.execute("SELECT nspowner::regrole::text FROM pg_namespace WHERE nspname = %s", [self.schema])
+        cursor.execute(f"SET LOCAL ROLE {cursor.fetchone()[0]}")
+
+    def _held(self, cursor: Any) -> set[str]:
+        """Kinds that have a table; a schema of an older version lacks those of newer kinds."""
+        cursor.execute("SELECT tablename FROM pg_tables WHERE schemaname = %s", [self.schema])
+        return {kinds_by_table()[table] for (table,) in cursor.fetchall() if table in kinds_by_table()}
+
     def _check_columns(self, cursor: Any, table: str, wanted: Sequence[str]) -> None:
         cursor.execute(
             "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
             [self.schema, table],
         )
         there = {name for (name,) in cursor.fetchall()}
-        if not there:
-            raise HomeError(f"the table '{table}' is missing", change="restore it from a backup", file=self.name)
         missing = [name for name in (*wanted, "fid", "geom") if name not in there]
         if missing:
             raise HomeError(f"the column '{missing[0]}' of the table '{table}' is missing", file=self.name)
@@ -202,25 +211,32 @@ class PostGis(Home):
                                 file=self.name)  # fmt: skip
         return found
 
-    def _authors(self, cursor: Any) -> dict[tuple[str, str], Author]:
+    def _authors(self, cursor: Any) -> dict[tuple[str, str, str], Author]:
         cursor.execute(
-            f"SELECT layer, fid, asset_id, who, at FROM {self.schema}.history "
+            "SELECT layer, fid, asset_id, who, at, CASE WHEN action = 'DELETE' THEN ARRAY['status'] ELSE "
+            "ARRAY(SELECT key FROM jsonb_each(new) WHERE old IS NULL OR old -> key IS DISTINCT FROM value) END "
+            f"FROM {self.schema}.history "
             f"WHERE id > (SELECT coalesce(max(history_id), 0) FROM {self.schema}.{MARKS}) ORDER BY id"
         )
-        found: dict[tuple[str, str], Author] = {}
-        for layer, fid, asset_id, who, at in cursor.fetchall():
+        found: dict[tuple[str, str, str], Author] = {}
+        for layer, fid, asset_id, who, at, names in cursor.fetchall():
             kind = kinds_by_table().get(layer)
             if kind is not None:
                 moment = at.astimezone(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-                found[kind, asset_id or f"fid {fid}"] = Author(who, moment)
+                author = Author(who, moment)
+                for name in names:
+                    found[kind, asset_id or f"fid {fid}", GEOMETRY if name == "geom" else name] = author
         return found
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
         """Replace all rows in one transaction."""
         with self._transaction("READ COMMITTED") as cursor:
-            if self._mark(cursor) is None:
-                for statement in statements(self.schema, self.srid, self.kinds):
-                    cursor.execute(statement)
+            is_new = self._mark(cursor) is None
+            if not is_new:
+                self._as_owner(cursor)
+            missing = [kind for kind in self.kinds if is_new or kind not in self._held(cursor)]
+            for statement in statements(self.schema, self.srid, missing, is_new=is_new) if missing else ():
+                cursor.execute(statement)
             tables = ", ".join(f"{self.schema}.{asset_schema(kind).table}" for kind in self.kinds)
             cursor.execute(f"LOCK TABLE {tables} IN ACCESS EXCLUSIVE MODE")
             cursor.execute(f"SELECT coalesce(max(id), 0) FROM {self.schema}.history")

@@ -23,7 +23,9 @@ CREATE TABLE {s}.history (
 CREATE FUNCTION {s}.note_change() RETURNS trigger LANGUAGE plpgsql
   SECURITY DEFINER SET search_path = pg_catalog, public AS $$
 BEGIN
-  IF current_setting('roadscan.publishing', true) = 'yes' THEN RETURN NULL; END IF;
+  IF current_setting('roadscan.publishing', true) = 'yes' AND pg_has_role(
+    session_user, (SELECT nspowner FROM pg_namespace WHERE nspname = TG_TABLE_SCHEMA), 'MEMBER')
+  THEN RETURN NULL; END IF;
   INSERT INTO {s}.history (layer, action, fid, asset_id, old, new) VALUES (
     TG_TABLE_NAME, TG_OP, coalesce(NEW.fid, OLD.fid), coalesce(OLD.asset_id, NEW.asset_id),
     CASE WHEN TG_OP <> 'INSERT' THEN to_jsonb(OLD) END, CASE WHEN TG_OP <> 'DELETE' THEN to_jsonb(NEW) END);
@@ -35,18 +37,24 @@ CREATE TABLE {s}.roadscan_inventory (
 """
 
 
-def statements(schema: str, srid: int, kinds: Sequence[str]) -> Iterator[str]:
-    """Statements that make all tables in a new schema. Its name and the kinds' are checked: letters, digits, `_`."""
-    yield "CREATE EXTENSION IF NOT EXISTS postgis"
-    yield f"CREATE SCHEMA {schema}"
-    yield _HISTORY.format(s=schema)
+def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = True) -> Iterator[str]:
+    """Statements that make tables in a new schema, or further ones in one that is there.
+
+    Names of the schema and of the kinds are checked: letters, digits, `_`.
+    """
+    if is_new:
+        yield "CREATE EXTENSION IF NOT EXISTS postgis"
+        for role in ROLES:
+            yield (
+                f"DO $$ BEGIN IF NOT EXISTS (SELECT FROM pg_roles WHERE rolname = '{schema}_{role}') THEN "
+                f"CREATE ROLE {schema}_{role} NOLOGIN; END IF; END $$"
+            )
+        yield f"GRANT {schema}_admin TO CURRENT_USER"
+        yield f"CREATE SCHEMA {schema} AUTHORIZATION {schema}_admin"
+        yield f"SET LOCAL ROLE {schema}_admin"  # all that is made belongs to every administrator
+        yield _HISTORY.format(s=schema)
     for kind in kinds:
         yield from _kind(schema, kind, srid)
-    for role in ROLES:
-        yield (
-            f"DO $$ BEGIN IF NOT EXISTS (SELECT FROM pg_roles WHERE rolname = '{schema}_{role}') THEN "
-            f"CREATE ROLE {schema}_{role} NOLOGIN; END IF; END $$"
-        )
     yield from grants(schema, kinds)
 
 

@@ -11,10 +11,9 @@ from roadscan.model.crs import crs_from_text
 from roadscan.tables.asset_schema import asset_schema
 
 _GEOMETRY: Final = {
-    "PointZ": ("Point", "PointZ"),
-    "LineStringZ": ("Line", "LineStringZ"),
-    "PolygonZ": ("Polygon", "PolygonZ"),
-}
+    "PointZ": "Point", "LineStringZ": "Line", "MultiLineStringZ": "Line", "PolygonZ": "Polygon",
+    "MultiPolygonZ": "Polygon",
+}  # fmt: skip
 _ORDER: Final = tuple(_GEOMETRY)
 """From the uppermost layer down."""
 
@@ -95,8 +94,7 @@ def _layer(name: str, title: str, source: Source, crs: str | None) -> Element:
 
 def _vector(name: str, title: str, geometry: str, source: Source, crs: str | None) -> Element:
     layer = _layer(name, title, source, crs)
-    shape, wkb = _GEOMETRY[geometry]
-    layer.attrib |= {"type": "vector", "geometry": shape, "wkbType": wkb, "readOnly": "0"}
+    layer.attrib |= {"type": "vector", "geometry": _GEOMETRY[geometry], "wkbType": geometry, "readOnly": "0"}
     return layer
 
 

@@ -26,7 +26,7 @@ _CHANGES: Final = {
     "moved": ("triangle", "31,119,180", 6.0), "changed": ("diamond", "148,103,189", 5.0),
 }  # fmt: skip
 """Marker, colour and size (mm) by what changed."""
-_SYMBOLS: Final = {"PointZ": "marker", "LineStringZ": "line", "PolygonZ": "fill"}
+_SYMBOLS: Final = {"PointZ": "marker", "LineStringZ": "line", "MultiLineStringZ": "line"}
 _LAYERS: Final = {"marker": "SimpleMarker", "line": "SimpleLine", "fill": "SimpleFill"}
 _COLOURS: Final = (
     "31,119,180", "255,127,14", "44,160,44", "214,39,40", "148,103,189", "140,86,75", "227,119,194", "127,127,127",
@@ -104,7 +104,7 @@ def sheet_elements(name: str) -> list[Element]:
 
 
 def _renderer(kind: str) -> Element:
-    symbol = _SYMBOLS[asset_schema(kind).geometry]
+    symbol = _SYMBOLS.get(asset_schema(kind).geometry, "fill")
     colour = _COLOURS[asset_kind_names().index(kind) % len(_COLOURS)]
     options: Mapping[str, str] = {
         "marker": _marker("circle", colour, 2.4),

@@ -160,8 +160,11 @@ def _sigma_of(name: str, names: Sequence[str]) -> str:
 
 
 def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[SiteLayer]:
-    """A layer of all rows of a table with shapes, as `about` describes it; nothing where the survey has none."""
-    held = material.table(table)
+    """A layer of all rows of a table with shapes, as `about` describes it.
+
+    There is none where the survey has no such rows, or where the inventory shows them with its edits.
+    """
+    held = None if table in material.tables_in_inventory else material.table(table)
     if held is None or held.shapes_m is None or not held.rows.num_rows:
         return
     names = [f.name for f in held.rows.schema if not _is_list(f)]

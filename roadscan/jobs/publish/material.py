@@ -21,10 +21,11 @@ from roadscan.jobs.products import StoredTiles, product_context
 from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE
 from roadscan.jobs.tiles.tiles import summary_of
-from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.errors import ConfigError, DamagedError, nearest
 from roadscan.model.ids import TileId
 from roadscan.products.base import ProductContext, TileSummary
 from roadscan.products.geo_table import read_geo_table
+from roadscan.tables.asset_schema import asset_schema
 from roadscan.tables.manifest import OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
@@ -153,12 +154,21 @@ class Material:
         held = truth_of(self.session)
         return (held.name, held.state()) if held.truth.commits else None
 
+    @cached_property
+    def tables_in_inventory(self) -> frozenset[str]:
+        """Tables of distresses whose rows the inventory holds, with what people made of them."""
+        try:
+            held = () if self.inventory is None else self.inventory[1].assets
+        except DamagedError:
+            held = ()
+        return frozenset(asset_schema(kind).found_in for kind in held)
+
     def check_edits(self) -> None:
         """Raise :class:`ConfigError` where the survey has no inventory that could be edited."""
         if self.inventory is None:
             raise ConfigError(
                 "there is nothing to be edited: the survey's inventory is empty",
-                expected="an inventory, which `roadscan inventory publish` makes of what the stage assets found",
+                expected="an inventory, which `roadscan inventory publish` makes of what was found",
                 change="run that first, or go without --edit",
             )
 

@@ -105,6 +105,7 @@ export class Editing {
         button('close', 'Reject', () => this.#add(selected, 'reject', {}, null)),
         button('edit', 'Correct', () => this.#form(selected, body)),
         selected.feature.geometry ? button('point', 'Move', () => this.#move(selected, body)) : null,
+        selected.layer.geometry === 'point' ? null : button('plus', 'Draw anew', () => this.#redraw(selected, body)),
       ),
       body,
     )
@@ -137,7 +138,8 @@ export class Editing {
       const geometry = feature.getGeometry()!
       this.#end()
       fill(body)
-      this.#add(selected, 'change', {}, { type: geometry.getType(), coordinates: geometry.getCoordinates() })
+      const before = placesOf(selected.feature.geometry!.coordinates)
+      this.#add(selected, 'change', {}, { type: geometry.getType(), coordinates: settled(geometry.getCoordinates(), before) })
     } }, 'Keep the new place')
     modify.on('modifyend', () => { done.disabled = false })
     const put = h('button', { type: 'button', onclick: () => {
@@ -154,16 +156,29 @@ export class Editing {
     }
   }
 
-  /** Draw an asset of a kind on the map, then fill in its form. */
-  #drawNew(kind: EditKind): void {
+  /** Draw the line or the area of a row anew, at the height of the surface. */
+  #redraw(selected: Selected, body: HTMLElement): void {
+    const { layer, feature } = selected
+    this.#drawShape(layer, body, async (drawn) => {
+      const { type, coordinates } = shapeOf(drawn)
+      const heights = await this.#heightsOf(coordinates)
+      const known = heights.some(([, , height]) => height !== null) ? heights : placesOf(feature.geometry!.coordinates)
+      this.#end()
+      fill(body)
+      this.#add(selected, 'change', {}, { type, coordinates: raised(coordinates, known, 0) })
+    })
+  }
+
+  /** Let a shape be drawn on the map. */
+  #drawShape({ title, geometry }: { title: string; geometry: EditKind['geometry'] }, body: HTMLElement, whenDrawn: (feature: Feature) => Promise<void>): void {
     this.#end()
     this.map.tool.value = 'select'
-    const draw = new Draw({ source: this.#source, type: DRAWN[kind.geometry], style: measuring(this.desk.dark.value) })
+    const draw = new Draw({ source: this.#source, type: DRAWN[geometry], style: measuring(this.desk.dark.value) })
     const button = (title: string, onclick: () => void): HTMLElement => h('button', { type: 'button', onclick }, title)
-    const isPoint = kind.geometry === 'point'
+    const isPoint = geometry === 'point'
     fill(
-      this.#body,
-      h('p', { class: 'hint' }, `${kind.title}: ${HOW[kind.geometry]} Without a mouse, the cross in the middle of the map serves.`),
+      body,
+      h('p', { class: 'hint' }, `${title}: ${HOW[geometry]} Without a mouse, the cross in the middle of the map serves.`),
       h('div', { class: 'actions' },
         button(isPoint ? 'Put it at the cross' : 'Corner at the cross', () => {
           const place = this.map.seen.centre
@@ -171,17 +186,25 @@ export class Editing {
           else draw.appendCoordinates([place])
         }),
         isPoint ? null : button('That was the last', () => draw.finishDrawing()),
-        button('Cancel', () => this.#end())),
+        button('Cancel', () => {
+          this.#end()
+          fill(body)
+        })),
     )
     // Draw adds what was drawn to the source, as the button does.
     const key = this.#source.on('addfeature', ({ feature }) => {
       this.#leave(draw, key)
       this.#stop = () => this.#source.removeFeature(feature!)
-      this.#formNew(kind, feature!).catch((error) => this.desk.complain(error))
+      whenDrawn(feature!).catch((error) => this.desk.complain(error))
     })
     this.map.map.addInteraction(draw)
     this.map.drawing = true
     this.#stop = () => this.#leave(draw, key)
+  }
+
+  /** Draw an asset of a kind on the map, then fill in its form. */
+  #drawNew(kind: EditKind): void {
+    this.#drawShape(kind, this.#body, (feature) => this.#formNew(kind, feature))
   }
 
   #leave(draw: Draw, key: EventsKey): void {
@@ -194,8 +217,7 @@ export class Editing {
   async #formNew(kind: EditKind, feature: Feature): Promise<void> {
     this.#forms ??= this.desk.source.json<EditForms>(this.rules.forms)
     this.#forms.catch(() => (this.#forms = null))
-    const geometry = feature.getGeometry() as SimpleGeometry
-    const shape = { type: geometry.getType(), coordinates: geometry.getCoordinates() }
+    const shape = shapeOf(feature)
     const [{ columns }, heights] = await Promise.all([this.#forms, this.#heightsOf(shape.coordinates)])
     if (!this.#source.hasFeature(feature)) return
     const fields = columns[kind.layer]!.map((column) => [column, field(column, null)] as const)
@@ -224,9 +246,8 @@ export class Editing {
   }
 
   /** Places of a shape with the height of the surface there; null where no raster knows it. */
-  #heightsOf(coordinates: any): Promise<Raised[]> {
-    const places = typeof coordinates[0] === 'number' ? [coordinates] : coordinates.flat(typeof coordinates[0][0] === 'number' ? 0 : 1)
-    return Promise.all(places.map(async ([e, n]: number[]) => [e, n, await this.map.heightAt(e!, n!)]))
+  #heightsOf(coordinates: unknown): Promise<Raised[]> {
+    return Promise.all(placesOf(coordinates).map(async ([e, n]): Promise<Raised> => [e, n, await this.map.heightAt(e, n)]))
   }
 
   /** Give up what is being drawn or moved. */
@@ -352,6 +373,24 @@ export class Editing {
 
 /** A place with its height; null where it is not known. */
 type Raised = readonly [number, number, number | null]
+
+/** What was drawn, as a document states it. */
+function shapeOf(feature: Feature): { type: string; coordinates: any } {
+  const geometry = feature.getGeometry() as SimpleGeometry
+  return { type: geometry.getType(), coordinates: geometry.getCoordinates() }
+}
+
+/** All places of a shape's coordinates, however these are nested; what was just drawn has no heights. */
+function placesOf(coordinates: any): Raised[] {
+  return typeof coordinates[0] === 'number' ? [coordinates] : coordinates.flatMap(placesOf)
+}
+
+/** Coordinates of a changed shape: a corner that was added got the height 0, and gets that of the nearest corner before. */
+function settled(coordinates: any, before: readonly Raised[]): any {
+  if (before.some(([, , height]) => !height)) return coordinates
+  if (typeof coordinates[0] !== 'number') return coordinates.map((one: any) => settled(one, before))
+  return coordinates[2] === 0 ? raised(coordinates, before, 0) : coordinates
+}
 
 /** Coordinates with heights: the surface's, where it is unknown that of the nearest place that has one, else the one given. */
 function raised(coordinates: any, heights: readonly Raised[], given_m: number): any {

@@ -1,4 +1,4 @@
-"""Layers of the assets, one a kind: those of the inventory, or what the newest run found where there is none."""
+"""Layers of the inventory, one a kind, or of the assets that the newest run found where there is none."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from roadscan.inventory.homes.page_edits import LAYER
 from roadscan.jobs.publish import evidence
 from roadscan.jobs.publish.layer import (
     BLUE,
+    GOOD_TO_POOR,
     GREEN,
     GREY,
     ORANGE,
@@ -29,21 +30,25 @@ from roadscan.jobs.publish.layer import (
     evidence_of_row,
 )
 from roadscan.jobs.publish.material import Material
-from roadscan.tables.asset_schema import AssetColumn, asset_kind_names, asset_schema
+from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 FOLDER: Final = "products/assets"
-GEOMETRY_OF: Final[dict[str, Geometry]] = {"PointZ": "point", "LineStringZ": "line", "PolygonZ": "polygon"}
+GEOMETRY_OF: Final[dict[str, Geometry]] = {
+    "PointZ": "point", "LineStringZ": "line", "MultiLineStringZ": "line", "PolygonZ": "polygon",
+    "MultiPolygonZ": "polygon",
+}  # fmt: skip
 """How a layer calls the geometry of a schema."""
 _WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}
 _COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+_GRADES: Final = (GOOD_TO_POOR[0], GOOD_TO_POOR[2], GOOD_TO_POOR[4])
 _STATES: Final = {"found": BLUE, "confirmed": GREEN, "missing": RED, "rejected": GREY}
 
 _Rows = tuple[pa.Table, npt.NDArray[Any]]
 
 
 class Assets(LayerKind):
-    """What stands beside, on and over the road."""
+    """What stands beside, on and over the road, and of an inventory the distresses of the pavement."""
 
     name = "assets"
 
@@ -53,7 +58,8 @@ class Assets(LayerKind):
         for place, (kind, colour) in enumerate(zip(asset_kind_names(), cycle(_COLOURS), strict=False)):
             held = _of_inventory(material, kind) if is_inventory else _found(material, kind)
             if held is not None and held[0].num_rows:
-                yield _layer(material, kind, held, 600 + place, colour)
+                order = (400 if asset_schema(kind).found_in else 600) + place
+                yield _layer(material, kind, held, order, colour)
 
 
 def _found(material: Material, kind: str) -> _Rows | None:
@@ -84,11 +90,13 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
     columns = {c.name: c for c in (asset_columns(kind) if is_inventory else schema.columns)}
     names = [n for n in rows.column_names if n in columns]
     edited = editable_columns(kind) if is_inventory and material.wishes.edits else frozenset()
-    styles = [Style("one colour", _WIDTH_PX[geometry], colour)]
+    width_px = 2 if schema.found_in else _WIDTH_PX[geometry]
+    styles = list(_styles(schema, width_px)) or [Style("one colour", width_px, colour)]
     if is_inventory:
-        styles.append(Style("Status", _WIDTH_PX[geometry], by="status", values=_STATES))
+        styles.append(Style("Status", width_px, by="status", values=_STATES))
     return SiteLayer(
-        f"{LAYER}{schema.table}", schema.title, "assets", geometry, order, shapes_m, rows.select(names).to_pylist(),
+        f"{LAYER}{schema.table}", schema.title, "distress" if schema.found_in else "assets", geometry, order, shapes_m,
+        rows.select(names).to_pylist(),
         [site_column(columns[n], names, is_edited=n in edited) for n in names], styles,
         key="asset_id" if is_inventory else "object",
         evidence=[_evidence(material, row) for row in rows.to_pylist()],
@@ -99,6 +107,17 @@ def _evidence(material: Material, row: Mapping[str, Any]) -> list[dict[str, Any]
     """What shows an asset: pictures, the passes of its first and last return, its place on the strips."""
     epochs = (row.get("first_epoch_gps_ns"), row.get("last_epoch_gps_ns"))
     return [*evidence.of_pictures(material, row), *evidence.of_passes(material, epochs), *evidence_of_row(row)]
+
+
+def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:
+    """Styles of a distress: by its type and severity, and by the figures that its severity follows from."""
+    for column in schema.own if schema.found_in else ():
+        if column.values:
+            colours = _GRADES if column.name == "severity" else _COLOURS
+            yield Style(column.title, width_px, by=column.name, values=dict(zip(column.values, colours, strict=False)))
+        if column.class_of:
+            figure = next(c for c in schema.own if c.name == column.class_of)
+            yield Style(f"{figure.title} ({figure.unit})", width_px, by=figure.name, limits=column.up_to)
 
 
 def site_column(column: AssetColumn, names: Sequence[str], *, is_edited: bool) -> SiteColumn:

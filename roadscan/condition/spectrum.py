@@ -116,9 +116,7 @@ def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
     return [(xs[a:b], hs[a:b]) for a, b in pairwise(ends) if b - a > 1]
 
 
-def _fitted(
-    frequency: Floats, density: Floats
-) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+def _fitted(frequency: Floats, density: Floats) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
     """C and w, a standard deviation behind each, and the range that the fit saw; over means of thirds of an octave."""
     inside = (frequency >= FIT_PER_M[0]) & (frequency <= FIT_PER_M[1]) & (density > 0.0)
     n, g = frequency[inside], density[inside]

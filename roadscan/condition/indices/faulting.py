@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData, Profile
-from roadscan.condition.on_lane.wheel_paths import bridged
+from roadscan.condition.of_sections.wheel_paths import bridged
 from roadscan.kernels.condition.steps import step_heights
 
 Float64 = npt.NDArray[np.float64]

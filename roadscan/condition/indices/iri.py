@@ -15,7 +15,7 @@ import numpy as np
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.iri import iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.wheel_paths import LEAD_M, NOISES, WheelPath, spread_of, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import LEAD_M, NOISES, WheelPath, spread_of, wheel_paths
 from roadscan.condition.quarter_car import RULES
 from roadscan.condition.ride import ride
 from roadscan.condition.segments import Segments

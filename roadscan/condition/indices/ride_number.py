@@ -1,4 +1,7 @@
-"""Ride number of a section, of both wheel paths together. Formula and sources: :mod:`roadscan.condition.ride_number`."""
+"""Ride number of a section, of both wheel paths together.
+
+Formula and sources: :mod:`roadscan.condition.ride_number`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import numpy as np
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.wheel_paths import LEAD_M, NOISES, spread_of, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import LEAD_M, NOISES, spread_of, wheel_paths
 from roadscan.condition.ride_number import ride_number, ride_number_of, ride_number_ride
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.wheel_paths import WheelPath, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import WheelPath, wheel_paths
 from roadscan.condition.spectrum import road_class, road_spectrum
 from roadscan.model.errors import ProfileError
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.wheel_paths import WheelPath, spread_of, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import WheelPath, spread_of, wheel_paths
 from roadscan.condition.straightedge import LENGTHS_M, straightedge_mm
 
 _BEAMS: Final = {"straightedge_3m_max_mm": LENGTHS_M["3 m"], "straightedge_16ft_max_mm": LENGTHS_M["16 ft"]}

@@ -96,9 +96,7 @@ def lane_levels(sections: Sequence[tuple[TextureSquares, Bool]]) -> dict[bool, L
         texture, kinds = _by_kind(squares, inside)
         for shared, own in kinds.items():
             found[shared].append(_level(texture[own]))
-    return {
-        shared: sorted(levels)[int(_LANE_SHARE * (len(levels) - 1))] for shared, levels in found.items() if levels
-    }
+    return {shared: sorted(levels)[int(_LANE_SHARE * (len(levels) - 1))] for shared, levels in found.items() if levels}
 
 
 def ravelled_section(
@@ -125,7 +123,7 @@ def ravelled_section(
                 level = usual
             else:
                 ratio = math.exp(level.middle - usual.middle)
-                remark = f"its texture is {ratio:.1f} times that of the lane: stones are lost all over, or it is another surface"
+                remark = f"its texture is {ratio:.1f} times that of the lane: another surface, or stones lost all over"
         excess[own], judged[own], limits[own] = texture[own] - level.middle, 1.0, level.limit
     known = judged > 0.0
     all_m2, measured_m2 = SQUARE_M**2 * float(inside.sum()), SQUARE_M**2 * float(known.sum())
@@ -139,7 +137,7 @@ def ravelled_section(
 
 
 def _by_kind(squares: TextureSquares, inside: Bool) -> tuple[Float64, dict[bool, Bool]]:
-    """Logarithms of texture (n, m), NaN where not known, and squares of one drive and of several, if there are enough."""
+    """Logarithms of texture (n, m), NaN where not known, and squares of one drive and of several, where enough."""
     with np.errstate(invalid="ignore", divide="ignore"):
         texture = np.log(squares.texture_mm)
     texture[~(np.isfinite(texture) & inside)] = np.nan

@@ -77,8 +77,9 @@ def tile_rows(files: SectionFiles) -> list[tuple[dict[str, Any], shapely.Polygon
     made = []
     for tile, sums in ordered:
         b = grid.bounds(tile)
-        row = {"tile": str(tile), "easting_m": b.easting_min_m, "northing_m": b.northing_min_m} | sums.row()
-        made.append((row, shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m)))
+        place = {"tile": str(tile), "easting_m": b.easting_min_m, "northing_m": b.northing_min_m}
+        outline = shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m)
+        made.append((place | sums.row(), outline))
     return made
 
 
@@ -120,7 +121,7 @@ class _Sums:
         sums += weight * np.array([1.0, value, sigma * sigma])
         self.greatest[quantity] = max(self.greatest.get(quantity, value), value)
 
-    def row(self) -> Mapping[str, Any]:
+    def row(self) -> dict[str, Any]:
         """Its columns."""
         row: dict[str, Any] = {
             "lanes": len(self.lanes),

@@ -126,7 +126,7 @@ class Condition(Stage):
             "tables/reference_lines", "tables/lanes", "tables/profiles_longitudinal",
             "tables/cross_sections", "tables/lane_texture", "tables/lane_line_offsets",
             "products/ravelling_patches", "products/ravelling_pictures", "tables/road_edge_offsets",
-            "products/road_surface", "tables/condition_values", "products/condition_sections", "products/condition_tiles",
-            "products/condition_pictures", "tables/roughness_sections", "products/roughness_regions",
-            "products/roughness_pictures",
+            "products/road_surface", "tables/condition_values", "products/condition_sections",
+            "products/condition_tiles", "products/condition_pictures", "tables/roughness_sections",
+            "products/roughness_regions", "products/roughness_pictures",
         )  # fmt: skip

@@ -225,7 +225,5 @@ def natural_neighbour_raster(mesh, count, centres, value, slopes, west_south, st
                     same = c
             question += 1
             out[i, j] = (
-                value[same]
-                if same >= 0
-                else sibson(mesh, centres, value, slopes, weight, arriving, last, question)
+                value[same] if same >= 0 else sibson(mesh, centres, value, slopes, weight, arriving, last, question)
             )

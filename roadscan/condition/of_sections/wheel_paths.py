@@ -1,4 +1,4 @@
-"""Wheel paths of a section as the indices of roughness take them: with a lead, gaps bridged, and draws of their noise."""
+"""Wheel paths of a section as indices of roughness take them: with a lead, gaps bridged, and draws of their noise."""
 
 from __future__ import annotations
 

@@ -79,6 +79,8 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
     """
     from scipy.signal import welch
 
+    if not 0.0 < window_m < np.inf:
+        raise ProfileError(f"windows of {window_m:g} m", expected="a finite length above 0 m")
     x = stations_of(x_m)
     pieces = _pieces(x, heights_of(height_m, x.size)[0])
     longest = max((xs[-1] - xs[0] for xs, _ in pieces), default=0.0)

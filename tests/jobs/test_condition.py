@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -20,6 +21,7 @@ from roadscan.code_reach import name_of
 from roadscan.condition.cell_table import cell_table
 from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_indices
 from roadscan.condition.indices.faulting import Faulting
+from roadscan.condition.indices.iri import Iri
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.survey_lane import survey_lane
 from roadscan.jobs.condition import stretches
@@ -119,6 +121,22 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert [height for _, height in found] == pytest.approx([height for _, height in right], abs=0.5)
         assert [at for at, _ in found[:2]] == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
         assert [height for _, height in found[:2]] == pytest.approx([-STEP_MM, STEP_MM], abs=1.0)  # so may heights
+
+
+def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
+    """Their mean is that of the section which they part."""
+    session = surveyed.session("store", section_m=50.0)
+    config = session.survey.config.condition
+    assert config is not None
+    group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
+    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(session.plan), group))
+    short = lane.config.model_copy(update={"section_m": 10.0})
+    tens = tuple((at, at + 10.0) for at in np.arange(50.0, 100.0, 10.0).tolist())
+    found = {}
+    for part in (replace(lane, sections_m=((50.0, 100.0),)), replace(lane, sections_m=tens, config=short)):
+        values = [v.value for v in Iri().values(part) if v.quantity == "iri_left_m_per_km"]
+        found[len(values)] = np.mean(values)
+    assert found[5] == pytest.approx(found[1], rel=2e-3)
 
 
 def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> None:

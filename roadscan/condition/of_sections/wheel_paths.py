@@ -19,7 +19,7 @@ LEAD_M: Final = 100.0
 NOISES: Final = 12
 """Profiles with added noise, from whose spread a standard deviation is told."""
 LEAST_M: Final = 20.0
-"""Shorter sections have no roughness."""
+"""Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +85,9 @@ def _judged(
     length, spacing, limit = between_m[1] - between_m[0], lane.config.profile_spacing_m, RULES.envelope_m
     due, measured = length / spacing, float(np.count_nonzero(~np.isnan(part.height_m[inside])))
     share = min(1.0, measured / max(due, 1.0))
-    if length < LEAST_M:
-        return share, f"the section is {length:.1f} m long; roughness takes {LEAST_M:g} m or more"
+    least = min(LEAST_M, lane.config.section_m)
+    if length < least - 1e-6:
+        return share, f"the section is {length:.1f} m long; roughness takes {least:g} m or more"
     if lane.cell_m > limit:
         return share, f"cells of {lane.cell_m:g} m are too coarse: {limit:g} m or less are needed"
     if measured < 0.5 * due:

@@ -15,7 +15,14 @@ import numpy as np
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.iri import iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.of_sections.wheel_paths import LEAD_M, NOISES, WheelPath, spread_of, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import (
+    LEAD_M,
+    NOISES,
+    WheelPath,
+    spread_of,
+    wheel_paths,
+    without_noise,
+)
 from roadscan.condition.quarter_car import RULES
 from roadscan.condition.ride import ride
 from roadscan.condition.segments import Segments
@@ -71,16 +78,17 @@ def _told(path: WheelPath) -> _Told:
     told = _Told(path.share, path.reason)
     if path.reason:
         return told
-    on = ride(path.profile.distance_m, path.with_noise())
+    on = ride(path.profile.distance_m, path.tried())
     rough = iri_of(on, path.ends).iri_m_per_km[:, 0]
     if np.isnan(rough[0]):
         told.reason = on.faults[0] or "a step that no road has"
         return told
-    told.iri, told.sigma = float(rough[0]), spread_of(rough)
-    rolling = rolling_iri(on)[:, path.inside]
-    if not np.isnan(rolling).all(axis=1).any():
-        most = np.nanmax(rolling, axis=1)
-        told.local, told.sigma_local = float(most[0]), spread_of(most)
+    told.iri, told.sigma, told.reason = without_noise(rough)
+    if told.reason:
+        return told
+    rolling = rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside]
+    most = np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in rolling])
+    told.local, told.sigma_local = float(most[0]), spread_of(most)
     if "start" in on.notes(path.ends)[0][0]:
         told.reason = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
     elif on.notes(path.ends)[0][0]:
@@ -91,7 +99,7 @@ def _told(path: WheelPath) -> _Told:
 def _half_car(left: WheelPath, right: WheelPath) -> tuple[float, float]:
     """IRI of the mean of two wheel paths, and its standard deviation; the noises of both are independent."""
     x = 0.5 * (left.profile.distance_m + right.profile.distance_m)
-    on = ride(x, 0.5 * (left.with_noise() + right.with_noise(NOISES)))
+    on = ride(x, 0.5 * (left.tried() + right.tried(NOISES)))
     ends = Segments(*(0.5 * (a + b) for a, b in zip(left.ends, right.ends, strict=True)))
-    rough = iri_of(on, ends).iri_m_per_km[:, 0]
-    return float(rough[0]), spread_of(rough)
+    cleared = without_noise(iri_of(on, ends).iri_m_per_km[:, 0])
+    return cleared.value, cleared.sigma

@@ -54,7 +54,7 @@ def _of_path(path: WheelPath) -> tuple[float, float, float, float, str]:
         return np.nan, np.nan, np.nan, np.nan, path.reason
     own, profile = path.inside, path.profile
     try:
-        found = road_spectrum(profile.distance_m[own], profile.height_m[own])
+        found = road_spectrum(profile.distance_m[own], path.sharpened(profile.height_m[None])[0, own])
     except ProfileError as error:
         return np.nan, np.nan, np.nan, np.nan, error.arrived
     return _CM3 * found.roughness_m3, _CM3 * found.sigma_roughness_m3, found.waviness, found.sigma_waviness, ""

@@ -45,7 +45,5 @@ def _greatest(path: WheelPath, length_m: float) -> tuple[float, float]:
     """Greatest deviation in the section (mm), and its standard deviation."""
     away = [np.abs(straightedge_mm(path.profile.distance_m, height, length_m))[path.inside]
             for height in path.with_noise()]  # fmt: skip
-    if any(np.isnan(one).all() for one in away):
-        return np.nan, np.nan
-    most = np.array([np.nanmax(one) for one in away])
+    most = np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in away])
     return float(most[0]), spread_of(most)

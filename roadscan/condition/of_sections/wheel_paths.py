@@ -1,12 +1,19 @@
-"""Wheel paths of a section as indices of roughness take them: with a lead, gaps bridged, and draws of their noise."""
+"""Wheel paths of a section as indices of roughness take them: with a lead, gaps bridged, and draws of their noise.
+
+A height is a mean over a window, which takes short waves, and it holds noise, which adds roughness. The profile gets
+back what the same window takes of it again (van Cittert's iteration, twice), and the power of the noise alone is taken
+from that of an index (:func:`without_noise`).
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy.ndimage
 
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.quarter_car import RULES
@@ -18,6 +25,11 @@ LEAD_M: Final = 100.0
 """A quarter car begins so far before a section, or where the profile begins."""
 NOISES: Final = 12
 """Profiles with added noise, from whose spread a standard deviation is told."""
+MOST_NOISE: Final = 0.75
+"""Share of the power of an index that may be noise."""
+_SIGMA_NOISE: Final = 0.3
+"""Of the standard deviations of heights (share): regular readings err less than their scatter within cells says."""
+_ROUNDS: Final = 2
 LEAST_M: Final = 20.0
 """Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
 
@@ -38,11 +50,35 @@ class WheelPath:
     """Why it has no roughness; empty where it has one."""
     spacing_m: float
     cell_m: float
+    window_m2: float
+    """Variance of the window along the road that a height is a mean over."""
 
     def with_noise(self, first_stream: int = 0) -> Float64:
-        """(1 + 12, n) heights, and the same with noise added."""
+        """(1 + 12, n) heights, and the same with noise added; NaN where nothing is known of it."""
         height = self.profile.height_m[None]
         return np.concatenate([height, height + noise(self.profile, self.spacing_m, self.cell_m, first_stream)])
+
+    def tried(self, first_stream: int = 0) -> Float64:
+        """(2 + 2 · 12, n) sharpened: heights, heights less so, heights with noise added, and the noise alone."""
+        noisy = self.with_noise(first_stream)
+        alone = noisy[1:] - noisy[0]
+        once = self.sharpened(noisy[:1], _ROUNDS - 1)
+        sharp = self.sharpened(np.concatenate([noisy, alone]))
+        return np.concatenate([sharp[:1], once, sharp[1:]])
+
+    def sharpened(self, height_m: Float64, rounds: int = _ROUNDS) -> Float64:
+        """(k, n) heights with what their window took of short waves; beside gaps they stay as they are."""
+        if not self.window_m2:
+            return height_m
+        at, window = _window(max(math.sqrt(6.0 * self.window_m2), 1.5 * self.spacing_m), self.spacing_m)
+        window /= window.sum()
+        scale = self.window_m2 / float(np.sum(window * at * at))
+        sharp, taken = height_m.copy(), height_m
+        for _ in range(rounds):
+            smooth = scipy.ndimage.correlate1d(taken, window, mode="nearest")
+            taken = np.nan_to_num(scale * (taken - smooth))
+            sharp += taken
+        return sharp
 
 
 def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPath]:
@@ -55,13 +91,38 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
         inside = (part.station_m >= from_m - 1e-6) & (part.station_m <= to_m + 1e-6)
         share, reason = _judged(part, inside, (from_m, to_m), lane)
         ends = _ends(part, from_m, to_m) if not reason else Segments(np.zeros(0), np.zeros(0))
-        found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m)
+        found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m, lane.window_m2)
     return found
 
 
 def spread_of(tried: Float64) -> float:
     """Standard deviation of a value (1 + draws,): the first is that without noise."""
     return float(np.sqrt(np.mean((tried[1:] - tried[0]) ** 2)))
+
+
+class Cleared(NamedTuple):
+    """A value without what noise adds to it."""
+
+    value: float
+    """NaN where noise makes more than three quarters of its power."""
+    sigma: float
+    reason: str
+
+
+def without_noise(tried: Float64) -> Cleared:
+    """An index of roughness (26,) of :meth:`WheelPath.tried`, less the power that noise alone has."""
+    value, once, noisy, alone = tried[0], tried[1], tried[2 : 2 + NOISES], tried[2 + NOISES :]
+    if not np.isfinite(alone).all():
+        return Cleared(float(value), np.nan, "")
+    power = float(np.mean(alone**2))
+    if power > MOST_NOISE * value**2:
+        share = 100.0 * min(power / value**2, 1.0)
+        return Cleared(np.nan, np.nan, f"noise of the heights makes {share:.0f} % of it")
+    clear = math.sqrt(value**2 - power)
+    if not clear:
+        return Cleared(0.0, 0.0, "")
+    spread = float(np.std(noisy, ddof=1)) * float(value) / clear
+    return Cleared(clear, math.hypot(spread, _SIGMA_NOISE * power / clear, float(value - once)), "")
 
 
 def bridged(profile: Profile, largest_gap_m: float) -> Profile:
@@ -111,16 +172,22 @@ def noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0)
     """
     number = np.rint(part.station_m / spacing_m).astype(np.int64)
     low, high = int(number.min()) - 64, int(number.max()) + 65
-    half = max(1, round(max(spacing_m, 1.5 * cell_m) / spacing_m))
-    window = 1.0 - np.abs(np.arange(-half, half + 1)) / (half + 1.0)
+    _, window = _window(max(spacing_m, 1.5 * cell_m), spacing_m)
     window /= np.sqrt(np.sum(window * window))
-    sigma = np.where(np.isnan(part.sigma_m), 0.0, part.sigma_m)
+    sigma = part.known_sigma_m
     out = np.empty((NOISES, number.size))
     for k in range(NOISES):
         drawn = np.concatenate([_normal(first_stream + k, block) for block in range(low // 1024, high // 1024 + 1)])
         alike = np.convolve(drawn, window, mode="same")
         out[k] = sigma * alike[number - low // 1024 * 1024]
     return out
+
+
+def _window(half_m: float, spacing_m: float) -> tuple[Float64, Float64]:
+    """Places of a window (m), and their weights, which fall linearly to its ends."""
+    reach = max(math.ceil(half_m / spacing_m - 1e-9) - 1, 0)
+    at = spacing_m * np.arange(-reach, reach + 1, dtype=np.float64)
+    return at, 1.0 - np.abs(at) / half_m
 
 
 def _normal(stream: int, block: int) -> Float64:

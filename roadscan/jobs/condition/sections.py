@@ -33,10 +33,13 @@ SECTIONS: Final = "condition_sections"
 _ROW: Final = ["road", "lane", "station_from_m", "station_to_m"]
 _SIGMAS: Final = {
     "sigma_mri_m_per_km": ("mri_m_per_km",),
+    "sigma_ride_number": ("ride_number",),
     "sigma_psd_worse_cm3": ("psd_worse_cm3",),
     "sigma_rut_depth_mean_mm": ("rut_depth_mean_left_mm", "rut_depth_mean_right_mm"),
     "sigma_cross_slope_mean_percent": ("cross_slope_mean_percent",),
+    "sigma_faulting_mean_mm": ("faulting_mean_mm",),
     "sigma_mpd_mean_mm": ("mpd_mean_mm",),
+    "sigma_texture_rms_mean_mm": ("texture_rms_mean_mm",),
     "sigma_ravelled_percent": ("ravelled_percent",),
     "sigma_lane_width_m": ("lane_width_m",),
 }

@@ -159,7 +159,15 @@ def _numbers(lines: Sequence[str], first_record: int, channels: int, samples: in
             change="the file was cut short; copy it anew",
         )
     whole = samples if samples > 0 else len(read) // channels
-    return np.ascontiguousarray(np.array(read[: whole * channels], np.float64).reshape(whole, channels).T)
+    if len(read) > whole * channels:
+        counted = f"{channels} × {samples:,}" if samples > 0 else f"a multiple of the {channels} channels"
+        raise FormatError(
+            f"{len(read):,} numbers",
+            expected=counted,
+            change="let the second line count the channels and samples that are there",
+            record=2,
+        )
+    return np.ascontiguousarray(np.array(read, np.float64).reshape(whole, channels).T)
 
 
 def _number(text: str, what: str) -> float:

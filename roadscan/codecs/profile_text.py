@@ -14,7 +14,7 @@ from roadscan.model.errors import FormatError
 Floats = npt.NDArray[np.float64]
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
-_UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|m|ft|in)$", re.IGNORECASE)
+_UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|m|ft|in|mil)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

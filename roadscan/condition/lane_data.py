@@ -38,6 +38,12 @@ class Profile:
         way: Float64 = np.concatenate([np.zeros(min(len(self.station_m), 1)), np.cumsum(steps)])
         return way
 
+    @property
+    def known_sigma_m(self) -> Float64:
+        """(n,) `sigma_m`, and its median where it is not known; NaN where it is known nowhere."""
+        known = np.isfinite(self.sigma_m)
+        return np.where(known, self.sigma_m, np.median(self.sigma_m[known]) if known.any() else np.nan)
+
     def between(self, from_m: float, to_m: float) -> Profile:
         """Heights whose station lies in [from, to]; their way is counted anew."""
         own = (self.station_m >= from_m - 1e-6) & (self.station_m <= to_m + 1e-6)
@@ -104,3 +110,11 @@ class LaneData:
     """The same of its height."""
     edges: EdgesOnLane | None = None
     """Edges of the road beside the lane; None where none are sought."""
+    window_m2: float = 0.0
+    """Variance of the window along the road that a profile's height is a mean over; 0 for heights of points."""
+
+    def paths_share(self, from_m: float, to_m: float) -> float:
+        """Share of the wheel paths between two stations that was measured, of the one with less."""
+        due = max((to_m - from_m) / self.config.profile_spacing_m, 1.0)
+        parts = [profile.between(from_m, to_m) for profile in self.profiles.values()]
+        return min(1.0, *(np.count_nonzero(~np.isnan(part.height_m)) / due for part in parts))

@@ -8,7 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.condition.delaunay_mesh import mesh_of, triangulate
-from roadscan.kernels.condition.natural_neighbour import STEP_M, circle_centres, natural_neighbour_raster
+from roadscan.kernels.condition.natural_neighbour import (
+    STEP_M,
+    circle_centres,
+    natural_neighbour_raster,
+    slopes_of_points,
+)
 
 Float64 = npt.NDArray[np.float64]
 
@@ -19,7 +24,14 @@ _IN_BIN: Final = 3.0
 
 
 def interpolate(
-    x_m: Float64, y_m: Float64, value: Float64, west_south_m: tuple[float, float], cell_m: float, shape: tuple[int, int]
+    x_m: Float64,
+    y_m: Float64,
+    value: Float64,
+    west_south_m: tuple[float, float],
+    cell_m: float,
+    shape: tuple[int, int],
+    *,
+    smooth: bool = False,
 ) -> Float64:
     """(rows, columns) natural-neighbour values (Sibson 1981) at the centres of cells; NaN outside the points' hull.
 
@@ -31,6 +43,8 @@ def interpolate(
     x_m, y_m, value : (n,) points, at most 100 m apart; of several at one place (2⁻³⁶ m) the first counts.
     west_south_m : corner of the first cell; rows go north, columns east.
     cell_m : edge of a cell; shape : rows and columns.
+    smooth : the slope is continuous, too (Sibson's C1). It is nearer to a smooth field, and carries more noise: it
+        weighs the planes at the points with their values, so values may lie beyond those of the points.
 
     Raises
     ------
@@ -49,10 +63,11 @@ def interpolate(
     count = triangulate(mesh, insertion_order(x, y))
     centres = np.empty((len(mesh.triangles), 2))
     circle_centres(mesh, count, centres)
+    held = np.ascontiguousarray(value, np.float64)
+    slopes = np.empty((x.size if smooth else 0, 2))
+    slopes_of_points(mesh, count if smooth else 0, centres, held, slopes)
     step, out = cell_m / STEP_M, np.empty(shape)
-    natural_neighbour_raster(
-        mesh, count, centres, np.ascontiguousarray(value, np.float64), np.full(2, 0.5 * step), step, out
-    )
+    natural_neighbour_raster(mesh, count, centres, held, slopes, np.full(2, 0.5 * step), step, out)
     return out
 
 

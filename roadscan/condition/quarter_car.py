@@ -18,10 +18,11 @@ from roadscan.kernels.condition.quarter_car import QuarterCar, Rules
 SPEED_M_PER_S = 80.0 / 3.6
 """Speed of all ride indices: 80 km/h."""
 
-RULES = Rules(envelope_m=0.25, start_m=11.0, longest_step_m=0.3048, highest_step_m=0.1)
+RULES = Rules(envelope_m=0.25, start_m=11.0, longest_step_m=0.306, highest_step_m=0.1)
 """Moving average of 250 mm and a start of 11 m, as World Bank Technical Paper 46 and ASTM E1926 have them.
 
-A sample a foot is the coarsest that is in use. Between two samples no road climbs 0.1 m: that is a fault of the data.
+A sample a foot is the coarsest that is in use, its stations rounded to a millimetre. Between two samples no road climbs
+0.1 m: that is a fault of the data.
 """
 
 

@@ -43,4 +43,10 @@ def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
 def ride_number_of(on: Ride, segments: Segments) -> RideNumber:
     """Ride number of one wheel path, or of several together, from the ride of its car."""
     squares, shares = on.means(segments)
-    return RideNumber(5.0 * np.exp(-160.0 * np.sqrt(squares.mean(axis=0))), np.sqrt(squares), shares)
+    return RideNumber(ride_number(np.sqrt(squares)), np.sqrt(squares), shares)
+
+
+def ride_number(profile_index: Floats) -> Floats:
+    """Ride number (k,) of wheel paths together, from their profile indices (paths, k)."""
+    rating: Floats = 5.0 * np.exp(-160.0 * np.sqrt(np.mean(profile_index**2, axis=0)))
+    return rating

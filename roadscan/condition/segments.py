@@ -41,6 +41,8 @@ def segments_of(
         raise ProfileError("a length of segments and fixed stations", expected="one of them")
     if stations_m is not None:
         ends: Floats = np.unique(np.asarray(stations_m, np.float64))
+        if not np.isfinite(ends).all():
+            raise ProfileError(f"a station {ends[~np.isfinite(ends)][0]}", expected="finite numbers, in metres")
         inside = (ends[1:] > first_m) & (ends[:-1] < last_m) if ends.size > 1 else np.zeros(0, bool)
         if not inside.any():
             raise ProfileError(
@@ -50,8 +52,8 @@ def segments_of(
         return Segments(ends[:-1][inside], ends[1:][inside])
     if length_m is None:
         return Segments(np.array([first_m]), np.array([last_m]))
-    if not length_m > 0.0:
-        raise ProfileError(f"segments of {length_m:g} m", expected="a length above 0 m")
+    if not 0.0 < length_m < np.inf:
+        raise ProfileError(f"segments of {length_m:g} m", expected="a finite length above 0 m")
     # A rest of less than a millionth of a segment is rounding.
     count = max(1, int(np.ceil((last_m - first_m) / length_m - 1e-6)))
     ends = np.asarray(first_m + length_m * np.arange(count + 1), np.float64)

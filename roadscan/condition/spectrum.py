@@ -44,8 +44,12 @@ class RoadSpectrum(NamedTuple):
     """(k,) displacement power spectral density (m³)."""
     roughness_m3: float
     """C: the fitted density at 0.1 cycles a metre (m³)."""
+    sigma_roughness_m3: float
+    """Its standard deviation, from how the bands scatter about the fitted line (m³)."""
     waviness: float
     """w: the fitted exponent."""
+    sigma_waviness: float
+    """Its standard deviation, likewise."""
     road_class: str
     """A to H, by C."""
     fit_per_m: tuple[float, float]
@@ -75,6 +79,8 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
     """
     from scipy.signal import welch
 
+    if not 0.0 < window_m < np.inf:
+        raise ProfileError(f"windows of {window_m:g} m", expected="a finite length above 0 m")
     x = stations_of(x_m)
     pieces = _pieces(x, heights_of(height_m, x.size)[0])
     longest = max((xs[-1] - xs[0] for xs, _ in pieces), default=0.0)
@@ -92,9 +98,15 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
             total += even.size * step * density
             weight += even.size * step
     density = total / weight
-    c, w, seen = _fitted(frequency[1:], density[1:])
-    road_class = "ABCDEFGH"[int(np.searchsorted(CLASS_LIMITS_M3, c))]
-    return RoadSpectrum(frequency[1:], density[1:], c, w, road_class, seen, samples * step, weight)
+    fitted, seen = _fitted(frequency[1:], density[1:])
+    return RoadSpectrum(
+        frequency[1:], density[1:], *fitted, road_class(fitted[0]), seen, samples * step, weight
+    )  # fmt: skip
+
+
+def road_class(roughness_m3: float) -> str:
+    """Class of ISO 8608, A to H, of a density at 0.1 cycles a metre (m³)."""
+    return "ABCDEFGH"[int(np.searchsorted(CLASS_LIMITS_M3, roughness_m3))]
 
 
 def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
@@ -106,8 +118,8 @@ def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
     return [(xs[a:b], hs[a:b]) for a, b in pairwise(ends) if b - a > 1]
 
 
-def _fitted(frequency: Floats, density: Floats) -> tuple[float, float, tuple[float, float]]:
-    """C, w, and the range that the fit saw; over means of thirds of an octave."""
+def _fitted(frequency: Floats, density: Floats) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+    """C and w, a standard deviation behind each, and the range that the fit saw; over means of thirds of an octave."""
     inside = (frequency >= FIT_PER_M[0]) & (frequency <= FIT_PER_M[1]) & (density > 0.0)
     n, g = frequency[inside], density[inside]
     band = np.floor(3.0 * np.log2(n / FIT_PER_M[0])).astype(np.int64)
@@ -120,5 +132,6 @@ def _fitted(frequency: Floats, density: Floats) -> tuple[float, float, tuple[flo
         )
     count = np.diff([*start, n.size])
     at = np.log(np.add.reduceat(n, start) / count / REFERENCE_PER_M)
-    slope, level = np.polyfit(at, np.log(np.add.reduceat(g, start) / count), 1)
-    return float(np.exp(level)), float(-slope), (float(n[0]), float(n[-1]))
+    (slope, level), scatter = np.polyfit(at, np.log(np.add.reduceat(g, start) / count), 1, cov=True)
+    c, spread = float(np.exp(level)), np.sqrt(np.diag(scatter))
+    return (c, c * float(spread[1]), float(-slope), float(spread[0])), (float(n[0]), float(n[-1]))

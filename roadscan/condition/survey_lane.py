@@ -80,6 +80,12 @@ def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float]
     return profile, cross
 
 
+def window_m2(config: SectionConfig, cell_m: float) -> float:
+    """Variance along the road of what a profile's height is a mean over (m²): its window's weights, and its cells."""
+    (along, _), _ = windows_m(config, cell_m)
+    return along * along / 6.0 + cell_m * cell_m / 12.0
+
+
 def reach_m(config: SectionConfig, cell_m: float) -> float:
     """How far beyond a lane's border, and before and behind a place, what is surveyed depends on cells (m)."""
     of_heights = max(math.hypot(*half) for half in windows_m(config, cell_m)) + cell_m
@@ -102,9 +108,7 @@ def survey_lane(
     for name, side in SIDES.items():
         offset = lane.offsets(station, side * config.wheel_paths_m)
         places = line.places(station, offset)
-        values = np.empty((station.size, 3))
-        sample(table, places, *profile, False, values)
-        paths[name] = PathHeights(station, offset, places, values)
+        paths[name] = PathHeights(station, offset, places, _heights(table, places, profile, config))
     every = _multiples(config.cross_section_spacing_m, between_m)
     return LaneHeights(
         paths, _cross_heights(table, line, lane, every, config, across), texture_squares(table, line, lane, between_m),
@@ -119,8 +123,7 @@ def _cross_heights(
     own = config.cross_section_step_m * (np.arange(count, dtype=np.float64) - count // 2)
     every = np.repeat(station, count)
     places = line.places(every, lane.offsets(every, np.tile(own, station.size)))
-    values = np.empty((every.size, 3))
-    sample(table, places, *half_m, True, values)
+    values = _heights(table, places, half_m, config, bend=True)
     height = values[:, 0].reshape(station.size, count)
     known = ~np.isnan(height)
     first = np.argmax(known, axis=1)
@@ -130,6 +133,20 @@ def _cross_heights(
         station, middle, line.places(station, middle), own, base, height - base[:, None],
         values[:, 1].reshape(station.size, count),
     )  # fmt: skip
+
+
+def _heights(
+    table: CellTable, places: Float64, half_m: tuple[float, float], config: SectionConfig, *, bend: bool = False
+) -> Float64:
+    """Heights (n, 3) at places, as :func:`roadscan.kernels.condition.sampling.sample` has them.
+
+    Neighbours of a reconstructed surface err alike, so how they scatter says nothing of their errors.
+    """
+    values = np.empty((len(places), 3))
+    sample(table, places, *half_m, bend, values)
+    if config.heights == "surface":
+        values[:, 1] = np.nan
+    return values
 
 
 def _multiples(spacing_m: float, between_m: tuple[float, float]) -> Float64:

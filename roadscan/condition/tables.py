@@ -97,6 +97,8 @@ def localised_roughness(
     """
     import pandas as pd
 
+    if not np.isfinite(limit_m_per_km):
+        raise ProfileError(f"a limit of {limit_m_per_km} m/km", expected="a finite number")
     on, _ = _sound_ride(x_m, height_m)
     found = stretches_above(on.x_m, rolling_iri(on, length_m).mean(axis=0), limit_m_per_km)
     return pd.DataFrame(
@@ -136,7 +138,7 @@ def mpd(
     """
     import pandas as pd
 
-    if segment_m is not None and (segment_m < 0.1 or abs(segment_m / 0.1 - round(segment_m / 0.1)) > 1e-6):
+    if segment_m is not None and not (0.1 <= segment_m < np.inf and abs((segment_m + 0.05) % 0.1 - 0.05) < 1e-7):
         raise ProfileError(f"stretches of {segment_m:g} m", expected="a multiple of the 0.1 m of a segment")
     x = stations_of(x_m)
     if heights_of(height_m, x.size).shape[0] != 1:

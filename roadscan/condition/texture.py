@@ -104,9 +104,9 @@ def texture_segments(
     found = []
     for k in range(int(samples[-1]) + 1):
         there, raw = samples == k, own == k
-        if there.sum() < 0.9 * SEGMENT_MM / chosen.resampled_mm or not raw.any():
+        if there.sum() < 0.9 * SEGMENT_MM / chosen.resampled_mm:
             continue
-        dropouts = max(float(dropout[raw].mean()), 1.0 - float(read[there].mean()))
+        dropouts = max(float(dropout[raw].mean()) if raw.any() else 1.0, 1.0 - float(read[there].mean()))
         spikes = float(spike[there].mean())
         faults = {
             "dropouts": dropouts > chosen.most_dropouts,

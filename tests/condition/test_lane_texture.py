@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ import shapely
 
 from roadscan.condition.mpd import mean_profile_depth
 from roadscan.condition.on_lane.lines import lane_lines
-from roadscan.condition.on_lane.ravelling import RavelledSection, ravelled_section
-from roadscan.condition.on_lane.squares import texture_squares
+from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
+from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
 from roadscan.condition.texture import texture_segments
 from roadscan.edges.painted_line import painted_line, without_lines
 from roadscan.kernels.condition.intensity_means import mean_intensities
@@ -81,6 +82,43 @@ def test_nothing_is_found_where_no_stones_are_lost(
     assert found.reason == ""
     assert found.share > 0.9
     assert found.patches == ()
+
+
+def test_where_most_has_lost_stones_the_lane_says_what_is_sound() -> None:
+    """Stones are lost from border to border but for 0.6 m in the middle, along a section of 6 m: 70 % of it."""
+    both = [PATCH | {"offset_m": o, "length_m": 12.0, "width_m": 0.7, "lost_share": 0.3, "depth_m": 0.006}
+            for o in (-0.75, 0.65)]  # fmt: skip
+    worn, sound, other = (
+        texture_squares(road.table(0.01, 1), road.line, road.lane, (4.0, 10.0))
+        for road in (
+            LaneOfCells(texture=TEXTURE_OF, ravelling=both),
+            LaneOfCells(texture=TEXTURE_OF),
+            LaneOfCells(texture={"mpd_mm": 2.0, "grain_mm": 14.0}),
+        )
+    )
+    inside = np.ones(worn.texture_mm.shape, bool)
+    levels = lane_levels([(worn, inside), (sound, inside), (other, inside)])
+    assert np.exp(levels[False].middle) == pytest.approx(np.median(sound.texture_mm), rel=0.01)
+    found = ravelled_section(worn, inside, levels)
+    known = {"sound": np.abs(worn.offset_m + 0.05) < 0.25, "worn": (np.abs(worn.offset_m + 0.05) > 0.5)}
+    patches = shapely.union_all([patch.outline for patch in found.patches])
+    for kind, columns in known.items():
+        share = np.mean(
+            [[patches.intersects(shapely.Point(s, o)) for o in worn.offset_m[columns]] for s in worn.station_m]
+        )
+        assert share >= 0.8 if kind == "worn" else share <= 0.1, kind
+    assert all(patch.severity == "high" for patch in found.patches)
+    assert ravelled_section(worn, inside).patches == ()  # by itself it is its own measure
+    assert ravelled_section(sound, inside, levels).patches == ()
+    # Coarser from border to border: another surface, or stones lost all over. It is told, and not measured.
+    coarser = ravelled_section(other, inside, levels)
+    assert coarser.patches == ()
+    assert "times that of the lane" in coarser.remark
+    half = TextureSquares(worn.station_m, worn.offset_m, *(
+        np.where((worn.station_m < 5.5)[:, None], a, b)
+        for a, b in ((getattr(sound, f.name), getattr(other, f.name)) for f in fields(sound)[2:])
+    ))  # fmt: skip
+    assert ravelled_section(half, inside, levels).patches == ()  # the other surface begins within the section
 
 
 def test_coarse_cells_show_it_by_the_scatter_within_them() -> None:

@@ -123,6 +123,46 @@ def test_what_is_no_profile(road: tuple[np.ndarray, np.ndarray], tmp_path: Path)
         rs.mpd(texture, np.zeros((2, texture.size)))
 
 
+def test_an_erd_file_that_counts_its_numbers_wrong(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    """Two wheel paths read as one give 38 % of their roughness."""
+    x, h = road
+    file = tmp_path / "road.erd"
+    rs.write_erd(file, x, np.stack([h, h]))
+    text = file.read_text()
+    counts = text.splitlines()[1]
+    for wrong in (
+        counts.replace("       2,", "       1,", 1), counts.replace("1600", " 800"),
+        counts.replace("       2,", "       3,", 1).replace("1600", "  -1"),
+    ):  # fmt: skip
+        file.write_text(text.replace(counts, wrong))
+        assert "3,200 numbers" in refused("iri", file)
+
+
+def test_a_sample_a_foot(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    """Stations in feet, and in metres rounded to a millimetre."""
+    x, h = road
+    foot = np.arange(600)
+    at = np.interp(0.3048 * foot, x, h)
+    feet, metres = tmp_path / "feet.csv", tmp_path / "metres.csv"
+    feet.write_text("x_ft,height_mil\n" + "\n".join(f"{a},{b / 2.54e-5:.2f}" for a, b in zip(foot, at, strict=True)))
+    metres.write_text("x_m,height_m\n" + "\n".join(f"{0.3048 * a:.3f},{b:.6f}" for a, b in zip(foot, at, strict=True)))
+    for file in (feet, metres):
+        (row,) = json.loads(told("iri", file, "--json").stdout)["rows"]
+        assert row["iri_m_per_km"] == pytest.approx(rs.iri(0.3048 * foot, at).iri_m_per_km[0], rel=2e-3)
+        assert row["note"] == "start"
+
+
+def test_lengths_and_stations_that_are_no_numbers(road: tuple[np.ndarray, np.ndarray]) -> None:
+    x, h = road
+    for call in (
+        lambda: rs.iri(x, h, segment_m=np.inf), lambda: rs.iri(x, h, stations_m=[0.0, np.nan, 100.0]),
+        lambda: rs.iri(x, h, stations_m=[0.0, np.inf]), lambda: rs.localised_roughness(x, h, np.nan),
+        lambda: rs.road_spectrum(x, h, np.nan), lambda: rs.mpd(1e-4 * x, h, segment_m=np.inf),
+    ):  # fmt: skip
+        with pytest.raises(rs.RoadscanError, match=r"finite|multiple"):
+            call()
+
+
 def test_localised_roughness(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
     x, h = road
     h = h + 0.02 * np.exp(-(((x - 120.0) / 0.4) ** 2))

@@ -12,6 +12,7 @@ from scipy.signal import detrend
 from roadscan.condition.mpd import mean_profile_depth, mean_profile_depths, segment_depth_mm
 from roadscan.condition.rms_texture import rms_texture_mm, segment_rms_mm
 from roadscan.condition.segments import segments_of
+from roadscan.condition.tables import mpd
 from roadscan.condition.texture import TextureSettings, texture_segments
 from roadscan.model.errors import ProfileError
 
@@ -99,6 +100,15 @@ def test_rows_that_are_missing_count_as_dropouts() -> None:
     there = (x < 0.12) | (x > 0.16)
     parts = texture_segments(x[there], h[there])
     assert parts[1].dropout_share == pytest.approx(0.4, abs=0.02) and parts[1].note == "dropouts"
+
+
+def test_segments_without_any_row_count_as_well() -> None:
+    x = np.arange(0.0, 1.0, 0.0005)
+    height = 0.001 * np.sin(2 * np.pi * x / 0.02)
+    gap = (x > 0.1) & (x < 0.4)
+    whole, half = mpd(x[~gap], height[~gap], segment_m=0.5).itertuples()
+    assert (whole.valid_segments, whole.segments, whole.note) == (2, 5, "dropouts 3")
+    assert np.isnan(whole.mpd_mm) and half.segments == 5 and half.mpd_mm > 0.5
 
 
 def test_the_station_of_the_profile_does_not_matter() -> None:

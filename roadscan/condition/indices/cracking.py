@@ -45,9 +45,15 @@ class Cracking(ConditionIndex):
                 reason = "there is no table of cracks: let the survey make the product `cracks`"
                 for one in self.quantities:
                     yield Value(one.name, "section", from_m, to_m, np.nan, np.nan, 0.0, reason)
+                continue
+            share = lane.paths_share(from_m, to_m)
+            if share < lane.config.least_share:
+                reason = f"{100 * share:.0f} % of the wheel paths were measured"
+                for one in self.quantities:
+                    yield Value(one.name, "section", from_m, to_m, np.nan, np.nan, share, reason)
             else:
                 for name, value in self._section(lane, from_m, to_m).items():
-                    yield Value(name, "section", from_m, to_m, value, np.nan, 1.0)
+                    yield Value(name, "section", from_m, to_m, value, np.nan, share)
 
     def _section(self, lane: LaneData, from_m: float, to_m: float) -> dict[str, float]:
         found = {one.name: 0.0 for one in self.quantities}

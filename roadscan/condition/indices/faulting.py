@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
-from roadscan.condition.indices.iri import bridged
 from roadscan.condition.lane_data import LaneData, Profile
+from roadscan.condition.of_sections.wheel_paths import bridged
 from roadscan.kernels.condition.steps import step_heights
 
 Float64 = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ class _Side:
         due = max((to_m - from_m) / lane.config.profile_spacing_m, 1.0)
         found = np.full((part.height_m.size, 3), np.nan)
         if part.height_m.size > 2:
-            step_heights(part.distance_m, part.height_m, np.nan_to_num(part.sigma_m), (_NEAR_M, _FAR_M), found)
+            step_heights(part.distance_m, part.height_m, part.known_sigma_m, (_NEAR_M, _FAR_M), found)
         share = min(1.0, float((~np.isnan(part.height_m[inside])).sum()) / due)
         return cls(part, inside, found, share)
 
@@ -110,7 +110,12 @@ class _Side:
         """Station (m), height and standard deviation (mm) of each step that the other wheel path has as well."""
         height, sigma, sudden = self.found.T
         size, station = np.abs(height), self.profile.station_m
-        fits = (size >= _LEAST_M) & (size >= 3.0 * sigma) & (sudden * height >= _SUDDEN * size * size) & self.inside
+        fits = (
+            (size >= _LEAST_M)
+            & (size >= 3.0 * np.nan_to_num(sigma))
+            & (sudden * height >= _SUDDEN * size * size)
+            & self.inside
+        )
         for k in np.flatnonzero(fits).tolist():
             near = np.abs(station - station[k]) <= _APART_M
             beside = other.found[np.abs(other.profile.station_m - station[k]) <= _BESIDE_M, 0]

@@ -3,7 +3,8 @@
 The texture of a square of 0.2 m is the root mean square of its heights within blocks of 50 mm about their planes
 (:mod:`roadscan.kernels.condition.lane_texture`), so that slopes, ruts and wide holes count nothing. It is that of the
 median block, so that cracks count little. A patch is coarser than its section by 15 %, and by five times the spread of
-its sound squares; a road of another texture is its own measure, and a dark or wet place without texture is none.
+its sound squares; a road of another texture is its own measure, and a dark or wet place without texture is none. Where
+most of a section has lost stones, the lane over its kilometre says what is sound.
 
 Sources, as public descriptions have them; no compliance is claimed. Van Ooijen, van den Bol and Bouman, *High-speed
 measurement of ravelling on porous asphalt* (2004): missing stones told by their dimensions in the texture profile.
@@ -23,7 +24,8 @@ import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.ravelling import RavelledSection, ravelled_section
+from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
+from roadscan.condition.on_lane.squares import TextureSquares
 
 _CM3_PER_M2: Final = 1e3
 """Of a mean depth of a millimetre."""
@@ -44,25 +46,32 @@ class Ravelling(ConditionIndex):
 
     def values(self, lane: LaneData) -> Iterator[Value]:
         """Values of sections."""
-        for from_m, to_m in lane.sections_m:
-            for name, value, sigma, share, reason in _of_section(lane, from_m, to_m):
+        for (from_m, to_m), found in zip(lane.sections_m, looked_through(lane), strict=True):
+            for name, value, sigma, share, reason in _of_section(lane, found):
                 yield Value(name, "section", from_m, to_m, value, sigma, share, reason)
 
 
-def looked_through(lane: LaneData, from_m: float, to_m: float) -> RavelledSection:
-    """A section of a lane and its patches."""
+def looked_through(lane: LaneData) -> list[RavelledSection]:
+    """Each section of a lane with its patches."""
     if lane.config.heights == "surface":
-        return RavelledSection((), 0.0, 0.0, math.nan, "the reconstructed surface has no texture")
+        none = RavelledSection((), 0.0, 0.0, math.nan, "the reconstructed surface has no texture")
+        return [none] * len(lane.sections_m)
+    sections = [_squares(lane, *ends) for ends in lane.sections_m]
+    levels = lane_levels(sections)
+    return [ravelled_section(squares, inside, levels) for squares, inside in sections]
+
+
+def _squares(lane: LaneData, from_m: float, to_m: float) -> tuple[TextureSquares, npt.NDArray[np.bool_]]:
+    """Squares of a section, and which of them lie on the road."""
     squares = lane.texture.between(from_m, to_m)
     inside: npt.NDArray[np.bool_] = np.ones(squares.texture_mm.shape, bool)
     if lane.edges is not None:
         rows = [lane.edges.inside(np.full(squares.offset_m.size, s), squares.offset_m) for s in squares.station_m]
         inside = np.array(rows, bool).reshape(inside.shape)
-    return ravelled_section(squares, inside)
+    return squares, inside
 
 
-def _of_section(lane: LaneData, from_m: float, to_m: float) -> Iterator[tuple[str, float, float, float, str]]:
-    found = looked_through(lane, from_m, to_m)
+def _of_section(lane: LaneData, found: RavelledSection) -> Iterator[tuple[str, float, float, float, str]]:
     reason = found.reason
     if not reason and found.share < lane.config.least_share:
         reason = f"the texture of {100 * found.share:.0f} % of the lane was measured"
@@ -75,7 +84,7 @@ def _of_section(lane: LaneData, from_m: float, to_m: float) -> Iterator[tuple[st
     volumes = [(one.loss_mm * one.area_m2, one.loss_mm * one.sigma_area_m2) for one in found.patches]
     lost, sigma_lost = sum(v for v, _ in volumes), math.sqrt(sum(s * s for _, s in volumes))
     m2 = found.measured_m2
-    yield "ravelled_percent", 100.0 * area / m2, 100.0 * sigma / m2, found.share, ""
+    yield "ravelled_percent", 100.0 * area / m2, 100.0 * sigma / m2, found.share, found.remark
     yield "ravelled_area_m2", area, sigma, found.share, ""
     yield "ravelling_patches", float(len(found.patches)), math.nan, found.share, ""
     untold = "" if math.isfinite(lost) else "cells are too coarse to show the depth of what was lost"

@@ -13,7 +13,7 @@ import numpy as np
 
 from roadscan.condition.index import ConditionIndex, PerCrossSection, Quantity, Value, by_section
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.whole_sections import WholeSections
+from roadscan.condition.of_sections.whole_sections import WholeSections
 from roadscan.kernels.condition.ruts import straightedge
 
 _MM = 1e3

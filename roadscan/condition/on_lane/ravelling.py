@@ -1,11 +1,12 @@
-"""Patches of a lane that have lost stones: squares whose texture is coarser than that of their section."""
+"""Patches of a lane that have lost stones: squares whose texture is coarser than that of sound ones around them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from types import MappingProxyType
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +30,12 @@ _DIFFERS: Final = 3.0
 """Intensities differ where a patch's median is so many standard deviations of its section's squares off."""
 SEVERITIES: Final = {"low": 1.4, "moderate": 2.0, "high": math.inf}
 """Texture of a patch over that of its section, at the most. The limits are roadscan's own."""
+_LANE_SHARE: Final = 0.25
+"""The lane's texture is what so many of its sections stay below."""
+_SOUND_SHARE: Final = 0.2
+"""A row across the lane is partly sound where so many of its squares are like the lane."""
+_SOUND_ROWS: Final = 0.5
+"""So many rows are partly sound where a section has lost stones, and is not of another surface."""
 _CROSS: Final = scipy.ndimage.generate_binary_structure(2, 1)
 _SQUARE: Final = scipy.ndimage.generate_binary_structure(2, 2)
 
@@ -67,42 +74,90 @@ class RavelledSection:
     share: float
     """The same over the area of all of its squares."""
     background_mm: float
-    """Texture of the section: the median of its squares."""
+    """Texture of its sound squares: the median of all, or that of the lane."""
     reason: str = ""
     """Why it was not judged."""
+    remark: str = ""
+    """What is to be known of it."""
 
 
-def ravelled_section(squares: TextureSquares, inside: Bool) -> RavelledSection:
+class Level(NamedTuple):
+    """Texture of squares, as its logarithm (of mm)."""
+
+    middle: float
+    limit: float
+    """A square is coarser where it lies above the middle by more."""
+
+
+def lane_levels(sections: Sequence[tuple[TextureSquares, Bool]]) -> dict[bool, Level]:
+    """Texture of the lane: the lower quartile of that of its sections, of squares of one drive and of several."""
+    found: dict[bool, list[Level]] = {False: [], True: []}
+    for squares, inside in sections:
+        texture, kinds = _by_kind(squares, inside)
+        for shared, own in kinds.items():
+            found[shared].append(_level(texture[own]))
+    return {shared: sorted(levels)[int(_LANE_SHARE * (len(levels) - 1))] for shared, levels in found.items() if levels}
+
+
+def ravelled_section(
+    squares: TextureSquares, inside: Bool, lane: Mapping[bool, Level] = MappingProxyType({})
+) -> RavelledSection:
     """Patches of a section whose squares (n, m) are given.
 
     The logarithm of a square's texture is held against the median of its section and the spread of its lower half,
-    which patches do not widen. Where more than half of a section has lost stones, that is its texture, and nothing is
-    found.
-    A patch ends halfway between its own texture and that of the section, and with its section.
+    which patches do not widen. Where more than half of a section has lost stones, that median is of lost stones: so
+    where it is coarser than the lane, and half of the rows across the lane hold some squares that are like the lane,
+    squares are held against the lane. Where rows are coarser from border to border, the surface is another one as far
+    as can be told: the section's own median counts, and a remark says so.
+    A patch ends halfway between its own texture and that of sound squares, and with its section.
 
-    inside : (n, m) squares that lie on the road.
+    inside : (n, m) squares that lie on the road; lane : of :func:`lane_levels`.
     """
-    known = np.isfinite(squares.texture_mm) & (squares.texture_mm > 0.0) & inside
-    shared = np.nan_to_num(squares.passes_share) > _SHARED
-    excess, judged = np.full(known.shape, np.nan), np.zeros(known.shape, bool)
-    middles, limits = {}, np.full(known.shape, np.inf)
+    texture, kinds = _by_kind(squares, inside)
+    excess, judged, limits = (np.full(texture.shape, one) for one in (np.nan, 0.0, np.inf))
+    remark = ""
+    for shared, own in kinds.items():
+        level, usual = _level(texture[own]), lane.get(shared)
+        if usual is not None and level.middle - usual.middle > usual.limit:
+            if _mixed(texture, own, usual):
+                level = usual
+            else:
+                ratio = math.exp(level.middle - usual.middle)
+                remark = f"its texture is {ratio:.1f} times that of the lane: another surface, or stones lost all over"
+        excess[own], judged[own], limits[own] = texture[own] - level.middle, 1.0, level.limit
+    known = judged > 0.0
+    all_m2, measured_m2 = SQUARE_M**2 * float(inside.sum()), SQUARE_M**2 * float(known.sum())
+    share = measured_m2 / all_m2 if all_m2 else 0.0
+    if not known.any():
+        told = int(np.isfinite(texture).sum())
+        return RavelledSection((), 0.0, 0.0, math.nan, f"the texture of {told} squares is known")
+    background = math.exp(float(np.median((texture - excess)[known])))
+    patches = tuple(_patches(squares, excess, known, limits))
+    return RavelledSection(patches, measured_m2, share, background, "", remark)
+
+
+def _by_kind(squares: TextureSquares, inside: Bool) -> tuple[Float64, dict[bool, Bool]]:
+    """Logarithms of texture (n, m), NaN where not known, and squares of one drive and of several, where enough."""
     with np.errstate(invalid="ignore", divide="ignore"):
         texture = np.log(squares.texture_mm)
-    for one in (False, True):
-        own = known & (shared == one)
-        if own.sum() < LEAST_SQUARES:
-            continue
-        middle = float(np.median(texture[own]))
-        below = middle - texture[own & (texture <= middle)]
-        excess[own], judged[own], middles[one] = texture[own] - middle, True, middle
-        limits[own] = max(math.log(LEAST_RATIO), _SIGMAS * 1.4826 * float(np.median(below)))
-    all_m2, measured_m2 = SQUARE_M**2 * float(inside.sum()), SQUARE_M**2 * float(judged.sum())
-    share = measured_m2 / all_m2 if all_m2 else 0.0
-    if not judged.any():
-        return RavelledSection((), 0.0, 0.0, math.nan, f"the texture of {int(known.sum())} squares is known")
-    background = math.exp(float(np.median(texture[judged])))
-    patches = tuple(_patches(squares, excess, judged, limits))
-    return RavelledSection(patches, measured_m2, share, background)
+    texture[~(np.isfinite(texture) & inside)] = np.nan
+    several = np.nan_to_num(squares.passes_share) > _SHARED
+    kinds = {shared: np.isfinite(texture) & (several == shared) for shared in (False, True)}
+    return texture, {shared: own for shared, own in kinds.items() if own.sum() >= LEAST_SQUARES}
+
+
+def _level(texture: Float64) -> Level:
+    middle = float(np.median(texture))
+    below = float(np.median(middle - texture[texture <= middle]))
+    return Level(middle, max(math.log(LEAST_RATIO), _SIGMAS * 1.4826 * below))
+
+
+def _mixed(texture: Float64, own: Bool, lane: Level) -> bool:
+    """Whether half of the rows across the lane hold squares that are like the lane."""
+    rows = own.any(axis=1)
+    alike = own & (np.nan_to_num(texture, nan=np.inf) < lane.middle + 0.5 * lane.limit)
+    share = alike[rows].sum(axis=1) / own[rows].sum(axis=1)
+    return bool(np.mean(share >= _SOUND_SHARE) >= _SOUND_ROWS)
 
 
 def _patches(squares: TextureSquares, excess: Float64, judged: Bool, limits: Float64) -> Iterator[RavelledPatch]:
@@ -111,6 +166,7 @@ def _patches(squares: TextureSquares, excess: Float64, judged: Bool, limits: Flo
     coarse |= scipy.ndimage.binary_closing(np.pad(coarse, 1), _CROSS)[1:-1, 1:-1] & judged
     label, count = scipy.ndimage.label(scipy.ndimage.binary_opening(coarse, np.ones((2, 2))), _SQUARE)
     sound = judged & ~scipy.ndimage.binary_dilation(coarse, _SQUARE)
+    sound = sound if sound.any() else judged & ~coarse
     for number in range(1, count + 1):
         core = label == number
         half = 0.5 * float(np.median(excess[core]))

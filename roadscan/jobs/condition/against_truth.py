@@ -59,7 +59,9 @@ def true_lane(group: Group, lane: LaneData, height_at: HeightAt) -> LaneData:
     station = np.repeat(cross.station_m, m)
     places = group.line.places(station, group.lane.offsets(station, np.tile(cross.offset_m, n)))
     height = height_at(places[:, 0], places[:, 1]).reshape(n, m) - cross.base_m[:, None]
-    return replace(lane, profiles=profiles, cross_sections=replace(cross, height_m=height, sigma_m=np.zeros((n, m))))
+    return replace(
+        lane, profiles=profiles, cross_sections=replace(cross, height_m=height, sigma_m=np.zeros((n, m))), window_m2=0.0
+    )
 
 
 def _true_profile(profile: Profile, height_at: HeightAt) -> Profile:

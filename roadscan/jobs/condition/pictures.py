@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from roadscan.code_reach import code_digest
 from roadscan.condition.index import condition_indices
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.whole_sections import WholeSections
+from roadscan.condition.of_sections.whole_sections import WholeSections
 from roadscan.jobs.condition.values import VALUES, Group, GroupTask, load_lane
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.kernels.condition.ruts import wire_places

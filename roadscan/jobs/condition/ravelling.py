@@ -74,7 +74,7 @@ def patches_of_group(one: PatchTask) -> TaskResult:
     """Write patches and picture of a group (runs on a worker)."""
     try:
         lane = load_lane(one.task)
-        found = [(ends, looked_through(lane, *ends)) for ends in one.task.group.sections_m]
+        found = list(zip(lane.sections_m, looked_through(lane), strict=True))
         return TaskResult.of([_write(one, found), _draw(one, lane, found)], [], set())
     except Exception as error:  # noqa: BLE001  a damaged file costs this group
         return TaskResult.of((), [(one.units[0], reason_of(error))], {damaged_file(error)})

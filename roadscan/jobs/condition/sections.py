@@ -33,15 +33,19 @@ SECTIONS: Final = "condition_sections"
 _ROW: Final = ["road", "lane", "station_from_m", "station_to_m"]
 _SIGMAS: Final = {
     "sigma_mri_m_per_km": ("mri_m_per_km",),
+    "sigma_ride_number": ("ride_number",),
+    "sigma_psd_worse_cm3": ("psd_worse_cm3",),
     "sigma_rut_depth_mean_mm": ("rut_depth_mean_left_mm", "rut_depth_mean_right_mm"),
     "sigma_cross_slope_mean_percent": ("cross_slope_mean_percent",),
+    "sigma_faulting_mean_mm": ("faulting_mean_mm",),
     "sigma_mpd_mean_mm": ("mpd_mean_mm",),
+    "sigma_texture_rms_mean_mm": ("texture_rms_mean_mm",),
     "sigma_ravelled_percent": ("ravelled_percent",),
     "sigma_lane_width_m": ("lane_width_m",),
 }
 """Columns of standard deviations, and the quantities whose greatest they hold."""
-_FROM: Final = {"lane_width_from": "lane_width_m"}
-"""Columns that say what a quantity was taken from, which its remark holds."""
+_SAID: Final = {"lane_width_from": "lane_width_m", "iso_8608_class": "psd_worse_cm3"}
+"""Columns that hold the remark of a quantity: what it was taken from, or its class."""
 _MAIN: Final = ("mri_m_per_km", "rut_depth_mean_left_mm", "rut_depth_mean_right_mm", "cross_slope_mean_percent")
 """Quantities whose share stands in the row."""
 
@@ -102,8 +106,8 @@ def section_table(files: SectionFiles) -> tuple[pa.Table, npt.NDArray[Any]]:
     for name, of in _SIGMAS.items():
         known = [q for q in of if q in sigma]
         rows[name] = sigma[known].max(axis=1).to_numpy() if known else np.nan
-    for name, quantity in _FROM.items():
-        said = frame[frame["quantity"] == quantity].set_index(_ROW)["reason"]
+    for name, quantity in _SAID.items():
+        said = frame[(frame["quantity"] == quantity) & frame["value"].notna()].set_index(_ROW)["reason"]
         rows[name] = said.reindex(wide.index).to_numpy()
     main = frame[frame["quantity"].isin(_MAIN)]
     share = main.groupby(_ROW, sort=True)["share"].min()
@@ -134,8 +138,8 @@ def _of_sections(files: SectionFiles) -> pa.Table:
 def _reasons(own: pd.DataFrame) -> str | None:
     """What is said of a section's values, each thing once."""
     said: dict[str, list[str]] = {}
-    for quantity, reason in zip(own["quantity"], own["reason"], strict=True):
-        if isinstance(reason, str) and quantity not in _FROM.values():
+    for quantity, value, reason in zip(own["quantity"], own["value"], own["reason"], strict=True):
+        if isinstance(reason, str) and (quantity not in _SAID.values() or np.isnan(value)):
             said.setdefault(reason, []).append(quantity)
     return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in said.items()) or None
 

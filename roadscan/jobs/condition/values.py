@@ -21,6 +21,7 @@ from roadscan.condition.on_lane.lines import LaneLines
 from roadscan.condition.on_lane.squares import TextureSquares, columns_of
 from roadscan.condition.road_edges.on_lane import EdgeRows, EdgesOnLane, edges_on_lane
 from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.survey_lane import window_m2
 from roadscan.jobs.condition.lines import Roads
 from roadscan.jobs.condition.road_edges import EDGE_PIECE_M, EDGES, edge_unit
 from roadscan.jobs.condition.stretches import (
@@ -45,7 +46,7 @@ from roadscan.tables.writer import parquet_bytes
 
 VALUES: Final = "condition_values"
 _GROUP_M: Final = 1000.0
-"""Sections are computed together over about this length; it changes no value."""
+"""Sections are computed together over about this length; ravelling takes the lane's texture of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +255,7 @@ def load_lane(task: GroupTask) -> LaneData:
         curvature_per_m=group.line.curvature_per_m(_within(cross, group.sections_m).station_m),
         cracks=_cracks(task),
         edges=edges,
+        window_m2=window_m2(task.config, task.cell_m),
         sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
         sigma_pose_height_m=group.lane.sigma_height_m,
     )

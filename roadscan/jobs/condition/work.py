@@ -25,6 +25,7 @@ from roadscan.jobs.condition.stretches import (
     due_stretches,
     plan_stretches,
 )
+from roadscan.jobs.condition.tile_summary import TILES, due_tiles
 from roadscan.jobs.condition.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.jobs.products import product_context
 from roadscan.jobs.session import Session
@@ -34,8 +35,8 @@ from roadscan.model.settings.condition import ConditionConfig
 from roadscan.tables.manifest import OutputRecord
 
 MADE = (
-    LINES, LANES, *OF_STRETCHES, EDGES, SURFACES, VALUES, SECTIONS, PICTURES, RAVELLING, RAVELLING_PICTURES, REGIONS,
-    REGION_SECTIONS, REGION_PICTURES,
+    LINES, LANES, *OF_STRETCHES, EDGES, SURFACES, VALUES, SECTIONS, TILES, PICTURES, RAVELLING, RAVELLING_PICTURES,
+    REGIONS, REGION_SECTIONS, REGION_PICTURES,
 )  # fmt: skip
 """Names of all outputs in the manifest."""
 
@@ -52,6 +53,8 @@ class ConditionWork:
     due_groups: Sequence[Group] = ()
     files: SectionFiles | None = None
     due_files: Sequence[str] = ()
+    due_tiles: str = ""
+    """Key of the table by tile where it is missing or stale."""
     due_pictures: Sequence[PictureTask] = ()
     patches: Sequence[PatchTask] = ()
     """Groups of sections whose ravelled patches are written."""
@@ -110,7 +113,6 @@ def _along_lines(session: Session, config: ConditionConfig, key: str) -> Conditi
     ]
     return ConditionWork(
         key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
-        due_files(files, manifest), due_pictures(pictures, manifest), patches, due_patches(patches, manifest), edges,
-        due_edges(edges, manifest), pieces, due_pieces(pieces, manifest),
-        gone,
+        due_files(files, manifest), due_tiles(files, manifest), due_pictures(pictures, manifest), patches,
+        due_patches(patches, manifest), edges, due_edges(edges, manifest), pieces, due_pieces(pieces, manifest), gone,
     )  # fmt: skip

@@ -13,6 +13,7 @@ from roadscan.jobs.condition.sections import write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.surface_cells import check_surface_cells
 from roadscan.jobs.condition.tasks import P, PieceTask, S, run_units
+from roadscan.jobs.condition.tile_summary import write_tiles
 from roadscan.jobs.condition.values import GroupTask, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
 from roadscan.jobs.engine.bundles import run_bundles
@@ -61,6 +62,8 @@ class Condition(Stage):
         work = plan_condition(session) if values else work
         if work.files is not None and work.due_files:
             session.manifest.add(write_sections(work.files))
+        if work.files is not None and work.due_tiles:
+            session.manifest.add([write_tiles(work.files, work.due_tiles)])
         bar = session.bar("ravelled patches")
         session.failed(self.name, run_units(patches_of_group, work.due_patches, session.manifest, session.compute, bar))
         manifest, due = session.manifest, work.due_pictures
@@ -111,6 +114,7 @@ class Condition(Stage):
             + len(work.due_edges)
             + work.values_due
             + len(work.due_files)
+            + bool(work.due_tiles)
             + len(work.due_pictures)
             + len(work.due_patches)
             + len(work.due_pieces)
@@ -123,6 +127,6 @@ class Condition(Stage):
             "tables/cross_sections", "tables/lane_texture", "tables/lane_line_offsets",
             "products/ravelling_patches", "products/ravelling_pictures", "tables/road_edge_offsets",
             "products/road_surface", "tables/condition_values", "products/condition_sections",
-            "products/condition_pictures", "tables/roughness_sections", "products/roughness_regions",
-            "products/roughness_pictures",
+            "products/condition_tiles", "products/condition_pictures", "tables/roughness_sections",
+            "products/roughness_regions", "products/roughness_pictures",
         )  # fmt: skip

@@ -213,12 +213,12 @@ def residuals(found, count, base, surface, out):
 
 
 @kernel
-def sigma(found, count, size, away):
+def sigma(found, count, size, away, told):
     """Standard deviation of the height in the middle (m), from what the cells of the window say of their own errors.
 
     A cell's variance is that of its readings over their number (all readings of the window have one variance), or that
-    of the cells about the surface where this is more: a cell's readings need not lie around its middle.
-    size : terms of the surface; away : (count,) distances from it (m).
+    of the cells about a surface where this is more: a cell's readings need not lie around its middle.
+    size : terms of the surface that the height is of; away : (count,) distances (m) from one of `told` terms.
     """
     squares, freedom, spread, used = 0.0, 0.0, 0.0, 0.0
     for k in range(count):
@@ -229,9 +229,9 @@ def sigma(found, count, size, away):
         if found.readings[k] > 1.0 and found.noise[k] >= 0.0:
             squares += found.noise[k]
             freedom += found.readings[k] - 1.0
-    if used <= size:
+    if used <= told:
         return np.nan
-    spread /= used - size
+    spread /= used - told
     variance = squares / freedom if freedom >= 10.0 else 0.0
     normal, factor = np.zeros((TERMS, TERMS)), np.zeros((TERMS, TERMS))
     noise, terms, unit, row = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(TERMS), np.zeros(TERMS)
@@ -295,9 +295,11 @@ def sample(table, places, half_along, half_across, bend, out):
         size = fit(found, count, wanted, base, surface)
         if size < 3:
             continue
-        residuals(found, count, base, surface, away)
         out[i, 0] = base + surface[0]
-        out[i, 1] = sigma(found, count, size, away)
+        # A rut bends across the road whether or not the surface may: what it bends by is no error.
+        told = fit(found, count, TERMS, base, surface)
+        residuals(found, count, base, surface, away)
+        out[i, 1] = sigma(found, count, size, away, told)
 
 
 @inlined

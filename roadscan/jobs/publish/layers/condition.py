@@ -29,6 +29,11 @@ _STYLES = (
 """Limits of good, fair and poor for IRI, rutting, cracking and faulting are those of 23 CFR 490.313 (IRI 95 and 170
 in/mi, rutting 0.20 and 0.40 in, cracking 5 and 20 %, faulting 0.10 and 0.15 in); the others only part the colours."""
 
+_BY_TILE = (
+    Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0)),
+    Style("Rut depth (mm)", 6, by="rut_depth_mean_mm", limits=(2.5, 5.1, 10.2, 15.0)),
+)
+
 
 class Condition(LayerKind):
     """What the stage `condition` makes."""
@@ -43,6 +48,8 @@ class Condition(LayerKind):
             ("lanes", described("lanes", "Lanes", "survey", "line", 220, [Style("one colour", 2, SKY)], visible=False)),
             ("condition_sections", described("condition_sections", "Condition by section", "condition", "line", 300,
                 _STYLES)),
+            ("condition_tiles", described("condition_tiles", "Condition by tile", "condition", "polygon", 290, _BY_TILE,
+                visible=False)),
             ("road_surface", described("road_surface", "Road surface inside its edges", "survey", "polygon", 205,
                 [Style("one colour", 1, SKY)], visible=False)),
             ("roughness_regions", described("roughness_regions", "Roughness regions", "condition", "polygon", 310,

@@ -1,0 +1,195 @@
+"""Wheel paths of a section as indices of roughness take them: with a lead, gaps bridged, and draws of their noise.
+
+A height is a mean over a window, which takes short waves, and it holds noise, which adds roughness. The profile gets
+back what the same window takes of it again (van Cittert's iteration, twice), and the power of the noise alone is taken
+from that of an index (:func:`without_noise`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.ndimage
+
+from roadscan.condition.lane_data import LaneData, Profile
+from roadscan.condition.quarter_car import RULES
+from roadscan.condition.segments import Segments
+
+Float64 = npt.NDArray[np.float64]
+
+LEAD_M: Final = 100.0
+"""A quarter car begins so far before a section, or where the profile begins."""
+NOISES: Final = 12
+"""Profiles with added noise, from whose spread a standard deviation is told."""
+MOST_NOISE: Final = 0.75
+"""Share of the power of an index that may be noise."""
+_SIGMA_NOISE: Final = 0.3
+"""Of the standard deviations of heights (share): regular readings err less than their scatter within cells says."""
+_ROUNDS: Final = 2
+LEAST_M: Final = 20.0
+"""Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
+
+
+@dataclass(frozen=True, eq=False)
+class WheelPath:
+    """A wheel path along a section and before it."""
+
+    profile: Profile
+    """With its short gaps bridged."""
+    ends: Segments
+    """The section's ends along the path."""
+    inside: npt.NDArray[np.bool_]
+    """(n,) heights that lie in the section."""
+    share: float
+    """Share of the section that was measured."""
+    reason: str
+    """Why it has no roughness; empty where it has one."""
+    spacing_m: float
+    cell_m: float
+    window_m2: float
+    """Variance of the window along the road that a height is a mean over."""
+
+    def with_noise(self, first_stream: int = 0) -> Float64:
+        """(1 + 12, n) heights, and the same with noise added; NaN where nothing is known of it."""
+        height = self.profile.height_m[None]
+        return np.concatenate([height, height + noise(self.profile, self.spacing_m, self.cell_m, first_stream)])
+
+    def tried(self, first_stream: int = 0) -> Float64:
+        """(2 + 2 · 12, n) sharpened: heights, heights less so, heights with noise added, and the noise alone."""
+        noisy = self.with_noise(first_stream)
+        alone = noisy[1:] - noisy[0]
+        once = self.sharpened(noisy[:1], _ROUNDS - 1)
+        sharp = self.sharpened(np.concatenate([noisy, alone]))
+        return np.concatenate([sharp[:1], once, sharp[1:]])
+
+    def sharpened(self, height_m: Float64, rounds: int = _ROUNDS) -> Float64:
+        """(k, n) heights with what their window took of short waves; beside gaps they stay as they are."""
+        if not self.window_m2:
+            return height_m
+        at, window = _window(max(math.sqrt(6.0 * self.window_m2), 1.5 * self.spacing_m), self.spacing_m)
+        window /= window.sum()
+        scale = self.window_m2 / float(np.sum(window * at * at))
+        sharp, taken = height_m.copy(), height_m
+        for _ in range(rounds):
+            smooth = scipy.ndimage.correlate1d(taken, window, mode="nearest")
+            taken = np.nan_to_num(scale * (taken - smooth))
+            sharp += taken
+        return sharp
+
+
+def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPath]:
+    """Both wheel paths of a section, by side."""
+    before, after = (LEAD_M, 10.0) if lane.sign > 0 else (10.0, LEAD_M)
+    spacing = lane.config.profile_spacing_m
+    found = {}
+    for side, whole in lane.profiles.items():
+        part = bridged(whole.between(from_m - before, to_m + after), lane.config.largest_gap_m)
+        inside = (part.station_m >= from_m - 1e-6) & (part.station_m <= to_m + 1e-6)
+        share, reason = _judged(part, inside, (from_m, to_m), lane)
+        ends = _ends(part, from_m, to_m) if not reason else Segments(np.zeros(0), np.zeros(0))
+        found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m, lane.window_m2)
+    return found
+
+
+def spread_of(tried: Float64) -> float:
+    """Standard deviation of a value (1 + draws,): the first is that without noise."""
+    return float(np.sqrt(np.mean((tried[1:] - tried[0]) ** 2)))
+
+
+class Cleared(NamedTuple):
+    """A value without what noise adds to it."""
+
+    value: float
+    """NaN where noise makes more than three quarters of its power."""
+    sigma: float
+    reason: str
+
+
+def without_noise(tried: Float64) -> Cleared:
+    """An index of roughness (26,) of :meth:`WheelPath.tried`, less the power that noise alone has."""
+    value, once, noisy, alone = tried[0], tried[1], tried[2 : 2 + NOISES], tried[2 + NOISES :]
+    if not np.isfinite(alone).all():
+        return Cleared(float(value), np.nan, "")
+    power = float(np.mean(alone**2))
+    if power > MOST_NOISE * value**2:
+        share = 100.0 * min(power / value**2, 1.0)
+        return Cleared(np.nan, np.nan, f"noise of the heights makes {share:.0f} % of it")
+    clear = math.sqrt(value**2 - power)
+    if not clear:
+        return Cleared(0.0, 0.0, "")
+    spread = float(np.std(noisy, ddof=1)) * float(value) / clear
+    return Cleared(clear, math.hypot(spread, _SIGMA_NOISE * power / clear, float(value - once)), "")
+
+
+def bridged(profile: Profile, largest_gap_m: float) -> Profile:
+    """The profile with its short gaps bridged by straight lines."""
+    known = np.flatnonzero(~np.isnan(profile.height_m))
+    if known.size < 2:
+        return profile
+    height = np.interp(profile.distance_m, profile.distance_m[known], profile.height_m[known])
+    behind = np.searchsorted(known, np.arange(height.size), side="right")
+    last, after = known[np.maximum(behind - 1, 0)], known[np.minimum(behind, known.size - 1)]
+    wide = profile.distance_m[after] - profile.distance_m[last] > largest_gap_m + 1e-9
+    outside = (behind == 0) | ((behind == known.size) & (np.arange(height.size) > known[-1]))
+    gap = np.isnan(profile.height_m) & (wide | outside)
+    return Profile(profile.station_m, profile.place_m, np.where(gap, np.nan, height), profile.sigma_m)
+
+
+def _judged(
+    part: Profile, inside: npt.NDArray[np.bool_], between_m: tuple[float, float], lane: LaneData
+) -> tuple[float, str]:
+    """Share of a section that was measured, and why it can have no roughness."""
+    length, spacing, limit = between_m[1] - between_m[0], lane.config.profile_spacing_m, RULES.envelope_m
+    due, measured = length / spacing, float(np.count_nonzero(~np.isnan(part.height_m[inside])))
+    share = min(1.0, measured / max(due, 1.0))
+    least = min(LEAST_M, lane.config.section_m)
+    if length < least - 1e-6:
+        return share, f"the section is {length:.1f} m long; roughness takes {least:g} m or more"
+    if lane.cell_m > limit:
+        return share, f"cells of {lane.cell_m:g} m are too coarse: {limit:g} m or less are needed"
+    if measured < 0.5 * due:
+        return share, f"{100 * share:.0f} % of the wheel path were measured"
+    missing = (due - measured) * spacing
+    if missing > lane.config.largest_gap_m + spacing:
+        return share, f"gaps wider than {lane.config.largest_gap_m:g} m, {missing:.1f} m in all"
+    return share, ""
+
+
+def _ends(part: Profile, from_m: float, to_m: float) -> Segments:
+    order = np.argsort(part.station_m, kind="stable")
+    ends = np.sort(np.interp([from_m, to_m], part.station_m[order], part.distance_m[order]))
+    return Segments(ends[:1], ends[1:])
+
+
+def noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0) -> Float64:
+    """(k, n) errors as the noise of the readings makes them: those of neighbours are alike, for they share cells.
+
+    They are drawn from counters of the place, so a section has the same ones in every run.
+    """
+    number = np.rint(part.station_m / spacing_m).astype(np.int64)
+    low, high = int(number.min()) - 64, int(number.max()) + 65
+    _, window = _window(max(spacing_m, 1.5 * cell_m), spacing_m)
+    window /= np.sqrt(np.sum(window * window))
+    sigma = part.known_sigma_m
+    out = np.empty((NOISES, number.size))
+    for k in range(NOISES):
+        drawn = np.concatenate([_normal(first_stream + k, block) for block in range(low // 1024, high // 1024 + 1)])
+        alike = np.convolve(drawn, window, mode="same")
+        out[k] = sigma * alike[number - low // 1024 * 1024]
+    return out
+
+
+def _window(half_m: float, spacing_m: float) -> tuple[Float64, Float64]:
+    """Places of a window (m), and their weights, which fall linearly to its ends."""
+    reach = max(math.ceil(half_m / spacing_m - 1e-9) - 1, 0)
+    at = spacing_m * np.arange(-reach, reach + 1, dtype=np.float64)
+    return at, 1.0 - np.abs(at) / half_m
+
+
+def _normal(stream: int, block: int) -> Float64:
+    """1024 normal numbers of a block of places."""
+    return np.random.Generator(np.random.Philox(key=[stream, block & 0xFFFFFFFF])).standard_normal(1024)

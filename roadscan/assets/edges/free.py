@@ -1,4 +1,4 @@
-"""Edges that may be kerbs: along the foot of a fence, and of a rut under the vehicle, heights differ as at a step."""
+"""Edges that may be kerbs: heights differ as at a step also along a fence, a rut under the vehicle, and plants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.edges.find import Edge, edges_of
 from roadscan.assets.edges.line_pieces import columns_of
-from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.kernels.assets.corridors import mark_corridor
@@ -21,6 +21,8 @@ _FENCE_M: Final = (0.35, 1.2)
 _LEAST_RETURNS: Final = 2
 _MOST: Final = 0.5
 _VEHICLE_M: Final = 0.9
+_BEHIND_M: Final = (0.1, 0.2, 0.3, 0.4)
+"""A kerb's upper side is seen this far behind its face."""
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -30,14 +32,42 @@ _OTHERS: Final = (
 
 @once_a_scene
 def free_edges(scene: Scene) -> list[Edge]:
-    """The scene's edges without those that lie, at most of their nodes, where something stands or a drive went."""
+    """The scene's edges without those that lie, at most of their nodes, where something stands, a drive went, or plants
+    grow on the higher side.
+    """
     raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
+    grown = _grown(scene)
     kept = []
     for edge in edges_of(scene):
         nodes = columns_of(edge)
-        if np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST:
+        is_free = np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST
+        if is_free and _share_behind(edge, grown, raster) <= _MOST:
             kept.append(edge)
     return kept
+
+
+def _grown(scene: Scene) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Returns that count as ground in each cell (rows, columns) of the raster, and those of them that are plants."""
+    raster = raster_of(scene)
+    plants = raster.used & (scene.classes == classes.LOW_VEGETATION)
+    return _counted(raster, raster.used), _counted(raster, plants)
+
+
+def _counted(raster: HeightRaster, rows: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Number of some of the scene's returns (n,) in each cell (rows, columns) of its raster."""
+    return np.bincount(raster.cell[rows], minlength=raster.count.size).reshape(raster.count.shape)
+
+
+def _share_behind(
+    edge: Edge, grown: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]], raster: HeightRaster
+) -> float:
+    """Share of the returns close behind an edge, on its higher side, that are plants: the median of its nodes."""
+    nodes = edge.nodes.at(edge.seen)
+    x = nodes.x_m[:, None] + np.array(_BEHIND_M) * nodes.heading_y[:, None]
+    y = nodes.y_m[:, None] - np.array(_BEHIND_M) * nodes.heading_x[:, None]
+    every, plants = (one[raster.cells_of(x, y)].sum(axis=1) for one in grown)
+    held = every > 0
+    return float(np.median(plants[held] / every[held])) if held.any() else 0.0
 
 
 def _driven(scene: Scene) -> npt.NDArray[np.bool_]:

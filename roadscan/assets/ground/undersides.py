@@ -21,6 +21,10 @@ _MARGIN: Final = 0.05
 _SMOOTH: Final = (5, 5)
 """Cells over which the slope is taken."""
 _AROUND: Final = np.ones((5, 5), np.uint8)
+_OVER_SENSOR_M: Final = 1.0
+"""A structure hangs higher above the sensor; slopes, hedges and branches that come lower are left to other rules."""
+_LEAST: Final = np.ones((3, 3), np.uint8)
+"""A face is as wide as so many cells in both directions."""
 
 
 def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float32) -> Bools:
@@ -33,7 +37,7 @@ def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float3
     lowest_m : (rows, columns) lowest return of each cell; height_m : the same, whole between the known cells.
     """
     out = np.zeros(grid.shape, np.bool_)
-    rows = np.flatnonzero(returns.height_m > returns.sensor_height_m)
+    rows = np.flatnonzero(returns.height_m > returns.sensor_height_m + _OVER_SENSOR_M)
     column = np.floor((returns.x_m[rows] - grid.x_min_m) / grid.cell_m).astype(np.int64)
     row = np.floor((returns.y_m[rows] - grid.y_min_m) / grid.cell_m).astype(np.int64)
     kept = (row >= 0) & (column >= 0) & (row < grid.rows) & (column < grid.columns)
@@ -49,7 +53,8 @@ def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float3
     number, total = np.zeros(grid.shape), np.zeros(grid.shape)
     np.add.at(number, (row, column), 1.0)
     np.add.at(total, (row, column), excess)
-    out = (number > 0) & (total > _MARGIN * number)
+    seen_below = ((number > 0) & (total > _MARGIN * number)).view(np.uint8)
+    out = cv2.morphologyEx(seen_below, cv2.MORPH_OPEN, _LEAST) > 0
     # at the edge of a deck the surface falls to the ground beside it
     wider = cv2.dilate(out.view(np.uint8), _AROUND) > 0
     return np.asarray(out | (wider & (number > 0)))

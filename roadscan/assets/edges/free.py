@@ -23,6 +23,8 @@ _MOST: Final = 0.5
 _VEHICLE_M: Final = 0.9
 _BEHIND_M: Final = (0.1, 0.2, 0.3, 0.4)
 """A kerb's upper side is seen this far behind its face."""
+_SCATTER_M: Final = 0.015
+"""Heights of plants in a cell scatter by more beyond the noise of the data: even ground does not."""
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -36,38 +38,36 @@ def free_edges(scene: Scene) -> list[Edge]:
     grow on the higher side.
     """
     raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
-    grown = _grown(scene)
+    plants = _plants(scene)
     kept = []
     for edge in edges_of(scene):
         nodes = columns_of(edge)
         is_free = np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST
-        if is_free and _share_behind(edge, grown, raster) <= _MOST:
+        if is_free and not _is_grown_over(edge, plants, raster):
             kept.append(edge)
     return kept
 
 
-def _grown(scene: Scene) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Returns that count as ground in each cell (rows, columns) of the raster, and those of them that are plants."""
+def _plants(scene: Scene) -> npt.NDArray[np.int64]:
+    """Returns of low plants among those that count as ground, in each cell (rows, columns) of the raster."""
     raster = raster_of(scene)
-    plants = raster.used & (scene.classes == classes.LOW_VEGETATION)
-    return _counted(raster, raster.used), _counted(raster, plants)
+    cells = raster.cell[raster.used & (scene.classes == classes.LOW_VEGETATION)]
+    return np.bincount(cells, minlength=raster.count.size).reshape(raster.count.shape)
 
 
-def _counted(raster: HeightRaster, rows: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """Number of some of the scene's returns (n,) in each cell (rows, columns) of its raster."""
-    return np.bincount(raster.cell[rows], minlength=raster.count.size).reshape(raster.count.shape)
-
-
-def _share_behind(
-    edge: Edge, grown: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]], raster: HeightRaster
-) -> float:
-    """Share of the returns close behind an edge, on its higher side, that are plants: the median of its nodes."""
+def _is_grown_over(edge: Edge, plants: npt.NDArray[np.int64], raster: HeightRaster) -> bool:
+    """Whether plants are seen close behind most of an edge, on its higher side: by class or by scatter."""
     nodes = edge.nodes.at(edge.seen)
     x = nodes.x_m[:, None] + np.array(_BEHIND_M) * nodes.heading_y[:, None]
     y = nodes.y_m[:, None] - np.array(_BEHIND_M) * nodes.heading_x[:, None]
-    every, plants = (one[raster.cells_of(x, y)].sum(axis=1) for one in grown)
+    cells = raster.cells_of(x, y)
+    every = raster.count[cells].sum(axis=1)
     held = every > 0
-    return float(np.median(plants[held] / every[held])) if held.any() else 0.0
+    if not held.any():
+        return False
+    scatter = np.sqrt((raster.count[cells] * raster.spread_m[cells] ** 2).sum(axis=1)[held] / every[held])
+    share = plants[cells].sum(axis=1)[held] / every[held]
+    return float(np.median(share)) > _MOST or float(np.median(scatter)) > raster.noise_m + _SCATTER_M
 
 
 def _driven(scene: Scene) -> npt.NDArray[np.bool_]:

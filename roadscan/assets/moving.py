@@ -37,6 +37,8 @@ _BODY: Final = 0b111100
 _TALLEST: Final = 21
 """Level that a moving lorry may reach: 4.2 m."""
 _LEAST_CELLS: Final = 6
+_STAYS_SLOTS: Final = 8
+"""What is seen in so many slots, and in more than twice as many as the ground without it, stands."""
 _TREE_CELLS: Final = 60
 """Places that seem to move below a tree's crown count only from this size on (cells): branches swing."""
 _PERSON_M: Final = 1.2
@@ -116,7 +118,9 @@ def moving_cells(held: Columns) -> Bools:
     apart = (free >= 2) & (2 * free >= 3 * things) & (2 * both <= things)
     moving = (things > 0) & (apart | ((free >= 3) & (free >= 2 * things)))
     around = _around(moving)
-    return np.asarray((things > 0) & (2 * around >= _around(things > 0)) & (around >= 3))
+    # whatever its neighbours do: the edges of a post are seen now and then
+    stays = (things >= _STAYS_SLOTS) & (things > 2 * free)
+    return np.asarray((things > 0) & ~stays & (2 * around >= _around(things > 0)) & (around >= 3))
 
 
 def _around(cells: Bools) -> Int32:

@@ -45,7 +45,8 @@ def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float3
     rows, row, column = rows[kept], row[kept], column[kept]
     if not rows.size or min(grid.shape) < 2:
         return out
-    north, east = np.gradient(cv2.blur(height_m, _SMOOTH), grid.cell_m)
+    # slopes are made smooth, not heights: at the border these would be mirrored, and a bank look level
+    north, east = (cv2.blur(g, _SMOOTH, borderType=cv2.BORDER_REPLICATE) for g in np.gradient(height_m, grid.cell_m))
     dx, dy = returns.x_m[rows] - returns.sensor_x_m[rows], returns.y_m[rows] - returns.sensor_y_m[rows]
     away = np.maximum(np.hypot(dx, dy), 0.1)
     rise = (returns.height_m[rows] - returns.sensor_height_m[rows]) / away

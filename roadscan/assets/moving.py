@@ -34,6 +34,8 @@ _TALL: Final = 14
 """What reaches this level is no vehicle that is parked: 2.8 m."""
 _BODY: Final = 0b111100
 """Levels at which a vehicle has its body: 0.4–1.2 m."""
+_LOWEST_BODY: Final = 3
+"""What moves and does not reach above this level, 0.8 m, carries nothing that is higher than cars."""
 _TALLEST: Final = 21
 """Level that a moving lorry may reach: 4.2 m."""
 _LEAST_CELLS: Final = 6
@@ -145,7 +147,7 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
         target = vehicle if sides_m(inside)[1] >= _PERSON_M else person
         wider = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
         target[part][wider] = np.maximum(target[part][wider], reached)
-        if target is vehicle:
+        if target is vehicle and reached > _LOWEST_BODY:
             around = slice(max(low - 2, 0), low + height + 2), slice(max(left - 2, 0), left + width + 2)
             target[around] = np.maximum(target[around], load_levels(held, around, label[around] == k))
     return vehicle, person

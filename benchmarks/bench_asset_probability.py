@@ -22,7 +22,7 @@ from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
 from roadscan.assets.calibration import CURVES, GROUPS, Curve, curve_of
 
-FITTED_ON: Final = range(100, 124)
+FITTED_ON: Final = range(100, 140)
 HELD_OUT: Final = range(10)
 SETTINGS: Final = "classified = false\nbare_earth = false\nexports = []\n"
 _DOUBT: Final = 2.0

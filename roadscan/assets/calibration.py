@@ -35,22 +35,29 @@ GROUPS: Final = {
     "tree": "trees",
     "facade": "surfaces", "wall": "surfaces", "barrier": "surfaces", "guardrail": "surfaces", "fence": "surfaces",
     "attenuator": "surfaces",
-    "kerb": "edges", "sidewalk": "edges", "median": "edges", "road_edge": "edges", "shoulder": "edges",
+    "kerb": "edges", "sidewalk": "edges", "median": "edges", "road_edge": "edges",
+    "shoulder": "products",
     "lane_line": "paint", "road_marking": "paint",
     "landscape_area": "areas",
     "clearance": "clearances",
 }  # fmt: skip
-"""Group of each kind: kinds of one group share their evidence and its curve."""
+"""Group of each kind: kinds of one group share their evidence and its curve. A shoulder's is the product of what is
+stated of its edge and its line.
+"""
 CURVES: Final = {
-    "signs": Curve(0.0, 1.0),
-    "shafts": Curve(0.0, 1.0),
-    "trees": Curve(0.0, 1.0),
-    "surfaces": Curve(0.0, 1.0),
-    "edges": Curve(0.0, 1.0),
-    "paint": Curve(0.0, 1.0),
-    "areas": Curve(0.0, 1.0),
-    "clearances": Curve(0.0, 1.0),
+    "signs": Curve(0.36, 1.45),
+    "shafts": Curve(1.15, 0.46),
+    "trees": Curve(-0.29, 0.52),
+    "surfaces": Curve(-0.07, 0.48),
+    "edges": Curve(-1.56, 1.11),
+    "paint": Curve(-0.08, 0.52),
+    "areas": Curve(-0.04, 0.73),
+    "clearances": Curve(0.08, 1.11),
+    "products": Curve(0.0, 1.0),
 }
+"""Fitted to 771 objects of 40 drawn streets (seeds 100 to 139) by `python -m benchmarks asset_probability`; on ten others
+(seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them.
+"""
 UNCHANGED: Final = Curve(0.0, 1.0)
 
 

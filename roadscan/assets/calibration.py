@@ -55,8 +55,8 @@ CURVES: Final = {
     "clearances": Curve(0.08, 1.11),
     "products": Curve(0.0, 1.0),
 }
-"""Fitted to 771 objects of 40 drawn streets (seeds 100 to 139) by `python -m benchmarks asset_probability`; on ten others
-(seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them.
+"""Fitted to 771 objects of 40 drawn streets (seeds 100 to 139) by `python -m benchmarks asset_probability`. On ten
+others (seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them.
 """
 UNCHANGED: Final = Curve(0.0, 1.0)
 

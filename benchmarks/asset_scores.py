@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import rasterio
+import scipy.spatial
 import shapely
 
 from benchmarks.asset_streets import LOW_POST_M, Street
@@ -23,6 +24,8 @@ Float64 = npt.NDArray[np.float64]
 NEAR_M: Final = 0.5
 """A post or a plate is the one that stands there when it is found so near to it."""
 _STEP_M: Final = 0.1
+_HIT_M: Final = 0.2
+"""What no return hits within this is hidden: finders of edges look so far."""
 _PAINT_FROM: Final = 150.0
 """Digital numbers of the simulator: paint is 190, a kerb 135."""
 _CELL_M: Final = 0.1
@@ -310,6 +313,11 @@ def line_figures(street: Street) -> Iterator[Figure]:
         within, (full, right) = LINES[kind], bars.get(kind, (None, None))
         if kind != "lane_line":  # those of dashed lines lie between dashes too
             yield Figure(f"{kind}: within {within} m, found", _share_near(truth, lines, within), "", full)
+        if kind == "kerb":
+            places = _samples(truth)
+            hit = _hit(street, shapely.get_coordinates(places))
+            yield Figure(f"kerb: length that returns hit within {_HIT_M} m", float(hit.mean()), "")
+            yield Figure(f"kerb: within {within} m, found where hit", _share_of(places[hit], lines, within), "", full)
         shapely.prepare(truth)
         if every.size:
             share = float(shapely.dwithin(every, truth, within).mean())
@@ -320,6 +328,32 @@ def line_figures(street: Street) -> Iterator[Figure]:
         table = street.found(kind)
         false = sum(_share_near(g, solid, 0.3) < 0.5 for g in table.geometry)
         yield Figure(f"{kind}: false ones", float(false), "")
+
+
+def _hit(street: Street, places_m: Float64) -> npt.NDArray[np.bool_]:
+    """Which places (n, 2) have a return on the ground near: what no return hits, no method can see."""
+    parts = [np.zeros((0, 2))]
+    for x, y, z, _ in _classified(street):
+        on_ground = np.abs(z - street.surface.height_m(x, y, texture=False)) <= 0.1
+        parts.append(np.column_stack([x, y])[on_ground])
+    near = scipy.spatial.cKDTree(np.concatenate(parts)).query(places_m, distance_upper_bound=_HIT_M)[0]
+    return np.asarray(np.isfinite(near))
+
+
+def _grid_within(area: shapely.Geometry, every_m: float = 0.1) -> Float64:
+    """Places (n, 2) at even distances within an area."""
+    west, south, east, north = area.bounds
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(west, east, every_m), np.arange(south, north, every_m)))
+    return np.column_stack([x, y])[shapely.contains_xy(area, x, y)]
+
+
+def _classified(street: Street) -> Iterator[tuple[Float64, Float64, Float64, npt.NDArray[np.uint8]]]:
+    """Place (m) and class of the returns of each square."""
+    for path in street.session.store.files("products/classified_points", ".laz"):
+        with laspy.open(street.session.store.path(path)) as reader:
+            las = reader.read()
+        x, y, z = (np.asarray(v) * u for v, u in ((las.x, street.unit_m), (las.y, street.unit_m), (las.z, 1.0)))
+        yield x, y, z, np.asarray(las.classification)
 
 
 def _as_line(shape: shapely.Geometry) -> shapely.Geometry:
@@ -385,6 +419,12 @@ def area_figures(street: Street) -> Iterator[Figure]:
         found = found.intersection(region)
         both = found.intersection(truth).area
         yield Figure(f"{kind}: area found", both / truth.area, "", 0.90)
+        if kind == "sidewalk":
+            places = _grid_within(truth)
+            hit = _hit(street, places)
+            held = shapely.contains_xy(found, places[hit, 0], places[hit, 1])
+            yield Figure(f"sidewalk: area that returns hit within {_HIT_M} m", float(hit.mean()), "")
+            yield Figure("sidewalk: area found where hit", float(held.mean()), "", 0.90)
         if found.area > 0.0:
             yield Figure(f"{kind}: area right", both / found.area, "", 0.90)
 
@@ -422,21 +462,15 @@ def clearance_figures(street: Street) -> Iterator[Figure]:
 def marking_figures(street: Street) -> Iterator[Figure]:
     """F1 of cells of 0.1 m; a cell is paint where half of its returns are, in truth and as found."""
     both = told = true = 0
-    for path in street.session.store.files("products/classified_points", ".laz"):
-        with laspy.open(street.session.store.path(path)) as reader:
-            las = reader.read()
-        code = np.asarray(las.classification)
-        ground = np.isin(code, (classes.GROUND, classes.ROAD, classes.MARKING, classes.KERB, classes.SIDEWALK))
-        x, y, z = (np.asarray(v)[ground] * u for v, u in ((las.x, street.unit_m), (las.y, street.unit_m), (las.z, 1.0)))
-        marked = code[ground] == classes.MARKING
-        station, offset = street.along(x, y)
-        kept = (station >= street.ends_m[0]) & (station <= street.ends_m[1])
+    for every_x, every_y, every_z, code in _classified(street):
+        kept = np.isin(code, (classes.GROUND, classes.ROAD, classes.MARKING, classes.KERB, classes.SIDEWALK))
+        station, offset = street.along(every_x, every_y)
+        kept &= (station >= street.ends_m[0]) & (station <= street.ends_m[1])
         kept &= np.abs(offset) <= street.scene.road.paved_m
-        x, y, z, marked = x[kept], y[kept], z[kept], marked[kept]
-        if not x.size:
+        kept[kept] = np.abs(every_z[kept] - street.surface.height_m(every_x[kept], every_y[kept], texture=False)) <= 0.1
+        if not kept.any():
             continue
-        kept = np.abs(z - street.surface.height_m(x, y, texture=False)) <= 0.1
-        x, y, marked = x[kept], y[kept], marked[kept]
+        x, y, marked = every_x[kept], every_y[kept], code[kept] == classes.MARKING
         painted = street.surface.intensity(x, y) > _PAINT_FROM
         place = np.floor(np.stack([x - x.min(), y - y.min()]) / _CELL_M).astype(np.int64)
         _, cell = np.unique(place[0] * 1_000_000 + place[1], return_inverse=True)

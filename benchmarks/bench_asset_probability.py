@@ -1,44 +1,82 @@
-"""Whether the stated probabilities of assets mean what they say: objects of ten drawn streets against the truth.
+"""Whether the stated probabilities of assets mean what they say, and the curves that make them so.
 
-The error is the mean distance between stated probability and share that is right, over ten bins (expected calibration
-error). No weight of the stage was set on these ten streets.
+Curves (`roadscan/assets/calibration.py`) are fitted to the objects of some drawn streets. Others, which take no part in
+that, are held against them: ten drawn ones, and the town and the motorway of `asset_streets`. The error is the mean
+distance between stated probability and share that is right, over ten bins (expected calibration error).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
+import scipy.optimize
 
 from benchmarks.asset_scores import Judged, calibration_error, judged
-from benchmarks.asset_streets import processed
+from benchmarks.asset_streets import motorway, processed, town
 from benchmarks.drawn_streets import drawn_street
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
+from roadscan.assets.calibration import CURVES, GROUPS, Curve, curve_of
 
-SEEDS: Final = range(10)
+FITTED_ON: Final = range(100, 140)
+HELD_OUT: Final = range(10)
 SETTINGS: Final = "classified = false\nbare_earth = false\nexports = []\n"
+_DOUBT: Final = 2.0
+"""Weight of the squares of a curve's offset and of its slope less 1: few objects change it little."""
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """The error over all objects, then each bin, then each kind."""
-    objects: list[Judged] = []
-    for seed in SEEDS:
-        objects += judged_street(seed, bench_folder(folder))
-    yield Figure("expected calibration error", calibration_error(objects), "", 0.05, "the bar")
-    stated, right = np.array([o.probability for o in objects]), np.array([o.is_right for o in objects])
-    for low in np.arange(0.5, 1.0, 0.1):
-        own = (stated >= low) & (stated < low + 0.1 + 1e-9 * (low > 0.85))
-        if own.any():
-            what = f"right of {own.sum()} with {low:.1f} to {low + 0.1:.1f}"
-            yield Figure(what, float(right[own].mean()), "", float(stated[own].mean()), "stated")
-    for kind in sorted({o.kind for o in objects}):
-        own = np.array([o.kind == kind for o in objects])
-        yield Figure(f"right of {own.sum()} {kind}", float(right[own].mean()), "", float(stated[own].mean()), "stated")
+    """Errors of the streets that are held out, each bin and kind of these, and the curves that the others speak for."""
+    held = judged_streets(HELD_OUT, bench_folder(folder))
+    yield Figure("expected calibration error of ten other drawn streets", calibration_error(held), "", 0.05, "the bar")
+    for name, scene in (("town", town()), ("motorway", motorway())):
+        own = list(judged(processed(scene, bench_folder(folder) / f"probability-{name}", settings=SETTINGS)))
+        yield Figure(f"expected calibration error of {len(own)} objects, {name}", calibration_error(own), "")
+    stated, right = _arrays(held)
+    for low in np.arange(0.0, 1.0, 0.1):
+        own_bin = (stated >= low) & (stated < low + 0.1 + 1e-9 * (low > 0.85))
+        if own_bin.any():
+            what = f"right of {own_bin.sum()} with {low:.1f} to {low + 0.1:.1f}"
+            yield Figure(what, float(right[own_bin].mean()), "", float(stated[own_bin].mean()), "stated")
+    for kind in sorted({o.kind for o in held}):
+        of_kind = np.array([o.kind == kind for o in held])
+        what = f"right of {of_kind.sum()} {kind}"
+        yield Figure(what, float(right[of_kind].mean()), "", float(stated[of_kind].mean()), "stated")
+    for group, curve in fitted(judged_streets(FITTED_ON, bench_folder(folder))).items():
+        yield Figure(f"{group}: offset", curve.offset, "", CURVES[group].offset, "in force")
+        yield Figure(f"{group}: slope", curve.slope, "", CURVES[group].slope, "in force")
 
 
-def judged_street(seed: int, folder: Path) -> list[Judged]:
-    """Objects of a drawn street."""
-    return list(judged(processed(drawn_street(seed), folder / f"drawn-{seed}", settings=SETTINGS)))
+def judged_streets(seeds: Iterable[int], folder: Path) -> list[Judged]:
+    """Objects of drawn streets."""
+    found: list[Judged] = []
+    for seed in seeds:
+        found += judged(processed(drawn_street(seed), folder / f"drawn-{seed}", settings=SETTINGS))
+    return found
+
+
+def fitted(objects: Sequence[Judged]) -> dict[str, Curve]:
+    """The curve of each group that objects speak for: the greatest likelihood, less a doubt about any change."""
+    curves = {}
+    for group in CURVES:
+        own = [o for o in objects if GROUPS[o.kind] == group]
+        evidence = np.array([curve_of(o.kind).of_evidence(o.probability) for o in own])
+        odds, right = np.log(evidence / (1.0 - evidence)), np.array([o.is_right for o in own], np.float64)
+
+        def loss(line: npt.NDArray[np.float64], odds: object = odds, right: object = right) -> float:
+            z = line[0] + line[1] * np.asarray(odds)
+            unlikely = float(np.sum(np.logaddexp(0.0, z) - np.asarray(right) * z))
+            return unlikely + 0.5 * _DOUBT * float(line[0] ** 2 + (line[1] - 1.0) ** 2)
+
+        best = scipy.optimize.minimize(loss, np.array([0.0, 1.0]), bounds=[(None, None), (0.05, None)])
+        curves[group] = Curve(*map(float, best.x))
+    return curves
+
+
+def _arrays(objects: Sequence[Judged]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Stated probability (n,) of objects, and whether they are right (n,)."""
+    return np.array([o.probability for o in objects]), np.array([o.is_right for o in objects])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Final, NamedTuple
 
 import cv2
@@ -23,8 +24,8 @@ LEVEL_M: Final = 0.2
 SLOT_NS: Final = 200_000_000
 """Time is told in slots of this length, or of as many of them as leave no more than 64."""
 _SLOTS: Final = 64
-_THING_M: Final = (0.3, 2.5)
-"""Returns at these heights are of things that may move."""
+_THING_M: Final = (0.3, 2.5, 4.4)
+"""Returns between the first two heights are of things that may move, those up to the last may be the tops of these."""
 _GAP: Final = 2
 """What stands on the ground may have gaps of so many levels, as between a car's body and its roof."""
 _START: Final = 5
@@ -33,9 +34,13 @@ _TALL: Final = 14
 """What reaches this level is no vehicle that is parked: 2.8 m."""
 _BODY: Final = 0b111100
 """Levels at which a vehicle has its body: 0.4–1.2 m."""
+_LOWEST_BODY: Final = 3
+"""What moves and does not reach above this level, 0.8 m, carries nothing that is higher than cars."""
 _TALLEST: Final = 21
 """Level that a moving lorry may reach: 4.2 m."""
 _LEAST_CELLS: Final = 6
+_STAYS_SLOTS: Final = 8
+"""What is seen in so many slots, and in more than twice as many as the ground without it, stands."""
 _TREE_CELLS: Final = 60
 """Places that seem to move below a tree's crown count only from this size on (cells): branches swing."""
 _PERSON_M: Final = 1.2
@@ -58,7 +63,8 @@ class Columns(NamedTuple):
     """Level that what stands on the ground reaches; -1 of none."""
     things: npt.NDArray[np.uint64]
     grounds: npt.NDArray[np.uint64]
-    """Slots of time in which things and ground were seen, as bits."""
+    highs: npt.NDArray[np.uint64]
+    """Slots of time in which things, ground and what is higher were seen, as bits."""
 
 
 def road_users(
@@ -79,7 +85,7 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
     """What stands in each cell of a window, and when it was seen."""
     grid = grid_over(window, CELL_M)
     levels = np.zeros(grid.shape, np.uint32)
-    things, grounds = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.uint64)
+    seen = np.zeros((3, *grid.shape), np.uint64)
     columns.columns(
         returns.x_m,
         returns.y_m,
@@ -91,12 +97,11 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
         LEVEL_M,
         np.array(_THING_M),
         levels,
-        things,
-        grounds,
+        seen,
     )
     top = np.empty(grid.shape, np.int32)
     columns.tops(levels, 1, _START, _GAP, top)
-    return Columns(grid, levels, top, things, grounds)
+    return Columns(grid, levels, top, *seen)
 
 
 def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
@@ -115,7 +120,9 @@ def moving_cells(held: Columns) -> Bools:
     apart = (free >= 2) & (2 * free >= 3 * things) & (2 * both <= things)
     moving = (things > 0) & (apart | ((free >= 3) & (free >= 2 * things)))
     around = _around(moving)
-    return np.asarray((things > 0) & (2 * around >= _around(things > 0)) & (around >= 3))
+    # whatever its neighbours do: the edges of a post are seen now and then
+    stays = (things >= _STAYS_SLOTS) & (things > 2 * free)
+    return np.asarray((things > 0) & ~stays & (2 * around >= _around(things > 0)) & (around >= 3))
 
 
 def _around(cells: Bools) -> Int32:
@@ -140,7 +147,42 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
         target = vehicle if sides_m(inside)[1] >= _PERSON_M else person
         wider = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
         target[part][wider] = np.maximum(target[part][wider], reached)
+        if target is vehicle and reached > _LOWEST_BODY:
+            around = slice(max(low - 2, 0), low + height + 2), slice(max(left - 2, 0), left + width + 2)
+            target[around] = np.maximum(target[around], load_levels(held, around, label[around] == k))
     return vehicle, person
+
+
+def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int32:
+    """Level (rows, columns) of what moves along on a vehicle's track and is higher than cars; 0 elsewhere.
+
+    It was seen in the slots in which the track's lower things were, or in those beside them, and in no others:
+    branches, signs and decks are seen before and after. From afar a scanner shows some heights only, and not each in
+    each cell, so lower things within two cells count.
+    """
+    things = np.where(inside, held.things[part], np.uint64(0))
+    for axis in (0, 1):
+        things = functools.reduce(np.bitwise_or, (_shifted(things, step, axis) for step in range(-2, 3)))
+    one = np.uint64(1)
+    highs = held.highs[part]
+    high = (highs > 0) & (things > 0)
+    along = high & ((highs & ~(things | (things << one) | (things >> one))) == 0)
+    if 2 * np.count_nonzero(along) < np.count_nonzero(high):
+        return np.zeros(inside.shape, np.int32)
+    bits = np.maximum(held.levels[part] & np.uint32((1 << (_TALLEST + 1)) - 1), 1)
+    return np.where(along, np.log2(bits).astype(np.int32) + 1, 0)
+
+
+def _shifted(bits: npt.NDArray[np.uint64], step: int, axis: int) -> npt.NDArray[np.uint64]:
+    """Bits (rows, columns) of the cell so many steps away; 0 beyond the border."""
+    out = np.zeros_like(bits)
+    size = bits.shape[axis]
+    into, of = slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+    if axis == 0:
+        out[into] = bits[of]
+    else:
+        out[:, into] = bits[:, of]
+    return out
 
 
 def sides_m(cells: Bools) -> tuple[float, float]:

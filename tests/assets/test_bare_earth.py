@@ -11,13 +11,16 @@ import pytest
 from roadscan.assets import classes
 from roadscan.assets.ground.bare_earth import ground_returns
 from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.grid import Grid
 from roadscan.assets.ground.morphological import opened
 from roadscan.assets.ground.surface import Place, is_dense
+from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.model.settings.asset_ground import GroundSettings
 from roadscan.simulate import Scene as Street
+from tests.assets.edges.streets import returns_of
 from tests.assets.isprs import SAMPLES, isprs_sample
 from tests.assets.scenes import GROUND_LABELS, NOT_JUDGED, semantic_kitti_returns, semantic_kitti_scene
 from tests.assets.streets import street
@@ -167,3 +170,17 @@ def test_an_opening_is_that_of_opencv(radius: int) -> None:
     away = np.arange(-radius, radius + 1)
     disk = (away[:, None] ** 2 + away**2 <= radius * radius).astype(np.uint8)
     assert (opened(surface, radius) == cv2.dilate(cv2.erode(surface, disk), disk)).all()
+
+
+def test_the_lower_face_of_a_deck_is_no_ground_and_a_bank_is() -> None:
+    """A sensor 2 m above the road sees a deck 5.3 m above it from below, and a bank of 1 : 2 as high from above."""
+    grid = Grid(0.0, 0.0, 0.5, 40, 60)
+    x, y = np.meshgrid(*grid.middles_m)
+    is_deck = (y > 10.0) & (x > 12.0)
+    height = np.where(is_deck, 5.3, np.where(y > 10.0, 0.0, 0.5 * np.maximum(x - 6.0, 0.0)))
+    sensor = np.tile([0.0, 10.0, 2.0], (x.size, 1))
+    seen = returns_of(np.stack([x, y, height], axis=-1).reshape(-1, 3), np.ones(x.size), np.arange(x.size), sensor)
+    lowest = height.astype(np.float32)
+    found = undersides(seen, grid, lowest, lowest)
+    assert found[(y > 12.0) & (x > 14.0)].all()
+    assert not found[(y < 8.5) | (x < 10.5)].any()

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from roadscan.assets import classes
+from roadscan.assets.ground.grid import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
+from roadscan.assets.moving import Columns, load_levels, moving_cells
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
 from tests.assets.scenes import semantic_kitti_scene
@@ -65,3 +67,35 @@ def test_a_whole_drive() -> None:
         for part in kind.evidence(scene, kind.options()).marked:
             marked[part.rows] = True
     assert marked[framed == CAR].mean() <= 0.002  # 0.0002
+
+
+def test_the_top_of_a_lorry_moves_along_and_a_branch_over_its_track_does_not() -> None:
+    """Cells of 0.2 m: the lorry shows at 1 m and at 3.5 m in the same slots, not in the same cells; a branch stays."""
+    shape = (12, 20)
+    things, highs = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
+    levels = np.zeros(shape, np.uint32)
+    inside = np.zeros(shape, np.bool_)
+    inside[2:10] = True
+    for column in range(20):
+        slot = np.uint64(1) << np.uint64(column // 4)
+        things[2:10:2, column], levels[2:10:2, column] = slot, 1 << 5
+        highs[3:10:2, column], levels[3:10:2, column] = slot, 1 << 17
+    highs[5, 8:11], levels[5, 8:11] = np.uint64(2**20 - 1), 1 << 15
+    grid = Grid(0.0, 0.0, 0.2, *shape)
+    held = Columns(grid, levels, np.full(shape, 5, np.int32), things, np.zeros(shape, np.uint64), highs)
+    found = load_levels(held, (slice(None), slice(None)), inside)
+    assert (found[3, :] == 18).all() and (found[5, :7] == 18).all()
+    assert (found[5, 8:11] == 0).all() and (found[2::2] == 0).all()
+    highs[3:10:2] = np.uint64(2**20 - 1)  # a crown all along
+    assert not load_levels(held, (slice(None), slice(None)), inside).any()
+
+
+def test_a_post_stands_although_its_edges_are_seen_now_and_then() -> None:
+    """Slots of 0.2 s: the middle cell shows the post ten times, those around it once, as of somebody who passes."""
+    things, grounds = np.zeros((9, 9), np.uint64), np.full((9, 9), 0b1111, np.uint64)
+    things[3:6, 3:6] = 1 << 8
+    held = Columns(Grid(0.0, 0.0, 0.2, 9, 9), np.zeros((9, 9), np.uint32), np.zeros((9, 9), np.int32), things, grounds,
+                   np.zeros((9, 9), np.uint64))  # fmt: skip
+    assert moving_cells(held)[3:6, 3:6].all()
+    things[4, 4] = 0b11_1111_1111 << 8
+    assert not moving_cells(held)[4, 4] and moving_cells(held)[3, 3:6].all()

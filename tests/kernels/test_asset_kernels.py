@@ -123,12 +123,12 @@ def test_columns_and_their_tops() -> None:
     x = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 9.0])
     ground = np.array([True, False, False, False, False, False])
     levels = np.zeros((1, 1), np.uint32)
-    things, grounds = np.zeros((1, 1), np.uint64), np.zeros((1, 1), np.uint64)
+    seen = np.zeros((3, 1, 1), np.uint64)
     slot = np.array([0, 1, 1, 2, 3, 4], np.uint8)
-    band = np.array([0.4, 2.5])
-    columns(x, np.full(6, 0.5), above, ground, slot, np.zeros(2), 1.0, 0.2, band, levels, things, grounds)
+    band = np.array([0.4, 2.5, 4.4])
+    columns(x, np.full(6, 0.5), above, ground, slot, np.zeros(2), 1.0, 0.2, band, levels, seen)
     assert int(levels[0, 0]) == (1 << 1) | (1 << 2) | (1 << 7) | (1 << 15)
-    assert int(things[0, 0]) == 0b110 and int(grounds[0, 0]) == 0b1
+    assert seen[:, 0, 0].tolist() == [0b110, 0b1, 0b1000]
     top = np.empty((1, 1), np.int32)
     for first, start, gap, expected in [(1, 5, 2, 2), (1, 5, 4, 7), (1, 5, 7, 15), (3, 5, 2, -1), (3, 8, 2, 7)]:
         tops(levels, first, start, gap, top)

@@ -1,4 +1,4 @@
-"""Edges that may be kerbs: along the foot of a fence, and of a rut under the vehicle, heights differ as at a step."""
+"""Edges that may be kerbs: heights differ as at a step also along a fence, a rut under the vehicle, and plants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.edges.find import Edge, edges_of
 from roadscan.assets.edges.line_pieces import columns_of
-from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.kernels.assets.corridors import mark_corridor
@@ -21,6 +21,10 @@ _FENCE_M: Final = (0.35, 1.2)
 _LEAST_RETURNS: Final = 2
 _MOST: Final = 0.5
 _VEHICLE_M: Final = 0.9
+_BEHIND_M: Final = (0.1, 0.2, 0.3, 0.4)
+"""A kerb's upper side is seen this far behind its face."""
+_SCATTER_M: Final = 0.015
+"""Heights of plants in a cell scatter by more beyond the noise of the data: even ground does not."""
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -30,14 +34,40 @@ _OTHERS: Final = (
 
 @once_a_scene
 def free_edges(scene: Scene) -> list[Edge]:
-    """The scene's edges without those that lie, at most of their nodes, where something stands or a drive went."""
+    """The scene's edges without those that lie, at most of their nodes, where something stands, a drive went, or plants
+    grow on the higher side.
+    """
     raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
+    plants = _plants(scene)
     kept = []
     for edge in edges_of(scene):
         nodes = columns_of(edge)
-        if np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST:
+        is_free = np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST
+        if is_free and not _is_grown_over(edge, plants, raster):
             kept.append(edge)
     return kept
+
+
+def _plants(scene: Scene) -> npt.NDArray[np.int64]:
+    """Returns of low plants among those that count as ground, in each cell (rows, columns) of the raster."""
+    raster = raster_of(scene)
+    cells = raster.cell[raster.used & (scene.classes == classes.LOW_VEGETATION)]
+    return np.bincount(cells, minlength=raster.count.size).reshape(raster.count.shape)
+
+
+def _is_grown_over(edge: Edge, plants: npt.NDArray[np.int64], raster: HeightRaster) -> bool:
+    """Whether plants are seen close behind most of an edge, on its higher side: by class or by scatter."""
+    nodes = edge.nodes.at(edge.seen)
+    x = nodes.x_m[:, None] + np.array(_BEHIND_M) * nodes.heading_y[:, None]
+    y = nodes.y_m[:, None] - np.array(_BEHIND_M) * nodes.heading_x[:, None]
+    cells = raster.cells_of(x, y)
+    every = raster.count[cells].sum(axis=1)
+    held = every > 0
+    if not held.any():
+        return False
+    scatter = np.sqrt((raster.count[cells] * raster.spread_m[cells] ** 2).sum(axis=1)[held] / every[held])
+    share = plants[cells].sum(axis=1)[held] / every[held]
+    return float(np.median(share)) > _MOST or float(np.median(scatter)) > raster.noise_m + _SCATTER_M
 
 
 def _driven(scene: Scene) -> npt.NDArray[np.bool_]:

@@ -49,6 +49,10 @@ class HeightRaster:
     """(rows, columns) mean height; NaN where there is none."""
     sigma_m: Float64
     """(rows, columns) standard deviation of the mean; NaN where there is none."""
+    spread_m: Float64
+    """(rows, columns) standard deviation of the heights in a cell."""
+    noise_m: float
+    """Median of these over the cells with four heights or more; 0 where there is none."""
     used: npt.NDArray[np.bool_]
     """(n,) returns of the scene that count as ground; none where the raster was made of cells."""
     cell: npt.NDArray[np.int32]
@@ -144,6 +148,6 @@ def of_cells(
     known = count > 0
     sigma = np.sqrt(UNEVENNESS_M**2 + max(noise, 0.001) ** 2 / np.maximum(count, 1))
     return HeightRaster(
-        x_min_m, y_min_m, cell_m, count, np.where(known, mean_m, np.nan), np.where(known, sigma, np.nan),
-        np.zeros(0, np.bool_), np.zeros(0, np.int32),
+        x_min_m, y_min_m, cell_m, count, np.where(known, mean_m, np.nan), np.where(known, sigma, np.nan), spread_m,
+        noise, np.zeros(0, np.bool_), np.zeros(0, np.int32),
     )  # fmt: skip

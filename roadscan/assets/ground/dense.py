@@ -12,6 +12,7 @@ from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.ground.morphological import bare_cells
 from roadscan.assets.ground.surface import Found, Place, Surface
+from roadscan.assets.ground.undersides import undersides
 from roadscan.kernels.assets.ground_cells import on_ground, scatter
 from roadscan.kernels.assets.lowest import lowest_returns
 
@@ -59,6 +60,9 @@ def dense_ground(place: Place) -> Found:
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
     known = bare_cells(lowest, grid.cell_m, _PIT_M, place.settings)
     base = Surface(grid, filled(lowest, known))
+    below = undersides(returns, grid, lowest, base.height_m) & known
+    if below.any():
+        base = Surface(grid, filled(lowest, known & ~below))
     fine, above = grid_over(place.window, _CELL_M), np.empty(x.size, np.float32)
     sums = np.zeros((*fine.shape, 5))
     limits = np.array([*_NEAR_M, _CLOSE_M])

@@ -38,7 +38,7 @@ class KerbOptions(Strict):
     """Settings of kerbs."""
 
     least_probability: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Lines that are less probable than this are left out."""
+    """Lines whose evidence says less than this are left out, before the curve of the probability."""
     least_length_m: float = Field(default=2.0, ge=0.5)
     """Shorter lines are left out (m)."""
     dropped_m: float = Field(default=0.05, gt=0.0, le=0.2)

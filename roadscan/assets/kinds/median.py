@@ -30,7 +30,7 @@ class MedianOptions(Strict):
     least_length_m: float = Field(default=3.0, gt=0.0)
     """Shorter ones are left out (m)."""
     least_probability: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Those behind a line that is less probably a kerb are left out."""
+    """Those behind a line whose evidence says less of a kerb are left out."""
 
 
 class Median(AssetKind):

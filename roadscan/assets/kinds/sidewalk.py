@@ -27,7 +27,7 @@ class SidewalkOptions(Strict):
     least_length_m: float = Field(default=3.0, gt=0.0)
     """Shorter ones are left out (m)."""
     least_probability: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Those behind a line that is less probably a kerb are left out."""
+    """Those behind a line whose evidence says less of a kerb are left out."""
     dropped_m: float = Field(default=0.05, gt=0.0, le=0.2)
     """A kerb lower than this, and less than half of its line's, is a ramp (m)."""
 

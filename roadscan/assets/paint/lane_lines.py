@@ -19,7 +19,7 @@ from roadscan.assets.paint.probability import probability
 
 Float64 = npt.NDArray[np.float64]
 
-_SHORTEST_M: Final = 0.5
+_SHORTEST_M: Final = 1.0
 """Shorter paint, alone, is no line."""
 
 

@@ -22,6 +22,8 @@ _SECTORS: Final = 8
 _CROWN_REACH_M: Final = 4.5
 _HEAD_REACH_M: Final = 0.75
 _CROWN_M: Final = 1.5
+_CROWN_GAP_M: Final = 2.0
+"""A crown begins no higher above the shaft's top."""
 _BEYOND_SHARE: Final = 0.1
 _ARM_M: Final = 0.2
 """What hangs from an arm lies below its top by more."""
@@ -73,9 +75,14 @@ def about(scene: Scene, shaft: Shaft) -> About:
 def crown_share(near: About, shaft: Shaft) -> float:
     """Share of the eight directions that hold returns within 1.5 m, mean of the three fullest levels of 0.4 m.
 
-    Crowns fill all directions; plates, arms and façades one to three of them.
+    Crowns fill all directions; plates, arms and façades one to three of them. What begins far above the shaft's top,
+    and above all that hangs on it, is no crown of it.
     """
     close = near.away_m < 1.5
+    heights = np.sort(near.above_m[close])
+    gaps = np.flatnonzero(np.diff(np.maximum(heights, shaft.top_above_m), prepend=shaft.top_above_m) > _CROWN_GAP_M)
+    if gaps.size:
+        close &= near.above_m < heights[gaps[0]]
     level = np.floor(near.above_m[close] / _LEVEL_M).astype(np.int64)
     if level.size == 0:
         return 0.0

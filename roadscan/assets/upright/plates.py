@@ -29,6 +29,9 @@ _SEARCHED_ABOVE_M: Final = 1.0
 _BESIDE_M: Final = 0.7
 """Returns this far beyond a cluster tell how large its plate is."""
 _LEAST_BRIGHT: Final = 8
+_FOOT_M, _BAND_M, _BEHIND_M = 0.3, 0.3, 0.15
+"""Below a plate, from this height above the ground, bands of this height are looked at, this far before and behind its
+plane (m)."""
 _ENOUGH_BRIGHT: Final = 60
 """So many bright returns tell the outline by themselves."""
 
@@ -170,6 +173,8 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     above = float(place[2]) - ground
     if not _has_size(outline, options) or not options.least_height_m <= above <= options.greatest_height_m:
         return None
+    if _stands(scene, near, (place, normal), outline, ground):
+        return None
     large = outline.width_m > options.greatest_size_m or outline.height_m > options.greatest_size_m
     share = float(bright[rows].mean())
     probability = logistic(
@@ -207,6 +212,21 @@ def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, clust
     n = int(inside.sum())
     beside = int((outer & ~inside & (np.abs(u) > 0.15)).sum())
     return near[inside], beside / max(n + beside, 1)
+
+
+def _stands(scene: Scene, near: Int64, plane: tuple[Float64, Float64], outline: Outline, ground_m: float) -> bool:
+    """Whether the plane goes on to the ground, about as wide: then it is an end of a pier, a wall or a box."""
+    returns, (middle, normal) = scene.returns, plane
+    past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - middle
+    right, _ = _axes(normal)
+    u, away, half = past @ right, np.abs(past[:, :2] @ normal[:2]), outline.width_m / 2
+    low, high = ground_m + _FOOT_M, float(middle[2]) - outline.height_m / 2 - 0.1
+    below = (away < _BEHIND_M) & (np.abs(u) < half + 0.1) & (returns.height_m[near] > low)
+    below &= returns.height_m[near] < high
+    band = np.floor((returns.height_m[near][below] - low) / _BAND_M).astype(np.int64)
+    widths = [float(np.ptp(u[below][band == k])) for k in np.unique(band).tolist() if (band == k).sum() >= 3]
+    wide = sum(w > 0.6 * outline.width_m for w in widths)
+    return wide >= max(2.0, 0.6 * len(widths), 0.3 * (high - low) / _BAND_M)
 
 
 def _wide(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> Int64:

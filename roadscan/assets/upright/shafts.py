@@ -32,7 +32,7 @@ _HIGHEST_FOOT_M: Final = 2.0
 _FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1
 _MOST_FITTED: Final = 3000
 _RING_M: Final = 0.6
-_ALONE_M: Final = 0.6
+ALONE_M: Final = 0.6
 _LEAST_ALONE: Final = 0.25
 """Clumps of leaves and pieces of façades have more about them."""
 
@@ -97,9 +97,9 @@ def _alone(slices: Slices, members: Int64, returns: int) -> float:
     """Share of the returns about some components, in their slices, that belong to them."""
     levels = np.unique(slices.level[members])
     x, y = float(np.median(slices.x_m[members])), float(np.median(slices.y_m[members]))
-    near = around(slices, x, y, _ALONE_M)[levels]
+    near = around(slices, x, y, ALONE_M)[levels]
     dy, dx = np.indices(near.shape[1:]) - np.array(near.shape[1:])[:, None, None] // 2
-    inside = np.hypot(dx, dy) * CELL_M <= _ALONE_M
+    inside = np.hypot(dx, dy) * CELL_M <= ALONE_M
     return min(returns / max(int(near[:, inside].sum(dtype=np.int64)), 1), 1.0)
 
 

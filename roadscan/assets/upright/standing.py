@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -13,9 +13,10 @@ import numpy.typing as npt
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, is_head_alone, signal_head
+from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import Region, regions_of
-from roadscan.assets.upright.shafts import Shaft, shafts_of
+from roadscan.assets.upright.shafts import ALONE_M, Shaft, shafts_of
 
 Int64 = npt.NDArray[np.int64]
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
@@ -29,6 +30,8 @@ _SIGNAL_M: Final = 8.0
 _LAMP_M: Final = 3.5
 """Least height of a lamp post."""
 _IN_PLANE_M: Final = 0.35
+_BESIDE_M: Final = 0.9
+_LONG_M: Final = 2.5
 _APART_M: Final = 0.45
 
 
@@ -48,7 +51,8 @@ class Upright:
 def uprights_of(scene: Scene) -> list[Upright]:
     """Everything thin that stands upright in a scene with its halo, what is probable at 0.5 or more."""
     planes = [r for r in regions_of(scene) if r.length_m > 2.5 and r.top_above_m > 1.6]
-    judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts_of(scene)]
+    shafts = _beside_surfaces(scene, shafts_of(scene))
+    judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts]
     probable = _apart([(s, p) for s, p in judged if p >= LEAST])
     near = [about(scene, shaft) for shaft, _ in probable]
     crowns = [
@@ -62,9 +66,31 @@ def uprights_of(scene: Scene) -> list[Upright]:
     ]
 
 
+def _beside_surfaces(scene: Scene, shafts: list[Shaft]) -> list[Shaft]:
+    """The shafts; of what is about low ones, long low surfaces beside them, such as guard rails, do not count."""
+    surfaces = [r for r in regions_of(scene) if r.length_m > _LONG_M and r.top_above_m <= _LOW_M]
+    on_surface = np.zeros(len(scene.returns), np.bool_)
+    for one in surfaces:
+        on_surface[one.rows] = True
+    out = []
+    for shaft in shafts:
+        x, y = shaft.axis.x_m, shaft.axis.y_m
+        away = [one.distance_m(x, y, 0.5) for one in surfaces] if shaft.top_above_m <= _LOW_M else []
+        if any(_IN_PLANE_M <= a <= _BESIDE_M for a in away) and not any(a < _IN_PLANE_M for a in away):
+            near = places_of(scene).within(x, y, ALONE_M)
+            above = scene.above_ground_m[near]
+            near = near[(above >= shaft.low_above_m) & (above <= shaft.top_above_m) & ~on_surface[near]]
+            alone = min(shaft.rows.size / max(np.union1d(near, shaft.rows).size, 1), 1.0)
+            out.append(replace(shaft, alone=max(alone, shaft.alone)))
+        else:
+            out.append(shaft)
+    return out
+
+
 def in_plane(shaft: Shaft, planes: list[Region]) -> bool:
     """Whether the shaft lies in an upright surface and is as good as a piece of it."""
-    return any(r.distance_m(shaft.axis.x_m, shaft.axis.y_m, 0.5) < _IN_PLANE_M for r in planes)
+    x, y = shaft.axis.x_m, shaft.axis.y_m
+    return any(r.low_above_m <= shaft.top_above_m and r.distance_m(x, y, 0.5) < _IN_PLANE_M for r in planes)
 
 
 def probability_of(shaft: Shaft, inside_plane: bool) -> float:

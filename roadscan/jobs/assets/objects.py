@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.assets.calibration import curve_of
 from roadscan.assets.kind import AssetObject, asset_kinds
 from roadscan.assets.object_table import objects_of_table, table_of_objects
 from roadscan.assets.tiling import AssetGrid
@@ -158,7 +159,11 @@ def _joined(task: JoinTask) -> OutputRecord:
     pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
-    found = list(kind.objects(pieces.combine_chunks(), task.options, others))
+    curve = curve_of(name)
+    found = [
+        replace(one, probability=curve.stated(one.probability))
+        for one in kind.objects(pieces.combine_chunks(), task.options, others)
+    ]
     rows = table_of_objects(name, found, schema)
     unit = task.cluster.unit
     if not rows.num_rows:

@@ -10,6 +10,8 @@ from roadscan.kernels.options import kernel
 
 LEVELS = 32
 """Bits of a column: heights above ground in steps."""
+THINGS, GROUND, HIGH = range(3)
+"""What may be seen in a slot of time."""
 
 
 @kernel
@@ -42,15 +44,15 @@ def slots(epoch, step, steps, per_slot, out):
 
 
 @kernel
-def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, things, grounds):
-    """Heights that each cell holds, and the slots of time in which things and ground were seen in it.
+def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, seen):
+    """Heights that each cell holds, and the slots of time in which things, ground, and what is higher were seen in it.
 
     Parameters
     ----------
     x, y : (n,) float64 (m); above : (n,) float32 (m); on_ground : (n,) bool; slot : (n,) uint8 below 64.
     origin : (2,) float64; per_m : cells a metre; level_m : height of a level.
-    band : (2,) float64, things are returns between these heights (m).
-    levels : (rows, columns) uint32, bits of heights; things, grounds : (rows, columns) uint64, bits of slots.
+    band : (3,) float64, things are returns between the first two of these heights, what is higher reaches the last (m).
+    levels : (rows, columns) uint32, bits of heights; seen : (3, rows, columns) uint64, bits of slots.
     """
     rows, many = levels.shape
     for k in range(x.size):
@@ -58,13 +60,13 @@ def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, 
         if i < 0 or j < 0 or i >= rows or j >= many:
             continue
         if on_ground[k]:
-            grounds[i, j] |= np.uint64(1) << np.uint64(slot[k])
+            seen[GROUND, i, j] |= np.uint64(1) << np.uint64(slot[k])
             continue
         h = above[k]
         if h >= 0.0 and h < LEVELS * level_m:
             levels[i, j] |= np.uint32(1) << np.uint32(int(h / level_m))
-            if band[0] <= h <= band[1]:
-                things[i, j] |= np.uint64(1) << np.uint64(slot[k])
+            if band[0] <= h <= band[2]:
+                seen[THINGS if h <= band[1] else HIGH, i, j] |= np.uint64(1) << np.uint64(slot[k])
 
 
 @kernel

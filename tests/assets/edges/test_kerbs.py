@@ -177,3 +177,19 @@ def test_the_foot_of_a_fence_is_no_kerb() -> None:
     box = Box(0.0, -8.0, 20.0, 8.0)
     found = kerbs_of(make_scene(returns, box, box, drive))
     assert found and all(one.geometry.centroid.y > 4.5 for one in found)
+
+
+def test_the_border_of_a_bed_of_plants_is_no_kerb() -> None:
+    """Plants of 5 to 25 cm behind y = 5 m, ground seen between them; a kerb of 8 cm on the other side."""
+    rng = np.random.default_rng(9)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-8.0, 8.0, 0.05)))
+    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    grown = np.where((y > 5.0) & (rng.random(x.size) < 0.8), rng.uniform(0.05, 0.25, x.size), 0.0)
+    z = 100.0 + np.where(y < -5.0, 0.08, 0.0) + grown + rng.normal(0.0, 0.005, x.size)
+    points = np.column_stack([x, y, z])
+    sensor = np.column_stack([points[:, 0], np.zeros(len(points)), np.full(len(points), 102.0)])
+    returns = returns_of(points, np.full(len(points), 1000.0), np.arange(len(points)), sensor)
+    drive = np.column_stack([np.arange(0.0, 20.0), np.zeros(20), np.full(20, 102.0), np.ones(20)])
+    box = Box(0.0, -8.0, 20.0, 8.0)
+    found = kerbs_of(make_scene(returns, box, box, drive))
+    assert found and all(one.geometry.centroid.y < -4.5 for one in found)

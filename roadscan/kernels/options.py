@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -66,17 +66,26 @@ def _folder_of_source(source: str) -> str:
     return cache_folder("kernels", seen)
 
 
+@functools.cache
 def _imported_kernels(file: Path) -> list[Path]:
     """Files of this package that a file imports, anywhere in it, whatever form the import has."""
     here = Path(__file__).parent
     within = ("roadscan", "kernels", *file.parent.relative_to(here).parts) if file.is_relative_to(here) else ()
     found = []
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in _statements(ast.parse(file.read_bytes())):
         for name in _imported_names(node, within):
             if name[:2] == ("roadscan", "kernels"):
                 module = here.joinpath(*name[2:])
                 found += [file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file()]
     return found
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node. Expressions, which hold no import, are most of a tree, and are passed over."""
+    for below in ast.iter_child_nodes(node):
+        if isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):
+            yield below
+            yield from _statements(below)
 
 
 def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:

@@ -43,7 +43,7 @@ except ImportError:  # no such locks on this system: each process compiles for i
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -> Function:
+def compiled(function: Function, folder: str, *, counted: bool, entry: bool = True, inlined: bool = False) -> Function:
     """Compile a loop over arrays once per machine, serially, without the GIL.
 
     `fastmath` stays off, so that the order of operations, and with it every bit of the result, is the same everywhere.
@@ -51,23 +51,24 @@ def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -
     Parameters
     ----------
     folder : from :func:`cache_folder`.
-    inlined : only ever into the compiled functions that call it; it gets no entry for Python, which would take longer
-        to make than the function itself.
     counted : references to arrays are counted; a function that makes no array needs none. It may not hand one back
         either: its callers would give back a reference that was never counted. Compiling such a function fails.
+    entry : Python can call it. An entry takes longer to make than a small function itself, so what only compiled
+        functions call has none.
+    inlined : only ever into the compiled functions that call it.
     """
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder  # read when the function is decorated
     try:
         made = numba.njit(
             nogil=True, cache=True, error_model="numpy", forceinline=inlined, _nrt=counted,
-            no_cpython_wrapper=inlined, no_cfunc_wrapper=True,
+            no_cpython_wrapper=not entry, no_cfunc_wrapper=True,
         )(function)  # fmt: skip
     finally:
         numba.config.CACHE_DIR = before
     if not numba.config.DISABLE_JIT:
         _compile_once(made, folder, counted=counted)
-        if inlined:
+        if not entry:
             made.__class__ = _Part
     return cast("Function", made)
 
@@ -95,7 +96,7 @@ class _Part(CPUDispatcher):  # type: ignore[misc]
     """A piece of compiled functions. Called from Python, where it has no entry, it would end the process."""
 
     def __call__(self, *_: object, **__: object) -> None:
-        raise TypeError(f"{self.py_func.__name__} is compiled into its callers only; Python calls a kernel")
+        raise TypeError(f"{self.py_func.__name__} is compiled for its callers only; Python calls a kernel")
 
 
 def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:

@@ -17,7 +17,12 @@ Kernel = Callable[..., Any]
 
 def kernel(function: Kernel) -> Kernel:
     """Compile a loop over arrays."""
-    return compiled(function, _folder_of(function), inlined=False, counted=True)
+    return compiled(function, _folder_of(function), counted=True)
+
+
+def inner(function: Kernel) -> Kernel:
+    """Compile a loop that kernels alone call: an entry for Python takes as long to make as a small function."""
+    return compiled(function, _folder_of(function), counted=True, entry=False)
 
 
 def bare(function: Kernel) -> Kernel:
@@ -26,17 +31,22 @@ def bare(function: Kernel) -> Kernel:
     To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     take as long for that as for the readings.
     """
-    return compiled(function, _folder_of(function), inlined=False, counted=False)
+    return compiled(function, _folder_of(function), counted=False)
+
+
+def bare_inner(function: Kernel) -> Kernel:
+    """Compile a loop that `bare` kernels alone call; it makes no array either."""
+    return compiled(function, _folder_of(function), counted=False, entry=False)
 
 
 def inlined(function: Kernel) -> Kernel:
     """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
-    return compiled(function, _folder_of(function), inlined=True, counted=True)
+    return compiled(function, _folder_of(function), counted=True, entry=False, inlined=True)
 
 
 def bare_inlined(function: Kernel) -> Kernel:
     """Compile a piece of a `bare` kernel into it; it makes no array either."""
-    return compiled(function, _folder_of(function), inlined=True, counted=False)
+    return compiled(function, _folder_of(function), counted=False, entry=False, inlined=True)
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -51,11 +51,14 @@ THROUGH_ITS_CALLER = {
 """Kernels whose input takes a room to make, and the test that holds what comes out against truth from outside."""
 
 
+COMPILED = {"kernel", "bare", "inner", "bare_inner"}
+
+
 def kernels_of(file: Path) -> Iterator[str]:
     """Public kernels of a file that Python or other kernels call, and instructions."""
     for node in ast.parse(file.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
-            if {"kernel", "bare"} & {ast.unparse(decorator) for decorator in node.decorator_list}:
+            if COMPILED & {ast.unparse(decorator) for decorator in node.decorator_list}:
                 yield node.name
         elif isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) == "Kernel":
             yield ast.unparse(node.target)

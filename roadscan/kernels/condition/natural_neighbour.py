@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.condition.delaunay_mesh import dig, walk
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 STEP_M = 2.0**-36
 """Unit of whole-number places."""
@@ -62,7 +62,7 @@ def linear(mesh, t, value):
     return weighed / total
 
 
-@kernel
+@inner
 def sibson(mesh, centres, value, weight, arriving, t, question):
     """Sibson's value at the place asked, which triangle t holds.
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 from roadscan.kernels.packing.bit_words import appended
 from roadscan.kernels.packing.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
@@ -60,7 +60,7 @@ def _joined(low, high, bit):
     return (low >> bit) | (high << _U(1) << (_U(63) - bit))
 
 
-@kernel
+@inner
 def _varints(data, at, end, found):
     """Read as many unsigned varints as `found` has room for; returns where they end, −1 where they do not."""
     for k in range(found.size):
@@ -77,7 +77,7 @@ def _varints(data, at, end, found):
     return at
 
 
-@kernel
+@inner
 def _miniblocks(data, at, end, miniblocks, per_miniblock, offsets, widths, steps):
     """List where the miniblocks of a page start (byte), their bit widths and least differences; returns (fault, end).
 
@@ -110,7 +110,7 @@ def _miniblocks(data, at, end, miniblocks, per_miniblock, offsets, widths, steps
     return WHOLE, at
 
 
-@kernel
+@inner
 def _unpack(words, per_miniblock, offsets, widths, steps, zigzag, values):
     """Write the values of listed miniblocks; `words` is the page's buffer as 64-bit words."""
     value, size = _signed(zigzag), values.size
@@ -206,7 +206,7 @@ def varint_bits(number):
     return bits, size
 
 
-@kernel
+@inner
 def pack_block(above, widths, words, to, word, used):
     """Write the miniblocks of a block behind what words hold: (word to go on with, its index, its bits)."""
     for k in range(MINIBLOCKS):
@@ -221,7 +221,7 @@ def pack_block(above, widths, words, to, word, used):
     return to, word, used
 
 
-@kernel
+@inner
 def widths_of(above):
     """Bit widths of a block's miniblocks, one a byte, the first one lowest."""
     widths = _U(0)

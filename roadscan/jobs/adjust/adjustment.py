@@ -150,7 +150,8 @@ def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float])
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
     """Places of dense sensors, then those of lidars, which are larger: they are numbered through."""
     dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
-    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], settings)
+    ahead = settings.model_copy(update={"per_km": settings.lidar_per_km})
+    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], ahead)
     return [*dense, *(replace(place, number=len(dense) + place.number) for place in sparse)]
 
 

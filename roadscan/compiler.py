@@ -11,6 +11,9 @@ for ever. The system gives back the locks of a process that dies.
 
 What is compiled is code that a process runs: a cache that other users can write to is refused.
 
+Functions that compiled functions alone call are kept as LLVM's bitcode. Numba would optimise each of them by itself and
+make machine code of it, which nothing runs: their callers take them in and are optimised with them.
+
 Each compilation has a number of its own in the names of its machine code, whichever process it ran in. Numba counts
 from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
 name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
@@ -30,6 +33,8 @@ from typing import Any, TypeVar, cast
 import llvmlite.binding
 import numba
 from numba.core.bytecode import FunctionIdentity
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
@@ -62,7 +67,7 @@ def compiled(function: Function, folder: str, *, counted: bool, entry: bool = Tr
     try:
         made = numba.njit(
             nogil=True, cache=True, error_model="numpy", forceinline=inlined, _nrt=counted,
-            no_cpython_wrapper=not entry, no_cfunc_wrapper=True,
+            no_cpython_wrapper=not entry, no_cfunc_wrapper=True, pipeline_class=Compiler if entry else _PartCompiler,
         )(function)  # fmt: skip
     finally:
         numba.config.CACHE_DIR = before
@@ -97,6 +102,54 @@ class _Part(CPUDispatcher):  # type: ignore[misc]
 
     def __call__(self, *_: object, **__: object) -> None:
         raise TypeError(f"{self.py_func.__name__} is compiled for its callers only; Python calls a kernel")
+
+
+class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Bitcode of a part for its callers to take in: no machine code, so no address and no environment at one."""
+
+    def _optimize_final_module(self) -> None:
+        manager, builder = self._codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
+        )
+        manager.run(self._final_module, builder)
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    serialize_using_object_code = JITCodeLibrary.serialize_using_bitcode
+
+    def get_pointer_to_function(self, _: str) -> int:
+        return 0
+
+    @property
+    def codegen(self) -> _PartLibrary:
+        return self
+
+    def set_env(self, *_: object) -> None:
+        pass
+
+
+class _PartCompiler(Compiler):  # type: ignore[misc]
+    def compile_extra(self, function: Callable[..., Any]) -> Any:
+        self.state.library = _PartLibrary(self.state.targetctx.codegen(), function.__qualname__)
+        return super().compile_extra(function)
+
+
+def _read_parts_as_bitcode() -> None:
+    """Let Numba's cache give back parts as what they were stored."""
+    read_code = JITCPUCodegen.unserialize_library
+
+    def read(codegen: Any, stored: tuple[str, str, Any]) -> Any:
+        name, kind, content = stored
+        if kind != "bitcode":
+            return read_code(codegen, stored)
+        part = _PartLibrary(codegen, name)
+        part._final_module = llvmlite.binding.parse_bitcode(content)
+        part._finalize_final_module()
+        return part
+
+    JITCPUCodegen.unserialize_library = read
 
 
 def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
@@ -166,3 +219,4 @@ def _number_apart() -> None:
 
 _use_whole_registers()
 _number_apart()
+_read_parts_as_bitcode()

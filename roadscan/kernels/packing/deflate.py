@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.options import bare, bare_inlined, bare_inner, inner, kernel
+from roadscan.kernels.options import bare, bare_inlined, kernel
 from roadscan.kernels.packing.bit_words import appended
 
 SEGMENT = 16
@@ -197,7 +197,7 @@ def head(entries, distances, words):
     return word, to, used
 
 
-@inner
+@kernel
 def _pair_up(entries, pairs):
     """Write the codes of all pairs of bytes, the first one lowest, and above 27 bits of it their length."""
     bits, lengths = np.empty(256, np.uint32), np.empty(256, np.uint32)
@@ -234,7 +234,7 @@ def _run(run, entries, words, word, to, used):
     return word, to, used
 
 
-@bare_inner
+@bare
 def _pack(data, pixels, literals, entries, distances, pairs, words):
     """Write the head, all bytes and the block's end; returns the bits written."""
     word, to, used = head(entries, distances, words)

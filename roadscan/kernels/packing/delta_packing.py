@@ -60,7 +60,7 @@ def _joined(low, high, bit):
     return (low >> bit) | (high << _U(1) << (_U(63) - bit))
 
 
-@inner
+@kernel
 def _varints(data, at, end, found):
     """Read as many unsigned varints as `found` has room for; returns where they end, −1 where they do not."""
     for k in range(found.size):
@@ -77,7 +77,7 @@ def _varints(data, at, end, found):
     return at
 
 
-@inner
+@kernel
 def _miniblocks(data, at, end, miniblocks, per_miniblock, offsets, widths, steps):
     """List where the miniblocks of a page start (byte), their bit widths and least differences; returns (fault, end).
 
@@ -110,7 +110,7 @@ def _miniblocks(data, at, end, miniblocks, per_miniblock, offsets, widths, steps
     return WHOLE, at
 
 
-@inner
+@kernel
 def _unpack(words, per_miniblock, offsets, widths, steps, zigzag, values):
     """Write the values of listed miniblocks; `words` is the page's buffer as 64-bit words."""
     value, size = _signed(zigzag), values.size

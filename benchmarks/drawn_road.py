@@ -126,7 +126,7 @@ def ties(road: Road, drawn: Drawn, rng: np.random.Generator, *, shifts: bool = T
                     KINDS.index("shift_tie" if number else "height_tie"),
                     (run, run + 1), (epochs, epochs), (rows[0], -rows[1]),
                     ends[0] @ rows[0] - ends[1] @ rows[1] + sigma * rng.standard_normal(stations.size),
-                    sigma, 2 * np.arange(stations.size) + (number > 0) + 2 * stations.size * run,
+                    (sigma, 0.0), 2 * np.arange(stations.size) + (number > 0) + 2 * stations.size * run,
                     np.arange(stations.size),
                 )
             )  # fmt: skip
@@ -151,8 +151,8 @@ def control(road: Road, drawn: Drawn, rng: np.random.Generator) -> Observations:
             kind = KINDS.index("control_height" if upright else "control_position")
             group = (run * n + np.arange(n)) * 2 + upright
             parts.append(
-                _rows(kind, (run, FIXED), (epochs, 0 * epochs), (row, 0.0 * row), observed, seen, group,
-                      np.arange(n), survey)
+                _rows(kind, (run, FIXED), (epochs, 0 * epochs), (row, 0.0 * row), observed, (seen, survey),
+                      group, np.arange(n))
             )  # fmt: skip
     return _joined(parts)
 
@@ -163,16 +163,16 @@ def _rows(
     epochs: tuple[Int64, Int64],
     rows: tuple[Float64, Float64],
     observed: Float64,
-    sigma: float,
+    sigmas: tuple[float, float],
     group: Int64,
     place: Int64,
-    survey: float = 0.0,
 ) -> Observations:
+    """Observations of one kind; `sigmas` are those of what was seen and of the survey."""
     n = observed.size
     return Observations(
         np.full(n, kind, np.uint8), np.tile(np.array(runs, np.int32), (n, 1)), np.stack(epochs, axis=1),
-        np.tile(np.stack(rows), (n, 1, 1)), observed, np.full(n, sigma), group.astype(np.int64),
-        place.astype(np.int64), np.full(n, survey),
+        np.tile(np.stack(rows), (n, 1, 1)), observed, np.full(n, sigmas[0]), group.astype(np.int64),
+        place.astype(np.int64), np.full(n, sigmas[1]),
     )  # fmt: skip
 
 

@@ -11,6 +11,9 @@ for ever. The system gives back the locks of a process that dies.
 
 What is compiled is code that a process runs: a cache that other users can write to is refused.
 
+Functions that compiled functions alone call are kept as LLVM's bitcode. Numba would optimise each of them by itself and
+make machine code of it, which nothing runs: their callers take them in and are optimised with them.
+
 Each compilation has a number of its own in the names of its machine code, whichever process it ran in. Numba counts
 from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
 name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
@@ -30,6 +33,8 @@ from typing import Any, TypeVar, cast
 import llvmlite.binding
 import numba
 from numba.core.bytecode import FunctionIdentity
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
@@ -43,7 +48,7 @@ except ImportError:  # no such locks on this system: each process compiles for i
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -> Function:
+def compiled(function: Function, folder: str, *, counted: bool, entry: bool = True, inlined: bool = False) -> Function:
     """Compile a loop over arrays once per machine, serially, without the GIL.
 
     `fastmath` stays off, so that the order of operations, and with it every bit of the result, is the same everywhere.
@@ -51,23 +56,24 @@ def compiled(function: Function, folder: str, *, inlined: bool, counted: bool) -
     Parameters
     ----------
     folder : from :func:`cache_folder`.
-    inlined : only ever into the compiled functions that call it; it gets no entry for Python, which would take longer
-        to make than the function itself.
     counted : references to arrays are counted; a function that makes no array needs none. It may not hand one back
         either: its callers would give back a reference that was never counted. Compiling such a function fails.
+    entry : Python can call it. An entry takes longer to make than a small function itself, so what only compiled
+        functions call has none.
+    inlined : only ever into the compiled functions that call it.
     """
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder  # read when the function is decorated
     try:
         made = numba.njit(
             nogil=True, cache=True, error_model="numpy", forceinline=inlined, _nrt=counted,
-            no_cpython_wrapper=inlined, no_cfunc_wrapper=True,
+            no_cpython_wrapper=not entry, no_cfunc_wrapper=True, pipeline_class=Compiler if entry else _PartCompiler,
         )(function)  # fmt: skip
     finally:
         numba.config.CACHE_DIR = before
     if not numba.config.DISABLE_JIT:
         _compile_once(made, folder, counted=counted)
-        if inlined:
+        if not entry:
             made.__class__ = _Part
     return cast("Function", made)
 
@@ -95,7 +101,55 @@ class _Part(CPUDispatcher):  # type: ignore[misc]
     """A piece of compiled functions. Called from Python, where it has no entry, it would end the process."""
 
     def __call__(self, *_: object, **__: object) -> None:
-        raise TypeError(f"{self.py_func.__name__} is compiled into its callers only; Python calls a kernel")
+        raise TypeError(f"{self.py_func.__name__} is compiled for its callers only; Python calls a kernel")
+
+
+class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Bitcode of a part for its callers to take in: no machine code, so no address and no environment at one."""
+
+    def _optimize_final_module(self) -> None:
+        manager, builder = self._codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
+        )
+        manager.run(self._final_module, builder)
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    serialize_using_object_code = JITCodeLibrary.serialize_using_bitcode
+
+    def get_pointer_to_function(self, _: str) -> int:
+        return 0
+
+    @property
+    def codegen(self) -> _PartLibrary:
+        return self
+
+    def set_env(self, *_: object) -> None:
+        pass
+
+
+class _PartCompiler(Compiler):  # type: ignore[misc]
+    def compile_extra(self, function: Callable[..., Any]) -> Any:
+        self.state.library = _PartLibrary(self.state.targetctx.codegen(), function.__qualname__)
+        return super().compile_extra(function)
+
+
+def _read_parts_as_bitcode() -> None:
+    """Let Numba's cache give back parts as what they were stored."""
+    read_code = JITCPUCodegen.unserialize_library
+
+    def read(codegen: Any, stored: tuple[str, str, Any]) -> Any:
+        name, kind, content = stored
+        if kind != "bitcode":
+            return read_code(codegen, stored)
+        part = _PartLibrary(codegen, name)
+        part._final_module = llvmlite.binding.parse_bitcode(content)
+        part._finalize_final_module()
+        return part
+
+    JITCPUCodegen.unserialize_library = read
 
 
 def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
@@ -165,3 +219,4 @@ def _number_apart() -> None:
 
 _use_whole_registers()
 _number_apart()
+_read_parts_as_bitcode()

@@ -71,7 +71,7 @@ def test_a_written_number_makes_no_second_variant_and_a_part_is_not_called_from_
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, str(tmp_path / "parts.py")]
     said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    assert said.startswith("4 1\none_more is compiled into its callers only")
+    assert said.startswith("4 1\none_more is compiled for its callers only")
 
 
 HANDED_BACK = """

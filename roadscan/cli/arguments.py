@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import textwrap
 import tomllib
+from collections.abc import Callable
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, get_type_hints
 
 import typer
 
@@ -126,3 +130,27 @@ Dashboard = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object, and nothing else.")]
+
+
+def options_apart(command: Callable[..., None]) -> Callable[..., None]:
+    """The command as it is called from a shell: each field of its dataclasses is an option of its own."""
+    hints = get_type_hints(command, include_extras=True)
+    structures = {name: kind for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)}
+    options: dict[str, inspect.Parameter] = {}
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name not in structures:
+            options[name] = parameter.replace(annotation=hints[name])
+            continue
+        kinds = get_type_hints(structures[name], include_extras=True)
+        for field in fields(structures[name]):
+            default = parameter.empty if field.default is MISSING else field.default
+            options[field.name] = parameter.replace(name=field.name, annotation=kinds[field.name], default=default)
+
+    @functools.wraps(command)
+    def called(**given: Any) -> None:
+        held = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in structures.items()}
+        command(**given, **held)
+
+    called.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
+    called.__annotations__ = {name: option.annotation for name, option in options.items()}
+    return called

@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from roadscan.cli.arguments import SurveyFile
+from roadscan.cli.arguments import SurveyFile, options_apart
 from roadscan.cli.terminal import new_reporter, print_table
 
 
+@dataclass(frozen=True)
+class GridOptions:
+    """Settings of an OpenCRG grid."""
+
+    pass_id: Annotated[int | None, typer.Option("--pass", help="opencrg: pass, where the run has several.")] = None
+    u_step: Annotated[float, typer.Option(help="opencrg: distance from row to row (m).")] = 0.05
+    v_step: Annotated[float, typer.Option(help="opencrg: distance from column to column (m).")] = 0.05
+    left: Annotated[float, typer.Option(help="opencrg: reach to the left of the driven path (m).")] = 2.0
+    right: Annotated[float, typer.Option(help="opencrg: reach to the right of the driven path (m).")] = 2.0
+    smoothing: Annotated[float, typer.Option(help="opencrg: length over which the path is smoothed (m).")] = 10.0
+    hole: Annotated[float, typer.Option(help="opencrg: longest hole closed by straight lines (m).")] = 0.25
+    encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI"
+
+
+@options_apart
 def export(
     survey_file: SurveyFile,
     format_: Annotated[str, typer.Option("--format", help="psi (a run's profiles) or opencrg (a pass's heights).")],
@@ -18,14 +34,7 @@ def export(
     sensor: Annotated[str, typer.Option(help="Sensor of the rig.")],
     out: Annotated[Path, typer.Option(help="Folder to write to; new or empty.")],
     length: Annotated[float, typer.Option(help="psi: road a file (m).")] = 5.0,
-    pass_id: Annotated[int | None, typer.Option("--pass", help="opencrg: pass, where the run has several.")] = None,
-    u_step: Annotated[float, typer.Option(help="opencrg: distance from row to row (m).")] = 0.05,
-    v_step: Annotated[float, typer.Option(help="opencrg: distance from column to column (m).")] = 0.05,
-    left: Annotated[float, typer.Option(help="opencrg: reach to the left of the driven path (m).")] = 2.0,
-    right: Annotated[float, typer.Option(help="opencrg: reach to the right of the driven path (m).")] = 2.0,
-    smoothing: Annotated[float, typer.Option(help="opencrg: length over which the path is smoothed (m).")] = 10.0,
-    hole: Annotated[float, typer.Option(help="opencrg: longest hole closed by straight lines (m).")] = 0.25,
-    encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI",
+    grid: GridOptions = GridOptions(),
 ) -> None:
     """Ingested readings as files of other programs: PSI containers or an OpenCRG grid."""
     from roadscan.jobs.export.export_opencrg import CrgSettings, export_opencrg
@@ -40,8 +49,7 @@ def export(
     if format_ == "psi":
         written = export_psi(loaded, store, run_id, sensor, out, PsiSettings(length))
     elif format_ == "opencrg":
-        settings = CrgSettings(pass_id, u_step, v_step, left, right, smoothing, hole, encoding)
-        written = export_opencrg(loaded, store, run_id, sensor, out, settings)
+        written = export_opencrg(loaded, store, run_id, sensor, out, CrgSettings(*astuple(grid)))
     else:
         raise ConfigError(f"--format {format_}", expected="psi or opencrg")
     for note in written.notes:

@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from roadscan.cli.arguments import SurveyFile
+from roadscan.cli.arguments import SurveyFile, options_apart
 
 
+@dataclass(frozen=True)
+class SiteOptions:
+    """What a site is to hold."""
+
+    box: Annotated[
+        str | None, typer.Option(help="Only this part: WEST,SOUTH,EAST,NORTH in metres of the survey's map.")
+    ] = None
+    road: Annotated[str | None, typer.Option(help="Only the surroundings of this road of `reference_lines`.")] = None
+    finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0
+    clouds: Annotated[bool, typer.Option(help="With the points.")] = True
+    pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True
+    edit: Annotated[
+        bool, typer.Option("--edit", help="With edits of the inventory; the page saves them as a file to be pulled.")
+    ] = False
+
+
+@options_apart
 def publish(
     survey_file: SurveyFile,
     out: Annotated[Path | None, typer.Option(help="Folder of the site; one that was published is renewed.")] = None,
     single: Annotated[Path | None, typer.Option(help="Write one HTML file with all in it, and no folder.")] = None,
-    box: Annotated[
-        str | None, typer.Option(help="Only this part: WEST,SOUTH,EAST,NORTH in metres of the survey's map.")
-    ] = None,
+    asked: SiteOptions = SiteOptions(),
     over: Annotated[
         list[Path] | None, typer.Option(help="Survey file of another survey of the roads, for strips over one another.")
     ] = None,
-    road: Annotated[str | None, typer.Option(help="Only the surroundings of this road of `reference_lines`.")] = None,
-    finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0,
-    clouds: Annotated[bool, typer.Option(help="With the points.")] = True,
-    pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True,
-    edit: Annotated[
-        bool, typer.Option("--edit", help="With edits of the inventory; the page saves them as a file to be pulled.")
-    ] = False,
     largest: Annotated[float, typer.Option(help="--single: largest file (MB).")] = 200.0,
 ) -> None:
     """The survey as a page to look at: a folder for any web server with range requests, or one file."""
@@ -44,13 +53,13 @@ def publish(
     session, *others = (Session.open(file) for file in (survey_file, *(over or ())))
     for opened in (session, *others):
         opened.hear_of_damage()
-    if box is not None and road is not None:
+    if asked.box is not None and asked.road is not None:
         raise ConfigError("--box and --road are both given", expected="one of them")
-    near = box_from_text(box) if box is not None else None
-    near = near if road is None else box_of_road(Material(session), road)
-    wishes = Wishes(clouds, pictures, finest, near, "file" if edit else "")
+    near = box_from_text(asked.box) if asked.box is not None else None
+    near = near if asked.road is None else box_of_road(Material(session), asked.road)
+    wishes = Wishes(asked.clouds, asked.pictures, asked.finest, near, "file" if asked.edit else "")
     material = Material(session, wishes, tuple(others))
-    if edit:
+    if asked.edit:
         material.check_edits()
     reporter = new_reporter()
     if single is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ Kernel = Callable[..., Any]
 
 def kernel(function: Kernel) -> Kernel:
     """Compile a loop over arrays."""
-    return compiled(function, _folder_of(function), inlined=False, counted=True)
+    return compiled(function, _folder_of(function), counted=True)
+
+
+def inner(function: Kernel) -> Kernel:
+    """Compile a loop that kernels alone call: an entry for Python takes as long to make as a small function."""
+    return compiled(function, _folder_of(function), counted=True, entry=False)
 
 
 def bare(function: Kernel) -> Kernel:
@@ -26,17 +31,22 @@ def bare(function: Kernel) -> Kernel:
     To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     take as long for that as for the readings.
     """
-    return compiled(function, _folder_of(function), inlined=False, counted=False)
+    return compiled(function, _folder_of(function), counted=False)
+
+
+def bare_inner(function: Kernel) -> Kernel:
+    """Compile a loop that `bare` kernels alone call; it makes no array either."""
+    return compiled(function, _folder_of(function), counted=False, entry=False)
 
 
 def inlined(function: Kernel) -> Kernel:
     """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
-    return compiled(function, _folder_of(function), inlined=True, counted=True)
+    return compiled(function, _folder_of(function), counted=True, entry=False, inlined=True)
 
 
 def bare_inlined(function: Kernel) -> Kernel:
     """Compile a piece of a `bare` kernel into it; it makes no array either."""
-    return compiled(function, _folder_of(function), inlined=True, counted=False)
+    return compiled(function, _folder_of(function), counted=False, entry=False, inlined=True)
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -66,17 +76,26 @@ def _folder_of_source(source: str) -> str:
     return cache_folder("kernels", seen)
 
 
+@functools.cache
 def _imported_kernels(file: Path) -> list[Path]:
     """Files of this package that a file imports, anywhere in it, whatever form the import has."""
     here = Path(__file__).parent
     within = ("roadscan", "kernels", *file.parent.relative_to(here).parts) if file.is_relative_to(here) else ()
     found = []
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in _statements(ast.parse(file.read_bytes())):
         for name in _imported_names(node, within):
             if name[:2] == ("roadscan", "kernels"):
                 module = here.joinpath(*name[2:])
                 found += [file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file()]
     return found
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node. Expressions, which hold no import, are most of a tree, and are passed over."""
+    for below in ast.iter_child_nodes(node):
+        if isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):
+            yield below
+            yield from _statements(below)
 
 
 def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:

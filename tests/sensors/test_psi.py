@@ -151,21 +151,20 @@ singles = st.floats(-1e9, 1e9, width=32)
     ),
     shape=st.tuples(st.integers(1, 9), st.integers(1, 9)),
     has=st.tuples(st.booleans(), st.booleans()),
-    codec2d=st.sampled_from(["raw", "zip", "png"]),
-    codec3d=st.sampled_from(["raw", "zip"]),
+    codecs=st.tuples(st.sampled_from(["raw", "zip", "png"]), st.sampled_from(["raw", "zip"])),
     order=st.sampled_from(["row", "column"]),
     metadata=st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20),
     seed=st.integers(0, 99),
 )  # fmt: skip
 def test_round_trip(
-    tmp_path: Path, header: PsiHeader, shape: tuple[int, int], has: tuple[bool, bool], codec2d: Any, codec3d: Any,
-    order: Any, metadata: str, seed: int,
+    tmp_path: Path, header: PsiHeader, shape: tuple[int, int], has: tuple[bool, bool], codecs: Any, order: Any,
+    metadata: str, seed: int,
 ) -> None:  # fmt: skip
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, shape).astype(np.uint8) if has[0] else None
     surface = rng.integers(0, 65_536, shape[::-1]).astype(np.uint16) if has[1] else None
     path = tmp_path / "a.psi"
-    write_psi(PsiContainer(header, image, surface, metadata), path, codec2d=codec2d, codec3d=codec3d, order=order)
+    write_psi(PsiContainer(header, image, surface, metadata), path, codec2d=codecs[0], codec3d=codecs[1], order=order)
     back = read_psi(path)
     assert back.header == header
     assert back.metadata == metadata

@@ -53,15 +53,13 @@ def place(station: float, offset: float) -> np.ndarray:
     return station * AHEAD + offset * RIGHT
 
 
-def cast(
-    world: World, at, direction: np.ndarray, *, time_s=0.0, key=1, reach=80.0, wide_deg=0.0, beside=None, steps=1
-) -> Hits:
+def cast(world: World, at, direction: np.ndarray, *, key=1, wide_deg=0.0, beside=None, steps=1) -> Hits:
     """Rays (n, 3) from a tripod, all at one time."""
     tripod = Tripod(tuple(at))
     n = len(direction)
-    limits = (0.0, reach)
+    limits = (0.0, 80.0)
     pattern = Pattern(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n), wide_deg, limits, beside, (steps, 1))
-    begin = tripod.start_gps_ns + round(time_s * 1e9)
+    begin = tripod.start_gps_ns
     interval = np.array([[[begin, begin + 1_000]]])
     found = world.cast(tripod, HERE, np.eye(3), interval, np.ascontiguousarray(direction[None]), pattern, key)
     return Hits(*(getattr(found, name)[0] for name in ("range_m", "enh_m", "intensity", "object_id", "is_mixed")))

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from roadscan.kernels.cells.pool import header_of_pass, longer_chain, new_group, slot_with_room
 from roadscan.kernels.cells.selection import bounds_of
 from roadscan.kernels.georeferencing.readings import KEPT
-from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.options import bare, bare_inlined, bare_inner
 from roadscan.kernels.simd.cell_streaks import find_streaks, sum_up
 from roadscan.kernels.simd.height_slots import (
     COUNTS,
@@ -91,7 +91,7 @@ def work_arrays(tiles: int) -> CountingWork:
     return CountingWork(readings, streaks, np.zeros(tiles, np.uint8))
 
 
-@bare
+@bare_inner
 def count_slowly(own, heights, intensity, gain, first, end, mark, pool):
     """Count readings `first` to `end` − 1 into the cell that begins with the slot `own`, one by one."""
     headers, bases = pool.headers, pool.bases
@@ -141,7 +141,7 @@ def tile_at(x, y, edge, tile_rows):
     return across * edge, along * edge, np.int64(tile_rows[along, across]) if inside else np.int64(-1)
 
 
-@bare
+@bare_inner
 def find_slots(heights, streaks, count, active, pool, touched):
     """First slot of each streak's cell, −1 outside the active tiles, into `streaks`. Takes new groups.
 

@@ -23,7 +23,7 @@ from roadscan.kernels.cells.row_buckets import (
     last_block,
     size_of,
 )
-from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.options import bare, bare_inlined, bare_inner
 from roadscan.kernels.simd.column_statistics import LANES, statistics_of, statistics_of_64
 
 statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
@@ -51,7 +51,7 @@ def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
     return row, table, own, np.zeros(3, np.int64), np.zeros((6, LANES)), select_arrays(most)
 
 
-@bare
+@bare_inner
 def mark_row(end, buckets, marks):
     """Note the passes of a row's cells; marks : (edge, w) uint64, in/out, zeros. See :func:`sort_row`."""
     records, before, sizes, owners, _, _ = buckets
@@ -63,7 +63,7 @@ def mark_row(end, buckets, marks):
         block = np.int64(before[block])
 
 
-@bare
+@bare_inner
 def sort_row(end, buckets, sums, ends, used, heights):
     """Heights of a row cell by cell, in the order of the cells; returns how many cells have one.
 
@@ -113,7 +113,7 @@ def put_aside(heights, first, n, light, target, kind, table, own, lane):
         table[at + k, lane] = heights[np.uint64(first) + k] - base
 
 
-@bare
+@bare_inner
 def finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns):
     """Write the statistics of the cells in a part of the table to their places; it is empty then."""
     own = owns[_NUMBERS * kind : _NUMBERS * (kind + 1)]

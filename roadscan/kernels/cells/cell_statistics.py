@@ -9,7 +9,7 @@ import numpy as np
 from roadscan.kernels.cells.cell_columns import write_statistics
 from roadscan.kernels.cells.large_cells import select_arrays, statistics_of_full
 from roadscan.kernels.cells.pool import header_of, release
-from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.options import bare, bare_inlined, bare_inner
 from roadscan.kernels.simd.column_statistics import statistics_of_64
 from roadscan.kernels.simd.height_slots import (
     COUNTS,
@@ -103,7 +103,7 @@ def add_chains(first_slot, longer, pool, heights, counts, light, marks):
             slot = np.int64(chain[slot])
 
 
-@bare
+@bare_inner
 def gather_many(first_slot, pool, heights):
     """All heights (quanta) of a cell → heights, int32. Returns their number and the sum of their intensities."""
     n, light, slot = 0, np.int64(0), first_slot

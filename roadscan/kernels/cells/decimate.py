@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.kernels.cells.adjacent_cells import run_end
 from roadscan.kernels.copies import copy_values
-from roadscan.kernels.options import bare, bare_inlined, kernel
+from roadscan.kernels.options import bare_inlined, bare_inner, kernel
 from roadscan.kernels.simd.column_statistics import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
 
 ABSENT = np.int32(2**31 - 1)
@@ -134,19 +134,19 @@ def micrometres(height, base):
     return np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
 
 
-@bare
+@bare_inner
 def _micrometres(height, base, out):
     for k in range(out.size):
         out[k] = micrometres(height[k], base)
 
 
-@bare
+@bare_inner
 def _light_steps(intensity, out):
     for k in range(out.size):
         out[k] = np.int32(intensity[k] * LIGHT_STEPS + 0.5)
 
 
-@bare
+@bare_inner
 def fill_strip(cells, start, base, first_row, rows, strip, listed):
     """Lay the cells from `start` on out in a strip, as far as its rows reach.
 
@@ -291,7 +291,7 @@ def small_squares(strip, patches, south, per_patch, side, slopes, base, floor_um
     return written
 
 
-@bare
+@bare_inner
 def decimate_strip(strip, patches, patch, side, base, floor_um, scratch, table, slopes, out, first_row, written):
     """Squares of those patches of a strip that hold a cell; returns how many are written by now.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.cells.decimate import ABSENT, LIGHT_STEPS, micrometres, reach_of
-from roadscan.kernels.options import bare, bare_inlined, kernel
+from roadscan.kernels.options import bare, bare_inlined, bare_inner, kernel
 
 AT_ONCE = 512
 """Squares that are gathered before they are computed."""
@@ -52,7 +52,7 @@ def _known(east, north, out):
         north[k] = north[k] if north[k] != ABSENT else np.int32(0)
 
 
-@bare
+@bare_inner
 def _flatten(heights, east, north, up, right):
     """Take the slopes off the cells of one place; `up` and `right` are its row and column, 0.0 or 1.0."""
     for k in range(heights.size):
@@ -72,13 +72,13 @@ def _medians(a, b, c, d, out):
         out[k] = min(low, less) if max(inner, other) == ABSENT else min(inner, other)
 
 
-@bare
+@bare_inner
 def _distances(heights, median, out):
     for k in range(out.size):
         out[k] = np.int32(abs(np.int32(heights[k] - median[k]))) if heights[k] != ABSENT else ABSENT
 
 
-@bare
+@bare_inner
 def _reaches(mad, floor_um):
     for k in range(mad.size):
         mad[k] = reach_of(mad[k], floor_um)

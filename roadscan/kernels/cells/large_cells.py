@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.kernels.cells.selection import BINS, bounds_of, smallest
-from roadscan.kernels.options import bare
+from roadscan.kernels.options import bare, bare_inner
 from roadscan.kernels.simd.column_statistics import REACH
 
 _MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)
@@ -33,7 +33,7 @@ def distances(heights, middle, out):
         out[k] = abs(heights[k] - middle)
 
 
-@bare
+@bare_inner
 def sums_of(heights, middle, reach):
     """Of (n,) int32 less another: sum, sum of squares, number within reach, and their sum."""
     total, squares, used, near = np.int64(0), np.int64(0), np.int64(0), np.int64(0)

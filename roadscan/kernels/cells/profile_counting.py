@@ -11,7 +11,7 @@ from roadscan.kernels.cells.accumulate import NOWHERE, PIECE, Heights, accumulat
 from roadscan.kernels.georeferencing.flat_profiles import HALF, on_plane, planes_of
 from roadscan.kernels.georeferencing.poses import find_interval
 from roadscan.kernels.georeferencing.readings import HEIGHT, KEPT, NO_POSE, NO_RETURN, OUTSIDE, RANGE
-from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.options import bare, bare_inlined, bare_inner
 
 
 class Plane(NamedTuple):
@@ -45,7 +45,7 @@ def plane_of(anchors, maps, heights, active):
     return Plane(maps, (east_rest, north_rest), first, np.float32(1.0 / active.cell_quanta), heights)
 
 
-@bare
+@bare_inner
 def place_profile(raw, rays, scale, raw_limits, plane, out):
     """Cells and heights of readings of a profile. A function of its own: inside a larger one it stays scalar.
 
@@ -71,7 +71,7 @@ def place_profile(raw, rays, scale, raw_limits, plane, out):
         height[j] = np.int32(np.floor(h + HALF)) + first[2]
 
 
-@bare
+@bare_inner
 def count_out_of_range(raw, raw_limits):
     """How many readings have no return, and how many have one that is too near or too far."""
     silent, within = np.uint32(0), np.uint32(0)
@@ -81,7 +81,7 @@ def count_out_of_range(raw, raw_limits):
     return np.int64(silent), raw.size - np.int64(silent) - np.int64(within)
 
 
-@bare
+@bare_inner
 def reach_of_kept(column, height):
     """How many readings are kept, and their lowest and highest height (int64)."""
     good, low, high = 0, np.int32(2**31 - 1), np.int32(-(2**31))

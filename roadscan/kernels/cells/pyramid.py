@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.cells.adjacent_cells import run_end
-from roadscan.kernels.options import bare, kernel
+from roadscan.kernels.options import bare, bare_inner, kernel
 
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
 """Added and taken away again, it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""
@@ -49,7 +49,7 @@ class Pixels(NamedTuple):
     """(n,) mean of the readings' intensities."""
 
 
-@bare
+@bare_inner
 def _add_pairs(count, height, intensity, base, cells, points, above, light):
     """Add two cells side by side to each pixel."""
     for p in range(cells.size):
@@ -65,7 +65,7 @@ def _add_pairs(count, height, intensity, base, cells, points, above, light):
         light[p] += ((west + TO_WHOLE) - TO_WHOLE) + ((east + TO_WHOLE) - TO_WHOLE)
 
 
-@bare
+@bare_inner
 def _add_run(first, factor, count, height, intensity, base, sums):
     """Add cells side by side, from column `first` on, to the sums (4, …) of their pixels."""
     end, pairs = count.size, 0
@@ -122,7 +122,7 @@ def _means(cells, points, above, light, base, out_count, out_cells, out_height, 
         out_intensity[p] = light[p] / points[p]
 
 
-@bare
+@bare_inner
 def _is_scattered(column, row):
     """True where fewer than half of the cells have one beside them, by a sample: it does not pay to look for runs."""
     beside, looked = 0, 0
@@ -132,7 +132,7 @@ def _is_scattered(column, row):
     return 2 * beside < looked
 
 
-@bare
+@bare_inner
 def _add_cells(column, factor, count, height, intensity, base, cells, above, points, light):
     """Add cells one by one to the sums of their pixels; returns the first pixel and the one behind the last."""
     west, east = cells.size, 0
@@ -147,7 +147,7 @@ def _add_cells(column, factor, count, height, intensity, base, cells, above, poi
     return west, east
 
 
-@bare
+@bare_inner
 def _write_pixels(sums, west, east, base, line, at, out):
     """Write pixels one by one; returns where the next one goes."""
     for pixel in range(west, east):
@@ -161,7 +161,7 @@ def _write_pixels(sums, west, east, base, line, at, out):
     return at
 
 
-@bare
+@bare_inner
 def _reduce(cells, base, levels, sums, pixels, west, east):
     """:func:`reduce_cells`; west, east : (levels,) int64, edges[0] and 0, pixels of a strip that have sums."""
     column, row, height, intensity, count = cells

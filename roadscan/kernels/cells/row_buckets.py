@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.kernels.georeferencing.readings import CLASS_KEPT, KEPT, OUTSIDE
-from roadscan.kernels.options import bare, bare_inlined
+from roadscan.kernels.options import bare, bare_inlined, bare_inner
 from roadscan.kernels.simd.height_slots import prefetch
 
 BLOCK = 64
@@ -65,7 +65,7 @@ class Places(NamedTuple):
     """(a,) interval of the trajectory whose σ each active tile has already, −1 for none."""
 
 
-@bare
+@bare_inner
 def find_places(placed, n, active, places):
     """Cells of the first n placed readings in their tiles, into `places`; one loop without branches.
 
@@ -98,7 +98,7 @@ def new_block(end, number, buckets):
     return block << _BITS
 
 
-@bare
+@bare_inner
 def close_buckets(ends, sizes):
     """End the last block of every bucket: what comes next begins a new one."""
     flat = ends.reshape(-1)
@@ -109,7 +109,7 @@ def close_buckets(ends, sizes):
             flat[k] += BLOCK - used
 
 
-@bare
+@bare_inner
 def put_in_buckets(placed, measured, first, end, places, active, buckets):
     """Put readings `first` to `end` − 1, of one pass, into the buckets of the active tiles.
 

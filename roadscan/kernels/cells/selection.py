@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import bare
+from roadscan.kernels.options import bare, bare_inner
 
 BINS = 256
 _BITS = 8
@@ -28,7 +28,7 @@ def _count(values, low, shift, bins):
         bins[np.uint64(np.int64(values[i]) - low) >> shift] += np.int32(1)
 
 
-@bare
+@bare_inner
 def _of_bin(values, low, shift, wanted, found):
     n = 0
     for i in range(values.size):

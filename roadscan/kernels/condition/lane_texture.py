@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from roadscan.kernels.condition.sampling import MOST_CELLS, Cells, gather
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 BLOCK_M = 0.05
 """Edge of a block, or the cells' own where that is more (m)."""
@@ -50,7 +50,7 @@ def plane(sums, b, slopes):
         slopes[b, 1] = (xx * yh - xy * xh) / det
 
 
-@kernel
+@inner
 def block_scatter(sums, b, slopes, cell_m):
     """Variance of the heights of block b about its plane (m²): of its cells, and of the readings within them.
 
@@ -126,7 +126,7 @@ def peaks(found, count, base, half, pitch, lattice, out):
     out[1] = square / segments if segments else np.nan
 
 
-@kernel
+@inner
 def fill_blocks(found, count, base, half, blocks, sums):
     """Sums of the heights and places of the cells of each block of a square, and of all in the last row.
 

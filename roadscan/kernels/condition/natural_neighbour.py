@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from roadscan.kernels.condition.delaunay_mesh import dig, walk
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 STEP_M = 2.0**-36
 """Unit of whole-number places."""
@@ -64,7 +64,7 @@ def linear(mesh, t, value):
     return weighed / total
 
 
-@kernel
+@inner
 def sibson(mesh, centres, value, slopes, weight, arriving, t, question):
     """Sibson's value at the place asked, which triangle t holds; slopes : (n, 2) of the field at the points, or (0, 2).
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 _SAME_STEP_M = 1e-9
 """Steps that differ by less are one: stations at 100 km are rounded to 15 pm."""
@@ -55,7 +55,7 @@ def _growth(pole, near, rest):
     return near * ((1.0 + z) + z * z * (0.5 + z * (1 / 6 + z * (1 / 24))))
 
 
-@kernel
+@inner
 def _feel(xs, hs, rules, slope, grade):
     """Slope (n,) that the tyre feels over the step before each sample; `slope[0]` is that of the start.
 
@@ -83,7 +83,7 @@ def _feel(xs, hs, rules, slope, grade):
     slope[0] = (hs[k] + (end - xs[k]) * grade[k] - hs[0]) / rules.start_m
 
 
-@kernel
+@inner
 def _grow(steps, car, growth):
     """What both modes (block, 2) are multiplied by over the steps (block,) of a block."""
     p1, p2 = car.pole_per_m
@@ -94,7 +94,7 @@ def _grow(steps, car, growth):
         growth[i, 1] = _growth(p2, car.growth[whole, 1], rest)
 
 
-@kernel
+@inner
 def _roll_piece(xs, hs, car, rules, squared, response_m, measured_m):
     """Roll over a piece without gaps, which is as long as the start at least; sums go on from the first element."""
     response, measured = response_m[0], measured_m[0]
@@ -127,7 +127,7 @@ def _roll_piece(xs, hs, car, rules, squared, response_m, measured_m):
             response_m[begin + i], measured_m[begin + i] = response, measured
 
 
-@kernel
+@inner
 def _roll_valid(xs, hs, car, rules, squared, response_m, measured_m):
     """Roll over the pieces between gaps and jumps; pieces that are too short add nothing."""
     n, first = xs.size, 0
@@ -147,7 +147,7 @@ def _roll_valid(xs, hs, car, rules, squared, response_m, measured_m):
         first = i
 
 
-@kernel
+@inner
 def _to_all(x_m, xs, sums, out):
     """Sums at samples with a height, made sums at all samples: linear between."""
     last, k = xs.size - 1, 0

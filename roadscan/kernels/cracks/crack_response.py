@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 
 @kernel
@@ -33,7 +33,7 @@ def line_sums(heights, line, out):
             add_row(own, heights[i + margin + line[k, 0], first : first + n])
 
 
-@kernel
+@inner
 def deepen_row(middle, left, right, far_left, far_right, most, code, depth, which):
     """Keep the depth of the middle below its lower flank, and its code, where it is the deepest so far.
 
@@ -49,7 +49,7 @@ def deepen_row(middle, left, right, far_left, far_right, most, code, depth, whic
         which[j] = code if deeper else which[j]
 
 
-@kernel
+@inner
 def bend_row(middle, left, right, bend):
     """Add: bend += |left + right - 2 middle|; all (n,) int32."""
     for j in range(bend.size):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 HALF_ALONG = 4.5
 """Cells along the valley, to either side, that a cross-section is the mean of."""
@@ -14,7 +14,7 @@ BINS = 2
 """Bins a cell."""
 
 
-@kernel
+@inner
 def fill_bins(heights, i, j, north, east, reach, total, count):
     """Sum and count of the cells around (i, j) by their distance to the right of a line through its middle.
 
@@ -39,7 +39,7 @@ def fill_bins(heights, i, j, north, east, reach, total, count):
     return base
 
 
-@kernel
+@inner
 def mean_between(total, count, first, end):
     """Mean height and mean place of the bins from `first` to `end`; NaN where they hold nothing."""
     height, place, n = 0.0, 0.0, 0.0
@@ -77,7 +77,7 @@ def depths(total, count, flank, depth):
     return (left + slope * (middle - left_at), min(left, right)) if any_bin else (np.nan, np.nan)
 
 
-@kernel
+@inner
 def half_way(depth, peak, step, half):
     """Bins from `peak` to where the depth falls to `half`, going by `step`, interpolated."""
     k = peak

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 HALF_LENGTH = 10
 """Rows (or columns) of cells to each side that a strip is fitted to."""
@@ -33,7 +33,7 @@ def larger(a, b):
     return a if a > b else b
 
 
-@kernel
+@inner
 def depth_row(ground, median, count, least, scale, absent, depth):
     """Of each median of a line how deep it lies below the ground, times `scale`; 0 of too few heights. All (n,)."""
     for j in range(depth.size):
@@ -49,7 +49,7 @@ def line_depths(ground, median, count, least, scale, absent, margin, depth):
         depth_row(ground[i], median[i], count[i], least, scale, absent, depth[i + margin, margin : margin + n])
 
 
-@kernel
+@inner
 def chain_row(middle, a, b, c, d, e, f, direction, best, best_direction):
     """Depth of a line with the deepest of three before it and of three behind it, kept where it is the most so far."""
     for j in range(best.size):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 CELLS = 7
 """Cells of a line, its middle among them."""
@@ -51,7 +51,7 @@ def middle_two(v0, v1, v2, v3, v4, v5, v6, absent):
     return low, high, n
 
 
-@kernel
+@inner
 def median_row(a, b, c, d, e, f, g, absent, median, count, own):
     """Of each place of seven rows (n,) the median, how many heights it is of, and the share of `d` in it.
 
@@ -70,7 +70,7 @@ def or_mirrored(value, opposite, middle, absent):
     return value if value < absent else (2.0 * middle - opposite if opposite < absent else absent)
 
 
-@kernel
+@inner
 def mirrored_median_row(a, b, c, d, e, f, g, middle, absent, median):
     """As :func:`median_row`; where one side has two heights more than the other, the other's are mirrored.
 
@@ -155,7 +155,7 @@ def mirrored_line_medians(values, margin, line, middle, absent, median):
         )
 
 
-@kernel
+@inner
 def mean_row(a, b, c, d, e, f, g, absent, mean):
     """Of each place of seven rows (n,) the mean of the middle one `d` and of the pairs about it; see `line_means`."""
     for j in range(mean.size):
@@ -184,7 +184,7 @@ def line_means(values, margin, line, absent, mean):
         )
 
 
-@kernel
+@inner
 def judge_row(heights, ground, median, count, own, least, sigma, limit, absent, contrast, risk):
     """How far medians along a line lie from the ground and from the heights; all (n,), see :func:`judge_lines`."""
     for j in range(risk.size):

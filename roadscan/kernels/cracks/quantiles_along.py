@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from roadscan.kernels.cells.selection import sort_few
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 HALF_ALONG = 10
 """Cells to either side, in rows and in columns, that a stretch takes in."""
@@ -15,7 +15,7 @@ _HALF_ASIDE = 2.5
 """Cells aside: bends of the line within the stretch, and no other line beyond."""
 
 
-@kernel
+@inner
 def quantile_of(values, count, level):
     """Quantile of the first `count` values, which change places; between two it is interpolated. NaN of none."""
     sort_few(values[:count])

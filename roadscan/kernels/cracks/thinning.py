@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 
-@kernel
+@inner
 def neighbour_bits(cells, i, j):
     """The eight neighbours of a cell as bits: north is bit 0, then clockwise (rows grow to the south here)."""
     return (

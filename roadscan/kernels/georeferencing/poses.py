@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 POSITION = slice(0, 12)
 """Columns of an interval's coefficients: c0, c1, c2, c3 of x, then of y, then of z."""
@@ -150,7 +150,7 @@ def cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@kernel
+@inner
 def _interval(dt, k, positions, quaternions, velocity, rate, out):
     for a in range(3):
         step = positions[k + 1, a] - positions[k, a]

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from roadscan.kernels.georeferencing.charts import box_of, chart_index, expansion, map_value
 from roadscan.kernels.georeferencing.poses import attitude_at, find_interval, interval, position_at
 from roadscan.kernels.georeferencing.tile_set import add_tile, mark_zonotope, take, tile_set
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 SLACK_M = 0.001
 """Rounding: float32 coordinates to 1 km, whole quanta, nanoseconds."""
@@ -77,7 +77,7 @@ def norm_of(a, b, x, y, z):
     return norm3(a * abs(x[0]) + b * abs(x[1]), a * abs(y[0]) + b * abs(y[1]), a * abs(z[0]) + b * abs(z[1]))
 
 
-@kernel
+@inner
 def motion_bounds(poses):
     """Largest speed and acceleration of the body in each interval.
 
@@ -145,7 +145,7 @@ def stretch(k, since, until, arm, step_m, bend_m, poses, motion):
         k += 1
 
 
-@kernel
+@inner
 def chart_near(px, py, pz, within, charts):
     """Chart of a world position, or of one `within` metres along the axes; −1 where there is none."""
     lattice, table = charts.lattice, charts.table
@@ -215,7 +215,7 @@ def pose_at(epoch, k, poses):
     return position_at(c, u), attitude_at(c, u)
 
 
-@kernel
+@inner
 def frames_between(k0, t0, k1, t1, speed, bend, reach, moved_m, georeference):
     """The sensor's frame on the map between two instants of an unbroken piece of the trajectory.
 
@@ -270,7 +270,7 @@ def frames_between(k0, t0, k1, t1, speed, bend, reach, moved_m, georeference):
     return True, middle, half, margin
 
 
-@kernel
+@inner
 def nearest_and_farthest(low, high, block, first, end):
     """Least of the `low` and greatest of the `high` (n, m) of rows with a reading, and how many rows that are."""
     near, far, rows = 65535, 0, 0
@@ -282,7 +282,7 @@ def nearest_and_farthest(low, high, block, first, end):
     return near, far, rows
 
 
-@kernel
+@inner
 def mark_piece(pieces, p, nearest_m, farthest_m, readings, frames, found, count):
     """Add the tiles of one piece of a profile, swept between two poses; returns how many tiles there are.
 
@@ -317,7 +317,7 @@ def mark_piece(pieces, p, nearest_m, farthest_m, readings, frames, found, count)
     return count
 
 
-@kernel
+@inner
 def mark_profiles(t0, t1, first, end, profiles, limits, frames, found, count):
     """Add the tiles of all pieces of some profiles between two poses; returns how many tiles there are.
 
@@ -421,7 +421,7 @@ def disk_radius(m, reach):
     return math.sqrt(0.5 * (ee + nn) + math.hypot(0.5 * (ee - nn), en)) * reach
 
 
-@kernel
+@inner
 def mark_box(centre, edge, reach, frames, found, count):
     """Add the tiles of a box of the sensor's frame within its reach, swept between two poses.
 
@@ -439,7 +439,7 @@ def mark_box(centre, edge, reach, frames, found, count):
     return mark_zonotope(e, n, g, margin + rest, disk, found, count)
 
 
-@kernel
+@inner
 def share_out(readings, e, n, found, count):
     """Share readings out over tiles by their distance from a place: as 1 / (d² + tile²)."""
     tile_m, _, tiles, weights = found

@@ -14,7 +14,7 @@ from roadscan.kernels.georeferencing.readings import (
     write_point,
 )
 from roadscan.kernels.georeferencing.timed_readings import CHUNK, place_mirror, place_returns
-from roadscan.kernels.options import bare, kernel
+from roadscan.kernels.options import bare_inner, kernel
 
 
 @kernel
@@ -23,7 +23,7 @@ def places(n):
     return Placed(np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
 
 
-@bare
+@bare_inner
 def keep_points(first, n, made, placed, window, out):
     """Append the readings that are kept and lie in the window; write the classes of all where they are wanted.
 

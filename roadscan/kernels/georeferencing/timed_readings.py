@@ -35,7 +35,7 @@ from roadscan.kernels.georeferencing.readings import (
     Placed,
     Returns,
 )
-from roadscan.kernels.options import bare, inlined, kernel
+from roadscan.kernels.options import bare_inner, inlined, inner, kernel
 
 STEP_NS = 5_000_000
 """Longest pose step: one an interval of a trajectory at 200 Hz."""
@@ -62,7 +62,7 @@ def sensor_at(c, u, b, centre, height_chart, out):
     out[BODY_HEIGHT] = map_value(height_chart, px, py, pz)
 
 
-@bare
+@bare_inner
 def pose_step(epoch, k, georeference, nodes, motion):
     """The pose step that holds an epoch (GPS ns); `k` is the interval to search from.
 
@@ -132,7 +132,7 @@ def at(c, s):
     return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
 
 
-@bare
+@bare_inner
 def place_step(step, motion, georeference, readings, begin, end, out):
     """Place readings `begin` to `end` − 1, of one pose step; see :func:`place_ranged`.
 
@@ -183,7 +183,7 @@ def placed_of(out, first, end):
     )  # fmt: skip
 
 
-@kernel
+@inner
 def place_ranged(readings, georeference, out, fates):
     """Place readings whose classes say already what their ranges are worth.
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from roadscan.kernels.inertial.kalman_states import NAVIGATION, cross_rows, decays, level_axes
 from roadscan.kernels.inertial.strapdown import EARTH_RATE_RAD_PER_S, exponential, matrix, product, unit
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 Float64 = npt.NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def _smoothed(rows, adjoint, information, work, correction, covariance):
             covariance[j, i] = total
 
 
-@kernel
+@inner
 def _smoothed_values(p, nominal, adjoint, information, values, sigmas):
     n = p.shape[0]
     for i in range(9, n):
@@ -94,7 +94,7 @@ def _smoothed_values(p, nominal, adjoint, information, values, sigmas):
         sigmas[i - 9] = math.sqrt(variance)
 
 
-@kernel
+@inner
 def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
     """λ and Λ before a whitened update; z : (n, n) scratch, of which `size` rows are used."""
     n = adjoint.size
@@ -124,7 +124,7 @@ def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
     _downdate(row, z, size, information)
 
 
-@kernel
+@inner
 def _downdate(row, z, size, information):
     """Λ ← Λ − rowᵀ z − zᵀ row; a symmetric Λ stays symmetric to the last bit."""
     n = information.shape[0]
@@ -135,7 +135,7 @@ def _downdate(row, z, size, information):
                 information[i, j] -= f * z[c, j] + g * row[c, j]
 
 
-@kernel
+@inner
 def _adjoint_step(phi, decay, adjoint, information, work):
     """λ ← Φᵀλ and Λ ← ΦᵀΛΦ; phi : (9, inertial) rows of navigation, decay : (n,) diagonal of the others.
 
@@ -164,7 +164,7 @@ def _adjoint_step(phi, decay, adjoint, information, work):
             information[j, i] = information[i, j]
 
 
-@kernel
+@inner
 def _times_transition(information, phi, decay, out):
     """(n, n) Λ Φ."""
     n = decay.size
@@ -284,7 +284,7 @@ def _note_sigma_rph(poses, e, c, level):
     poses.sigma_rph[e, 2] = math.sqrt(tan * tan * along + 2.0 * tan * (ch * nd + sh * ed) + dd)
 
 
-@kernel
+@inner
 def _levelled(covariance, level, reach, out):
     """Covariances (3, 3, 3) of position at the end of `reach` (m, ECEF), attitude and velocity, north-east-down."""
     moved = np.zeros((3, 3))

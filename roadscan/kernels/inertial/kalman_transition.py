@@ -28,7 +28,7 @@ from roadscan.kernels.inertial.strapdown import (
     matrix,
     strapdown_step,
 )
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 
 @kernel
@@ -149,7 +149,7 @@ def _accumulate(sums, ways, c0, c1, v0, v1, turn, push, gain, dt, scaled):
         ways[2, j] += turn[j]
 
 
-@kernel
+@inner
 def _transition(sums, ways, seconds, field, scaled, phi):
     """Rows of position, velocity and attitude of the transition (9, inertial) over an interval."""
     phi[:] = 0.0
@@ -213,7 +213,7 @@ def predict(k, nodes, model, layout, present, interval, record, work):
     _add_noise(k, nodes, model, present, interval, phi)
 
 
-@kernel
+@inner
 def _moved_rows(p, phi, work):
     """Rows of navigation: work (9, n) ← Φ P, and the block Φ P Φᵀ of them in `p`."""
     n, mixed = p.shape[0], phi.shape[1]
@@ -234,7 +234,7 @@ def _moved_rows(p, phi, work):
             p[j, i] = total
 
 
-@kernel
+@inner
 def _add_noise(k, nodes, model, present, interval, phi):
     """Noise of gyroscopes and accelerometers, and of motion in a silence of the IMU.
 

@@ -23,7 +23,7 @@ from roadscan.kernels.inertial.kalman_states import (
     level_axes,
 )
 from roadscan.kernels.inertial.strapdown import EARTH_RATE_RAD_PER_S, exponential, matrix, product, unit
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 
 @kernel
@@ -61,7 +61,7 @@ def offered(kind, k, nodes, fixes, model, layout, track, present, interval, offe
     return size
 
 
-@kernel
+@inner
 def _gnss_position(fixes, g, layout, present, offer):
     """Antenna's position against the predicted one, ECEF."""
     h, y, noise, values = offer.row, offer.innovation, offer.noise, present.values
@@ -91,7 +91,7 @@ def _gnss_position(fixes, g, layout, present, offer):
             noise[i, j] = total
 
 
-@kernel
+@inner
 def _gnss_velocity(fixes, g, rate, model, layout, present, interval, offer):
     """Antenna's velocity against the predicted one, ECEF; `rate` (3,) of the IMU in its own axes."""
     h, y, noise, values = offer.row, offer.innovation, offer.noise, present.values
@@ -271,7 +271,7 @@ def apply(present, offer, size, limit, at, updates):
     _shifted(present, shift)
 
 
-@kernel
+@inner
 def _whitened_rows(h, ph, factor, size, row, gain):
     """L⁻¹ H and (P Hᵀ L⁻ᵀ)ᵀ by forward substitution."""
     for c in range(size):
@@ -298,7 +298,7 @@ def _shifted(present, shift):
         present.quaternion[j] = q[j]
 
 
-@kernel
+@inner
 def _whiten(predicted, noise, weight, size, y, factor, white):
     """Cholesky factor of the innovation's covariance, L⁻¹y, and its squared length by component."""
     total = 0.0

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 from roadscan.kernels.packing.bit_words import appended
 from roadscan.kernels.packing.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
@@ -206,7 +206,7 @@ def varint_bits(number):
     return bits, size
 
 
-@kernel
+@inner
 def pack_block(above, widths, words, to, word, used):
     """Write the miniblocks of a block behind what words hold: (word to go on with, its index, its bits)."""
     for k in range(MINIBLOCKS):
@@ -221,7 +221,7 @@ def pack_block(above, widths, words, to, word, used):
     return to, word, used
 
 
-@kernel
+@inner
 def widths_of(above):
     """Bit widths of a block's miniblocks, one a byte, the first one lowest."""
     widths = _U(0)

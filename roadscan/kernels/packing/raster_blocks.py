@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.copies import copy_values
-from roadscan.kernels.options import bare
+from roadscan.kernels.options import bare, bare_inner
 
 EMPTY_LINE = (0x7F, 0xC0 - 0x7F, 0x100 - 0xC0, 0)
 """Where the planes of a line of NaN begin; all else in it is 0."""
@@ -46,13 +46,13 @@ def round_values(values, per_step, step, rounded):
         rounded[k] = np.rint(values[k] * per_step) * step
 
 
-@bare
+@bare_inner
 def _scatter(column, values, west, line):
     for i in range(column.size):
         line[np.uint64(np.int64(column[i]) - west)] = values[i]
 
 
-@bare
+@bare_inner
 def _subtract(bytes_, before, differences):
     for i in range(differences.size):
         differences[i] = bytes_[i] - before[i]
@@ -65,7 +65,7 @@ def _pick(words, shift, plane):
         plane[x] = np.uint8((words[x] >> shift) & np.uint32(255))
 
 
-@bare
+@bare_inner
 def _encode_line(pixels, differences, by_byte, coded):
     width = differences.size
     _subtract(pixels[4:], pixels[:-4], by_byte[4:])

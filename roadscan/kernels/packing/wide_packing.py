@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 from roadscan.kernels.packing.delta_packing import BLOCK, MINIBLOCK, MINIBLOCKS, widths_of
 from roadscan.kernels.simd.processor import compiles_for
 from roadscan.kernels.simd.vectors import I32, I64, constant, everywhere, instruction, load, picked, start, store
@@ -92,7 +92,7 @@ def pack_block(typingctx, above, first, width, data, to):
     return types.void(above, first, width, data, to), write
 
 
-@kernel
+@inner
 def _pack_wide(above, first, width, data, to):
     """Write 32 numbers of more than 16 bits."""
     bits, used = _U(0), _U(0)
@@ -106,7 +106,7 @@ def _pack_wide(above, first, width, data, to):
             to += _U(1)
 
 
-@kernel
+@inner
 def _put(data, to, number):
     """Write a number as a varint; returns the byte behind it."""
     while number > _U(127):
@@ -117,7 +117,7 @@ def _put(data, to, number):
     return to + _U(1)
 
 
-@kernel
+@inner
 def _last_differences(values, first, above):
     """`_differences` of fewer than 128 values that are left; the others are as the least one."""
     least = np.int32(1 << 30)

@@ -9,7 +9,7 @@ import numpy as np
 
 from roadscan.kernels.copies import copy_values
 from roadscan.kernels.georeferencing.readings import CLASS_KEPT
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 CLASS_SCATTERED, CLASS_OFF_ROAD = 10, 12
 """Classes of objects that the road goes on behind, and of what lies beyond its edge."""
@@ -53,7 +53,7 @@ def counted_in(line, y, up, sign):
     )
 
 
-@kernel
+@inner
 def follow_road(y, up, height, spread, start, way, settings, trail, head, line, kinds):
     """Step 4: go outwards from reading `start` as long as the readings carry on the road's line.
 
@@ -121,7 +121,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, head, line, 
         first += way
 
 
-@kernel
+@inner
 def road_from(start, y, up, height, spread, settings, trail, kinds):
     """Step 4 from one reading on: both ways, beginning with the line through the readings around it.
 
@@ -154,7 +154,7 @@ def road_from(start, y, up, height, spread, settings, trail, kinds):
     return count_kept(kinds)
 
 
-@kernel
+@inner
 def count_kept(kinds):
     """How many readings are road."""
     kept = 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.kernels.georeferencing.readings import CLASS_KEPT, CLASS_NO_RETURN, CLASS_TOO_FAR, CLASS_TOO_NEAR
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 from roadscan.kernels.road.carriageway import (
     BIN,
     CHORD,
@@ -43,7 +43,7 @@ LEAST_DZ = 0.2
 """Beams nearer to the horizontal have an error of height as if they fell by so much a metre."""
 
 
-@kernel
+@inner
 def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index):
     """Returns of one profile within the range limits, in the order of their readings.
 
@@ -67,7 +67,7 @@ def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index
     return n
 
 
-@kernel
+@inner
 def place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up):
     """Class and place (m,) of every reading; arguments of :func:`profile_points`. Alone, the loop vectorises."""
     low, high = np.uint16(raw_limits[0]), np.uint16(raw_limits[1])
@@ -127,7 +127,7 @@ def fitted(y, up, first, end, stride, near, gate, bent):
     return (height - p1 * m1, p1, 0.0, origin)
 
 
-@kernel
+@inner
 def road_datum(y, up, gate):
     """The road's own level in a profile: a parabola (1, y, y²; m) and the y that it counts from.
 
@@ -194,14 +194,14 @@ def height_threshold(height, bin_m, share, counts):
     return low + (second + 2) * bin_m
 
 
-@kernel
+@inner
 def mark_above(height, threshold, kinds):
     """Step 2: readings higher than the threshold."""
     for j in range(height.size):
         kinds[j] = CLASS_ABOVE if height[j] > threshold else CLASS_KEPT
 
 
-@kernel
+@inner
 def curvatures(y, up, bend):
     """Step 3 (i): how far each reading stands above the line through its two neighbours (n,), m.
 
@@ -218,7 +218,7 @@ def curvatures(y, up, bend):
         bend[j] = over if inside else 0.0
 
 
-@kernel
+@inner
 def range_noise(bend, index, dz, kinds, sample):
     """Standard deviation of the ranges (m) as the profile itself shows it: from the median of :func:`curvatures`.
 
@@ -243,7 +243,7 @@ def range_noise(bend, index, dz, kinds, sample):
     return max(sample[count // 2] / (0.6745 * np.sqrt(1.5)), LEAST_NOISE_M)
 
 
-@kernel
+@inner
 def mark_scattered(bend, index, dz, noise, factor, neighbours, sums, kinds):
     """Step 3 (i): readings that stand out upwards, `factor` times more than the readings around them.
 
@@ -280,7 +280,7 @@ def is_near(y, up, j, k, least):
     return a * a + b * b < least
 
 
-@kernel
+@inner
 def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
     """Step 3 (ii): readings where beam and surface meet at less than the limit, seen from both sides.
 

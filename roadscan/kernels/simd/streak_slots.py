@@ -8,7 +8,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from roadscan.kernels.options import Kernel, bare
+from roadscan.kernels.options import Kernel, bare_inner
 from roadscan.kernels.simd.processor import compiles_for
 from roadscan.kernels.simd.vectors import I8, I16, I32, I64, constant, everywhere, instruction, load, start, store
 
@@ -50,7 +50,7 @@ def _found(typingctx, columns, rows, first, streaks, tile, nowhere, table, at, s
     return types.uint64(columns, rows, first, streaks, tile, nowhere, table, at, slots), write
 
 
-@bare
+@bare_inner
 def _none_found(columns, rows, first, streaks, tile, nowhere, table, at, slots):
     unknown, bit = np.uint64(0), np.uint64(1)
     for streak in range(first, min(first + np.uint64(AT_ONCE), streaks)):

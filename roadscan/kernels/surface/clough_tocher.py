@@ -19,7 +19,7 @@ The theory stands in ``surfaces.clough_tocher``.
 
 from __future__ import annotations
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 from roadscan.kernels.simd.patch_heights import BY_CORNER, BY_EDGE, CENTRE, CORNER, EDGE, INNER
 
 ALONG, ACROSS, SLOPE = 0, 1, 2
@@ -87,7 +87,7 @@ def misfits(x, y, z, gradients, lo, hi, a):
     return s, t, height, along, 3.0 * third_of_slope(gradients, a, -ey, ex) - ends
 
 
-@kernel
+@inner
 def slope_beside_thin(x, y, z, gradients, lo, hi, wide, thin, seen_wide, seen_thin):
     """Slope across the middle of an edge beside a thin triangle, from what the cubic through the wide one has to meet.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 NOTHING, MEASURED, INTERPOLATED, FILLED = 0, 1, 2, 3
 """Origins of a node of the coarse model."""
@@ -128,7 +128,7 @@ def spline_profiles(across, height, classes, every, first_node, spacing, reach, 
             begin = end
 
 
-@kernel
+@inner
 def spline_piece(x, z, bend, node, begin, end, first_node, spacing, surface, origin):
     """Evaluate the spline of knots `begin` to `end` − 1 at the nodes from its first to its last.
 
@@ -161,7 +161,7 @@ def spline_piece(x, z, bend, node, begin, end, first_node, spacing, surface, ori
         origin[node[i]] = MEASURED
 
 
-@kernel
+@inner
 def median_of_rows(above, here, below, out):
     """Medians of 3 × 3 neighbourhoods (K − 2,) of three rows (K,), where all nine are there.
 
@@ -187,7 +187,7 @@ def median_of_rows(above, here, below, out):
         out[k] = max(min(low, middle), min(max(low, middle), high))
 
 
-@kernel
+@inner
 def median_of_some(surface, p, k, some):
     """Median of those of the 3 × 3 nodes around (p, k) that there are; of an even number the mean of the middle two.
 
@@ -227,7 +227,7 @@ def median_filter(surface, out):
                 out[p, k] = median_of_some(surface, p, k, some)
 
 
-@kernel
+@inner
 def count_gaps(above, here, below, gaps):
     """How many of the three nodes of each column (K,) there are not."""
     for k in range(gaps.size):

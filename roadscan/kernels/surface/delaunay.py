@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import inlined, kernel
+from roadscan.kernels.options import inlined, inner, kernel
 
 ERROR_BOUND = 2.0**-49
 """Of the determinant in floating point, of the sum of its terms' sizes (Shewchuk 1997: 1.1e-15, here 1.8e-15)."""
@@ -59,7 +59,7 @@ def cross(ax, ay, bx, by):
     return sum_128(product_128(wide(ax), wide(by)), negative_128(product_128(wide(ay), wide(bx))))
 
 
-@kernel
+@inner
 def in_circle_exactly(ax, ay, bx, by, cx, cy):
     """Sign of the determinant where floating point could not tell.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 
-@kernel
+@inner
 def choose_row(surface, measured, i, limit, chosen, own, residual):
     """Filter, its weight of the cell itself and its residual, for the cells of one row.
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 _SLOPES = 401
 """Classes of a slope …"""
@@ -31,14 +31,14 @@ _DAMPED = 8.0
 """A slope counts half that is told by so many pairs of blocks."""
 
 
-@kernel
+@inner
 def slope_class(slope, steepest):
     """Class of a slope, from 0 for -steepest up."""
     share = (slope + steepest) / (2.0 * steepest)
     return int(min(max(share, 0.0), 1.0) * (_SLOPES - 1) + 0.5)
 
 
-@kernel
+@inner
 def median_slope(counts, steepest):
     """Median of slopes of which each class (401,) holds so many; 0 of none."""
     n = 0
@@ -52,7 +52,7 @@ def median_slope(counts, steepest):
     return 0.0
 
 
-@kernel
+@inner
 def slope_towards(heights, i, j, half, way, step_m, counts):
     """Median slope (m/m) about block (i, j), from blocks `way` (rows, columns), `step_m`, apart.
 
@@ -126,7 +126,7 @@ def steepest(along, start, level):
     return found
 
 
-@kernel
+@inner
 def level_about(heights, i, j, away, north, east, rise, along):
     """What stands about block (i, j) in every direction: the lowest of the highest along rays.
 
@@ -181,7 +181,7 @@ def rim(along, level, slack):
     return -1
 
 
-@kernel
+@inner
 def slope_beyond(along, start, counts):
     """Median rise over a block of a profile (n,) from place `start` on, damped where it goes on for few blocks."""
     counts[:] = 0
@@ -194,7 +194,7 @@ def slope_beyond(along, start, counts):
     return median_slope(counts, _STEEPEST_M) * (n / (n + _DAMPED))
 
 
-@kernel
+@inner
 def mean_below(height, weight, step):
     """Weighted mean of heights (n,) that are no more than `step` above their lower quartile; NaN of none."""
     n = height.size

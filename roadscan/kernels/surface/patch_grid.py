@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import bare, inlined, kernel
+from roadscan.kernels.options import bare_inner, inlined, kernel
 from roadscan.kernels.simd.patch_heights import AT_ONCE, POINTS, SCALE, heights_of_eight
 
 ROOM = 64
@@ -43,7 +43,7 @@ def narrowed(line, bounds, up, low, high):
     return max(low, meets + bounds[1]), min(high, meets + bounds[2])
 
 
-@bare
+@bare_inner
 def write_heights(edges, patches, patch, nodes, count, heights):
     """Heights of a triangle at the nodes that are noted; each is asked exactly whether it lies in the triangle.
 

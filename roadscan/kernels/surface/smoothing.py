@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 
 REACH = 4
 """Cells that a step sees to each side: a filter and its transpose."""
@@ -17,7 +17,7 @@ _NONE, _TWELFTH, _SIXTEENTH, _FIFTY_SIXTH = (np.float32(v) for v in (0.0, 1.0 / 
 _TWO, _C1, _C2, _C3, _C4, _C5 = (np.float32(v) for v in (2.0, 1.0, 2.0, 3.0, 4.0, 5.0))
 
 
-@kernel
+@inner
 def residual_row(u, i, chosen, own, fixed, residual):
     """Residual of the chosen filter at the cells of one row.
 
@@ -45,7 +45,7 @@ def residual_row(u, i, chosen, own, fixed, residual):
         residual[j] = own[j] * u[i, j + 2] - neighbours + fixed[j]
 
 
-@kernel
+@inner
 def spread_row(chosen, residual, near, down, along, right, left, around):
     """The residuals (n,) times the weight that their filters give to each kind of neighbour.
 
@@ -64,7 +64,7 @@ def spread_row(chosen, residual, near, down, along, right, left, around):
         around[j] = all_around
 
 
-@kernel
+@inner
 def descent_row(ring, first, own, before, pull, aim, push, after):
     """One row's step against the gradient.
 

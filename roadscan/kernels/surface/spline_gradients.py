@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import bare, kernel
+from roadscan.kernels.options import bare, bare_inner, kernel
 from roadscan.kernels.simd.covariances import PEAK, REACH, covariances, slope_covariances
 from roadscan.kernels.simd.factorisation import LANES, TOGETHER, factorise
 from roadscan.kernels.surface.vertex_neighbourhoods import MOST
@@ -75,7 +75,7 @@ def load(x, y, z, first, order, begin, members, counts, axes, present, offsets, 
     return size
 
 
-@bare
+@bare_inner
 def set_diagonal(system, present, size, variance):
     """Variances of the points; one where a point is not there."""
     for k in range(size):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.options import kernel
+from roadscan.kernels.options import inner, kernel
 from roadscan.kernels.surface.vertex_rings import MOST_RINGS, grow, is_narrow, offset_squares, whitening
 
 RINGS, FEWEST, LEAST, MOST = 2, 10, 20, 32
@@ -18,7 +18,7 @@ STRETCH = 3.0
 """By how much a neighbourhood may be longer than wide before its length is counted in smaller units."""
 
 
-@kernel
+@inner
 def keep_nearest(x, y, i, ring, count, white, far):
     """Sort a ring by whitened distance from its vertex; what is equally far keeps its order."""
     for k in range(count):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import inlined, inner
 from roadscan.simulate.kernels.road import STATION, RoadArrays, defect_depth, node_at, project, worn_height
 
 Float64 = npt.NDArray[np.float64]
@@ -34,7 +34,7 @@ def through(beam: Float64, axis: int, step: float, first: float, second: float, 
     beam[axis, 2] = (first - 2.0 * second + third) / (2.0 * step * step)
 
 
-@compiled
+@inner
 def into_defect(road: RoadArrays, beam: Float64, r: float, fall: float) -> tuple[float, float]:
     """Follow a beam from the rim's level at `r` down to the wall or floor of a pothole or crack.
 
@@ -79,7 +79,7 @@ def into_defect(road: RoadArrays, beam: Float64, r: float, fall: float) -> tuple
     return middle, depth
 
 
-@compiled
+@inner
 def clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tuple[float, int, float, float]:
     """Height of a beam's point above the surface without defects, and its node, u, offset.
 
@@ -89,7 +89,7 @@ def clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tuple[flo
     return along_beam(beam, 2, r) - worn_height(road, k, u, offset), k, u, offset
 
 
-@compiled
+@inner
 def turn_to_road(road: RoadArrays, beam: Float64, r: float, step: float, near: int) -> None:
     """Turn a beam in the map into road coordinates and count it from range `r`.
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.simulate.kernels.beams import along_beam, clearance
-from roadscan.simulate.kernels.options import compiled
+from roadscan.simulate.kernels.options import compiled, inner
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,
@@ -133,7 +133,7 @@ def bound_cells(road: RoadArrays, cells: Cells, station: Float64, offset: Float6
             raise_bounds(road, cells, easting, northing, height, 1.5 * bend + 0.02, flags, k)
 
 
-@compiled
+@inner
 def raise_bounds(
     road: RoadArrays,
     cells: Cells,
@@ -165,7 +165,7 @@ def raise_bounds(
             cells.top[tile] = max(cells.top[tile], highest)
 
 
-@compiled
+@inner
 def lay_plane(road: RoadArrays, cells: Cells, index: int, easting: float, northing: float, near: int) -> None:
     """Lay a cell's plane through the ground around its middle."""
     reach = 0.35 * CELL_M
@@ -191,7 +191,7 @@ def lay_plane(road: RoadArrays, cells: Cells, index: int, easting: float, northi
     cells.plane[index, 4] = 0.0
 
 
-@compiled
+@inner
 def kerb_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Height of the kerb on this side (m); 0: none."""
     column = KERB_RIGHT if offset > 0.0 else KERB_LEFT
@@ -199,7 +199,7 @@ def kerb_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return value
 
 
-@compiled
+@inner
 def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """What kerbs and patches add to the height (m)."""
     section, patches = road.section, road.patches
@@ -215,7 +215,7 @@ def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return height
 
 
-@compiled
+@inner
 def is_near_steps(road: RoadArrays, k: int, u: float, offset: float, reach: float) -> bool:
     """Whether a kerb's face or the edge of a patch is within reach."""
     section, patches = road.section, road.patches
@@ -234,7 +234,7 @@ def is_near_steps(road: RoadArrays, k: int, u: float, offset: float, reach: floa
 # --- search ------------------------------------------------------------------------------------------
 
 
-@compiled
+@inner
 def steps_between(
     road: RoadArrays, k0: int, u0: float, offset0: float, k1: int, u1: float, offset1: float, level: float
 ) -> tuple[float, float]:
@@ -263,7 +263,7 @@ def steps_between(
     return bend, rise
 
 
-@compiled
+@inner
 def first_ground(
     road: RoadArrays,
     cells: Cells,
@@ -299,7 +299,7 @@ def first_ground(
     return searched(road, beam, start, end, bend, level, k)
 
 
-@compiled
+@inner
 def chased(
     road: RoadArrays, beam: Float64, guess: float, fall: float, near: int
 ) -> tuple[float, float, int, float, float]:
@@ -326,7 +326,7 @@ def chased(
     return np.nan, fall, k, u, offset
 
 
-@compiled
+@inner
 def searched(
     road: RoadArrays, beam: Float64, start: float, end: float, bend: float, level: float, near: int
 ) -> tuple[float, int, float, float]:
@@ -366,7 +366,7 @@ def searched(
     return np.nan, k, u, offset
 
 
-@compiled
+@inner
 def between_signs(
     road: RoadArrays, beam: Float64, low: float, low_gap: float, high: float, high_gap: float, near: int
 ) -> tuple[float, int, float, float]:
@@ -394,7 +394,7 @@ def between_signs(
 # --- potholes, cracks, joints --------------------------------------------------------------------------
 
 
-@compiled
+@inner
 def hole_clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tuple[float, float, int, float, float]:
     """Height of a beam's point above the floor, depth of the floor, node, u and offset."""
     k, u, offset = project(road, along_beam(beam, 0, r), along_beam(beam, 1, r), near)
@@ -402,7 +402,7 @@ def hole_clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tupl
     return along_beam(beam, 2, r) - worn_height(road, k, u, offset) + depth, depth, k, u, offset
 
 
-@compiled
+@inner
 def steepest(road: RoadArrays, k: int, offset: float) -> float:
     """Slope of the ground near a node, at most: walls of defects, a kerb's face, edges of patches (m/m)."""
     section, nodes, defects, patches = road.section, road.nodes, road.defects, road.patches
@@ -417,7 +417,7 @@ def steepest(road: RoadArrays, k: int, offset: float) -> float:
     return 0.4 + slope
 
 
-@compiled
+@inner
 def into_hole(road: RoadArrays, beam: Float64, r: float, near: int) -> tuple[float, float, int, float, float]:
     """Follow a beam from the rim's level at `r` to the wall or floor of a pothole, crack or joint.
 

@@ -16,12 +16,17 @@ def compiled(function: _Function) -> _Function:
 
     So nothing can be allocated inside; scratch arrays are handed in.
     """
-    return compiler.compiled(function, _FOLDER, inlined=False, counted=False)
+    return compiler.compiled(function, _FOLDER, counted=False)
+
+
+def inner(function: _Function) -> _Function:
+    """Compile a loop that other loops alone call: an entry for Python takes as long to make as a small function."""
+    return compiler.compiled(function, _FOLDER, counted=False, entry=False)
 
 
 def inlined(function: _Function) -> _Function:
     """Compile a piece of a loop into its callers: handing on the road's arrays costs more than the arithmetic."""
-    return compiler.compiled(function, _FOLDER, inlined=True, counted=False)
+    return compiler.compiled(function, _FOLDER, counted=False, entry=False, inlined=True)
 
 
 _FOLDER = compiler.cache_folder("simulate", Path(__file__).parent.glob("*.py"))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
 from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import compiled, inlined, inner
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,
@@ -210,7 +210,7 @@ def scan_profiles(
             intensity[p, i] = int(min(max(value + 0.5, 0.0), 255.0)) if seen else 0
 
 
-@compiled
+@inner
 def place_movers(bodies: Float64, movers: Float64, p: int) -> None:
     """Overwrite the last of the bodies (b, 18) by what moves (p, m, 18), as it is at profile `p`."""
     first = bodies.shape[0] - movers.shape[1]
@@ -289,7 +289,7 @@ def road_clearance(road: RoadArrays, beam: Float64, r: float) -> tuple[float, in
     return along_beam(beam, 2, r) - worn_height(road, k, u, offset), k, u, offset
 
 
-@compiled
+@inner
 def walked_range(road: RoadArrays, beam: Float64, near: float) -> tuple[float, int, float, float]:
     """Range, node, u, offset of the first meeting of a beam in road coordinates with the surface, within 0.5 m."""
     stride = 0.002
@@ -312,7 +312,7 @@ def walked_range(road: RoadArrays, beam: Float64, near: float) -> tuple[float, i
     return high, k, u, offset
 
 
-@compiled
+@inner
 def polished_range(
     road: RoadArrays, beam: Float64, start: float, fall: float, near: int
 ) -> tuple[float, int, float, float]:

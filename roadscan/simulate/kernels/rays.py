@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.simulate.kernels.beams import along_beam, through
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import compiled, inlined, inner
 from roadscan.simulate.kernels.road import DEFECTS, DEFECTS_END, RoadArrays, brightness, defect_depth, on_surface
 from roadscan.simulate.kernels.things import (
     BODY_COLUMNS,
@@ -199,7 +199,7 @@ def lay_beam(
 # --- one ray -----------------------------------------------------------------------------------------
 
 
-@compiled
+@inner
 def cast(
     world: World,
     movers: Movers,
@@ -247,7 +247,7 @@ def cast(
         state[BEST] = r
 
 
-@compiled
+@inner
 def place_mover(movers: Movers, time_s: float, i: int, body: Float64) -> None:
     """Body `i` of the movers at a time. body : (1, 18), out."""
     slot = min(max(int(time_s / movers.slot_s), 0), movers.bodies.shape[0] - 1)
@@ -261,7 +261,7 @@ def place_mover(movers: Movers, time_s: float, i: int, body: Float64) -> None:
         body[0, column] += rise
 
 
-@compiled
+@inner
 def meet_movers(
     world: World, movers: Movers, time_s: float, beam: Float64, dx: float, dy: float, dz: float, key: np.uint64,
     body: Float64, state: Float64,
@@ -371,7 +371,7 @@ def walk_cells(
         r = leave
 
 
-@compiled
+@inner
 def meet_ground(
     world: World, index: int, middle_e: float, middle_n: float, beam: Float64, begin: float, end: float, state: Float64
 ) -> None:
@@ -495,7 +495,7 @@ def cast_one(
     note_echo(world, movers, time_s, scratch.beam, rays.weight[s], scratch.body, scratch.state, echoes, row)
 
 
-@compiled
+@inner
 def cast_once(
     world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch
 ) -> None:
@@ -505,7 +505,7 @@ def cast_once(
         scratch.echoes[s, 4] = 1.0
 
 
-@compiled
+@inner
 def may_meet_edge(centres: Float64, rays: Rays, i: int) -> bool:
     """Whether an edge may lie on any side of a ray."""
     found = False
@@ -514,7 +514,7 @@ def may_meet_edge(centres: Float64, rays: Rays, i: int) -> bool:
     return found
 
 
-@compiled
+@inner
 def meets_edge(
     world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, scratch: Scratch
 ) -> bool:
@@ -616,7 +616,7 @@ def is_smooth(before: float, middle: float, after: float) -> bool:
     return bent <= max(MIXED_WITHIN_M, BENT_SHARE * change)
 
 
-@compiled
+@inner
 def note_echo(
     world: World, movers: Movers, time_s: float, beam: Float64, weight: float, body: Float64, state: Float64,
     echoes: Float64, s: int,
@@ -642,7 +642,7 @@ def note_echo(
     echoes[s, 3] = weight * max(value, 1.0) / (r * r) if value >= 0.0 else 0.0
 
 
-@compiled
+@inner
 def write_found(
     rays: Rays, beam: Float64, found: Found, g: int, i: int, r: float, value: float, number: float, is_mixed: bool
 ) -> None:
@@ -656,7 +656,7 @@ def write_found(
     found.is_mixed[g, i] = is_mixed and is_seen
 
 
-@compiled
+@inner
 def merged(echoes: Float64) -> tuple[float, float, float, bool]:
     """Range, intensity, object and whether they are mixed, of the echoes (5, 5) of one ray; its middle comes first.
 
@@ -684,7 +684,7 @@ def is_within(echoes: Float64, s: int, low: float, high: float) -> bool:
     return inside
 
 
-@compiled
+@inner
 def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
     """Whether the echoes (5, 5) within ranges come from the surface in the ray's middle and from no other.
 
@@ -702,7 +702,7 @@ def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
     return True
 
 
-@compiled
+@inner
 def strongest_group(echoes: Float64) -> tuple[float, float, float]:
     """Energy, nearest and farthest range of the echoes that arrive together with the most energy; 0: there are none.
 
@@ -720,7 +720,7 @@ def strongest_group(echoes: Float64) -> tuple[float, float, float]:
     return best, best_low, best_high
 
 
-@compiled
+@inner
 def grown_group(echoes: Float64, s: int) -> tuple[float, float, float]:
     """Energy, nearest and farthest range of the echoes that merge with that of row `s`, directly or by others."""
     energy, low, high = echoes[s, 3], echoes[s, 0], echoes[s, 0]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import compiled, inlined, inner
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -91,7 +91,7 @@ def clothoid(curvature: float, rate: float, u: float) -> tuple[float, float, flo
     return along, right, sine, cosine
 
 
-@compiled
+@inner
 def project(road: RoadArrays, easting: float, northing: float, near: int) -> tuple[int, float, float]:
     """Node, station past it and offset of the foot of a map point on the reference line.
 
@@ -288,7 +288,7 @@ def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return height
 
 
-@compiled
+@inner
 def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[float, float]:
     """Depth of the deepest pothole, crack or joint here, and the smallest radius or half width near this node (m)."""
     nodes, defects = road.nodes, road.defects

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import inlined, inner
 
 Float64 = npt.NDArray[np.float64]
 
@@ -167,7 +167,7 @@ def meet_ellipsoid(
     return first
 
 
-@compiled
+@inner
 def shade(rows: Float64, i: int, x: float, y: float, z: float) -> float:
     """Intensity of body `i` at a point of its outside; NaN in a window, which mirrors beams away."""
     if rows[i, BAY] > 0.0:

@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_reference_site import BARS, REPEATABILITY_MM, SITE, pose_covariance, survey_covariance
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.adjust.control import Sighting, observations_of
+from roadscan.adjust.control import Sighting
 from roadscan.adjust.observations import KINDS, Observations
 from roadscan.jobs.adjust import adjustment
 from roadscan.jobs.adjust.solution import Evidence, Solution
@@ -170,9 +170,12 @@ def scene(size: Settings, seed: int) -> Scene:
 
 
 def survey_control(folder: Path, spacing_m: float, seed: int) -> None:
-    """Write the control of one spacing, with the errors of its survey; the points of the other spacing are checks."""
+    """Write the control of one spacing, with the errors of its survey; the points of the other spacing are checks.
+
+    Both spacings have one survey, so that what was seen of a check point is seen once.
+    """
     known = truth.load(folder)
-    rng = np.random.default_rng([seed, round(spacing_m)])
+    rng = np.random.default_rng(seed)
     own = control_stations(spacing_m, known.scene.length_m)
     with (folder / "control.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -200,6 +203,7 @@ def adjusted(survey_file: Path, mode: str, spacing_m: float) -> Adjusted:
     values["adjust"] |= {"mode": mode}
     values["adjust"]["targets"] |= {"shape": "circle"}
     values["control"][0]["path"] = control_file(survey.folder, spacing_m).name
+    values["adjust"]["places"]["per_km"] = 100.0
     if Settings.current().reference_spacing_mm > 20.0:
         values["adjust"]["ties"]["cell_m"] = 0.05
     store = Store(str(survey_file.parent / "store"), survey.config.id)
@@ -256,7 +260,7 @@ def outcome(one: Adjusted, *, joint: bool) -> Outcome:
 
 def of_observations(sightings: tuple[Sighting, ...]) -> list[Sighting]:
     """The sighting of each observation of the control."""
-    return [one for one in sightings for _ in range(observations_of([one]).size)]
+    return [one for one in sightings for _ in range(one.observed)]
 
 
 def of_evidence(one: Adjusted, what: str) -> Iterator[Figure]:

@@ -93,14 +93,20 @@ class Circle:
 class NearReader:
     """Places readings near places; keeps the row groups that the next place may need as well."""
 
-    def __init__(self, store: Store, ground: Ground, files: Sequence[NearFile], runs: Sequence[str]) -> None:
-        """`runs` : all runs of the survey, in the order that traverses count them."""
+    def __init__(
+        self, store: Store, ground: Ground, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
+    ) -> None:
+        """`runs` : all runs of the survey, in the order that traverses count them.
+
+        apart_m : of profiles that lie closer than this, as many are left out as still keeps them closer.
+        """
         self._store, self._frame, self._runs = store, ground.map, runs
         self._placer = Placer(store, ground, [one.slice for one in files], recorded=True)
         self._files: dict[tuple[str, str], list[NearFile]] = {}
         for one in files:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)
         self._kept: dict[tuple[str, int], pa.RecordBatch] = {}
+        self._apart_m = apart_m
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
         """Readings of one traverse within a circle."""
@@ -124,11 +130,22 @@ class NearReader:
         if rows.size < batch.num_rows:
             in_order = rows[-1] - rows[0] + 1 == rows.size
             batch = batch.slice(int(rows[0]), rows.size) if in_order else batch.take(rows)
+        if self._apart_m and file.source.table == "scans":
+            every = self._every(file.source, batch.column("epoch_gps_ns").to_numpy())
+            batch = batch.take(np.arange(0, batch.num_rows, every)) if every > 1 else batch
         found = placed_readings(batch, file.source, self._placer.placement(file.source))
         away = found.points_m[:, :2] - [circle.easting_m, circle.northing_m]
         near = np.einsum("ni,ni->n", away, away) <= circle.radius_m**2
         if near.any():
             yield found.chosen(near)
+
+    def _every(self, source: ReadingSource, epochs_gps_ns: Int64) -> int:
+        """Of each so many profiles in a row one is enough."""
+        poses = self._placer.trajectory(source).poses(epochs_gps_ns[[0, -1]])
+        if epochs_gps_ns.size < 3 or not poses.found.all():
+            return 1
+        driven_m = float(np.linalg.norm(np.diff(poses.position_world_m, axis=0)))
+        return max(1, int(self._apart_m * (epochs_gps_ns.size - 1) / max(driven_m, 1e-3)))
 
     def _batch(self, file: NearFile, group: int) -> pa.RecordBatch:
         known = self._kept.get((file.path, group))

@@ -160,7 +160,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
 
 def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
     """The sighting of each observation of :func:`observations_of`."""
-    return [one for one in sightings for _ in range(observations_of([one]).size)]
+    return [one for one in sightings for _ in range(one.observed)]
 
 
 def _moves(prior: RunPrior) -> bool:

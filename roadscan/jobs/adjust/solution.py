@@ -135,7 +135,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     names = np.array([one.point.name for one in _by_observation(evidence.sightings)], dtype=object)
     entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
     notes = [datum] if datum else []
-    notes += _far_notes(far)
+    notes += _far_notes(far, evidence)
     if config.mode == "helmert":
         corrections = _helmert(plan, evidence, entering)
         ties = evidence.ties.observations.size
@@ -185,14 +185,23 @@ def _points(found: Adjustment, first: int) -> dict[tuple[int, int], PointFigures
     return points
 
 
-def _far_notes(far: Mapping[str, float]) -> list[str]:
+def _far_notes(far: Mapping[str, float], evidence: Evidence) -> list[str]:
     if not far:
         return []
     words = [f"{name} ({away:+.3f} m)" for name, away in sorted(far.items())]
-    return [
+    notes = [
         f"{len(far)} control points lie far above or below the road that was measured, and are not used: "
         f"{listed(words)}; they are in another height datum or CRS, or under a bridge"
     ]
+    surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
+    # The poses are as they were recorded.
+    sigma = max((float(prior.sigmas[2]) for prior in evidence.priors), default=0.0)
+    points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
+    return notes + _swapped_notes(points)
+
+
+def _swapped_notes(points: Sequence[WrongPoint]) -> list[str]:
+    return [f"the heights of {one} and {other} look exchanged" for one, other in swapped(points)]
 
 
 def _wrong_notes(
@@ -214,8 +223,7 @@ def _wrong_notes(
         f"{len(ordered)} control points contradict all other evidence and do not count: "
         f"{listed([one.told() for one in ordered])}; their survey, or what stands for them, is wrong"
     ]
-    notes += [f"the heights of {one} and {other} look exchanged" for one, other in swapped(ordered)]
-    return notes
+    return notes + _swapped_notes(ordered)
 
 
 def _helmert(plan: SurveyPlan, evidence: Evidence, entering: Bool) -> dict[str, Corrections]:

@@ -373,6 +373,8 @@ def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Pat
     if mode == "vertical":
         level = rows(copy.store(), "SELECT max(abs(north_m) + abs(east_m) + abs(roll_rad)) AS most FROM corrections")
         assert level[0]["most"] == 0.0
+    left = rows(copy.store(), "FROM absolute_accuracy WHERE points = 'left_out' AND component = 'height'")
+    assert [row["count"] for row in left] == [12 if mode == "each_pass" else 4]
 
 
 def test_a_survey_without_overlap_and_control_is_told_so(raw: Simulated, tmp_path: Path) -> None:

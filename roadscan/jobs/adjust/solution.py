@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, adjust
+from roadscan.adjust.adjustment import Adjustment, ControlErrors, adjust
 from roadscan.adjust.control import Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height, listed, swapped
-from roadscan.adjust.helmert import helmert
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.rigid_fit import RigidFit, rigid_fit
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
@@ -137,9 +137,13 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     notes = [datum] if datum else []
     notes += _far_notes(far, evidence)
     if config.mode == "helmert":
-        corrections = _helmert(plan, evidence, entering)
-        ties = evidence.ties.observations.size
-        return Solution(corrections, np.zeros(ties), {}, control, tuple(notes), {}, 0)
+        fit = _rigid_fit(evidence, entering)
+        points = _points(fit.control, 0)
+        notes += _wrong_notes(evidence.sightings, points)
+        return Solution(
+            _rigid_corrections(plan, evidence, fit), np.zeros(evidence.ties.observations.size), points, control,
+            tuple(notes), {}, 0, leave_one_out(fit.control),
+        )  # fmt: skip
     accepted = evidence.ties.accepted
     first_point = int(evidence.ties.observations.place.max(initial=-1)) + 1
     points_apart = replace(control, place=control.place + first_point).chosen(entering)
@@ -148,7 +152,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found = adjust(joined, evidence.priors, settings)
     weight = np.zeros(accepted.size)
     weight[accepted] = found.weight[: int(accepted.sum())]
-    points = _points(found, first_point)
+    points = _points(found.control, first_point)
     notes += _wrong_notes(evidence.sightings, points)
     reached = {int(run) for run in np.unique(joined.run) if run != FIXED and _moves(evidence.priors[int(run)])}
     corrections = {evidence.runs[k]: _with_sigma(found, k) for k in sorted(reached)}
@@ -172,9 +176,8 @@ def _with_sigma(found: Adjustment, run: int) -> Corrections:
     return replace(own, sigma=found.sigma[run])
 
 
-def _points(found: Adjustment, first: int) -> dict[tuple[int, int], PointFigures]:
+def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFigures]:
     """Figures by number of the point and run; `first` : place that stands for point 0."""
-    control = found.control
     points: dict[tuple[int, int], PointFigures] = {}
     for k, (place, run) in enumerate(zip(control.place.tolist(), control.run.tolist(), strict=True)):
         points[place - first, run] = PointFigures(
@@ -226,23 +229,17 @@ def _wrong_notes(
     return notes + _swapped_notes(ordered)
 
 
-def _helmert(plan: SurveyPlan, evidence: Evidence, entering: Bool) -> dict[str, Corrections]:
-    """The one rigid movement of the survey onto its targets, as corrections of each run."""
-    sightings, rows = _by_observation(evidence.sightings), np.flatnonzero(entering)
-    names = {id(sightings[k]): sightings[k] for k in rows}
-    own = [one for one in names.values() if one.is_placed and np.isfinite(one.height_m)]
-    measured = np.array([[o.easting_m, o.northing_m, o.height_m] for o in own]).reshape(-1, 3)
-    surveyed = np.array([[o.point.easting_m, o.point.northing_m, o.point.height_m] for o in own]).reshape(-1, 3)
-    origin = measured.mean(axis=0) if own else np.zeros(3)
-    turned = float(np.mean([o.convergence_rad for o in own])) if own else 0.0
-    sigma = np.array(
-        [
-            [*[np.hypot(o.point.sigma_horizontal_m, np.sqrt(np.trace(o.covariance_m2) / 2))] * 2,
-             np.hypot(o.point.sigma_height_m, o.sigma_height_m)]
-            for o in own
-        ]
-    ).reshape(-1, 3)  # fmt: skip
-    found = helmert(level_from_map(measured - origin, turned), level_from_map(surveyed - origin, turned), sigma)
+def _rigid_fit(evidence: Evidence, entering: Bool) -> RigidFit:
+    """The one rigid movement of the survey onto its targets."""
+    sightings = _by_observation(evidence.sightings)
+    own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
+    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
+    sigma = np.array([evidence.priors[one.run].sigmas[:3] for one in seen]).reshape(-1, 3)
+    return rigid_fit(seen, sigma)
+
+
+def _rigid_corrections(plan: SurveyPlan, evidence: Evidence, fit: RigidFit) -> dict[str, Corrections]:
+    """A rigid movement as corrections of each run."""
     corrections: dict[str, Corrections] = {}
     for prior in evidence.priors:
         source = next((s for s, _ in plan.sources if s.run == prior.run and s.trajectory is not None), None)
@@ -254,6 +251,6 @@ def _helmert(plan: SurveyPlan, evidence: Evidence, entering: Bool) -> dict[str, 
         )
         poses = level_poses(recorded, plan.ground.map, knots)
         if poses.epoch_gps_ns.size:
-            places = level_from_map(poses.body_m - origin, turned)
-            corrections[prior.run] = found.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
+            places = level_from_map(poses.body_m - fit.origin_m, fit.convergence_rad)
+            corrections[prior.run] = fit.helmert.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
     return corrections

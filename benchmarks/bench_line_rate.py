@@ -48,7 +48,7 @@ def of_runs(runs: Runs) -> Iterator[Figure]:
     survey, name = runs.survey, _NAMES[runs.survey.name]
     sensor = survey.readings / survey.recorded_s / 1e6
     count = f"{survey.readings / 1e6:,.1f} M readings, {survey.recorded_s:,.1f} s"
-    for stage in ("ingest", *(s for s in END_TO_END if runs.wall_s(s) > 0.05)):
+    for stage in ("ingest", "adjust", *(s for s in END_TO_END if runs.wall_s(s) > 0.05)):
         yield Figure(f"{name}: {stage}", rate(runs, stage), "M/s", sensor, "the sensor")
     made = ", ".join(runs.figures[0]["products"])
     yield Figure(f"{name}: end to end ({made}; {count})", rate(runs, *END_TO_END), "M/s", sensor, "the sensor")

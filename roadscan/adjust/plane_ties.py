@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,9 +18,9 @@ import numpy.typing as npt
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie import COUNTS, PLANE, TOO_FAR, End, Tie
+from roadscan.kernels.adjust.plane_moments import add_moments, leave_out_far
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.settings.tie_settings import TieSettings
-from roadscan.navigation.calibration.surfels import plane_moments
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -32,6 +31,13 @@ _FLAT: Final = 0.25
 _WIDE: Final = 0.1
 """Its returns spread (1 σ) over this share of the cube along both of its axes."""
 _TRIM: Final = 3.0
+_LEAST_VARIANCE_M2: Final = 1e-10
+_FIRST: Final = (0, 0, 0, 1, 1, 2)
+_SECOND: Final = (0, 1, 2, 1, 2, 2)
+_SHARE: Final = 6
+"""A plane in so many is kept for each direction, if there are so many of it."""
+_SPARSE: Final = 16
+"""Numbers are looked up in a table where their range is no larger than this many times their count."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +46,12 @@ class _Returns:
 
     point_m: Float64
     """(n, 3) from the place, map axes."""
-    traverse: Int64
-    """(n,)"""
     pose: Int64
     """(n,) row in the poses of its traverse."""
-    epoch_gps_ns: Int64
+    window: Int64
+    """(n,) number of its window, by traverse and time."""
+    traverse: Int64
+    """(w,) of each window."""
 
 
 @dataclass(frozen=True)
@@ -72,62 +79,87 @@ def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSett
 
     Where more ties hold windows together than are needed, their σ are larger: q ties of m windows say m − 1 things.
     """
-    near = _near(place, readings) if readings else None
+    near = _near(place, readings, settings) if readings else None
     if near is None or near.pose.size == 0:
         return []
     planes = _planes(near, settings)
-    out: list[Tie] = []
-    for cube in _largest(planes, settings.most_planes):
-        windows = np.flatnonzero(planes.cube == cube)
-        pairs = _pairs(windows.size)
-        weaker = math.sqrt(len(pairs) / (windows.size - 1))
-        for a, b in pairs:
-            tie = _tie(place, readings, planes, (int(windows[a]), int(windows[b])), settings)
-            out.append(replace(tie, sigma_m=tie.sigma_m * weaker, group=len(out)))
-    return out
+    first, second, weaker = _pairs(planes, _chosen(place, planes, settings.most_planes))
+    return _ties(place, readings, planes, (first, second), weaker, settings)
 
 
-def _near(place: Place, readings: Sequence[PassReadings]) -> _Returns:
-    """Returns within the radius of a place."""
-    parts = []
+def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> _Returns:
+    """Returns within the square of a place."""
+    length = round(settings.window_s * NS_PER_S)
+    parts: list[tuple[Float64, Int64, Int64]] = []
+    traverse: list[int] = []
     for number, one in enumerate(readings):
+        windows, of_pose = np.unique(one.epoch_gps_ns // length, return_inverse=True)
         point = np.stack([one.easting_m - place.easting_m, one.northing_m - place.northing_m, one.height_m], axis=-1)
         inside = np.flatnonzero((np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2]))
         pose = one.pose[inside].astype(np.int64)
-        parts.append((point[inside], np.full(inside.size, number), pose, one.epoch_gps_ns[pose]))
-    return _Returns(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        parts.append((point[inside], pose, len(traverse) + of_pose[pose]))
+        traverse += [number] * windows.size
+    points, poses, numbers = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return _Returns(points, poses, numbers, np.array(traverse, np.int64))
 
 
 def _planes(near: _Returns, settings: TieSettings) -> _Planes:
     """Cubes in which two windows or more see one plane."""
-    window = near.epoch_gps_ns // round(settings.window_s * NS_PER_S)
-    whole = np.floor(near.point_m / settings.plane_cell_m).astype(np.int64)
-    cubes, cube = np.unique(_packed(whole), return_inverse=True)
-    keys, group = np.unique(_packed(np.stack([cube, near.traverse, window], axis=-1)), return_inverse=True)
-    first = np.empty(keys.size, np.int64)
-    first[group[::-1]] = np.arange(group.size)[::-1]
-    cube_of, traverse_of = cube[first], near.traverse[first]
-    kept = np.ones(len(near.point_m), np.bool_)
+    edge_m, least = settings.plane_cell_m, settings.least_returns
+    whole = np.floor(near.point_m / edge_m)
+    cubes, cube = _numbered(_packed(whole.astype(np.int64)))
+    keys, group = _numbered(cube * near.traverse.size + near.window)
+    cube_of, window_of = np.divmod(keys, near.traverse.size)
+    middle = np.empty((keys.size, 3))
+    middle[group] = (whole + 0.5) * edge_m
+    point, kept = near.point_m - middle[group], np.ones(group.size, np.bool_)
+    windows = _Windows.of(point, group, kept, keys.size)
     for _ in range(2):
-        count = np.bincount(group[kept], minlength=keys.size)
-        kept &= count[group] >= settings.least_returns
-        mean = _means(near.point_m, group, kept, keys.size)
-        centred = near.point_m - mean[group]
-        number, _, values, vectors = plane_moments(centred[kept], cube_of[group[kept]], cubes.size)
-        values = np.maximum(values, 1e-10)
-        away = np.abs(np.einsum("ni,ni->n", centred, vectors[cube_of[group], :, 0]))
-        kept &= away <= _TRIM * np.sqrt(values[cube_of[group], 0])
-    flat = (values[:, 0] < _FLAT**2 * values[:, 1]) & (values[:, 1] > (_WIDE * settings.plane_cell_m) ** 2)
+        number, values, vectors = windows.scattered(cube_of, cubes.size, least)
+        normal = np.ascontiguousarray(vectors[:, :, 0])
+        limit = np.where(windows.count >= least, _TRIM * np.sqrt(values[cube_of, 0]), -1.0)
+        leave_out_far(point, group, windows.mean_m, normal[cube_of], limit, kept)
+        windows = _Windows.of(point, group, kept, keys.size)
+    flat = (values[:, 0] < _FLAT**2 * values[:, 1]) & (values[:, 1] > (_WIDE * edge_m) ** 2)
     flat &= (values[:, 0] <= settings.thickest_m**2) & (number > 0)
-    count = np.bincount(group[kept], minlength=keys.size)
-    used = flat[cube_of] & (count >= settings.least_returns)
+    used = flat[cube_of] & (windows.count >= least)
     used &= np.bincount(cube_of[used], minlength=cubes.size)[cube_of] > 1
-    pose = np.bincount(group[kept], near.pose[kept], keys.size) / np.maximum(count, 1)
+    pose = np.bincount(group[kept], near.pose[kept], keys.size) / np.maximum(windows.count, 1)
     tilt = values[:, 0] / (np.maximum(number, 1) * values[:, 1])
     return _Planes(
-        cube_of[used], _means(near.point_m, group, kept, keys.size)[used], count[used], traverse_of[used],
-        np.rint(pose[used]).astype(np.int64), vectors[:, :, 0], np.sqrt(values[:, 0]), tilt,
+        cube_of[used], (windows.mean_m + middle)[used], windows.count[used], near.traverse[window_of[used]],
+        np.rint(pose[used]).astype(np.int64), normal, np.sqrt(values[:, 0]), tilt,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Moments of the returns of each of g windows of a cube."""
+
+    count: Int64
+    mean_m: Float64
+    """(g, 3)"""
+    scatter_m2: Float64
+    """(g, 6) sums of products about the mean: xx, xy, xz, yy, yz, zz."""
+
+    @classmethod
+    def of(cls, point_m: Float64, group: Int64, kept: Bool, size: int) -> _Windows:
+        """From the kept points (n, 3) of each group."""
+        count, total, squares = np.zeros(size, np.int64), np.zeros((size, 3)), np.zeros((size, 6))
+        add_moments(point_m, group, kept, count, total, squares)
+        mean = total / np.maximum(count, 1)[:, None]
+        return cls(count, mean, squares - total[:, _FIRST] * mean[:, _SECOND])
+
+    def scattered(self, cube_of: Int64, cubes: int, least: int) -> tuple[Int64, Float64, Float64]:
+        """Returns (c,), ascending variances (c, 3) and axes (c, 3, 3; columns) of cubes, about their windows' means."""
+        told = self.count >= least
+        number = np.bincount(cube_of[told], self.count[told], cubes).astype(np.int64)
+        covariance = np.empty((cubes, 3, 3))
+        for k, (a, b) in enumerate(zip(_FIRST, _SECOND, strict=True)):
+            sums = np.bincount(cube_of[told], self.scatter_m2[told, k], cubes)
+            covariance[:, a, b] = covariance[:, b, a] = sums / np.maximum(number, 1)
+        values, vectors = np.linalg.eigh(covariance)
+        return number, np.maximum(values, _LEAST_VARIANCE_M2), vectors
 
 
 def _packed(rows: Int64) -> Int64:
@@ -138,42 +170,79 @@ def _packed(rows: Int64) -> Int64:
     return out
 
 
-def _means(point_m: Float64, group: Int64, kept: Bool, size: int) -> Float64:
-    count = np.maximum(np.bincount(group[kept], minlength=size), 1)
-    sums = [np.bincount(group[kept], point_m[kept, a], size) for a in range(3)]
-    return np.asarray(np.stack(sums, axis=-1) / count[:, None])
+def _numbered(key: Int64) -> tuple[Int64, Int64]:
+    """Distinct numbers, ascending, and the rank (n,) of each of n numbers among them; none is negative."""
+    size = int(key.max()) + 1
+    if size > _SPARSE * key.size:
+        return np.unique(key, return_inverse=True)
+    there = np.zeros(size, np.bool_)
+    there[key] = True
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[key]
 
 
-def _largest(planes: _Planes, most: int) -> list[int]:
-    """Cubes with the most returns, in their own order."""
-    total = np.bincount(planes.cube, planes.count.astype(np.float64))
-    order = np.argsort(-total, kind="stable")[:most]
-    return sorted(int(c) for c in order if total[c] > 0)
+def _chosen(place: Place, planes: _Planes, most: int) -> list[int]:
+    """Cubes whose planes make ties, in their own order: those with the most returns along, across and up, then of all.
+
+    Otherwise the road beside the vehicle would leave no room for the walls, which tell what it cannot.
+    """
+    total = np.bincount(planes.cube, planes.count.astype(np.float64), len(planes.normal))
+    order = np.argsort(-total, kind="stable")
+    order = order[total[order] > 0]
+    sine, cosine = math.sin(place.heading_rad), math.cos(place.heading_rad)
+    axes = np.array([[sine, cosine, 0.0], [cosine, -sine, 0.0], [0.0, 0.0, 1.0]])
+    direction = np.abs(planes.normal[order] @ axes.T).argmax(axis=1)
+    first = np.concatenate([np.flatnonzero(direction == axis)[: most // _SHARE] for axis in range(3)])
+    rest = np.setdiff1d(np.arange(order.size), first)
+    return sorted(order[np.concatenate([first, rest])[:most]].tolist())
 
 
-def _pairs(count: int) -> list[tuple[int, int]]:
-    """Each window with the next, and with the one half the way through: neighbours, and those long after."""
-    half = count // 2
-    far = [(k, k + half) for k in range(count - half)] if half > 1 else []
-    return [*pairwise(range(count)), *far]
+def _pairs(planes: _Planes, cubes: Sequence[int]) -> tuple[Int64, Int64, Float64]:
+    """Pairs (t,) of windows of each cube, and by what their σ are larger (t,).
+
+    Each window is paired with the next, and with the one half the way through: neighbours, and those long after.
+    """
+    pairs, weaker = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+    for cube in cubes:
+        windows = np.flatnonzero(planes.cube == cube)
+        half = windows.size // 2
+        steps = (1, half) if half > 1 else (1,)
+        own = np.concatenate([np.stack([windows[:-step], windows[step:]], axis=-1) for step in steps])
+        pairs.append(own)
+        weaker.append(np.full(len(own), math.sqrt(len(own) / (windows.size - 1))))
+    first, second = np.concatenate(pairs).T
+    return first, second, np.concatenate(weaker)
 
 
-def _tie(
-    place: Place, readings: Sequence[PassReadings], planes: _Planes, windows: tuple[int, int], settings: TieSettings
-) -> Tie:
-    """The tie of two windows of one cube."""
-    a, b = windows
+def _ties(
+    place: Place,
+    readings: Sequence[PassReadings],
+    planes: _Planes,
+    pairs: tuple[Int64, Int64],
+    weaker: Float64,
+    settings: TieSettings,
+) -> list[Tie]:
+    """The ties of pairs of windows, each of one cube."""
+    a, b = pairs
     cube = planes.cube[a]
     normal = planes.normal[cube]
     between = planes.mean_m[b] - planes.mean_m[a]
-    value = float(normal @ between)
-    lateral2 = max(float(between @ between) - value**2, 0.0)
+    value = np.einsum("ni,ni->n", normal, between)
+    lateral2 = np.maximum(np.einsum("ni,ni->n", between, between) - value**2, 0.0)
     noise = planes.thickness_m[cube] ** 2 * (1.0 / planes.count[a] + 1.0 / planes.count[b])
-    sigma = math.sqrt(float(noise + lateral2 * planes.tilt[cube]) + 2.0 * settings.uneven_m**2)
-    offset = np.array([place.easting_m, place.northing_m, 0.0])
-    one, other = (
-        End(readings[planes.traverse[k]], int(planes.pose[k]), planes.mean_m[k] + offset) for k in (a, b)
-    )  # fmt: skip
-    direction = level_from_map(normal[None], one.readings.convergence_rad)[0]
-    why = TOO_FAR if abs(value) > settings.most_apart_m else COUNTS
-    return Tie(PLANE, (one, other), direction, value, sigma, int(planes.count[a] + planes.count[b]), math.nan, why)
+    sigma = weaker * np.sqrt(noise + lateral2 * planes.tilt[cube] + 2.0 * settings.uneven_m**2)
+    mean = planes.mean_m + np.array([place.easting_m, place.northing_m, 0.0])
+    ends = [
+        End(readings[traverse], pose, point)
+        for traverse, pose, point in zip(planes.traverse.tolist(), planes.pose.tolist(), mean, strict=True)
+    ]
+    direction = np.empty((a.size, 3))
+    for traverse, one in enumerate(readings):
+        own = planes.traverse[a] == traverse
+        direction[own] = level_from_map(normal[own], one.convergence_rad)
+    out = []
+    for k, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
+        count = int(planes.count[i] + planes.count[j])
+        why = TOO_FAR if abs(value[k]) > settings.most_apart_m else COUNTS
+        measured = float(value[k]), float(sigma[k])
+        out.append(Tie(PLANE, (ends[i], ends[j]), direction[k], *measured, count, math.nan, why, group=k))
+    return out

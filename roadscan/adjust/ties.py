@@ -116,15 +116,17 @@ def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
     if not found:
         return Ties.joined([])
     n = len(found)
+    direction = np.array([tie.direction_level for tie in found])
     derivatives = np.zeros((n, 2, 6))
-    for k, tie in enumerate(found):
-        for side, end in enumerate(tie.ends):
-            pose = np.array([end.pose])
-            arm = end.readings.arm_body_m(end.point_m[None], pose)
-            sign = 1.0 - 2.0 * side
-            derivatives[k, side] = sign * partials(
-                tie.direction_level[None], end.readings.level_from_body[pose], arm
-            )[0]  # fmt: skip
+    for side in (0, 1):
+        ends = [tie.ends[side] for tie in found]
+        point, pose = np.array([end.point_m for end in ends]), np.array([end.pose for end in ends])
+        seen = np.array([id(end.readings) for end in ends])
+        for readings in {id(end.readings): end.readings for end in ends}.values():
+            own = np.flatnonzero(seen == id(readings))
+            arm = readings.arm_body_m(point[own], pose[own])
+            derivatives[own, side] = partials(direction[own], readings.level_from_body[pose[own]], arm)
+    derivatives[:, 1] *= -1.0
     observations = Observations(
         np.array([KINDS.index(t.kind) for t in found], np.uint8),
         np.array([[e.readings.run for e in t.ends] for t in found], np.int32),

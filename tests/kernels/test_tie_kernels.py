@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from roadscan.kernels.adjust.correlation import Laid, correlate, lay_upon
 from roadscan.kernels.adjust.patch_cells import Cells, Frame, Splat, cell_numbers, fill_cells, local_axes, splat
+from roadscan.kernels.adjust.plane_moments import add_moments, leave_out_far
 from roadscan.kernels.adjust.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 
 
@@ -127,3 +128,23 @@ def test_lay_upon_a_shifted_picture() -> None:
     slope = laid.first_slope[inside]
     assert np.abs(slope - laid.second_slope[inside]).max() < 0.1 * np.abs(slope).max()
     assert slope[..., 1] == pytest.approx(np.gradient(wave, axis=0)[inside])
+
+
+def test_moments_of_groups_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(3)
+    point, group, kept = rng.normal(size=(40, 3)), rng.integers(0, 3, 40), rng.random(40) < 0.8
+    count, total, squares = np.zeros(4, np.int64), np.zeros((4, 3)), np.zeros((4, 6))
+    add_moments(point, group, kept, count, total, squares)
+    for g in range(4):
+        own = point[kept & (group == g)]
+        assert count[g] == len(own)
+        assert total[g] == pytest.approx(own.sum(axis=0))
+        assert squares[g] == pytest.approx((own.T @ own)[np.triu_indices(3)])
+
+
+def test_points_far_from_the_plane_of_their_group_are_left_out() -> None:
+    point = np.array([[0.0, 0.0, 0.1], [5.0, 0.0, 0.3], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0]])
+    kept = np.array([True, True, True, False])
+    normal = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    leave_out_far(point, np.array([0, 0, 1, 0]), np.zeros((2, 3)), normal, np.array([0.2, -1.0]), kept)
+    assert kept.tolist() == [True, False, False, False]

@@ -150,7 +150,8 @@ def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float])
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
     """Places of dense sensors, then those of lidars, which are larger: they are numbered through."""
     dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
-    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], settings)
+    ahead = settings.model_copy(update={"per_km": settings.lidar_per_km})
+    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], ahead)
     return [*dense, *(replace(place, number=len(dense) + place.number) for place in sparse)]
 
 
@@ -223,11 +224,11 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[str]:
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
     """Points that no pass saw, and how far they lie from where the nearest sensor went."""
     seen = {one.point.number for one in sightings if one.status != "unseen"}
-    ways = np.concatenate([np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks])
+    unseen = [one for one in work.points if one.number not in seen]
+    ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
     return [
         f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
-        for one in work.points
-        if one.number not in seen
+        for one in unseen
     ]
 
 

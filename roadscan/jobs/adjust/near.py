@@ -25,6 +25,9 @@ Int64 = npt.NDArray[np.int64]
 _POSE_STEP_NS: Final = 2_000_000
 """Readings so near in time share a pose: at 30 m/s arms of 60 mm more or less."""
 _KEPT_GROUPS: Final = 8
+"""Row groups of profiles, as they are stored."""
+_KEPT_RETURNS: Final = 6_000_000
+"""Returns of a lidar, placed: those of one place are near the next one, too. They take 34 bytes each."""
 
 
 Sources: TypeAlias = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
@@ -107,6 +110,7 @@ class NearReader:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)
         self._kept: dict[tuple[str, int], pa.RecordBatch] = {}
         self._apart_m = apart_m
+        self._returns: dict[tuple[str, int], PlacedReadings] = {}
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
         """Readings of one traverse within a circle."""
@@ -122,27 +126,51 @@ class NearReader:
 
     def _placed(self, file: NearFile, group: int, traverse: Traverse, circle: Circle) -> Iterator[PlacedReadings]:
         """Readings of a row group within the traverse and the circle."""
-        batch = self._batch(file, group)
-        column = batch.column("epoch_gps_ns").to_numpy()
-        rows = np.flatnonzero((column >= traverse.first_gps_ns) & (column <= traverse.last_gps_ns))
-        if not rows.size:
-            return
-        if rows.size < batch.num_rows:
-            in_order = rows[-1] - rows[0] + 1 == rows.size
-            batch = batch.slice(int(rows[0]), rows.size) if in_order else batch.take(rows)
-        if self._apart_m and file.source.table == "scans":
-            every = self._every(file.source, batch.column("epoch_gps_ns").to_numpy())
-            batch = batch.take(np.arange(0, batch.num_rows, every)) if every > 1 else batch
-        found = placed_readings(batch, file.source, self._placer.placement(file.source))
-        away = found.points_m[:, :2] - [circle.easting_m, circle.northing_m]
-        near = np.einsum("ni,ni->n", away, away) <= circle.radius_m**2
+        span = traverse.first_gps_ns, traverse.last_gps_ns
+        if file.source.table == "returns":
+            found = self._placed_returns(file, group)
+            within = (found.epoch_gps_ns >= span[0]) & (found.epoch_gps_ns <= span[1])
+        else:
+            profiles = self._profiles(file, group, span)
+            if profiles is None:
+                return
+            found = placed_readings(profiles, file.source, self._placer.placement(file.source))
+            within = np.ones(len(found.points_m), np.bool_)
+        east, north = found.points_m[:, 0] - circle.easting_m, found.points_m[:, 1] - circle.northing_m
+        near = within & (east * east + north * north <= circle.radius_m**2)
         if near.any():
             yield found.chosen(near)
 
+    def _placed_returns(self, file: NearFile, group: int) -> PlacedReadings:
+        """Returns of a row group, the row of each its own."""
+        known = self._returns.get((file.path, group))
+        if known is None:
+            batch = read_rows(self._store, file.source, file.path, [group]).combine_chunks().to_batches()[0]
+            known = placed_readings(batch, file.source, self._placer.placement(file.source))
+            self._returns[file.path, group] = known
+            while len(self._returns) > 1 and sum(len(one.points_m) for one in self._returns.values()) > _KEPT_RETURNS:
+                self._returns.pop(next(iter(self._returns)))
+        return known
+
+    def _profiles(self, file: NearFile, group: int, span: tuple[int, int]) -> pa.RecordBatch | None:
+        """Rows of a row group within a span of epochs, no closer than is wanted; None where there is none."""
+        batch = self._batch(file, group)
+        column = batch.column("epoch_gps_ns").to_numpy()
+        rows = np.flatnonzero((column >= span[0]) & (column <= span[1]))
+        if not rows.size:
+            return None
+        rows = rows[:: self._every(file.source, column[rows])]
+        if rows.size == batch.num_rows:
+            return batch
+        return batch.slice(int(rows[0]), rows.size) if rows[-1] - rows[0] + 1 == rows.size else batch.take(rows)
+
     def _every(self, source: ReadingSource, epochs_gps_ns: Int64) -> int:
         """Of each so many profiles in a row one is enough."""
-        poses = self._placer.trajectory(source).poses(epochs_gps_ns[[0, -1]])
-        if epochs_gps_ns.size < 3 or not poses.found.all():
+        trajectory = self._placer.trajectory(source)
+        if not self._apart_m or trajectory is None or epochs_gps_ns.size < 3:
+            return 1
+        poses = trajectory.poses(epochs_gps_ns[[0, -1]])
+        if not poses.found.all():
             return 1
         driven_m = float(np.linalg.norm(np.diff(poses.position_world_m, axis=0)))
         return max(1, int(self._apart_m * (epochs_gps_ns.size - 1) / max(driven_m, 1e-3)))
@@ -160,7 +188,7 @@ class NearReader:
         files = self._files.get((run, traverse.sensor), [])
         found = PlacedReadings.joined(parts)
         trajectory = self._placer.trajectory(files[0].source) if files else None
-        steps, pose = np.unique(found.epoch_gps_ns // _POSE_STEP_NS, return_inverse=True)
+        steps, pose = _ranked(found.epoch_gps_ns // _POSE_STEP_NS)
         if trajectory is None or not steps.size:
             poses = _no_poses()
         else:
@@ -201,8 +229,11 @@ class PlacedReadings:
     """(r,)"""
 
     def chosen(self, which: npt.NDArray[np.bool_]) -> PlacedReadings:
-        """Some of them."""
-        return PlacedReadings(self.points_m[which], self.intensity[which], self.row[which], self.epoch_gps_ns)
+        """Some of them; of returns, whose rows are their own, those rows alone."""
+        points, intensity, row = self.points_m[which], self.intensity[which], self.row[which]
+        if len(which) == self.epoch_gps_ns.size and len(row) < len(which):
+            return PlacedReadings(points, intensity, np.arange(row.size), self.epoch_gps_ns[row])
+        return PlacedReadings(points, intensity, row, self.epoch_gps_ns)
 
     @classmethod
     def joined(cls, parts: Sequence[PlacedReadings]) -> PlacedReadings:
@@ -236,6 +267,15 @@ def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Pla
         digital = batch.column("intensity").flatten().to_numpy(zero_copy_only=False)
         intensity = digital[kept].astype(np.uint16) * np.uint16(EIGHT_TO_SIXTEEN_BITS)
     return PlacedReadings(points, intensity, kept // geometry.readings, profiles.epoch_gps_ns)
+
+
+def _ranked(numbers: Int64) -> tuple[Int64, Int64]:
+    """Distinct numbers, ascending, and the rank (n,) of each among them; numbers that ascend need no sorting."""
+    step = np.diff(numbers)
+    if (step < 0).any():
+        return np.unique(numbers, return_inverse=True)
+    new = np.concatenate([np.ones(min(numbers.size, 1), np.bool_), step > 0])
+    return numbers[new], np.cumsum(new) - 1
 
 
 def _no_poses() -> LevelPoses:

@@ -14,8 +14,10 @@ class PlaceSettings(Strict):
     """Places per kilometre of road and overlapping strip."""
     radius_m: float = Field(default=0.5, gt=0.0, le=20.0)
     """Half the edge of the patch of road that is compared (m)."""
+    lidar_per_km: float = Field(default=50.0, gt=0.0, le=2000.0)
+    """Places per kilometre for sensors that see ahead, whose planes are compared."""
     lidar_radius_m: float = Field(default=8.0, gt=0.0, le=100.0)
-    """The same for sensors that see ahead, whose planes are compared (m)."""
+    """Half the edge of the square that their planes are taken from (m)."""
     margin_m: float = Field(default=0.3, ge=0.0)
     """Readings are taken from so much farther ahead and behind: passes lie apart by what their poses are off (m)."""
     least_overlap_m: float = Field(default=0.2, gt=0.0)
@@ -81,5 +83,6 @@ class TieSettings(Strict):
     """Returns of a plane scatter about it no more than this (m, 1 σ)."""
     uneven_m: float = Field(default=0.003, ge=0.0)
     """1 σ of how far the means of returns on different spots of a plane differ because it is uneven (m)."""
-    most_planes: int = Field(default=60, ge=1)
-    """Planes of a place that make ties: those with the most returns."""
+    most_planes: int = Field(default=30, ge=1)
+    """Planes of a place that make ties: those with the most returns, a sixth of them for each direction (along the
+    road, across and up) where there are so many."""

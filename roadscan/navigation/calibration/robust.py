@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy
+from scipy.special import chdtrc, chdtri, gammaincinv
 
 from roadscan.model.settings.calibration import CalibrationSettings
 from roadscan.navigation.calibration.observations import Observations
@@ -140,7 +140,7 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
     redundancy = rows - parameters
     if redundancy < 1.0 or whole == 0:
         return 1.0
-    if squares <= scipy.stats.chi2.ppf(_SIGNIFICANT, redundancy):
+    if squares <= 2.0 * gammaincinv(redundancy / 2.0, _SIGNIFICANT):
         return 1.0
     # Normal equations hold the mean weight where Huber's formula has the squared share of whole residuals.
     clipped = (total_weight / used) / (whole / used) ** 2
@@ -152,10 +152,10 @@ def length_limit(limit: float, rows: int) -> float:
     """Length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
     # Farther out probabilities have no number.
     usual = min(limit, 30.0)
-    return float(np.sqrt(scipy.stats.chi2.isf(scipy.stats.chi2.sf(usual**2, 1), rows))) + limit - usual
+    return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual
 
 
 @cache
 def _median(rows: int) -> float:
     """Median of the squared length of `rows` standard normal numbers."""
-    return float(scipy.stats.chi2.median(rows))
+    return float(2.0 * gammaincinv(rows / 2.0, 0.5))

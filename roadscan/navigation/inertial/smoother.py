@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy
+from scipy.special import chdtri
 
 from roadscan.kernels.inertial.kalman import filter_forwards
 from roadscan.kernels.inertial.kalman_smoother import Poses, smooth_backwards, spread
@@ -184,7 +184,7 @@ def _model(vehicle: VehicleSensors, config: SmootherConfig) -> Model:
         zero_rate_sigma=float(np.radians(config.standing_deg_per_s)),
         loose_rate=0.2,
         loose_force=2.0,
-        outlier=np.array([np.inf, *(scipy.stats.chi2.ppf(1.0 - config.outlier_probability, c) / c for c in (1, 2, 3))]),
+        outlier=np.array([np.inf, *(chdtri(c, config.outlier_probability) / c for c in (1, 2, 3))]),
         patience_s=config.outlier_patience_s,
         delay_wander=config.imu_clock_wander_ms_per_sqrt_s * 1e-3,
         interval_s=1.0 / config.constraints_per_s,

@@ -1,4 +1,4 @@
-"""The reference site through raw logs: 3.3 km, 12 runs, control each 300 m or 825 m, a check point each 25 m.
+"""The reference site through raw logs: 3.3 km, 12 runs, painted control each 300 m or 825 m, 500 painted check points.
 
 The logs are simulated, and the stages from ingest to adjustment run as for any survey. What counts is the height of the
 adjusted surface at the check points against the true one. Beside it stands what the best linear unbiased estimate makes
@@ -6,11 +6,17 @@ of the same ties and sightings with the true statistics (dense covariances, no c
 points of a site err by chance, and both have the same luck. Then the evidence itself is held against the true poses.
 
 The survey of control is of the road without its macrotexture, as a prism on a plate is, and so is the true height.
+
+Sizes are settings: each seed takes 3 bytes a reading for its logs, which are removed once they are ingested, and about
+as much for the store. `reference_m=1000 reference_spacing_mm=5 reference_readings=2000 reference_seeds=1` is a
+kilometre at full density.
 """
 
 from __future__ import annotations
 
+import csv
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_reference_site import BARS, REPEATABILITY_MM, SITE, pose_covariance, survey_covariance
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.adjust.control import Sighting, observations_of
+from roadscan.adjust.control import Sighting
 from roadscan.adjust.observations import KINDS, Observations
 from roadscan.jobs.adjust import adjustment
 from roadscan.jobs.adjust.solution import Evidence, Solution
@@ -45,9 +51,15 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 STAGES = ("ingest", "navigate", "footprints", "adjust")
-CHECK_SPACING_M = 25.0
-OFFSET_M = 1.9
-"""Control and check points lie in the middle of the lane that all runs drive."""
+CHECKS_PER_M = 500 / 3300
+EDGE_M = 3.2
+"""Control lies at the edge of the pavement, on the right of the lane that all runs drive."""
+CHECKS_M = (0.8, 1.9, 2.9)
+"""Offsets of check points in turns: over the whole lane."""
+SURVEY_M = (0.003, 0.003, 0.002)
+"""1 σ of the survey of control: easting, northing, height."""
+_EACH = 10
+"""Of every so-manieth sighting the expected error is computed."""
 _HEIGHTS = (KINDS.index("height_tie"), KINDS.index("control_height"))
 _OFF = {"on": False}
 
@@ -89,18 +101,30 @@ class Outcome:
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """By spacing of the control and mode: mean absolute height error, best estimate, repeatability; the evidence."""
+    """Of each seed, by spacing of the control and mode: mean absolute height error, best estimate, repeatability, and
+    the evidence; then mean and spread over the seeds."""
     size = Settings.current()
-    for spacing in BARS:
-        name = folder / f"site-{spacing:.0f}"
-        yield from of_site(simulate(scene(spacing, size.reference_m, size.reference_runs), name).survey_file, spacing)
-        shutil.rmtree(name)
+    seen: dict[str, list[tuple[float, float | None]]] = {}
+    for seed in range(size.reference_seeds):
+        began, own = time.perf_counter(), folder / f"seed-{seed}"
+        survey_file = simulate(scene(size, seed), own).survey_file
+        for spacing in BARS:
+            survey_control(survey_file.parent, spacing, seed)
+            for figure in of_site(survey_file, spacing):
+                seen.setdefault(figure.what, []).append((figure.value, figure.other))
+                yield replace(figure, what=f"seed {seed}: {figure.what}")
+        yield Figure(f"seed {seed}: wall time of all", (time.perf_counter() - began) / 60.0, "min", 30.0, "bar")
+        shutil.rmtree(own)
+    if size.reference_seeds > 1:
+        for what, values in seen.items():
+            mean, spread = np.mean([v for v, _ in values]), np.std([v for v, _ in values], ddof=1)
+            yield Figure(f"mean of {len(values)} seeds, {what}", float(mean), "mm", float(spread), "spread")
 
 
 def of_site(survey_file: Path, spacing: float) -> Iterator[Figure]:
-    """Figures of a simulated site."""
+    """Figures of a simulated site with the control of one spacing."""
     for mode, bar in zip(("each_pass", "joint"), BARS[spacing], strict=True):
-        one = adjusted(survey_file, mode)
+        one = adjusted(survey_file, mode, spacing)
         found = outcome(one, joint=mode == "joint")
         what = f"{spacing:.0f} m, {'all runs' if mode == 'joint' else 'each run alone'}, from raw logs"
         mean, best = (1e3 * float(np.abs(values).mean()) for values in (found.error, found.best))
@@ -110,38 +134,78 @@ def of_site(survey_file: Path, spacing: float) -> Iterator[Figure]:
     yield from of_evidence(one, f"{spacing:.0f} m")
 
 
-def scene(spacing_m: float, length_m: float, runs: int) -> Scene:
-    """The reference site, longer: points without paint, profilers alone, a post-processor's errors."""
-    points = [("gcp", float(s)) for s in np.arange(0.0, length_m + 0.1, spacing_m)]
-    points += [("check", float(s)) for s in np.arange(CHECK_SPACING_M / 2, length_m, CHECK_SPACING_M)]
-    targets = [
-        {"station_m": min(max(s, 1.0), length_m - 4.0), "offset_m": OFFSET_M, "role": role}
-        for role, s in sorted(points)
-    ]
+def control_stations(spacing_m: float, length_m: float) -> Float64:
+    """Stations of the control points, the ends of the site among them."""
+    return np.clip(np.arange(0.0, length_m + 0.1, spacing_m), 1.0, length_m - 4.0)
+
+
+def scene(size: Settings, seed: int) -> Scene:
+    """The reference site, longer: profilers alone, a post-processor's errors, control without errors."""
+    length = size.reference_m
+    gcps = np.unique(np.concatenate([control_stations(spacing, length) for spacing in BARS]))
+    checks = (np.arange(round(CHECKS_PER_M * length)) + 0.5) / CHECKS_PER_M
+    checks = checks[np.abs(checks[:, None] - gcps).min(axis=1) > 1.0]
+    points = [(s, EDGE_M, "gcp") for s in gcps.tolist()]
+    points += [(s, CHECKS_M[k % len(CHECKS_M)], "check") for k, s in enumerate(checks.tolist())]
+    targets = [{"station_m": s, "offset_m": offset, "role": role} for s, offset, role in points]
     bare: dict[str, Any] = {
         k: [] for k in ("joints", "cracks", "alligators", "potholes", "patches", "stains", "tyre_marks")
     }
     return Scene.load("reference_site").changed(
-        length_m=length_m,
-        road={"alignment": [{"kind": "straight", "length_m": length_m + 200.0}], "targets": targets, **bare},
-        passes=[{"lane": 2, "offset_m": (-0.2, 0.0, 0.2)[k % 3]} for k in range(runs)],
+        seed=7201 + seed,
+        length_m=length,
+        road={"alignment": [{"kind": "straight", "length_m": length + 200.0}], "targets": targets, **bare},
+        passes=[{"lane": 2, "offset_m": (-0.2, 0.0, 0.2)[k % 3]} for k in range(size.reference_runs)],
         roadside={"poles": [], "trees": []},
-        profilers={"spacing_m": 0.05, "readings": 400, "head_imus": None},
+        profilers={
+            "spacing_m": size.reference_spacing_mm / 1e3, "readings": size.reference_readings, "head_imus": None,
+        },
         lidar=_OFF, imu=_OFF, gnss=_OFF, encoder=_OFF, camera=_OFF,
         vehicle={"speed_m_per_s": 100 / 3.6, "standstill_s": 0.0},
         noise={
-            "position_m": 0.010, "down_m": 0.015, "time_constant_s": 120.0, "attitude_deg": 0.004, "heading_deg": 0.008,
-            "attitude_time_constant_s": 60.0, "control_m": 0.002,
+            "profiler_range_m": 0.0005, "position_m": 0.010, "down_m": 0.015, "time_constant_s": 120.0,
+            "attitude_deg": 0.004, "heading_deg": 0.008, "attitude_time_constant_s": 60.0, "control_m": 0.0,
         },
     )  # fmt: skip
 
 
-def adjusted(survey_file: Path, mode: str) -> Adjusted:
-    """The site after its stages, with what the adjustment was given."""
+def survey_control(folder: Path, spacing_m: float, seed: int) -> None:
+    """Write the control of one spacing, with the errors of its survey; the points of the other spacing are checks.
+
+    Both spacings have one survey, so that what was seen of a check point is seen once.
+    """
+    known = truth.load(folder)
+    rng = np.random.default_rng(seed)
+    own = control_stations(spacing_m, known.scene.length_m)
+    with (folder / "control.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row, target in zip(rows, known.scene.road.targets, strict=True):
+        is_own = target.role == "gcp" and bool(np.abs(own - target.station_m).min() < 1e-6)
+        row["role"] = "gcp" if is_own else "check"
+        for axis, sigma in zip(("easting_m", "northing_m", "height_m"), SURVEY_M, strict=True):
+            row[axis] = f"{float(row[axis]) + sigma * rng.standard_normal():.4f}"
+        row["sigma_horizontal_m"], row["sigma_height_m"] = f"{SURVEY_M[0]}", f"{SURVEY_M[2]}"
+    with control_file(folder, spacing_m).open("w", newline="") as stream:
+        out = csv.DictWriter(stream, list(rows[0]))
+        out.writeheader()
+        out.writerows(rows)
+
+
+def control_file(folder: Path, spacing_m: float) -> Path:
+    """Where the control of one spacing stands."""
+    return folder / f"control-{spacing_m:.0f}.csv"
+
+
+def adjusted(survey_file: Path, mode: str, spacing_m: float) -> Adjusted:
+    """The site after its stages, with what the adjustment was given; the logs of the profilers are gone then."""
     survey = Survey.load(survey_file)
     values = survey.config.model_dump() | {"rig": survey.rig.model_dump()}
     values["adjust"] |= {"mode": mode}
-    values["adjust"]["ties"]["cell_m"] = 0.05
+    values["adjust"]["targets"] |= {"shape": "circle"}
+    values["control"][0]["path"] = control_file(survey.folder, spacing_m).name
+    values["adjust"]["places"]["per_km"] = 100.0
+    if Settings.current().reference_spacing_mm > 20.0:
+        values["adjust"]["ties"]["cell_m"] = 0.05
     store = Store(str(survey_file.parent / "store"), survey.config.id)
     kept: list[tuple[Evidence, Solution]] = []
     original = adjustment.solve
@@ -153,7 +217,10 @@ def adjusted(survey_file: Path, mode: str) -> Adjusted:
 
     with compute_on(Settings.current().workers) as compute, mock.patch.object(adjustment, "solve", solve):
         session = Session(Survey.parse(values, folder=survey.folder), store, compute, None, Reporter())
-        run_stages(session, [stage_named(name) for name in STAGES])
+        run_stages(session, [stage_named(STAGES[0])])
+        for log in survey.folder.glob("raw/*/profiler_*.parquet"):
+            log.unlink()
+        run_stages(session, [stage_named(name) for name in STAGES[1:]])
     evidence, solution = kept[-1]
     return Adjusted(Session(session.survey, store), evidence, solution)
 
@@ -183,18 +250,17 @@ def outcome(one: Adjusted, *, joint: bool) -> Outcome:
     own = pose_covariance(road, by, by) + np.diag(by.sigma_m**2) + survey_covariance(by, joint=joint)
     across = pose_covariance(road, wanted, by)
     factor = cho_factor(own, overwrite_a=True, lower=True)
-    variance = [
-        pose_covariance(road, alone, alone)[0, 0] - row @ cho_solve(factor, row)
-        for alone, row in ((wanted.chosen(np.arange(wanted.size) == k), across[k]) for k in range(wanted.size))
-    ]
+    some = np.arange(0, wanted.size, _EACH)
+    prior = np.diag(pose_covariance(road, wanted.chosen(some), wanted.chosen(some)))
+    variance = prior - np.einsum("ij,ji->i", across[some], cho_solve(factor, across[some].T))
     best = wanted.observed_m + off - across @ cho_solve(factor, by.observed_m)
     number = np.array([s.point.number for s in checks], np.int64)
-    return Outcome(number, off + after, best, float(np.sqrt(2.0 / np.pi * np.array(variance)).mean()))
+    return Outcome(number, off + after, best, float(np.sqrt(2.0 / np.pi * variance).mean()))
 
 
 def of_observations(sightings: tuple[Sighting, ...]) -> list[Sighting]:
     """The sighting of each observation of the control."""
-    return [one for one in sightings for _ in range(observations_of([one]).size)]
+    return [one for one in sightings for _ in range(one.observed)]
 
 
 def of_evidence(one: Adjusted, what: str) -> Iterator[Figure]:

@@ -42,6 +42,12 @@ class Settings:
     """Length of the reference site whose logs are simulated."""
     reference_runs: int = 12
     """Runs over it."""
+    reference_spacing_mm: float = 10.0
+    """From profile to profile of its logs."""
+    reference_readings: int = 500
+    """Readings of a profile and head; the two heads see the lane together."""
+    reference_seeds: int = 2
+    """Whole draws of it."""
     seam_m: float = 120.0
     """Length of the roads whose seams are judged."""
     site: str = ""

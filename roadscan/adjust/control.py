@@ -93,6 +93,11 @@ class Sighting:
         """Whether the place was measured, and not the height alone."""
         return self.status in ("found", "picked")
 
+    @property
+    def observed(self) -> int:
+        """Number of observations that it makes."""
+        return int(np.isfinite(self.height_m)) + 2 * self.is_placed
+
 
 def passes_by(track: Track, easting_m: float, northing_m: float, radius_m: float, apart_s: float) -> list[Traverse]:
     """When a sensor saw a circle of the road, one each time that it came by.

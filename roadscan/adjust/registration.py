@@ -35,6 +35,8 @@ _STEP: Final = 2
 _LEAST_SHARE: Final = 0.25
 _LOBE_CELLS: Final = 4.0
 """Correlations this near to the best one, along what is known of the shift, belong to it."""
+_LEFT_OVER: Final = 2.0
+"""Of the variance that the best shift leaves of a picture, so many times is much more."""
 _ROUNDS: Final = 12
 _DONE_CELLS: Final = 0.01
 _COARSE: Final = 3
@@ -109,7 +111,7 @@ def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
     reach = int(settings.search_m / settings.shift_cell_m) // _STEP
     shifts = _STEP * np.arange(-reach, reach + 1)
     every = max(1, math.ceil(len(first) / math.sqrt(_SAMPLES)))
-    least = int(_LEAST_SHARE * (len(first) / every) ** 2)
+    least = int(_LEAST_SHARE * min(int(np.isfinite(picture).sum()) for picture in (first, second)) / every**2)
     likeness = np.empty((shifts.size, shifts.size))
     correlate(first, second, every, shifts, shifts, least, likeness)
     if not np.isfinite(likeness).any():
@@ -124,8 +126,7 @@ def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
         return _nothing(FEATURELESS, best)
     place, sums = found
     shift = _known(place, sums, one.sampling_m2 + other.sampling_m2, len(first), settings)
-    why = _why_not(likeness, shifts, start, shift, settings)
-    return replace(shift, why_not=why)
+    return shift if shift.why_not else _tested(likeness, shifts, start, shift, settings)
 
 
 def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, _Equations] | None:
@@ -241,21 +242,22 @@ def _directions(sums: _Equations, coherence: float) -> tuple[Float64, Float64]:
     return (along / length).T, np.sqrt(np.maximum(variance, 0.0)) / length
 
 
-def _why_not(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, settings: TieSettings) -> str:
-    """The test that a shift fails: known at all, inside the search, and the only one along what is known of it."""
-    if shift.why_not:
-        return shift.why_not
+def _tested(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, settings: TieSettings) -> Shift:
+    """A shift that lies inside the search, in the directions in which no other one fits as well."""
     if (np.abs(shift.directions @ (shift.value_m / settings.shift_cell_m)) > shifts[-1] - _STEP).any():
-        return AT_EDGE
+        return replace(shift, why_not=AT_EDGE)
     if np.abs(start).max() >= shifts[-1] and len(shift.directions) == 2:
-        return AT_EDGE
-    best = np.nanmax(likeness)
-    rows, columns = np.nonzero(np.nan_to_num(likeness, nan=-1.0) >= settings.rival_share * best)
-    for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
-        away = shift.directions @ (np.array([shifts[r], shifts[c]]) - start)
-        if np.linalg.norm(away) > _LOBE_CELLS and _is_summit(likeness, r, c):
-            return AMBIGUOUS
-    return ""
+        return replace(shift, why_not=AT_EDGE)
+    best = float(np.nanmax(likeness))
+    # What a rival leaves unexplained is not much more than what the best one does.
+    least = max(settings.rival_share * best, math.sqrt(max(1.0 - _LEFT_OVER * (1.0 - best**2), 0.0)))
+    single = np.ones(len(shift.directions), bool)
+    for r, c in zip(*(n.tolist() for n in np.nonzero(np.nan_to_num(likeness, nan=-1.0) >= least)), strict=True):
+        if _is_summit(likeness, r, c):
+            single &= np.abs(shift.directions @ (np.array([shifts[r], shifts[c]]) - start)) <= _LOBE_CELLS
+    if not single.any():
+        return replace(shift, why_not=AMBIGUOUS)
+    return replace(shift, directions=shift.directions[single], sigma_m=shift.sigma_m[single])
 
 
 def _is_summit(likeness: Float64, row: int, column: int) -> bool:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.helmert import helmert
+from roadscan.adjust.rigid_fit import rigid_fit
 from roadscan.model.errors import ConfigError
 from roadscan.model.frames import ENU_FROM_NED
 from roadscan.navigation.trajectory import Trajectory
@@ -52,6 +54,45 @@ def test_covariance_is_that_of_drawn_errors(with_scale: bool) -> None:
     assert normalised.mean() == pytest.approx(size, rel=0.12)
     assert np.mean(factors) == pytest.approx(1.0, rel=0.06)
     np.testing.assert_allclose(np.std(away, axis=0), found.sigma_of(elsewhere)[0], rtol=0.15)
+
+
+def sightings(rng: np.random.Generator, wrong_m: float) -> list[Sighting]:
+    """Eight points along 300 m, each seen by three runs whose poses err by 20 mm; the survey of point 5 is wrong."""
+    east = np.linspace(0.0, 300.0, 8)
+    found = []
+    for number, place in enumerate(np.stack([east, 10.0 * np.sin(east), 0.02 * east], axis=-1)):
+        lift = wrong_m * (number == 5)
+        survey = place + rng.normal(0.0, 0.002, 3) + [0.0, 0.0, lift]
+        point = ControlPoint(number, f"G{number}", "gcp", "", *survey.tolist(), 0.002, 0.002, None)
+        for run in range(3):
+            seen = place + SHIFT + rng.normal(0.0, 0.02, 3)
+            found.append(
+                Sighting(
+                    point, run, "p", "picked", "", 0, seen[0], seen[1], 1e-6 * np.eye(2), seen[2], 0.001, 0.0, 0.0, 9,
+                    1.0, 1.0, np.zeros(3), np.eye(3), 0.0,
+                )
+            )  # fmt: skip
+    return found
+
+
+def test_a_point_that_contradicts_the_others_is_left_out_and_told_by_how_much() -> None:
+    rng = np.random.default_rng(17)
+    seen = sightings(rng, 0.1)
+    found = rigid_fit(seen, np.full((len(seen), 3), 0.02))
+    assert found.control.weight[:, 2].tolist() == [1, 1, 1, 1, 1, 0, 1, 1]
+    sigma = found.control.left_out_sigma_m[5, 2]
+    assert 0.02 / np.sqrt(3) < sigma < 0.02
+    assert -found.control.left_out_m[5, 2] == pytest.approx(0.1, abs=3 * sigma)
+    without = rigid_fit([one for one in seen if one.point.number != 5], np.full((len(seen) - 3, 3), 0.02))
+    np.testing.assert_allclose(found.helmert.rotation, without.helmert.rotation, atol=1e-6)
+    # Normalised left-out errors of right points over many draws.
+    squares, dropped = [], 0
+    for _ in range(40):
+        fit = rigid_fit(sightings(rng, 0.0), np.full((24, 3), 0.02)).control
+        squares.append(np.nanmean(np.square(fit.left_out_m / fit.left_out_sigma_m)))
+        dropped += int((fit.weight[:, 2] == 0.0).sum())
+    assert np.mean(squares) == pytest.approx(1.0, rel=0.15)
+    assert dropped <= 2
 
 
 def test_corrections_move_every_point_as_the_transformation_does() -> None:

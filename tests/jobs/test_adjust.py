@@ -345,6 +345,24 @@ def test_control_in_another_crs_is_named(adjusted: Simulated, tmp_path: Path) ->
     assert not rows(copy.store(), "SELECT * FROM outputs WHERE product = 'control_sightings'")
 
 
+def test_one_point_in_another_crs_is_named_and_so_are_heights_exchanged_that_are_too_far_to_be_used(
+    adjusted: Simulated, tmp_path: Path
+) -> None:
+    """470 km to the west; and heights exchanged that differ by more than `largest_m`, as 300 m of a slope make them."""
+
+    def change(points: dict[str, dict[str, str]]) -> None:
+        points["G003"]["easting_m"] = f"{float(points['G003']['easting_m']) - 470_000.0:.4f}"
+        one, other = points["G001"], points["G005"]
+        one["height_m"], other["height_m"] = other["height_m"], one["height_m"]
+
+    copy = with_control(adjusted, tmp_path / "survey", change)
+    stages = ("ingest", "navigate", "footprints", "adjust")
+    lines = adjust(copy, stages=stages, adjust__control={"largest_m": 0.06}).reporter.lines
+    assert [line for line in lines if "1 of 6 control points lie where no pass saw the road: G003 (469," in line]
+    assert [line for line in lines if "2 control points lie far above or below" in line]
+    assert [line for line in lines if "the heights of G001 and G005 look exchanged" in line]
+
+
 @pytest.mark.parametrize("mode", ["each_pass", "vertical", "helmert"])
 def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Path, mode: str) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
@@ -355,6 +373,8 @@ def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Pat
     if mode == "vertical":
         level = rows(copy.store(), "SELECT max(abs(north_m) + abs(east_m) + abs(roll_rad)) AS most FROM corrections")
         assert level[0]["most"] == 0.0
+    left = rows(copy.store(), "FROM absolute_accuracy WHERE points = 'left_out' AND component = 'height'")
+    assert [row["count"] for row in left] == [12 if mode == "each_pass" else 4]
 
 
 def test_a_survey_without_overlap_and_control_is_told_so(raw: Simulated, tmp_path: Path) -> None:

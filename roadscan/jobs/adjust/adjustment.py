@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.adjust.control import Sighting
+from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.code_reach import code_digest
@@ -52,7 +52,7 @@ class Work:
     tracks: tuple[Track, ...]
     ties: tuple[TieTask, ...]
     control: tuple[ControlTask, ...]
-    points: int
+    points: tuple[ControlPoint, ...]
     """Control points of the survey."""
 
 
@@ -144,7 +144,7 @@ def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float])
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan))
     control = control_tasks(plan, sources, tracks, points, sigma_pose_m)
-    return Work(tuple(tracks), tuple(ties), tuple(control), len(points))
+    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points))
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
@@ -194,7 +194,7 @@ def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
     if not work.points:
         return "no control point"
     seen = len({one.point.number for one in sightings if one.status != "unseen"})
-    return f"{seen} of {work.points} control points seen"
+    return f"{seen} of {len(work.points)} control points seen"
 
 
 def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[str]:
@@ -202,7 +202,12 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[str]:
     notes: list[str] = []
     if work.points and not work.control:
         notes.append(
-            f"not one of the {work.points} control points lies where a pass drove: check crs of their [[control]]"
+            f"not one of the {len(work.points)} control points lies where a pass drove: check crs of their [[control]]"
+        )
+    elif beside := _beside(work, sightings):
+        notes.append(
+            f"{len(beside)} of {len(work.points)} control points lie where no pass saw the road: {listed(beside)}; "
+            "they are of another stretch, or in another CRS"
         )
     for status, words in (
         ("missed", "targets were not found"),
@@ -214,6 +219,17 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[str]:
             told = [f"{one.point.name} in {one.sensor}: {one.why_not}" for one in own]
             notes.append(f"{len(own)} {words}: {listed(told)}")
     return notes
+
+
+def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
+    """Points that no pass saw, and how far they lie from where the nearest sensor went."""
+    seen = {one.point.number for one in sightings if one.status != "unseen"}
+    unseen = [one for one in work.points if one.number not in seen]
+    ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
+    return [
+        f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
+        for one in unseen
+    ]
 
 
 def _lines(

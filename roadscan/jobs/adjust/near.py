@@ -96,14 +96,20 @@ class Circle:
 class NearReader:
     """Places readings near places; keeps the row groups that the next place may need as well."""
 
-    def __init__(self, store: Store, ground: Ground, files: Sequence[NearFile], runs: Sequence[str]) -> None:
-        """`runs` : all runs of the survey, in the order that traverses count them."""
+    def __init__(
+        self, store: Store, ground: Ground, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
+    ) -> None:
+        """`runs` : all runs of the survey, in the order that traverses count them.
+
+        apart_m : of profiles that lie closer than this, as many are left out as still keeps them closer.
+        """
         self._store, self._frame, self._runs = store, ground.map, runs
         self._placer = Placer(store, ground, [one.slice for one in files], recorded=True)
         self._files: dict[tuple[str, str], list[NearFile]] = {}
         for one in files:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)
         self._kept: dict[tuple[str, int], pa.RecordBatch] = {}
+        self._apart_m = apart_m
         self._returns: dict[tuple[str, int], PlacedReadings] = {}
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
@@ -147,15 +153,27 @@ class NearReader:
         return known
 
     def _profiles(self, file: NearFile, group: int, span: tuple[int, int]) -> pa.RecordBatch | None:
-        """Rows of a row group within a span of epochs; None where there is none."""
+        """Rows of a row group within a span of epochs, no closer than is wanted; None where there is none."""
         batch = self._batch(file, group)
         column = batch.column("epoch_gps_ns").to_numpy()
         rows = np.flatnonzero((column >= span[0]) & (column <= span[1]))
         if not rows.size:
             return None
+        rows = rows[:: self._every(file.source, column[rows])]
         if rows.size == batch.num_rows:
             return batch
         return batch.slice(int(rows[0]), rows.size) if rows[-1] - rows[0] + 1 == rows.size else batch.take(rows)
+
+    def _every(self, source: ReadingSource, epochs_gps_ns: Int64) -> int:
+        """Of each so many profiles in a row one is enough."""
+        trajectory = self._placer.trajectory(source)
+        if not self._apart_m or trajectory is None or epochs_gps_ns.size < 3:
+            return 1
+        poses = trajectory.poses(epochs_gps_ns[[0, -1]])
+        if not poses.found.all():
+            return 1
+        driven_m = float(np.linalg.norm(np.diff(poses.position_world_m, axis=0)))
+        return max(1, int(self._apart_m * (epochs_gps_ns.size - 1) / max(driven_m, 1e-3)))
 
     def _batch(self, file: NearFile, group: int) -> pa.RecordBatch:
         known = self._kept.get((file.path, group))

@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, adjust
+from roadscan.adjust.adjustment import Adjustment, ControlErrors, adjust
 from roadscan.adjust.control import Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height, listed, swapped
-from roadscan.adjust.helmert import helmert
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.rigid_fit import RigidFit, rigid_fit
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
@@ -135,11 +135,15 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     names = np.array([one.point.name for one in _by_observation(evidence.sightings)], dtype=object)
     entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
     notes = [datum] if datum else []
-    notes += _far_notes(far)
+    notes += _far_notes(far, evidence)
     if config.mode == "helmert":
-        corrections = _helmert(plan, evidence, entering)
-        ties = evidence.ties.observations.size
-        return Solution(corrections, np.zeros(ties), {}, control, tuple(notes), {}, 0)
+        fit = _rigid_fit(evidence, entering)
+        points = _points(fit.control, 0)
+        notes += _wrong_notes(evidence.sightings, points)
+        return Solution(
+            _rigid_corrections(plan, evidence, fit), np.zeros(evidence.ties.observations.size), points, control,
+            tuple(notes), {}, 0, leave_one_out(fit.control),
+        )  # fmt: skip
     accepted = evidence.ties.accepted
     first_point = int(evidence.ties.observations.place.max(initial=-1)) + 1
     points_apart = replace(control, place=control.place + first_point).chosen(entering)
@@ -148,7 +152,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found = adjust(joined, evidence.priors, settings)
     weight = np.zeros(accepted.size)
     weight[accepted] = found.weight[: int(accepted.sum())]
-    points = _points(found, first_point)
+    points = _points(found.control, first_point)
     notes += _wrong_notes(evidence.sightings, points)
     reached = {int(run) for run in np.unique(joined.run) if run != FIXED and _moves(evidence.priors[int(run)])}
     corrections = {evidence.runs[k]: _with_sigma(found, k) for k in sorted(reached)}
@@ -160,7 +164,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
 
 def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
     """The sighting of each observation of :func:`observations_of`."""
-    return [one for one in sightings for _ in range(observations_of([one]).size)]
+    return [one for one in sightings for _ in range(one.observed)]
 
 
 def _moves(prior: RunPrior) -> bool:
@@ -172,9 +176,8 @@ def _with_sigma(found: Adjustment, run: int) -> Corrections:
     return replace(own, sigma=found.sigma[run])
 
 
-def _points(found: Adjustment, first: int) -> dict[tuple[int, int], PointFigures]:
+def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFigures]:
     """Figures by number of the point and run; `first` : place that stands for point 0."""
-    control = found.control
     points: dict[tuple[int, int], PointFigures] = {}
     for k, (place, run) in enumerate(zip(control.place.tolist(), control.run.tolist(), strict=True)):
         points[place - first, run] = PointFigures(
@@ -185,14 +188,23 @@ def _points(found: Adjustment, first: int) -> dict[tuple[int, int], PointFigures
     return points
 
 
-def _far_notes(far: Mapping[str, float]) -> list[str]:
+def _far_notes(far: Mapping[str, float], evidence: Evidence) -> list[str]:
     if not far:
         return []
     words = [f"{name} ({away:+.3f} m)" for name, away in sorted(far.items())]
-    return [
+    notes = [
         f"{len(far)} control points lie far above or below the road that was measured, and are not used: "
         f"{listed(words)}; they are in another height datum or CRS, or under a bridge"
     ]
+    surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
+    # The poses are as they were recorded.
+    sigma = max((float(prior.sigmas[2]) for prior in evidence.priors), default=0.0)
+    points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
+    return notes + _swapped_notes(points)
+
+
+def _swapped_notes(points: Sequence[WrongPoint]) -> list[str]:
+    return [f"the heights of {one} and {other} look exchanged" for one, other in swapped(points)]
 
 
 def _wrong_notes(
@@ -214,27 +226,20 @@ def _wrong_notes(
         f"{len(ordered)} control points contradict all other evidence and do not count: "
         f"{listed([one.told() for one in ordered])}; their survey, or what stands for them, is wrong"
     ]
-    notes += [f"the heights of {one} and {other} look exchanged" for one, other in swapped(ordered)]
-    return notes
+    return notes + _swapped_notes(ordered)
 
 
-def _helmert(plan: SurveyPlan, evidence: Evidence, entering: Bool) -> dict[str, Corrections]:
-    """The one rigid movement of the survey onto its targets, as corrections of each run."""
-    sightings, rows = _by_observation(evidence.sightings), np.flatnonzero(entering)
-    names = {id(sightings[k]): sightings[k] for k in rows}
-    own = [one for one in names.values() if one.is_placed and np.isfinite(one.height_m)]
-    measured = np.array([[o.easting_m, o.northing_m, o.height_m] for o in own]).reshape(-1, 3)
-    surveyed = np.array([[o.point.easting_m, o.point.northing_m, o.point.height_m] for o in own]).reshape(-1, 3)
-    origin = measured.mean(axis=0) if own else np.zeros(3)
-    turned = float(np.mean([o.convergence_rad for o in own])) if own else 0.0
-    sigma = np.array(
-        [
-            [*[np.hypot(o.point.sigma_horizontal_m, np.sqrt(np.trace(o.covariance_m2) / 2))] * 2,
-             np.hypot(o.point.sigma_height_m, o.sigma_height_m)]
-            for o in own
-        ]
-    ).reshape(-1, 3)  # fmt: skip
-    found = helmert(level_from_map(measured - origin, turned), level_from_map(surveyed - origin, turned), sigma)
+def _rigid_fit(evidence: Evidence, entering: Bool) -> RigidFit:
+    """The one rigid movement of the survey onto its targets."""
+    sightings = _by_observation(evidence.sightings)
+    own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
+    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
+    sigma = np.array([evidence.priors[one.run].sigmas[:3] for one in seen]).reshape(-1, 3)
+    return rigid_fit(seen, sigma)
+
+
+def _rigid_corrections(plan: SurveyPlan, evidence: Evidence, fit: RigidFit) -> dict[str, Corrections]:
+    """A rigid movement as corrections of each run."""
     corrections: dict[str, Corrections] = {}
     for prior in evidence.priors:
         source = next((s for s, _ in plan.sources if s.run == prior.run and s.trajectory is not None), None)
@@ -246,6 +251,6 @@ def _helmert(plan: SurveyPlan, evidence: Evidence, entering: Bool) -> dict[str, 
         )
         poses = level_poses(recorded, plan.ground.map, knots)
         if poses.epoch_gps_ns.size:
-            places = level_from_map(poses.body_m - origin, turned)
-            corrections[prior.run] = found.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
+            places = level_from_map(poses.body_m - fit.origin_m, fit.convergence_rad)
+            corrections[prior.run] = fit.helmert.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
     return corrections

@@ -32,6 +32,8 @@ _PLACES: Final = 50
 """Places of a task: half a kilometre of one road at the usual spacing."""
 DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
+_APART: Final = 0.25
+"""Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
 _TURNS: Final = tuple(
     f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
 )
@@ -76,7 +78,7 @@ def tie_tasks(plan: SurveyPlan, sources: Sources, places: Sequence[Place], runs:
 
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write what was found (runs on a worker)."""
-    reader = NearReader(task.store, task.ground, task.files, task.runs)
+    reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
     parts = [
         ties_at(place, [reader.of(t, circle) for t in place.traverses], task.settings)
         for place in task.places

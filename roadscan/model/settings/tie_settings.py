@@ -10,7 +10,7 @@ from roadscan.model.strict import Strict
 class PlaceSettings(Strict):
     """Where passes are tied to one another."""
 
-    per_km: float = Field(default=100.0, gt=0.0, le=2000.0)
+    per_km: float = Field(default=200.0, gt=0.0, le=2000.0)
     """Places per kilometre of road and overlapping strip."""
     radius_m: float = Field(default=0.5, gt=0.0, le=20.0)
     """Half the edge of the patch of road that is compared (m)."""

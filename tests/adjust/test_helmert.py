@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.control import ControlPoint, Sighting
-from roadscan.adjust.helmert import helmert
-from roadscan.adjust.rigid_fit import rigid_fit
+from roadscan.adjust.helmert import helmert, rigid_fit
 from roadscan.model.errors import ConfigError
 from roadscan.model.frames import ENU_FROM_NED
 from roadscan.navigation.trajectory import Trajectory

@@ -63,7 +63,7 @@ def test_the_same_lane_and_the_opposite_direction_share_places() -> None:
 
 def test_a_track_is_left_to_the_first_that_sees_it() -> None:
     """Of three lanes the middle one leads where it comes first: no place of the others lies in it."""
-    places = places_of_overlap([lane(0, 0.0), lane(1, 3.6), lane(2, -3.6)], PlaceSettings())
+    places = places_of_overlap([lane(0, 0.0), lane(1, 3.6), lane(2, -3.6)], PlaceSettings(per_km=100.0))
     assert met(places) == {((0, "p"), (1, "p")): 101, ((0, "p"), (2, "p")): 101}
 
 
@@ -92,7 +92,7 @@ def test_a_loop_of_one_run_meets_itself_after_the_stated_time() -> None:
 
 def test_heads_of_one_run_are_for_quality_only() -> None:
     heads = [lane(0, 0.0, "left", right_m=0.2), lane(0, 0.0, "right", left_m=0.2)]
-    places = places_of_overlap(heads, PlaceSettings())
+    places = places_of_overlap(heads, PlaceSettings(per_km=100.0))
     assert met(places) == {((0, "left"), (0, "right")): 101}
     assert all(p.quality_only(30.0) for p in places)
     again = places_of_overlap([*heads, lane(1, 0.0, "left", right_m=0.2)], PlaceSettings())

@@ -97,7 +97,8 @@ class KittiDrive:
 
     def __init__(self, folder: Path, unpacked: Path) -> None:
         with tarfile.open(folder / "velodyne_points.tar.xz") as archive:
-            archive.extractall(unpacked, filter="data")
+            archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4
+            archive.extractall(unpacked)
         poses = pd.read_csv(folder / "poses.csv")
         self.stamp_s = poses.unix_utc_s.to_numpy() - poses.unix_utc_s[0]
         columns = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]

@@ -10,7 +10,12 @@ from scipy.spatial import Delaunay
 
 from roadscan.condition.natural_neighbour import insertion_order, interpolate
 from roadscan.kernels.condition.delaunay_mesh import dig, mesh_of, triangulate, walk
-from roadscan.kernels.condition.natural_neighbour import STEP_M, circle_centres, natural_neighbour_raster
+from roadscan.kernels.condition.natural_neighbour import (
+    STEP_M,
+    circle_centres,
+    natural_neighbour_raster,
+    slopes_of_points,
+)
 
 
 def scattered(n: int, seed: int = 0) -> np.ndarray:
@@ -98,6 +103,19 @@ def test_exact_on_linear_fields(kind: str, smooth: bool) -> None:
     )
     assert np.array_equal(np.isnan(out), ~inside)
     assert np.nanmax(wrong) < 1e-9
+
+
+def test_slopes_of_a_plane_and_of_a_paraboloid() -> None:
+    """Those of a plane at all points; those of x² + y², 2 x and 2 y, at points whose cells have an end well inside."""
+    places = STEP_M * np.rint(scattered(300, 4) / STEP_M)
+    mesh, count = meshed(places)
+    centres, slopes = np.empty((len(mesh.triangles), 2)), np.empty((300, 2))
+    circle_centres(mesh, count, centres)
+    slopes_of_points(mesh, count, centres, 5.0 + places @ [0.7, -0.3], slopes)
+    assert slopes == pytest.approx(np.tile([0.7, -0.3], (300, 1)), abs=1e-9)
+    slopes_of_points(mesh, count, centres, np.sum(places**2, axis=1), slopes)
+    inside = (np.abs(places - 0.5) < 0.3).all(axis=1)
+    assert slopes[inside] == pytest.approx(2.0 * places[inside], abs=1e-6)
 
 
 def test_franke_beside_linear() -> None:

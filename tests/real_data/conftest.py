@@ -96,7 +96,8 @@ def place(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Place:
 def kitti(place: Place) -> Path:
     """The KITTI survey, finished."""
     with tarfile.open(place.recordings / "kitti_drive" / "velodyne_points.tar.xz") as archive:
-        archive.extractall(place.unpacked / "kitti_drive", filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4
+        archive.extractall(place.unpacked / "kitti_drive")
     survey_file = place.folder / "kitti.toml"
     place.run(survey_file)
     return survey_file

@@ -162,7 +162,8 @@ VELO_FROM_IMU_M = np.array([-0.8086759, 0.3195559, -0.7997231])
 def drive(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kitti_drive")
     with tarfile.open(recordings / "kitti_drive" / "velodyne_points.tar.xz") as archive:
-        archive.extractall(folder, filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4
+        archive.extractall(folder)
     return folder
 
 

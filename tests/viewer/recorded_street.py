@@ -120,7 +120,8 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     (folder / "poses.csv").write_bytes((recording / "poses.csv").read_bytes())
     shutil.copytree(recording / "image_0", folder / "image_0")
     with tarfile.open(recording / "sweeps.tar.xz") as archive:
-        archive.extractall(folder / "sweeps", filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4
+        archive.extractall(folder / "sweeps")
     stamps = (recording / "poses.csv").read_text().splitlines()
     frames = [(line.split(",")[0], line.split(",")[1]) for line in stamps[1:]]
     swept = [one for one in frames if (folder / f"sweeps/velodyne_points/data/{int(one[0]):010d}.bin").is_file()]

@@ -12,12 +12,12 @@ import numpy.typing as npt
 from roadscan.adjust.adjustment import Adjustment, ControlErrors, adjust
 from roadscan.adjust.control import Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height, listed, swapped
+from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
-from roadscan.adjust.rigid_fit import RigidFit, rigid_fit
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of

@@ -20,7 +20,8 @@ from benchmarks.asset_streets import motorway, processed, town
 from benchmarks.drawn_streets import drawn_street
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
-from roadscan.assets.calibration import CURVES, GROUPS, Curve, curve_of
+from roadscan.assets.calibration import CURVES, Curve
+from roadscan.assets.kind import asset_kinds
 
 FITTED_ON: Final = range(100, 140)
 HELD_OUT: Final = range(10)
@@ -63,8 +64,8 @@ def fitted(objects: Sequence[Judged]) -> dict[str, Curve]:
     """The curve of each group that objects speak for: the greatest likelihood, less a doubt about any change."""
     curves = {}
     for group in CURVES:
-        own = [o for o in objects if GROUPS[o.kind] == group]
-        evidence = np.array([curve_of(o.kind).of_evidence(o.probability) for o in own])
+        own = [o for o in objects if asset_kinds()[o.kind].curve == group]
+        evidence = np.array([CURVES[group].of_evidence(o.probability) for o in own])
         odds, right = np.log(evidence / (1.0 - evidence)), np.array([o.is_right for o in own], np.float64)
 
         def loss(line: npt.NDArray[np.float64], odds: object = odds, right: object = right) -> float:

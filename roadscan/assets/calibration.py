@@ -29,21 +29,6 @@ class Curve(NamedTuple):
         return _of_odds((_odds(stated) - self.offset) / self.slope)
 
 
-GROUPS: Final = {
-    "sign": "signs",
-    "pole": "shafts", "lighting": "shafts", "signal": "shafts", "delineator": "shafts",
-    "tree": "trees",
-    "facade": "surfaces", "wall": "surfaces", "barrier": "surfaces", "guardrail": "surfaces", "fence": "surfaces",
-    "attenuator": "surfaces",
-    "kerb": "edges", "sidewalk": "edges", "median": "edges", "road_edge": "edges",
-    "shoulder": "products",
-    "lane_line": "paint", "road_marking": "paint",
-    "landscape_area": "areas",
-    "clearance": "clearances",
-}  # fmt: skip
-"""Group of each kind: kinds of one group share their evidence and its curve. A shoulder's is the product of what is
-stated of its edge and its line.
-"""
 CURVES: Final = {
     "signs": Curve(0.36, 1.45),
     "shafts": Curve(1.15, 0.46),
@@ -56,14 +41,15 @@ CURVES: Final = {
     "products": Curve(0.0, 1.0),
 }
 """Fitted to 771 objects of 40 drawn streets (seeds 100 to 139) by `python -m benchmarks asset_probability`. On ten
-others (seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them.
+others (seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them. A kind names its
+curve (:class:`roadscan.assets.kind.AssetKind`): kinds that share their evidence share one.
 """
 UNCHANGED: Final = Curve(0.0, 1.0)
 
 
-def curve_of(kind: str) -> Curve:
-    """Curve of a kind; that of a kind without a group, as one of another package, changes nothing."""
-    return CURVES.get(GROUPS.get(kind, ""), UNCHANGED)
+def curve_named(name: str) -> Curve:
+    """Curve of a name; that of an empty one changes nothing."""
+    return CURVES[name] if name else UNCHANGED
 
 
 def _odds(probability: float) -> float:

@@ -70,6 +70,8 @@ class AssetKind(ABC):
     name: ClassVar[str]
     """Of its table and its schema, such as `pole`."""
     title: ClassVar[str]
+    curve: ClassVar[str] = ""
+    """Curve of :mod:`roadscan.assets.calibration` that states its probabilities; empty: as the evidence says."""
     options: ClassVar[type[Strict]] = NoOptions
     after: ClassVar[Sequence[str]] = ()
     """Kinds whose objects this one looks at when it joins."""

@@ -7,14 +7,14 @@ import pytest
 
 from benchmarks.asset_scores import Judged
 from benchmarks.bench_asset_probability import fitted
-from roadscan.assets.calibration import CURVES, GROUPS, Curve, curve_of
-from roadscan.assets.kind import asset_kinds
+from roadscan.assets.calibration import CURVES, Curve, curve_named
+from roadscan.assets.kind import AssetKind, asset_kinds
 
 
 def test_each_kind_has_a_curve_and_others_none() -> None:
-    assert set(GROUPS) == set(asset_kinds())
-    assert set(GROUPS.values()) == set(CURVES)
-    assert curve_of("bench").stated(0.7) == pytest.approx(0.7)
+    assert {kind.curve for kind in asset_kinds().values()} == set(CURVES)
+    assert AssetKind.curve == ""
+    assert curve_named("").stated(0.7) == pytest.approx(0.7)
 
 
 @pytest.mark.parametrize("group", CURVES)
@@ -27,7 +27,7 @@ def test_more_evidence_is_never_less_probable(group: str) -> None:
 
 def test_the_fit_finds_the_curve_that_objects_were_drawn_from() -> None:
     """2,000 signs whose evidence claims too much: right are as many as the curve says."""
-    random, true, now = np.random.default_rng(5), Curve(-0.8, 0.5), curve_of("sign")
+    random, true, now = np.random.default_rng(5), Curve(-0.8, 0.5), CURVES["signs"]
     evidence = random.uniform(0.5, 0.999, 2000)
     right = random.random(2000) < [true.stated(p) for p in evidence]
     objects = [Judged("sign", now.stated(p), bool(r)) for p, r in zip(evidence, right, strict=True)]

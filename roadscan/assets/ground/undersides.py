@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.returns import Returns
 
@@ -38,11 +39,10 @@ def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float3
     """
     out = np.zeros(grid.shape, np.bool_)
     rows = np.flatnonzero(returns.height_m > returns.sensor_height_m + _OVER_SENSOR_M)
-    column = np.floor((returns.x_m[rows] - grid.x_min_m) / grid.cell_m).astype(np.int64)
-    row = np.floor((returns.y_m[rows] - grid.y_min_m) / grid.cell_m).astype(np.int64)
-    kept = (row >= 0) & (column >= 0) & (row < grid.rows) & (column < grid.columns)
-    kept[kept] = returns.height_m[rows[kept]] <= lowest_m[row[kept], column[kept]] + _NEAR_LOWEST_M
-    rows, row, column = rows[kept], row[kept], column[kept]
+    cell = cells_of(returns.x_m[rows], returns.y_m[rows], (grid.x_min_m, grid.y_min_m, grid.cell_m), grid.shape)
+    kept = cell >= 0
+    kept[kept] = returns.height_m[rows[kept]] <= lowest_m.flat[cell[kept]] + _NEAR_LOWEST_M
+    rows, (row, column) = rows[kept], np.unravel_index(cell[kept], grid.shape)
     if not rows.size or min(grid.shape) < 2:
         return out
     # slopes are made smooth, not heights: at the border these would be mirrored, and a bank look level

@@ -23,6 +23,7 @@ class Attenuator(AssetKind):
 
     name = "attenuator"
     title = "Attenuator"
+    curve = "surfaces"
     after = ("guardrail", "barrier")
     piece_schema = PIECE_SCHEMA
 

@@ -11,4 +11,5 @@ class Barrier(SurfaceKind):
 
     name = "barrier"
     title = "Barrier"
+    curve = "surfaces"
     code = classes.BARRIER

@@ -18,6 +18,7 @@ class Clearance(AssetKind):
 
     name = "clearance"
     title = "Clearance"
+    curve = "clearances"
     options = ClearanceOptions
     piece_schema = PIECE_SCHEMA
 

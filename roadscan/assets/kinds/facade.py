@@ -21,6 +21,7 @@ class Facade(SurfaceKind):
 
     name = "facade"
     title = "Façade"
+    curve = "surfaces"
     code = classes.BUILDING
 
     def marks(self, scene: Scene, rows: Any) -> Any:

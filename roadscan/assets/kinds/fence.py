@@ -11,4 +11,5 @@ class Fence(SurfaceKind):
 
     name = "fence"
     title = "Fencing"
+    curve = "surfaces"
     code = classes.FENCE

@@ -11,4 +11,5 @@ class Guardrail(SurfaceKind):
 
     name = "guardrail"
     title = "Guard Rail"
+    curve = "surfaces"
     code = classes.BARRIER

@@ -50,6 +50,7 @@ class Kerb(AssetKind):
 
     name: ClassVar[str] = "kerb"
     title: ClassVar[str] = "kerbs: steps beside the road"
+    curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = KerbOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 

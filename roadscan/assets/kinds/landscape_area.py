@@ -18,6 +18,7 @@ class LandscapeArea(AssetKind):
 
     name = "landscape_area"
     title = "Landscape Areas"
+    curve = "areas"
     options = LandscapeOptions
     piece_schema = PIECE_SCHEMA
 

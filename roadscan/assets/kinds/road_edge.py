@@ -32,6 +32,7 @@ class RoadEdge(AssetKind):
 
     name: ClassVar[str] = "road_edge"
     title: ClassVar[str] = "edges of the carriageway: kerbs, verges, barriers"
+    curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = RoadEdgeOptions
     piece_schema: ClassVar[pa.Schema] = line_schema(EDGE_COLUMNS)
 

@@ -42,6 +42,8 @@ class Shoulder(AssetKind):
 
     name: ClassVar[str] = "shoulder"
     title: ClassVar[str] = "shoulders: paved strips beyond the outer lane line"
+    curve: ClassVar[str] = "products"
+    """It is the product of what is stated of its edge and of its line."""
     options: ClassVar[type[Strict]] = ShoulderOptions
     after: ClassVar[Sequence[str]] = ("lane_line", "road_edge")
     piece_schema: ClassVar[pa.Schema] = pa.schema(

@@ -37,6 +37,7 @@ class Sidewalk(AssetKind):
 
     name: ClassVar[str] = "sidewalk"
     title: ClassVar[str] = "sidewalks: walkways behind a kerb"
+    curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = SidewalkOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 

@@ -22,6 +22,7 @@ class Sign(AssetKind):
 
     name = "sign"
     title = "Road Signs/Boards"
+    curve = "signs"
     options = SignOptions
     piece_schema = schema_of(
         ["width_m", "plate_height_m", "clearance_m", "facing_deg", "tilt_deg"], ["message", "type", "shape", "colour"]

@@ -11,4 +11,5 @@ class Wall(SurfaceKind):
 
     name = "wall"
     title = "Wall"
+    curve = "surfaces"
     code = classes.BARRIER

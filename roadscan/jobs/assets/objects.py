@@ -10,7 +10,7 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.assets.calibration import curve_of
+from roadscan.assets.calibration import curve_named
 from roadscan.assets.kind import AssetObject, asset_kinds
 from roadscan.assets.object_table import objects_of_table, table_of_objects
 from roadscan.assets.tiling import AssetGrid
@@ -159,7 +159,7 @@ def _joined(task: JoinTask) -> OutputRecord:
     pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
-    curve = curve_of(name)
+    curve = curve_named(kind.curve)
     found = [
         replace(one, probability=curve.stated(one.probability))
         for one in kind.objects(pieces.combine_chunks(), task.options, others)

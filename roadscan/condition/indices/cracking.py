@@ -41,19 +41,14 @@ class Cracking(ConditionIndex):
     def values(self, lane: LaneData) -> Iterator[Value]:
         """Values of sections."""
         for from_m, to_m in lane.sections_m:
+            share, reason = lane.paths_share(from_m, to_m), ""
             if lane.cracks is None:
-                reason = "there is no table of cracks: let the survey make the product `cracks`"
-                for one in self.quantities:
-                    yield Value(one.name, "section", from_m, to_m, np.nan, np.nan, 0.0, reason)
-                continue
-            share = lane.paths_share(from_m, to_m)
-            if share < lane.config.least_share:
+                share, reason = 0.0, "there is no table of cracks: let the survey make the product `cracks`"
+            elif share < lane.config.least_share:
                 reason = f"{100 * share:.0f} % of the wheel paths were measured"
-                for one in self.quantities:
-                    yield Value(one.name, "section", from_m, to_m, np.nan, np.nan, share, reason)
-            else:
-                for name, value in self._section(lane, from_m, to_m).items():
-                    yield Value(name, "section", from_m, to_m, value, np.nan, share)
+            found = {} if reason else self._section(lane, from_m, to_m)
+            for one in self.quantities:
+                yield Value(one.name, "section", from_m, to_m, found.get(one.name, np.nan), np.nan, share, reason)
 
     def _section(self, lane: LaneData, from_m: float, to_m: float) -> dict[str, float]:
         found = {one.name: 0.0 for one in self.quantities}

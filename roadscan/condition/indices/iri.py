@@ -19,6 +19,7 @@ from roadscan.condition.of_sections.wheel_paths import (
     LEAD_M,
     NOISES,
     WheelPath,
+    greatest_of,
     spread_of,
     wheel_paths,
     without_noise,
@@ -86,13 +87,11 @@ def _told(path: WheelPath) -> _Told:
     told.iri, told.sigma, told.reason = without_noise(rough)
     if told.reason:
         return told
-    rolling = rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside]
-    most = np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in rolling])
+    most = greatest_of(rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside])
     told.local, told.sigma_local = float(most[0]), spread_of(most)
-    if "start" in on.notes(path.ends)[0][0]:
+    told.reason = on.notes(path.ends)[0][0]
+    if "start" in told.reason:
         told.reason = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
-    elif on.notes(path.ends)[0][0]:
-        told.reason = f"{on.notes(path.ends)[0][0]}"
     return told
 
 

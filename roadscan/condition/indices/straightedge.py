@@ -12,7 +12,7 @@ import numpy as np
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.of_sections.wheel_paths import WheelPath, spread_of, wheel_paths
+from roadscan.condition.of_sections.wheel_paths import WheelPath, greatest_of, spread_of, wheel_paths
 from roadscan.condition.straightedge import LENGTHS_M, straightedge_mm
 
 _BEAMS: Final = {"straightedge_3m_max_mm": LENGTHS_M["3 m"], "straightedge_16ft_max_mm": LENGTHS_M["16 ft"]}
@@ -45,5 +45,5 @@ def _greatest(path: WheelPath, length_m: float) -> tuple[float, float]:
     """Greatest deviation in the section (mm), and its standard deviation."""
     away = [np.abs(straightedge_mm(path.profile.distance_m, height, length_m))[path.inside]
             for height in path.with_noise()]  # fmt: skip
-    most = np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in away])
+    most = greatest_of(np.array(away))
     return float(most[0]), spread_of(most)

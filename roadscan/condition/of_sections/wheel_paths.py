@@ -95,6 +95,11 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
     return found
 
 
+def greatest_of(rows: Float64) -> Float64:
+    """(k,) greatest known value of each row; NaN where none is known."""
+    return np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in rows])
+
+
 def spread_of(tried: Float64) -> float:
     """Standard deviation of a value (1 + draws,): the first is that without noise."""
     return float(np.sqrt(np.mean((tried[1:] - tried[0]) ** 2)))

@@ -67,7 +67,7 @@ def tile_rows(files: SectionFiles) -> list[tuple[dict[str, Any], shapely.Polygon
     found: dict[TileId, _Sums] = {}
     ways = {(lane.road, lane.name): _Way.of(files.roads.lines[lane.road], lane, files) for lane in files.roads.lanes}
     for name, way in ways.items():
-        for tile, count in way.counts(np.ones(way.station_m.size, bool)):
+        for tile, count in way.counts(slice(None)):
             own = found.setdefault(tile, _Sums())
             own.lanes.add(name)
             own.places += count
@@ -97,7 +97,7 @@ class _Way:
         places = line.places(station, lane.offsets(station))[:, :2]
         return cls(station, np.floor(places / files.context.grid.size_m).astype(np.int64))
 
-    def counts(self, own: npt.NDArray[np.bool_]) -> Iterator[tuple[TileId, int]]:
+    def counts(self, own: slice) -> Iterator[tuple[TileId, int]]:
         """Tiles of some of the places, with their number."""
         tiles, counts = np.unique(self.tile[own], axis=0, return_counts=True)
         for (column, row), count in zip(tiles.tolist(), counts.tolist(), strict=True):
@@ -159,8 +159,8 @@ def _add(found: Mapping[TileId, _Sums], way: _Way, rows: Sequence[Mapping[str, A
     for row in rows:
         value, sigma = row["value"], np.nan if row["sigma"] is None else row["sigma"]
         if row["extent"] == "section":
-            own = (way.station_m >= row["station_from_m"]) & (way.station_m < row["station_to_m"])
             if value is not None:
+                own = slice(*np.searchsorted(way.station_m, (row["station_from_m"], row["station_to_m"])).tolist())
                 for tile, count in way.counts(own):
                     found[tile].add(row["quantity"], count, value, sigma)
             continue

@@ -16,10 +16,12 @@ from roadscan.jobs.publish.layer import (
 )
 from roadscan.jobs.publish.material import Material
 
+_ROUGHNESS = Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0))
+_RUTS_MM = (2.5, 5.1, 10.2, 15.0)
 _STYLES = (
-    Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0)),
-    Style("Rut depth left (mm)", 6, by="rut_depth_mean_left_mm", limits=(2.5, 5.1, 10.2, 15.0)),
-    Style("Rut depth right (mm)", 6, by="rut_depth_mean_right_mm", limits=(2.5, 5.1, 10.2, 15.0)),
+    _ROUGHNESS,
+    Style("Rut depth left (mm)", 6, by="rut_depth_mean_left_mm", limits=_RUTS_MM),
+    Style("Rut depth right (mm)", 6, by="rut_depth_mean_right_mm", limits=_RUTS_MM),
     Style("Cracked wheel path (%)", 6, by="cracked_wheel_path_percent", limits=(1.0, 5.0, 20.0, 40.0)),
     Style("Faulting (mm)", 6, by="faulting_mean_mm", limits=(1.0, 2.5, 3.8, 6.0)),
     Style("Cross-slope (%)", 6, by="cross_slope_mean_percent", limits=(-4.0, -1.0, 1.0, 4.0)),
@@ -29,10 +31,7 @@ _STYLES = (
 """Limits of good, fair and poor for IRI, rutting, cracking and faulting are those of 23 CFR 490.313 (IRI 95 and 170
 in/mi, rutting 0.20 and 0.40 in, cracking 5 and 20 %, faulting 0.10 and 0.15 in); the others only part the colours."""
 
-_BY_TILE = (
-    Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0)),
-    Style("Rut depth (mm)", 6, by="rut_depth_mean_mm", limits=(2.5, 5.1, 10.2, 15.0)),
-)
+_BY_TILE = (_ROUGHNESS, Style("Rut depth (mm)", 6, by="rut_depth_mean_mm", limits=_RUTS_MM))
 
 
 class Condition(LayerKind):

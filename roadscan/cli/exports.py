@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,15 +14,17 @@ from roadscan.cli.terminal import new_reporter, print_table
 
 @dataclass(frozen=True)
 class GridOptions:
-    """Settings of an OpenCRG grid."""
+    """Settings of an OpenCRG grid, named as those of `CrgSettings`."""
 
     pass_id: Annotated[int | None, typer.Option("--pass", help="opencrg: pass, where the run has several.")] = None
-    u_step: Annotated[float, typer.Option(help="opencrg: distance from row to row (m).")] = 0.05
-    v_step: Annotated[float, typer.Option(help="opencrg: distance from column to column (m).")] = 0.05
-    left: Annotated[float, typer.Option(help="opencrg: reach to the left of the driven path (m).")] = 2.0
-    right: Annotated[float, typer.Option(help="opencrg: reach to the right of the driven path (m).")] = 2.0
-    smoothing: Annotated[float, typer.Option(help="opencrg: length over which the path is smoothed (m).")] = 10.0
-    hole: Annotated[float, typer.Option(help="opencrg: longest hole closed by straight lines (m).")] = 0.25
+    u_step_m: Annotated[float, typer.Option("--u-step", help="opencrg: distance from row to row (m).")] = 0.05
+    v_step_m: Annotated[float, typer.Option("--v-step", help="opencrg: distance from column to column (m).")] = 0.05
+    left_m: Annotated[float, typer.Option("--left", help="opencrg: reach to the left of the driven path (m).")] = 2.0
+    right_m: Annotated[float, typer.Option("--right", help="opencrg: reach to the right of the driven path (m).")] = 2.0
+    smoothing_m: Annotated[
+        float, typer.Option("--smoothing", help="opencrg: length over which the path is smoothed (m).")
+    ] = 10.0
+    hole_m: Annotated[float, typer.Option("--hole", help="opencrg: longest hole closed by straight lines (m).")] = 0.25
     encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI"
 
 
@@ -49,7 +51,7 @@ def export(
     if format_ == "psi":
         written = export_psi(loaded, store, run_id, sensor, out, PsiSettings(length))
     elif format_ == "opencrg":
-        written = export_opencrg(loaded, store, run_id, sensor, out, CrgSettings(*astuple(grid)))
+        written = export_opencrg(loaded, store, run_id, sensor, out, CrgSettings(**asdict(grid)))
     else:
         raise ConfigError(f"--format {format_}", expected="psi or opencrg")
     for note in written.notes:

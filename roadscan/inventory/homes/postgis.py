@@ -234,7 +234,8 @@ class PostGis(Home):
             is_new = self._mark(cursor) is None
             if not is_new:
                 self._as_owner(cursor)
-            missing = [kind for kind in self.kinds if is_new or kind not in self._held(cursor)]
+            held = set() if is_new else self._held(cursor)
+            missing = [kind for kind in self.kinds if kind not in held]
             for statement in statements(self.schema, self.srid, missing, is_new=is_new) if missing else ():
                 cursor.execute(statement)
             tables = ", ".join(f"{self.schema}.{asset_schema(kind).table}" for kind in self.kinds)

@@ -29,7 +29,7 @@ TIES: Final = "ties"
 """Table, and product of its files in the manifest."""
 
 _PLACES: Final = 50
-"""Places of a task: half a kilometre of one road at the usual spacing."""
+"""Places of a task: a quarter of a kilometre of one road at the usual spacing."""
 DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25

@@ -21,6 +21,7 @@ help:  ## Show the targets.
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
 demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with its truth (into demo/).
+	@$(MAKE) --no-print-directory --silent viewer || echo "the page to look at is not built; all else of the demo is made" >&2
 	$(BIN)/roadscan demo --out demo
 
 test: $(VENV)/.installed-dev  ## All that CI runs: check, its parts side by side, then the tests.

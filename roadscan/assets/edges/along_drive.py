@@ -30,6 +30,8 @@ SAME_ROAD_M: Final = 8.0
 KERB_EVIDENCE: Final = 6.0
 BARRIER_EVIDENCE: Final = 3.0
 LEAST_EVIDENCE: Final = 0.6
+_INSIDE_M: Final = (0.45, 0.95)
+"""The height of an edge follows from the road this far inside it."""
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
 
 
@@ -121,10 +123,7 @@ def _one_side(
         if len(rows) < 5:
             continue
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
-        r, c = raster.cells_of(line[:, 0], line[:, 1])
-        level = beside.height_m[r, c]
-        if not np.isfinite(level).all():
-            level = np.where(np.isfinite(level), level, np.nanmedian(beside.height_m))
+        level = _road_level(line, out[rows], beside, raster)
         nodes = np.zeros((len(rows), len(EDGE_COLUMNS)))
         nodes[:, 3:5] = np.nan
         nodes[:, :3] = np.column_stack([line, level])
@@ -134,6 +133,15 @@ def _one_side(
             [by_kerb[rows], by_barrier[rows], np.full(len(rows), float(right)), found.evidence[rows]]
         )
         yield nodes
+
+
+def _road_level(line: Float64, out: Float64, beside: Beside, raster: HeightRaster) -> Float64:
+    """Heights (n,) of the road at points (n, 2) of its edge: its surface goes on from inside."""
+    near, far = (beside.height_m[raster.cells_of(*(line - away * out).T)] for away in _INSIDE_M)
+    level = near + (near - far) * _INSIDE_M[0] / (_INSIDE_M[1] - _INSIDE_M[0])
+    for other in (near, beside.height_m[raster.cells_of(*line.T)], np.nanmedian(beside.height_m)):
+        level = np.where(np.isfinite(level), level, other)
+    return level
 
 
 def _snapped(line: Float64, at_kerb: npt.NDArray[np.bool_], kerbs: list[Float64]) -> Float64:

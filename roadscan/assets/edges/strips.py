@@ -100,7 +100,7 @@ def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
 
 
 def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
-    """Greatest slope (m/m) along the middle of a strip over 2 m, of its heights smoothed over as much."""
+    """Greatest slope (m/m, up or down) along the middle of a strip over 2 m, of its heights smoothed over as much."""
     height = strip.column("middle_height_m")
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(strip.line.nodes[:, :2], axis=0).T)))
     good = strip.known & np.isfinite(height)
@@ -111,7 +111,7 @@ def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
     slope = (level[4:] - level[:-4]) / over_m if len(level) > 4 else np.zeros(0)
     if not slope.size:
         return None
-    return float(slope[np.argmax(np.abs(slope))])
+    return float(np.abs(slope).max())
 
 
 def sigma_width_m(strip: Strip) -> float:

@@ -113,6 +113,39 @@ def test_a_road_may_have_edges_on_one_side_alone() -> None:
     assert len(pieces)
 
 
+def street_with_walks() -> Scene:
+    """A road of 8 m with kerbs of 12 cm on both sides, which climbs by 3 % and falls by 3 % to both sides."""
+    rng = np.random.default_rng(5)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-6.5, 6.5, 0.05)))
+    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    behind = np.maximum(np.abs(y) - 4.0, 0.0)
+    z = 100.0 + 0.03 * x - 0.03 * np.minimum(np.abs(y), 4.0) + np.where(behind > 0.0, 0.12 + 0.02 * behind, 0.0)
+    z += rng.normal(0.0, 0.005, z.size)
+    sensor = np.column_stack([x, np.full(x.size, -1.5), np.full(x.size, 102.0)])
+    returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
+    drive = np.column_stack([np.arange(0.0, 20.0), np.full(20, -1.5), np.full(20, 102.0), np.ones(20)])
+    box = Box(0.0, -6.5, 20.0, 6.5)
+    return make_scene(returns, box, box, drive)
+
+
+def test_slopes_of_sidewalks_and_heights_of_road_edges_have_the_signs_that_they_state() -> None:
+    scene, walk, edge = street_with_walks(), Sidewalk(), RoadEdge()
+    walks = list(walk.objects(walk.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
+    assert len(walks) == 2
+    for one in walks:
+        # It falls to the road, and climbs: the same on both sides of it.
+        assert one.attributes["cross_slope"] == pytest.approx(0.02, abs=0.002)
+        assert one.attributes["running_slope"] == pytest.approx(0.03, abs=0.003)
+        assert not one.attributes["ramp"]
+    edges = list(edge.objects(edge.evidence(scene, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))
+    assert {o.attributes["side"] for o in edges} == {"left", "right"}
+    for one in edges:
+        x, y, z = shapely.get_coordinates(one.geometry, include_z=True).T
+        assert (np.median(y) > 0.0) == (one.attributes["side"] == "left")
+        # The height is the road's at the foot of the kerb, not one on its face.
+        assert np.abs(z - (100.0 + 0.03 * x - 0.03 * np.minimum(np.abs(y), 4.0))).max() < 0.02
+
+
 def test_the_edge_of_a_road_without_kerbs_is_where_its_verge_begins() -> None:
     """The simulated highway with a verge that falls by 15 % beyond a shoulder of 5 %, 8 mm of noise a cell."""
     plain = SimulatedScene.load("highway_three_lanes")

@@ -10,6 +10,7 @@ import pytest
 import shapely
 
 from roadscan.assets.kind import AssetObject
+from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.assets.kinds.median import Median, MedianOptions
 from roadscan.assets.kinds.road_edge import RoadEdge, RoadEdgeOptions
 from roadscan.assets.kinds.shoulder import Shoulder, ShoulderOptions
@@ -114,29 +115,46 @@ def test_a_road_may_have_edges_on_one_side_alone() -> None:
 
 
 def street_with_walks() -> Scene:
-    """A road of 8 m with kerbs of 12 cm on both sides, which climbs by 3 % and falls by 3 % to both sides."""
+    """A road of 8 m with kerbs of 12 cm on both sides, which climbs by 3 % and falls by 3 % to both sides.
+
+    The left kerb (y > 0) is lowered to 2 cm between x = 8 and 12; a metre behind it the sidewalk has its height again.
+    """
     rng = np.random.default_rng(5)
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-6.5, 6.5, 0.05)))
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-7.5, 7.5, 0.05)))
     x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
     behind = np.maximum(np.abs(y) - 4.0, 0.0)
     z = 100.0 + 0.03 * x - 0.03 * np.minimum(np.abs(y), 4.0) + np.where(behind > 0.0, 0.12 + 0.02 * behind, 0.0)
+    lowered = (behind > 0.0) & (y > 0.0) & (x > 8.0) & (x < 12.0)
+    z -= np.where(lowered, 0.1 * np.maximum(1.0 - behind, 0.0), 0.0)
     z += rng.normal(0.0, 0.005, z.size)
     sensor = np.column_stack([x, np.full(x.size, -1.5), np.full(x.size, 102.0)])
     returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
     drive = np.column_stack([np.arange(0.0, 20.0), np.full(20, -1.5), np.full(20, 102.0), np.ones(20)])
-    box = Box(0.0, -6.5, 20.0, 6.5)
+    box = Box(0.0, -7.5, 20.0, 7.5)
     return make_scene(returns, box, box, drive)
 
 
-def test_slopes_of_sidewalks_and_heights_of_road_edges_have_the_signs_that_they_state() -> None:
-    scene, walk, edge = street_with_walks(), Sidewalk(), RoadEdge()
+def test_sides_slopes_and_heights_beside_a_road_that_climbs() -> None:
+    scene, walk, edge, kerb = street_with_walks(), Sidewalk(), RoadEdge(), Kerb()
     walks = list(walk.objects(walk.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
     assert len(walks) == 2
     for one in walks:
         # It falls to the road, and climbs: the same on both sides of it.
         assert one.attributes["cross_slope"] == pytest.approx(0.02, abs=0.002)
-        assert one.attributes["running_slope"] == pytest.approx(0.03, abs=0.003)
-        assert not one.attributes["ramp"]
+        has_ramp = one.geometry.centroid.y > 0.0
+        assert one.attributes["running_slope"] == pytest.approx(0.03, abs=0.008 if has_ramp else 0.003)
+        assert one.attributes["ramp"] == has_ramp
+    kerbs = list(kerb.objects(kerb.evidence(scene, KerbOptions()).pieces, KerbOptions(), {}))
+    assert sorted((o.attributes["type"], round(o.geometry.centroid.y)) for o in kerbs) == [
+        ("dropped", 4), ("upright", -4), ("upright", 4), ("upright", 4),
+    ]  # fmt: skip
+    for one in kerbs:
+        x, y, z = shapely.get_coordinates(one.geometry, include_z=True).T
+        # The higher side, beyond |y| = 4, lies to the right; the line is at the height of the upper edge.
+        assert (x[-1] > x[0]) == (y[0] < 0.0)
+        step = 0.02 if one.attributes["type"] == "dropped" else 0.12
+        assert one.attributes["step_m"] == pytest.approx(step, abs=0.008)
+        assert np.median(z - (99.88 + 0.03 * x)) == pytest.approx(step, abs=0.01)
     edges = list(edge.objects(edge.evidence(scene, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))
     assert {o.attributes["side"] for o in edges} == {"left", "right"}
     for one in edges:

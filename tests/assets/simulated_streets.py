@@ -55,6 +55,11 @@ def street(name: str, station_m: float, tile_m: float = 40.0, *, whole: bool = F
         roadside = scene.roadside.model_copy(update={kind: [] for kind in _TALL})
         first = scene.passes[0].model_copy(update={"stops": []})
         scene = scene.model_copy(update={"roadside": roadside, "passes": [first]})
+    return street_of(scene, station_m, tile_m)
+
+
+def street_of(scene: SimulatedScene, station_m: float, tile_m: float = 40.0) -> SimulatedStreet:
+    """The tile around a station of a scene, as the lidar saw it in the first pass."""
     surface, earth = Surface(scene), Earth(scene.map.crs)
     easting, northing, _ = surface.place(np.array([station_m]), np.array([0.0]))
     corner = tuple(5.0 * round(float(v[0] - tile_m / 2) / 5.0) for v in (easting, northing))

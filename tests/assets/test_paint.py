@@ -15,8 +15,9 @@ import shapely
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import AssetObject, Evidence, asset_kinds
 from roadscan.assets.scene import Box, Scene
+from roadscan.simulate.scene import Scene as SimulatedScene
 from tests.assets.scenes import NOT_JUDGED, semantic_kitti_scene
-from tests.assets.simulated_streets import HALO_M, SimulatedStreet, faded, street
+from tests.assets.simulated_streets import HALO_M, SimulatedStreet, faded, street, street_of
 
 CELL_M = 0.1
 
@@ -97,6 +98,31 @@ def test_lines_of_the_highway_have_their_type_width_and_place() -> None:
     dashed = [line for line in lines if line.attributes["type"] == "dashed"]
     assert all(abs(line.attributes["dash_m"] - 3.0) <= 0.1 for line in dashed)
     assert all(abs(line.attributes["gap_m"] - 9.0) <= 0.1 for line in dashed)
+
+
+def test_two_lines_side_by_side_are_a_double_line() -> None:
+    """The gaps between them are 10, 15 and 18 cm wide, as painted on roads, or 38 cm."""
+    dashed = {"dash_m": 3.0, "gap_m": 6.0}
+    markings = [
+        {"offset_m": -0.10, "width_m": 0.10}, {"offset_m": 0.10, "width_m": 0.10},
+        {"offset_m": -3.20, "width_m": 0.10}, {"offset_m": -3.45, "width_m": 0.10, **dashed},
+        {"offset_m": 3.20, "width_m": 0.12, **dashed}, {"offset_m": 3.50, "width_m": 0.12, **dashed},
+        {"offset_m": 5.00, "width_m": 0.12}, {"offset_m": 5.50, "width_m": 0.12},
+    ]  # fmt: skip
+    plain = SimulatedScene.load("highway_three_lanes")
+    roadside = {kind: [] for kind in plain.roadside.model_dump()}
+    known = street_of(plain.changed(road={"markings": markings}, roadside=roadside, passes=[{"lane": 2}]), 60.0)
+    expected = {0.0: "double_solid", -3.325: "solid_dashed", 3.35: "double_dashed", 5.25: "double_solid"}
+    scene, seen = calibrated(known.scene), set()
+    for line in found(scene, "lane_line")[1]:
+        _, offset = along(known, line)
+        true = min(expected, key=lambda o: abs(o - offset.mean()))
+        assert np.abs(offset - true).max() <= 0.03
+        assert line.attributes["type"] == expected[true]
+        assert abs(line.attributes["width_m"] - (0.10 if true < 1.0 else 0.12)) <= 0.01
+        seen.add(true)
+    assert len(seen) == 4
+    assert {m.attributes["type"] for m in found(scene, "road_marking")[1]} <= {"raised_marker", "symbol"}
 
 
 @pytest.mark.nightly

@@ -69,7 +69,7 @@ def paint_of(scene: Scene) -> Paint:
     bands: list[Stripe] = []
     others: list[Component] = []
     for component in components_of(found):
-        stripes = stripes_of(found, component, scene.returns.corner_m)
+        stripes = stripes_of(found, component, scene.returns.corner_m, road)
         if stripes is None:
             others.append(component)
         else:

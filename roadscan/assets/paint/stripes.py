@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
+from roadscan.assets.paint.road_direction import RoadDirection
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -35,6 +36,16 @@ paint against the brighter one too, as where fresh bitumen lies along a line."""
 _FLAT_M: Final = 0.02
 _STEEPEST: Final = 0.15
 _STEP_M: Final = 0.04
+_TWO_SHORTEST_M: Final = 1.0
+_LEAST_APART_M: Final = 0.12
+"""Two lines side by side are at least so long, and their middles so far apart."""
+_WIDER: Final = 1.5
+_ALONG_ROAD: Final = 0.35
+"""Sine of the greatest angle between a double line and the road; what lies at a larger one is no lane line."""
+_TURNS_RAD: Final = np.linspace(-0.06, 0.06, 13)
+_BIN_M, _BINS = 0.03, 20
+"""Contrast is taken across in bins of this width, so many on each side."""
+_FEWEST_IN_BIN: Final = 3
 _PIECE_M: Final = 0.7
 """The middle of a band is sought in pieces of this length."""
 _FEWEST: Final = 8
@@ -80,15 +91,23 @@ class Stripe:
         return dx * self.along[0] + dy * self.along[1], dy * self.along[0] - dx * self.along[1]
 
 
-def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, float]) -> list[Stripe] | None:
-    """Bands that the component consists of, end to end; None if it is of another shape. Surfaces' edges are none."""
+def stripes_of(
+    found: Contrast, component: Component, corner_m: tuple[float, float], road: RoadDirection
+) -> list[Stripe] | None:
+    """Bands of a component, end to end or side by side; None if it is of another shape. Surfaces' edges are none."""
     axis = _axis(component.cell_x_m, component.cell_y_m)
     if axis is None:
         return None
     middle, along, length, width, rms = axis
+    turned = np.arctan2(along[1], along[0]) - road.at(*middle)
+    if _TWO_SHORTEST_M <= length <= _LONGEST_WHOLE_M and abs(np.sin(turned)) <= _ALONG_ROAD:
+        halves = _side_by_side(found, component, middle, along)
+        both = [stripe for half in halves or () for stripe in stripes_of(found, half, corner_m, road) or ()]
+        if len(both) == 2 and _are_alike(*both):
+            return both
     straight = rms <= 1.3 * width / np.sqrt(12.0) + 0.02
     if length > _LONGEST_WHOLE_M or (not straight and length > 4 * CELL_M + 2.5 * width):
-        return _of_parts(found, component, (middle, along, length), corner_m)
+        return _of_parts(found, component, (middle, along, length), corner_m, road)
     if not straight or length < _SHORTEST_M or width > WIDEST_M + 0.15 or length < _SLIMMEST * width:
         return None
     start = Stripe(
@@ -101,6 +120,45 @@ def stripes_of(found: Contrast, component: Component, corner_m: tuple[float, flo
     if stripe is None or stripe.width_m > WIDEST_M or stripe.length_m < max(_SHORTEST_M, _SLIMMEST * stripe.width_m):
         return None
     return [stripe]
+
+
+def _side_by_side(
+    found: Contrast, component: Component, middle: Float64, along: Float64
+) -> tuple[Component, Component] | None:
+    """Both lines of a double one whose cells touch; None unless the contrast across falls to less than half between.
+
+    The direction is that in which the contrast across varies the most.
+    """
+    contrast = found.contrast[component.near]
+    cells = np.stack([component.cell_x_m, component.cell_y_m], axis=1) - middle
+    returns = np.stack([found.x_m[component.near], found.y_m[component.near]], axis=1) - middle
+    profiles = []
+    for turn in _TURNS_RAD:
+        normal = np.array([-np.sin(turn) * along[0] - np.cos(turn) * along[1],
+                           np.cos(turn) * along[0] - np.sin(turn) * along[1]])  # fmt: skip
+        number = np.floor(returns @ normal / _BIN_M).astype(np.int64) + _BINS
+        held = (number >= 0) & (number < 2 * _BINS)
+        count = np.bincount(number[held], minlength=2 * _BINS)
+        total = np.bincount(number[held], weights=contrast[held], minlength=2 * _BINS)
+        profiles.append((np.where(count >= _FEWEST_IN_BIN, total / np.maximum(count, 1), 0.0), normal))
+    level, normal = max(profiles, key=lambda one: float(np.sum(one[0] ** 2)))
+    # The other line is where the level stands the most above the lowest one on the way from the brightest place.
+    at = int(np.argmax(level))
+    lowest = np.concatenate([np.minimum.accumulate(level[at::-1])[::-1], np.minimum.accumulate(level[at:])[1:]])
+    other = int(np.argmax(level - lowest))
+    first, last = min(at, other), max(at, other)
+    low = np.flatnonzero(level[first : last + 1] < 0.5 * level[other])
+    if (last - first) * _BIN_M < _LEAST_APART_M or level[other] < SEED_CONTRAST / 2 or low.size < 2:
+        return None
+    cut = (first + float(low.mean()) + 0.5 - _BINS) * _BIN_M
+    left, left_cells = returns @ normal > cut, cells @ normal > cut
+    return component.part(left_cells, left), component.part(~left_cells, ~left)
+
+
+def _are_alike(one: Stripe, other: Stripe) -> bool:
+    """True for two lines that may be a double one: neither is short, and one is hardly wider than the other."""
+    narrow, wide = sorted((one.width_m, other.width_m))
+    return min(one.length_m, other.length_m) >= _TWO_SHORTEST_M and wide <= _WIDER * narrow
 
 
 def fitted(found: Contrast, start: Stripe) -> Stripe | None:
@@ -257,7 +315,11 @@ def _axis(x: Float64, y: Float64) -> tuple[Float64, Float64, float, float, float
 
 
 def _of_parts(
-    found: Contrast, component: Component, axis: tuple[Float64, Float64, float], corner_m: tuple[float, float]
+    found: Contrast,
+    component: Component,
+    axis: tuple[Float64, Float64, float],
+    corner_m: tuple[float, float],
+    road: RoadDirection,
 ) -> list[Stripe] | None:
     """Stripes of the pieces of a component, cut at multiples of `CHUNK_M` in the map, or halved where it is short."""
     middle, along, length = axis
@@ -277,7 +339,7 @@ def _of_parts(
     for number in np.unique(of_cells):
         cells = of_cells == number
         part = component.part(cells, of_returns == number)
-        some = stripes_of(found, part, corner_m)
+        some = stripes_of(found, part, corner_m, road)
         if some is None:
             lost += int(np.count_nonzero(cells))
         else:

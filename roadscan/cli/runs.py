@@ -26,7 +26,7 @@ def run(
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
 ) -> None:
-    """Run a survey: ingest, navigate, footprints, adjust, tiles, surfaces, products. Does only what is due."""
+    """Run a survey: all stages, from ingest to condition and assets, and the report. Does only what is due."""
     if dry_run:
         found = found_status(survey_file)
         print_status(found, survey_file)

@@ -14,6 +14,7 @@ import shapely
 
 from roadscan.code_reach import code_digest
 from roadscan.jobs.assets.along_roads import along_roads
+from roadscan.jobs.assets.drives import Drives, with_pose_sigma
 from roadscan.jobs.assets.kinds import WantedKind
 from roadscan.jobs.assets.objects import OBJECTS
 from roadscan.jobs.assets.picture_work import PicturePlan
@@ -59,9 +60,13 @@ class FileTask:
 
 
 def plan_tables(
-    kinds: Sequence[WantedKind], manifest: Manifest, lines_key: str, context: ProductContext, pictures: PicturePlan
+    kinds: Sequence[WantedKind],
+    manifest: Manifest,
+    places_key: str,
+    context: ProductContext,
+    pictures: PicturePlan,
 ) -> list[TableTask]:
-    """A table for each kind."""
+    """A table for each kind; `places_key` is that of the roads and drives."""
     code = code_digest("roadscan.jobs.assets.tables:write_table")
     held = manifest.of(OBJECTS)
     tasks = []
@@ -71,7 +76,7 @@ def plan_tables(
         said = [[c.name, c.type] for c in schema.columns]
         seen = pictures.records(one.name, manifest)
         read = [(r.unit, r.digest) for r in (*own, *seen)]
-        key = key_of(code, said, schema.geometry, read, lines_key, context.map)
+        key = key_of(code, said, schema.geometry, read, places_key, context.map)
         tasks.append(TableTask(schema, own, seen, key))
     return tasks
 
@@ -105,11 +110,11 @@ def _one_geojson(path: Path, layers: Sequence[Layer], context: ProductContext) -
     write_geojson(path, layers[0], context)
 
 
-def write_table(task: TableTask, roads: Roads, store: Store, context: ProductContext) -> OutputRecord:
-    """Write a kind's table: the objects of all clusters, with where they lie along the roads."""
+def write_table(task: TableTask, roads: Roads, drives: Drives, store: Store, context: ProductContext) -> OutputRecord:
+    """Write a kind's table: the objects of all clusters, with where they lie along the roads, and σ of the poses."""
     schema = task.schema.arrow()
     parts = [store.parse_table(read_recorded(store, r), r.path).cast(schema) for r in task.objects]
-    rows = pa.concat_tables([schema.empty_table(), *parts]).combine_chunks()
+    rows = with_pose_sigma(pa.concat_tables([schema.empty_table(), *parts]).combine_chunks(), drives)
     along = along_roads(np.column_stack([rows["easting_m"].to_numpy(), rows["northing_m"].to_numpy()]), roads)
     told: Mapping[str, pa.Array] = {
         "road": pa.array(along.road, pa.string()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from roadscan.jobs.assets.drives import drives_key, load_drives
 from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
 from roadscan.jobs.assets.gains import current_gains, find_samples, sample_tasks, write_gains
 from roadscan.jobs.assets.objects import OBJECTS, Cluster, join_objects, plan_joins
@@ -103,9 +104,12 @@ class Assets(Stage):
         roads, key = survey_roads(plan.survey, manifest)
         if plan.kinds and not roads.lines:
             session.note("assets: no run has a trajectory of 20 m or more, so assets have no road, station and offset")
-        for table in plan_tables(plan.kinds, manifest, key, context, pictures):
-            if not manifest.is_current(TABLES, table.unit, table.key):
-                manifest.add([write_table(table, roads, session.store, context)])
+        tables = plan_tables(plan.kinds, manifest, key + drives_key(plan), context, pictures)
+        due = [one for one in tables if not manifest.is_current(TABLES, one.unit, one.key)]
+        if due:
+            drives = load_drives(plan)
+            for table in due:
+                manifest.add([write_table(table, roads, drives, session.store, context)])
         for file in plan_files(plan.kinds, manifest, plan.config, context):
             if not manifest.is_current(TABLES, file.unit, file.key):
                 manifest.add([write_file(file, session.store, context)])
@@ -142,7 +146,7 @@ class Assets(Stage):
 
     def _files_due(self, session: Session, plan: AssetPlan) -> int:
         manifest, context = session.manifest, plan.context
-        key = roads_key(plan.survey)
+        key = roads_key(plan.survey) + drives_key(plan)
         pictures = plan_asset_pictures(plan, manifest)
         tables = plan_tables(plan.kinds, manifest, key, context, pictures)
         due = len(pictures.due(manifest)) + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)

@@ -16,7 +16,7 @@ POINTS: Final = 7
 """A scan line that missed is known at so many places."""
 _SWEEP_GAP_NS: Final = 20_000_000
 _LINE_GAP_NS: Final = 2_000_000
-_OFTEN: Final = 3
+_OFTEN: Final = 2
 """A laser that so many sweeps have as the outermost one, and none as an inner one, may be the last of its fan."""
 _BESIDE: Final = 0.3
 """Lines that lie nearer to each other than this share of the widest gap are one."""
@@ -42,7 +42,7 @@ def misses_beside(returns: Returns, rows: Int64, places: Float64) -> Float64:
     ends_here = (np.diff(sweep[order]) != 0) | (np.diff(laser[order]) != 0) | (np.diff(epoch[order]) > _LINE_GAP_NS)
     starts = np.concatenate([[0], np.flatnonzero(ends_here) + 1])
     last = np.concatenate([starts[1:], [rows.size]]) - 1
-    places, away = places[order], returns.range_m[rows[order]][starts]
+    places, away = places[order], returns.at(rows[order[starts]]).range_m
     line_sweep, line_laser = sweep[order][starts], laser[order][starts]
     first, end = places[starts], places[last]
     steps = _steps(places, starts, last, away)

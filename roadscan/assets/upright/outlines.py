@@ -115,7 +115,8 @@ def _between(
 
 def _share(past_m: Float64) -> Float64:
     """Probability that something lies on the right side of an edge, by how far it does."""
-    return 1.0 / (1.0 + np.exp(np.clip(-past_m / _SOFT_M, -50.0, 50.0)))
+    share: Float64 = 1.0 / (1.0 + np.exp(np.clip(-past_m / _SOFT_M, -50.0, 50.0)))
+    return share
 
 
 def _outside(shape: str, tried: Float64, points: Float64) -> Float64:
@@ -123,12 +124,11 @@ def _outside(shape: str, tried: Float64, points: Float64) -> Float64:
     x, y = points.T
     if shape == "rectangle":
         left, right, low, high = tried.T[:, :, None]
-        return np.maximum(np.maximum(left - x, x - right), np.maximum(low - y, y - high))
+        box: Float64 = np.maximum(np.maximum(left - x, x - right), np.maximum(low - y, y - high))
+        return box
     x, y, size = x - tried[:, :1], y - tried[:, 1:2], tried[:, 2:]
-    if shape == "round":
-        return np.hypot(x, y) - size / 2
-    out = np.full(x.shape, -math.inf)
-    for degrees in _SIDES[shape]:
+    out: Float64 = np.hypot(x, y) - size / 2 if shape == "round" else np.full(x.shape, -math.inf)
+    for degrees in _SIDES.get(shape, ()):
         way = np.array([[math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]])
         reach = float(_TEMPLATES[shape][0](way)[0])
         np.maximum(out, x * way[0, 0] + y * way[0, 1] - size * reach, out=out)

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
+from roadscan.assets.upright.line_ends import misses_beside
 from roadscan.assets.upright.outlines import Outline, outline_of
 from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.probability import logistic
@@ -167,7 +168,8 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)
     right, up = _axes(normal)
     placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
-    outline = outline_of(np.column_stack([placed @ right, placed @ up]))
+    flat = np.column_stack([placed @ right, placed @ up])
+    outline = outline_of(flat, misses_beside(returns, edge, flat))
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     ground = float(scene.ground.height_at(place[0], place[1]))
     above = float(place[2]) - ground

@@ -62,6 +62,8 @@ class AssetObject:
     last_epoch_gps_ns: int
     attributes: Mapping[str, Any] = field(default_factory=dict)
     """Values of the kind's own columns; a missing one is unknown."""
+    sigma_size_m: float | None = None
+    """Of what the kind measures of its size: a diameter, a width, a step or a height."""
 
 
 class AssetKind(ABC):

@@ -19,7 +19,7 @@ _PLACE_M: Final = 0.1
 _OF_TABLES: Final = ("object", "easting_m", "northing_m", "height_m", "road", "station_m", "offset_m", "lane")
 """Columns that follow from the object's place."""
 _FIELDS: Final = (
-    "sigma_horizontal_m", "sigma_height_m", "probability", "returns", "passes", "first_epoch_gps_ns",
+    "sigma_horizontal_m", "sigma_height_m", "sigma_size_m", "probability", "returns", "passes", "first_epoch_gps_ns",
     "last_epoch_gps_ns",
 )  # fmt: skip
 
@@ -79,7 +79,7 @@ def table_of_objects(kind: str, objects: Sequence[AssetObject], schema: pa.Schem
         "northing_m": places[:, 1],
         "height_m": places[:, 2],
         "geometry": [shapely.to_wkb(o.geometry, output_dimension=3) for o in own],
-        **{name: [getattr(o, name) for o in own] for name in _FIELDS},
+        **{name: [_known(getattr(o, name)) for o in own] for name in _FIELDS},
     }
     arrays = []
     for field in schema:

@@ -48,5 +48,5 @@ class Attenuator(AssetKind):
             values = {name: row[name] for name in ("asset_height_m", "length_m", "width_m")}
             yield AssetObject(
                 box, 0.05, 0.03, probability, row["returns"], len(row["passes"]), row["first_epoch_gps_ns"],
-                row["last_epoch_gps_ns"], values,
+                row["last_epoch_gps_ns"], values, 0.05,
             )  # fmt: skip

@@ -35,5 +35,5 @@ class Clearance(AssetKind):
             yield AssetObject(
                 shapely.Point(row["easting_m"], row["northing_m"], row["height_m"]), 0.05, 0.02, probability,
                 row["returns"], len(row["passes"]), row["first_epoch_gps_ns"], row["last_epoch_gps_ns"],
-                {"clearance_m": row["clearance_m"], "type": row["type"]},
+                {"clearance_m": row["clearance_m"], "type": row["type"]}, 0.02,
             )  # fmt: skip

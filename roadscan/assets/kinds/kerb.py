@@ -121,6 +121,7 @@ def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject
         first_epoch_gps_ns=line.seen_by.first_epoch_gps_ns,
         last_epoch_gps_ns=line.seen_by.last_epoch_gps_ns,
         attributes=attributes,
+        sigma_size_m=sigma_height if known.any() else None,
     )
 
 

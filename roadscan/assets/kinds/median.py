@@ -89,4 +89,5 @@ def _median(strip: Strip, polygon: shapely.Polygon, probability: float) -> Asset
         first_epoch_gps_ns=seen_by.first_epoch_gps_ns,
         last_epoch_gps_ns=seen_by.last_epoch_gps_ns,
         attributes={name: value for name, value in attributes.items() if value is not None},
+        sigma_size_m=sigma_width_m(strip),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -109,6 +110,7 @@ def _beside(
                 "length_m": (len(rows) - 1) * STATION_M,
                 "cross_slope": float(np.median(fall[good[rows]])),
             },
+            sigma_size_m=math.hypot(edge.sigma_horizontal_m, max(one.sigma_horizontal_m for one in touched)),
         )
 
 

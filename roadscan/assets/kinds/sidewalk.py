@@ -84,4 +84,5 @@ def _sidewalk(strip: Strip, probability: float, settings: SidewalkOptions) -> As
         first_epoch_gps_ns=seen_by.first_epoch_gps_ns,
         last_epoch_gps_ns=seen_by.last_epoch_gps_ns,
         attributes={name: value for name, value in attributes.items() if value is not None},
+        sigma_size_m=sigma_width_m(strip),
     )

@@ -47,4 +47,4 @@ def _place(plate: Plate) -> Place:
         "width_m": plate.outline.width_m, "plate_height_m": plate.outline.height_m, "shape": plate.outline.shape,
         "clearance_m": max(plate.clearance_m, 0.0), "facing_deg": plate.facing_deg, "tilt_deg": plate.tilt_deg,
     }  # fmt: skip
-    return Place(*plate.middle_m, sigma, sigma, plate.probability, plate.rows, values)
+    return Place(*plate.middle_m, sigma, sigma, plate.probability, plate.rows, values, plate.outline.sigma_m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -125,6 +126,7 @@ def _object(pieces: _Pieces, group: tuple[str | None, list[Stretch]]) -> AssetOb
         first_epoch_gps_ns=min(pieces.table["first_epoch_gps_ns"][k].as_py() for k in numbers),
         last_epoch_gps_ns=max(pieces.table["last_epoch_gps_ns"][k].as_py() for k in numbers),
         attributes=attributes,
+        sigma_size_m=math.sqrt(2.0) * _middle(pieces.numbers("sigma_across_m")[numbers], weight),
     )
 
 

@@ -78,6 +78,7 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
             "area_m2": float(painted.area),
             "contrast": 1.0 + float(np.average(table["contrast"].to_numpy(), weights=returns)),
         },
+        sigma_size_m=float(CELL_M / np.sqrt(6.0)),
     )
 
 

@@ -63,6 +63,12 @@ class Chain:
         above = self.values[name] - self.values["ground_m"]
         return float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else math.nan
 
+    def sigma_median_m(self, name: str) -> float:
+        """1 σ (m) of that median, from how the stretches scatter about it."""
+        above = self.values[name] - self.values["ground_m"]
+        above = above[np.isfinite(above)]
+        return float(1.2533 * 1.4826 * np.median(np.abs(above - np.median(above))) / math.sqrt(above.size))
+
     @property
     def passing(self) -> float:
         """Share of the sight lines at it that go through."""

@@ -18,7 +18,8 @@ Int64 = npt.NDArray[np.int64]
 
 _COMMON: Final = (
     ("easting_m", pa.float64()), ("northing_m", pa.float64()), ("height_m", pa.float64()),
-    ("sigma_horizontal_m", pa.float64()), ("sigma_height_m", pa.float64()), ("probability", pa.float64()),
+    ("sigma_horizontal_m", pa.float64()), ("sigma_height_m", pa.float64()), ("sigma_size_m", pa.float64()),
+    ("probability", pa.float64()),
     ("returns", pa.int64()), ("passes", pa.list_(pa.int32())), ("first_epoch_gps_ns", pa.int64()),
     ("last_epoch_gps_ns", pa.int64()),
 )  # fmt: skip
@@ -38,6 +39,7 @@ class Place:
     rows: Int64
     """Returns that show it."""
     attributes: Mapping[str, float | str | None]
+    sigma_size_m: float | None = None
 
 
 def schema_of(numbers: Sequence[str], texts: Sequence[str] = ()) -> pa.Schema:
@@ -70,7 +72,7 @@ def pieces_of(scene: Scene, places: Iterable[Place], schema: pa.Schema) -> pa.Ta
         {
             "easting_m": east + p.x_m, "northing_m": north + p.y_m, "height_m": p.height_m,
             "sigma_horizontal_m": p.sigma_horizontal_m, "sigma_height_m": p.sigma_height_m,
-            "probability": p.probability, **seen_by(scene, p.rows),
+            "sigma_size_m": p.sigma_size_m, "probability": p.probability, **seen_by(scene, p.rows),
             **{n: p.attributes.get(n) for n in schema.names[len(_COMMON) :]},
         }
         for p in places
@@ -107,5 +109,5 @@ def _object(row: Mapping[str, Any], names: Sequence[str]) -> AssetObject:
     return AssetObject(
         shapely.Point(row["easting_m"], row["northing_m"], row["height_m"]), row["sigma_horizontal_m"],
         row["sigma_height_m"], row["probability"], row["returns"], len(row["passes"]), row["first_epoch_gps_ns"],
-        row["last_epoch_gps_ns"], {name: row[name] for name in names},
+        row["last_epoch_gps_ns"], {name: row[name] for name in names}, row["sigma_size_m"],
     )  # fmt: skip

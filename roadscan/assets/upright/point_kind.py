@@ -44,5 +44,5 @@ def _place(upright: Upright) -> Place:
     x, y = shaft.foot_xy_m
     return Place(
         x, y, shaft.ground_m, shaft.axis.sigma_m, _GROUND_SIGMA_M, upright.probability, upright.rows,
-        upright.attributes,
+        upright.attributes, 2.0 * shaft.axis.sigma_m,
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Final, Literal
@@ -20,6 +21,7 @@ from roadscan.assets.upright.probability import logistic
 Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
 _SIMPLE_M: Final = 0.03
+_GROUND_SIGMA_M: Final = 0.03
 _FENCE_PASSES: Final = 0.12
 """A surface that lets this share of the sight lines through is a fence."""
 _LEAST_FENCE_M: Final = 2.5
@@ -105,12 +107,15 @@ class SurfaceKind(AssetKind):
         height = np.concatenate([ground[:1], (ground[:-1] + ground[1:]) / 2, ground[-1:]])
         line = shapely.LineString(np.column_stack([chain.xy_m, height])).simplify(_SIMPLE_M)
         values = {"asset_height_m": chain.median("high_m"), "length_m": chain.length_m}
-        return as_object(chain, line, values)
+        return as_object(chain, line, values, math.hypot(_GROUND_SIGMA_M, chain.sigma_median_m("high_m")))
 
 
-def as_object(chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any]) -> AssetObject:
+def as_object(
+    chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any], sigma_size_m: float | None = None
+) -> AssetObject:
     """An object of a chain."""
     sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
     return AssetObject(
-        geometry, float(sigma), 0.03, probability_of(chain), chain.seen, chain.passes, *chain.epochs_gps_ns, values
-    )
+        geometry, float(sigma), _GROUND_SIGMA_M, probability_of(chain), chain.seen, chain.passes, *chain.epochs_gps_ns,
+        values, sigma_size_m,
+    )  # fmt: skip

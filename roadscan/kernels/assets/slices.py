@@ -10,7 +10,8 @@ def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
     """Count returns into the cells of their slice, and note the flat number of each return's cell (-1: none).
 
     x, y : (n,) float64, places (m); above : (n,) float32, height above the ground (m), NaN where that is not known;
-    corner : (x, y, height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,) int64.
+    corner : (x, y, height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,)
+    int64.
     """
     slices, rows, columns = counts.shape
     for i in range(x.size):

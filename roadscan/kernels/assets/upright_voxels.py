@@ -15,8 +15,8 @@ def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
 
     x, y : (n,) float64; above : (n,) float32 heights (m), NaN is left out; corner : (x, y, height) of voxel (0, 0, 0);
     sizes : (side, height of a layer) of a voxel (m); index : (layers, rows, columns) int32, all -1, gets the voxel's
-    number; moments : (most voxels, 10): n, Σx, Σy, Σx², Σxy, Σy² (from the voxel's corner), least and greatest height, row,
-    column; voxel_of : (n,) int32.
+    number; moments : (most voxels, 10): n, Σx, Σy, Σx², Σxy, Σy² (from the voxel's corner), least and greatest height,
+    row, column; voxel_of : (n,) int32.
     """
     layers, rows, columns = index.shape
     found = 0

@@ -219,7 +219,7 @@ def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_])
     sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
     grid = (float(ground.x_min_m), float(ground.y_min_m), float(ground.cell_m))
     meet_ground(place, sensor, grid, *_slopes(ground), wanted, range_m, cosine)
-    return range_m, np.degrees(np.arccos(cosine))
+    return range_m, np.degrees(np.arccos(cosine, out=cosine), out=cosine)
 
 
 def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:

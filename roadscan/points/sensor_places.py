@@ -34,9 +34,10 @@ def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings,
     if int(epochs.max()) // _TICK_NS - first > _MOST_TICKS:
         return _exact(trajectory, frame, mountings, epochs)
     ticks, number = _used(epochs // _TICK_NS - first)
-    found = np.empty((epochs.size, 3))
+    columns = np.empty((3, epochs.size))
     at = _exact(trajectory, frame, mountings, (ticks + first) * _TICK_NS)
-    between_ticks(read_only(epochs), _TICK_NS, first, number, at, found)
+    between_ticks(read_only(epochs), _TICK_NS, first, number, at, columns)
+    found = columns.T
     unknown = np.isnan(found[:, 0])
     if unknown.any():  # beside a gap, or at an end of the trajectory
         found[unknown] = _exact(trajectory, frame, mountings, epochs[unknown])

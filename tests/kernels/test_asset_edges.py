@@ -61,7 +61,8 @@ def test_the_filter_measures_a_step_and_is_strongest_at_it() -> None:
     step, evidence = np.empty(wide), np.empty(wide)
     freedom, active = np.full(wide, 80.0), np.zeros(wide, np.bool_)
     active[:, :20] = True
-    step_response(framed, freedom, active, np.full(wide, 0.02), across, (0.05**-2, 0.005), work, step, evidence)
+    slopes = (np.full(wide, 0.02), np.full(wide, 0.03), (1.0, 0.0))
+    step_response(framed, freedom, active, slopes, across, (0.05**-2, 0.005), work, step, evidence)
     assert (step[:, 20:] == 0.0).all()
     step, evidence = step[:, :20].copy(), evidence[:, :20].copy()
     assert np.abs(step[12, 9:11]) == pytest.approx([0.1, 0.1], abs=0.015)

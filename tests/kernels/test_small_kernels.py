@@ -321,7 +321,7 @@ def test_places_between_ticks_are_linear() -> None:
     at = np.random.default_rng(5).normal(size=(5, 3))
     number = np.array([0, 1, 2, 2, 3, 4])  # no epoch needs tick 73
     epochs = np.array([700, 705, 710, 719, 749, 740], np.int64)
-    found = np.empty((epochs.size, 3))
+    found = np.empty((3, epochs.size))
     between_ticks(epochs, 10, 70, number, at, found)
     for axis in range(3):
-        np.testing.assert_allclose(found[:, axis], np.interp(epochs, [700, 710, 720, 740, 750], at[:, axis]))
+        np.testing.assert_allclose(found[axis], np.interp(epochs, [700, 710, 720, 740, 750], at[:, axis]))

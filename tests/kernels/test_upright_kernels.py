@@ -11,8 +11,11 @@ from roadscan.kernels.assets.cylinders import fit_cylinder, radius_across
 from roadscan.kernels.assets.grown_cells import low_moments
 from roadscan.kernels.assets.slices import fill_slices, label_slices, owners, slices_above_one_another
 from roadscan.kernels.assets.upright_voxels import (
+    beside_line,
     gather_moments,
     grow_regions,
+    in_stretches,
+    near_middles,
     passing_lines,
     region_ranges,
     thin_elements,
@@ -23,6 +26,7 @@ def test_slices_and_their_components() -> None:
     rng = np.random.default_rng(1)
     x, y, above = rng.uniform(0, 2, 300), rng.uniform(0, 2, 300), rng.uniform(-0.5, 1.5, 300)
     above[7] = np.nan
+    above = above.astype(np.float32)
     counts, cell = np.zeros((3, 20, 20), np.uint16), np.empty(300, np.int64)
     fill_slices(x, y, above, np.array([0.0, 0.0, 0.2]), 0.1, 0.4, counts, cell)
     inside = (above >= 0.2) & (above < 1.4)
@@ -81,7 +85,7 @@ def test_a_wall_becomes_one_region_and_a_bush_none() -> None:
     x, y, above = np.concatenate([wall, bush]).T.copy()
     index = np.full((3, 24, 24), -1, np.int32)
     moments, voxel = np.empty((4000, 10)), np.empty(4000, np.int32)
-    found = gather_moments(x, y, above, np.zeros(3), np.array([0.25, 0.5]), index, moments, voxel)
+    found = gather_moments(x, y, above.astype(np.float32), np.zeros(3), np.array([0.25, 0.5]), index, moments, voxel)
     assert (voxel >= 0).all() and moments[:found, 0].sum() == 4000
     own = voxel == voxel[0]
     corner = moments[voxel[0], [9, 8]] * 0.25
@@ -144,3 +148,21 @@ def test_moments_of_what_lies_low() -> None:
     own = counted & (x >= 0.5) & (y < 0.5) & (above >= 0.1) & (above <= 0.8)
     h = above[own]
     np.testing.assert_allclose(sums[0, 1], [own.sum(), h.sum(), (h * h).sum(), light[own].sum()])
+
+
+def test_places_along_a_line_and_near_its_middles() -> None:
+    rng = np.random.default_rng(4)
+    x, y, rows = rng.uniform(0, 9, 500), rng.uniform(0, 9, 500), np.sort(rng.choice(500, 300, replace=False))
+    middle, along = np.array([4.0, 5.0]), np.array([0.8, 0.6])
+    t, d, near = np.empty(300), np.empty(300), np.empty(300, np.bool_)
+    beside_line(x, y, rows, middle, along, t, d)
+    past = np.column_stack([x[rows], y[rows]]) - middle
+    np.testing.assert_allclose(np.column_stack([t, d]), past @ np.array([[0.8, -0.6], [0.6, 0.8]]), atol=1e-12)
+    for count in (1, 7):
+        edges, stretch = np.linspace(-4.0, 3.0, count + 1), np.empty(300, np.int32)
+        t[:count] = edges[:-1]  # where one begins belongs to it
+        in_stretches(t, edges, stretch)
+        assert (stretch == np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)).all()
+        held = rng.uniform(-1.0, 1.0, count)
+        near_middles(t, d, stretch, edges, held, 0.5, near)
+        assert (near == (np.abs(d - np.interp(t, (edges[:-1] + edges[1:]) / 2, held)) <= 0.5)).all()

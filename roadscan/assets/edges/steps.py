@@ -105,9 +105,8 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
         u, v = (math.cos(angle), math.sin(angle)), (math.sin(angle), -math.cos(angle))
         strips(*field, _along(u, settings, raster.cell_m), wanted, work, strip)
         strip[:, :, FRAME + raster.count.shape[1] :] = 0.0  # no strip lies beyond the raster
-        slope = slopes[0] * v[0] + slopes[1] * v[1]
         across = _across(v, settings, raster.cell_m)
-        step_response(strip, freedom, active, slope, across, constants, work, step, evidence)
+        step_response(strip, freedom, active, (*slopes, v), across, constants, work, step, evidence)
         surroundings.take_excess(evidence, still)
         thin(step, evidence, float(k), v, limits, first, best)
     return _places(raster, best, first, settings)

@@ -15,7 +15,7 @@ from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.regions import Region, regions_of
-from roadscan.kernels.assets.upright_voxels import passing_lines
+from roadscan.kernels.assets.upright_voxels import beside_line, in_stretches, near_middles, passing_lines
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -60,7 +60,7 @@ class Panel:
     seen_from_m: tuple[float, float]
     """Mean place of the sensor."""
     rows: Int64
-    stretch: Int64
+    stretch: npt.NDArray[np.int32]
     """Stretch of each row."""
 
     def comes_near(self, tile: Box) -> bool:
@@ -89,15 +89,15 @@ def _highest_elevation_deg(scene: Scene) -> float:
 
 def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     returns, rows = scene.returns, region.rows
-    past = np.column_stack([returns.x_m[rows], returns.y_m[rows]]) - region.middle_xy_m
     beside = np.array([-region.along[1], region.along[0]])
-    t, d = past @ region.along, past @ beside
+    t, d, stretch = np.empty(rows.size), np.empty(rows.size), np.empty(rows.size, np.int32)
+    beside_line(returns.x_m, returns.y_m, rows, region.middle_xy_m, region.along, t, d)
     begin, end = quantiles(t, [0.003, 0.997])
     count = max(1, round((end - begin) / STRETCH_M))
     edges = np.linspace(begin, end, count + 1)
-    stretch = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
-    middle = _medians(d, stretch, count)
-    near = np.abs(d - np.interp(t, (edges[:-1] + edges[1:]) / 2, middle)) <= _BESIDE_M
+    in_stretches(t, edges, stretch)
+    middle, near = _medians(d, stretch, count), np.empty(rows.size, np.bool_)
+    near_middles(t, d, stretch, edges, middle, _BESIDE_M, near)
     if near.sum() < 10:
         return None
     rows, stretch = rows[near], stretch[near]
@@ -120,14 +120,14 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     centre = (xy[:-1] + xy[1:]) / 2
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
-    vegetation = float(np.isin(scene.classes[rows], _VEGETATION).mean())
+    vegetation = float(np.bincount(scene.classes[rows], minlength=256)[list(_VEGETATION)].sum() / rows.size)
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
         np.bincount(stretch, minlength=count), none, none, open_top, region.across_m, vegetation, sensor, rows, stretch,
     )  # fmt: skip
 
 
-def _medians(d: Float64, stretch: Int64, count: int) -> Float64:
+def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:
     """Median of d in each stretch (count,); where fewer than 5 are known, as beside it."""
     out = np.full(count, np.nan)
     starts, order = in_bins(stretch, count)

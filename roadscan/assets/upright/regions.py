@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.slices import usable
+from roadscan.assets.upright.slices import usable_above_m
 from roadscan.kernels.assets.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
 
 Float64 = npt.NDArray[np.float64]
@@ -72,7 +73,7 @@ def regions_of(scene: Scene) -> list[Region]:
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
     index = np.full((LAYERS, rows, columns), -1, np.int32)
-    above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)
+    above = usable_above_m(scene)
     most = min(int(np.count_nonzero(np.isfinite(above))), int(index.size))
     moments, voxel = np.empty((max(most, 1), 10)), np.empty(len(returns), np.int32)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
@@ -163,6 +164,6 @@ def _region(scene: Scene, elements: Float64, rows: Int64) -> Region | None:
     middle, along, low, high = _line(elements)
     if high - low < _LEAST_LENGTH_M + 2 * SIDE_M:
         return None
-    bottom, top = np.quantile(scene.above_ground_m[rows].astype(np.float64), [0.02, 0.98])
+    bottom, top = quantiles(scene.above_ground_m[rows].astype(np.float64), [0.02, 0.98])
     across = float(np.median(elements[:, 5]))
-    return Region(rows, middle, along, (low, high), across, float(bottom), float(top))
+    return Region(rows, middle, along, (low, high), across, bottom, top)

@@ -63,16 +63,21 @@ def usable(scene: Scene) -> npt.NDArray[np.bool_]:
 
 
 @once_a_scene
+def usable_above_m(scene: Scene) -> npt.NDArray[np.float32]:
+    """Height (n,) above the ground of the returns that may belong to something upright; NaN of all others."""
+    return np.where(usable(scene), scene.above_ground_m, np.float32(np.nan))
+
+
+@once_a_scene
 def slices_of(scene: Scene) -> Slices:
     """Slices of a scene, and their compact components: cells that touch, at most 1.1 m wide."""
     returns, window = scene.returns, scene.extent
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / CELL_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / CELL_M - 1e-9))
-    above = np.where(usable(scene), scene.above_ground_m, np.nan).astype(np.float64)
     counts = np.zeros((SLICES, rows, columns), np.uint16)
     cell = np.empty(len(returns), np.int64)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
-    fill_slices(returns.x_m, returns.y_m, above, corner, CELL_M, SLICE_M, counts, cell)
+    fill_slices(returns.x_m, returns.y_m, usable_above_m(scene), corner, CELL_M, SLICE_M, counts, cell)
     cells = _not_zero(counts.reshape(-1))
     labels, boxes = np.zeros(counts.shape, np.int32), np.empty((cells.size, 5), np.int32)
     found = label_slices(counts, cells, labels, boxes, np.empty(max(cells.size, 1), np.int64))

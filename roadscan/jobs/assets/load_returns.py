@@ -117,7 +117,7 @@ class _Block:
         rows = np.empty(c.x.size, np.int64)
         rows = rows[: rows_within(c.x, c.y, ends, rows)]
         corner = grid.corner_m(square)
-        x, y = _metres(c.x[rows] - np.int64(west)), _metres(c.y[rows] - np.int64(south))
+        x, y = _metres(c.x[rows] - np.int32(west)), _metres(c.y[rows] - np.int32(south))
         if self._centre is not None:
             w = grid.window(square)
             box = (w.easting_min_m, w.northing_min_m, w.easting_max_m, w.northing_max_m)
@@ -223,12 +223,13 @@ class _Block:
         found = [np.zeros((0, 4))]
         seen: set[int] = set()
         for number, rows in _by_source(own.source, len(self._sources)):
-            held = np.flatnonzero(np.bincount(own.pass_id[rows])).tolist()
+            ids = own.pass_id[rows]
+            held = [int(ids[0])] if ids.min() == ids.max() else np.flatnonzero(np.bincount(ids)).tolist()
             for one in held:
                 if one in seen:
                     continue
                 epochs = own.epoch_gps_ns[rows]
-                tick = distinct_steps(epochs if len(held) == 1 else epochs[own.pass_id[rows] == one], _DRIVE_TICK_NS)
+                tick = distinct_steps(epochs if len(held) == 1 else epochs[ids == one], _DRIVE_TICK_NS)
                 places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
                 places[:, :2] -= grid.corner_m(square)
                 places = places[grid.window_box.holds(places[:, 0], places[:, 1])]

@@ -9,8 +9,9 @@ from roadscan.kernels.options import kernel
 def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
     """Count returns into the cells of their slice, and note the flat number of each return's cell (-1: none).
 
-    x, y, above : (n,) float64, plan and height above the ground (m), NaN where that is not known; corner : (x, y,
-    height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,) int64.
+    x, y : (n,) float64, places (m); above : (n,) float32, height above the ground (m), NaN where that is not known;
+    corner : (x, y, height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,)
+    int64.
     """
     slices, rows, columns = counts.shape
     for i in range(x.size):
@@ -37,27 +38,32 @@ def label_slices(counts, cells, labels, boxes, stack):
     column; stack : (m,) int64, working space.
     """
     _, rows, columns = counts.shape
-    found = 0
+    found, line, k, r = 0, 0, 0, 0
     for cell in cells:
-        k, r, c = cell // (rows * columns), cell // columns % rows, cell % columns
+        while cell - line >= columns:
+            line += columns
+            r += 1
+            if r == rows:
+                k, r = k + 1, 0
+        c = cell - line
         if labels[k, r, c] != 0:
             continue
         found += 1
         labels[k, r, c] = found
-        stack[0] = r * columns + c
+        stack[0] = r << 32 | c
         waiting = 1
         south, north, west, east = r, r, c, c
         while waiting > 0:
             waiting -= 1
             at = stack[waiting]
-            row, column = at // columns, at % columns
+            row, column = at >> 32, at & 0xFFFFFFFF
             south, north = min(south, row), max(north, row)
             west, east = min(west, column), max(east, column)
             for rr in range(max(row - 1, 0), min(row + 2, rows)):
                 for cc in range(max(column - 1, 0), min(column + 2, columns)):
                     if counts[k, rr, cc] != 0 and labels[k, rr, cc] == 0:
                         labels[k, rr, cc] = found
-                        stack[waiting] = rr * columns + cc
+                        stack[waiting] = rr << 32 | cc
                         waiting += 1
         boxes[found - 1, 0] = k
         boxes[found - 1, 1], boxes[found - 1, 2] = south, north

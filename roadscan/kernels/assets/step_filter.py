@@ -217,15 +217,22 @@ def tell(active, right, left, out):
         out[i] = 1.0 if enough else 0.0
 
 
+@bare_inlined
+def slope_towards(slope_x, slope_y, unit, out):
+    """Slope in a direction."""
+    for i in range(CHUNK):
+        out[i] = slope_x[i] * unit[0] + slope_y[i] * unit[1]
+
+
 @bare
-def step_response(strip, freedom, active, slope, across, constants, work, step_m, evidence):
+def step_response(strip, freedom, active, slopes, across, constants, work, step_m, evidence):
     """Fill (rows, columns) `step_m`, height of the right side above the left one, and `evidence`, the step over its σ.
 
     strip : (3, …) of :func:`strips`, with a frame; the other rasters have none, and whole chunks of columns. freedom :
-    cells with a height near, for the degrees of freedom of χ². active : where to look. slope : slope of the ground at
-    large to the right (m/m), what is expected of each side. across : (s, 3) of each strip of the right side its column
-    and row from the edge and its distance from it (m). constants : (precision of the slope of a side (m/m)⁻², floor of
-    a step's σ (m)). work : (WORK, CHUNK) float64.
+    cells with a height near, for the degrees of freedom of χ². active : where to look. slopes : those of the ground at
+    large in x and in y (m/m), expected of each side, and the unit vector to the right. across : (s, 3) of each strip of
+    the right side its column and row from the edge and its distance from it (m). constants : (precision of the slope of
+    a side (m/m)⁻², floor of a step's σ (m)). work : (WORK, CHUNK) float64.
     """
     for row in range(active.shape[0]):
         for c in range(0, active.shape[1], CHUNK):
@@ -236,7 +243,8 @@ def step_response(strip, freedom, active, slope, across, constants, work, step_m
                 some |= here[i]
             if not some:
                 continue
-            expected = slope[row, c : c + CHUNK]
+            expected = work[19]
+            slope_towards(slopes[0][row, c : c + CHUNK], slopes[1][row, c : c + CHUNK], slopes[2], expected)
             side_lines(strip, row + FRAME, c + FRAME, across, 1, expected, constants[0], work, 6)
             side_lines(strip, row + FRAME, c + FRAME, across, -1, expected, constants[0], work, 11)
             tell(here, work[9], work[14], work[16])

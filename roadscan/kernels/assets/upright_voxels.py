@@ -13,10 +13,10 @@ from roadscan.kernels.options import inlined, kernel
 def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
     """Number of voxels with returns; their moments, and the voxel of each return (-1: none).
 
-    x, y, above : (n,) float64 (m), NaN heights are left out; corner : (x, y, height) of voxel (0, 0, 0); sizes : (side,
-    height of a layer) of a voxel (m); index : (layers, rows, columns) int32, all -1, gets the voxel's number; moments :
-    (most voxels, 10): n, Σx, Σy, Σx², Σxy, Σy² (from the voxel's corner), least and greatest height, row, column;
-    voxel_of : (n,) int32.
+    x, y : (n,) float64; above : (n,) float32 heights (m), NaN is left out; corner : (x, y, height) of voxel (0, 0, 0);
+    sizes : (side, height of a layer) of a voxel (m); index : (layers, rows, columns) int32, all -1, gets the voxel's
+    number; moments : (most voxels, 10): n, Σx, Σy, Σx², Σxy, Σy² (from the voxel's corner), least and greatest height,
+    row, column; voxel_of : (n,) int32.
     """
     layers, rows, columns = index.shape
     found = 0
@@ -141,6 +141,45 @@ def grow_regions(index, elements, least_cosine, most_m, reach, region, stack):
                                     stack[waiting, 0], stack[waiting, 1], stack[waiting, 2] = kk, rr, cc
                                     waiting += 1
     return found
+
+
+@kernel
+def beside_line(x, y, rows, middle, along, t, d):
+    """Fill `t` and `d` (k,): how far the places at `rows` (k,) lie along a line from its middle, and left of it (m)."""
+    for i in range(rows.size):
+        past_x, past_y = x[rows[i]] - middle[0], y[rows[i]] - middle[1]
+        t[i] = past_x * along[0] + past_y * along[1]
+        d[i] = past_y * along[0] - past_x * along[1]
+
+
+@kernel
+def in_stretches(t, edges, stretch):
+    """Fill `stretch` (k,) int32: the stretch of a line that t (k,) lies in; beyond the ends, the first and the last.
+
+    edges : (stretches + 1,) float64 where they begin, evenly apart, and where the last one ends (m).
+    """
+    last = edges.size - 2
+    scale = (last + 1) / max(edges[last + 1] - edges[0], 1e-9)
+    for i in range(t.size):
+        k = int(min(max((t[i] - edges[0]) * scale, 0.0), float(last)))
+        while k < last and t[i] >= edges[k + 1]:
+            k += 1
+        while k > 0 and t[i] < edges[k]:
+            k -= 1
+        stretch[i] = k
+
+
+@kernel
+def near_middles(t, d, stretch, edges, middle, most_m, near):
+    """Fill `near` (k,) bool: whether d is no farther than `most_m` from the line through the middles of stretches.
+
+    middle : (stretches,) float64 d of the line halfway along each; t, stretch, edges : as :func:`in_stretches`.
+    """
+    for i in range(t.size):
+        k = stretch[i]
+        share = (t[i] - edges[k]) / (edges[k + 1] - edges[k]) - 0.5
+        other = min(max(k + (1 if share > 0.0 else -1), 0), middle.size - 1)
+        near[i] = abs(d[i] - middle[k] - abs(share) * (middle[other] - middle[k])) <= most_m
 
 
 @kernel

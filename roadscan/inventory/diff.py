@@ -18,8 +18,7 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_table
 _OF_THE_EVIDENCE: Final = frozenset(
     {
         "asset_id", "object", "easting_m", "northing_m", "height_m", "sigma_horizontal_m", "sigma_height_m",
-        "sigma_size_m",
-        "probability", "returns", "passes", "first_epoch_gps_ns", "last_epoch_gps_ns", "pictures",
+        "sigma_size_m", "probability", "returns", "passes", "first_epoch_gps_ns", "last_epoch_gps_ns", "pictures",
     }
 )  # fmt: skip
 """Columns that tell of the evidence alone, or what the geometry tells."""

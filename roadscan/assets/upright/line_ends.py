@@ -18,6 +18,8 @@ _SWEEP_GAP_NS: Final = 20_000_000
 _LINE_GAP_NS: Final = 2_000_000
 _OFTEN: Final = 2
 """A laser that so many sweeps have as the outermost one, and none as an inner one, may be the last of its fan."""
+_STRAIGHT: Final = 0.2
+"""Where the way from return to return is longer than five times that from end to end, the returns draw no lines."""
 _BESIDE: Final = 0.3
 """Lines that lie nearer to each other than this share of the widest gap are one."""
 
@@ -27,6 +29,7 @@ def misses_beside(returns: Returns, rows: Int64, places: Float64) -> Float64:
 
     Along a line the next pulse lies a step beyond the last return. Across lines the next laser, or the next scan of a
     mirror, lies as far beyond the outermost line as lines of the sweep lie apart. What has not come back is so known.
+    Where returns draw no lines, there are none.
 
     Parameters
     ----------
@@ -45,6 +48,8 @@ def misses_beside(returns: Returns, rows: Int64, places: Float64) -> Float64:
     places, away = places[order], returns.at(rows[order[starts]]).range_m
     line_sweep, line_laser = sweep[order][starts], laser[order][starts]
     first, end = places[starts], places[last]
+    if not _draw_lines(places, starts, last):
+        return np.zeros((0, POINTS, 2))
     steps = _steps(places, starts, last, away)
     along = np.concatenate([first - steps, end + steps])
     way = np.linalg.eigh((end - first).T @ (end - first) + 1e-12 * np.eye(2))[1][:, 1]
@@ -58,6 +63,13 @@ def misses_beside(returns: Returns, rows: Int64, places: Float64) -> Float64:
 def _numbers(is_new: npt.NDArray[np.bool_]) -> Int64:
     """Number of the group of each of n + 1 elements, of which n may begin a new one."""
     return np.concatenate([[0], np.cumsum(is_new)])
+
+
+def _draw_lines(places: Float64, starts: Int64, last: Int64) -> bool:
+    """Whether returns follow one another along lines, rather than in an order that says nothing of a sensor."""
+    step = np.concatenate([[0.0], np.hypot(*np.diff(places, axis=0).T)])
+    step[starts] = 0.0
+    return float(np.hypot(*(places[last] - places[starts]).T).sum()) > _STRAIGHT * float(step.sum())
 
 
 def _steps(places: Float64, starts: Int64, last: Int64, away_m: Float64) -> Float64:

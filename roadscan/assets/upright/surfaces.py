@@ -111,6 +111,7 @@ class SurfaceKind(AssetKind):
 def as_object(chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any]) -> AssetObject:
     """An object of a chain."""
     sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
+    passes = len(chain.passes)
     return AssetObject(
-        geometry, float(sigma), 0.03, probability_of(chain), chain.seen, chain.passes, *chain.epochs_gps_ns, values
+        geometry, float(sigma), 0.03, probability_of(chain), chain.seen, passes, *chain.epochs_gps_ns, values
     )

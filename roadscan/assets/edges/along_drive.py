@@ -30,6 +30,9 @@ SAME_ROAD_M: Final = 8.0
 KERB_EVIDENCE: Final = 6.0
 BARRIER_EVIDENCE: Final = 3.0
 LEAST_EVIDENCE: Final = 0.6
+FOOT_M: Final = (0.4, 0.8)
+"""So far before a kerb the road's height is read, and carried on to the kerb's foot: nearer, smoothing mixes it with
+the kerb's."""
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
 
 
@@ -121,8 +124,10 @@ def _one_side(
         if len(rows) < 5:
             continue
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
-        r, c = raster.cells_of(line[:, 0], line[:, 1])
-        level = beside.height_m[r, c]
+        level = _height_at(line, beside, raster)
+        near, far = (_height_at(line - d * out[rows], beside, raster) for d in FOOT_M)
+        foot = near + (near - far) * FOOT_M[0] / (FOOT_M[1] - FOOT_M[0])
+        level = np.where((by_kerb[rows] > 0.5) & np.isfinite(foot), foot, level)
         if not np.isfinite(level).all():
             level = np.where(np.isfinite(level), level, np.nanmedian(beside.height_m))
         nodes = np.zeros((len(rows), len(EDGE_COLUMNS)))
@@ -134,6 +139,12 @@ def _one_side(
             [by_kerb[rows], by_barrier[rows], np.full(len(rows), float(right)), found.evidence[rows]]
         )
         yield nodes
+
+
+def _height_at(places: Float64, beside: Beside, raster: HeightRaster) -> Float64:
+    """Smoothed height (n,) of the surface at places (n, 2)."""
+    r, c = raster.cells_of(places[:, 0], places[:, 1])
+    return np.asarray(beside.height_m[r, c])
 
 
 def _snapped(line: Float64, at_kerb: npt.NDArray[np.bool_], kerbs: list[Float64]) -> Float64:

@@ -111,6 +111,11 @@ def test_a_road_may_have_edges_on_one_side_alone() -> None:
             "right" if right else "left"
         }
     assert len(pieces)
+    kerbs = [o for o in kind.objects(pieces, RoadEdgeOptions(), {}) if o.attributes["type"] == "kerb"]
+    # The edge is that of the carriageway: it lies at the foot of the kerb of 15 cm.
+    places = np.concatenate([np.array(o.geometry.coords)[:-1] for o in kerbs])
+    foot = 100.0 + 0.01 * places[:, 0] - 0.02 * np.abs(places[:, 1])
+    assert np.abs(places[:, 2] - foot).max() < 0.015
 
 
 def test_the_edge_of_a_road_without_kerbs_is_where_its_verge_begins() -> None:

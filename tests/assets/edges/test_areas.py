@@ -112,6 +112,7 @@ def test_a_road_may_have_edges_on_one_side_alone() -> None:
         }
     assert len(pieces)
     kerbs = [o for o in kind.objects(pieces, RoadEdgeOptions(), {}) if o.attributes["type"] == "kerb"]
+    assert sum(o.attributes["length_m"] for o in kerbs) > 27.0
     # The edge is that of the carriageway: it lies at the foot of the kerb of 15 cm.
     places = np.concatenate([np.array(o.geometry.coords)[:-1] for o in kerbs])
     foot = 100.0 + 0.01 * places[:, 0] - 0.02 * np.abs(places[:, 1])

@@ -232,6 +232,12 @@ def test_cross_sections_cross_the_road_on_bare_earth(street: Simulated) -> None:
     assert 0.0 < rows["sigma_height_m"].median() < 0.05
 
 
+def test_cross_sections_that_are_asked_for_later_are_due(street: Simulated) -> None:
+    own = session(street)
+    assert Assets().state(own).stale == 0
+    assert Assets().state(session(street, cross_sections={"spacing_m": 2.0, "half_width_m": 4.0})).stale == 2
+
+
 class Backwards(Inline):
     """Tasks from last to first."""
 

@@ -104,7 +104,11 @@ def _one_side(
     inside &= x < raster.x_min_m + raster.count.shape[1] * raster.cell_m
     inside &= y < raster.y_min_m + raster.count.shape[0] * raster.cell_m
     height = np.where(inside, height, np.nan)
-    up = beside.edge_x[row, column] * out[:, :1] + beside.edge_y[row, column] * out[:, 1:] > 0.5
+    up = np.zeros(height.shape, np.bool_)
+    # Kerbs are a cell wide: at steps of a whole cell a way across would miss some between two of its places.
+    for step in (0.0, raster.cell_m / 2):
+        r, c = raster.cells_of(x + step * out[:, :1], y + step * out[:, 1:])
+        up |= beside.edge_x[r, c] * out[:, :1] + beside.edge_y[r, c] * out[:, 1:] > 0.5
     stands = beside.blocked[row, column] & inside
     behind = np.cumsum(stands, axis=1) > 3
     known = np.where(up & inside, KERB_EVIDENCE, np.where(stands & ~behind, BARRIER_EVIDENCE, 0.0))

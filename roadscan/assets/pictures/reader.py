@@ -24,6 +24,7 @@ Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
 
 ENTRY_POINT_GROUP: Final = "roadscan.asset_picture_readers"
+_EYE_LEVEL_M: Final = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +78,8 @@ class PictureReader:
     """Of the kind."""
 
     def sight(self, one: AssetObject) -> Sight:
-        """What pictures have to show of an object: its reference point, unless a reader knows better."""
-        return Sight(np.array([reference_point(one.geometry)]))
+        """What pictures have to show of an object, unless a reader knows better (:func:`usual_sight`)."""
+        return usual_sight(one)
 
 
 class CutOutReader(PictureReader, ABC):
@@ -118,4 +119,15 @@ def picture_readers() -> dict[str, CutOutReader | ColourReader]:
 def sight_of(kind: str, one: AssetObject) -> Sight:
     """What pictures have to show of an object: what the reader of its kind says, else its reference point."""
     reader = picture_readers().get(kind)
-    return Sight(np.array([reference_point(one.geometry)])) if reader is None else reader.sight(one)
+    return usual_sight(one) if reader is None else reader.sight(one)
+
+
+def usual_sight(one: AssetObject) -> Sight:
+    """The reference point of an object; of what stands at a point its middle, but no more than 2 m above the foot.
+
+    Parked cars hide the feet of posts and trees.
+    """
+    easting, northing, height = reference_point(one.geometry)
+    if one.geometry.geom_type == "Point":
+        height += min((one.attributes.get("asset_height_m") or 0.0) / 2, _EYE_LEVEL_M)
+    return Sight(np.array([(easting, northing, height)]))

@@ -50,7 +50,7 @@ class Chain:
     vegetation: float
     sensor_xy_m: tuple[float, float]
     seen: int
-    passes: int
+    passes: frozenset[int]
     epochs_gps_ns: tuple[int, int]
 
     @property
@@ -172,7 +172,7 @@ def _part(row: dict[str, Any]) -> Chain:
     values = {name: np.array(row[name], np.float64) for name in STRETCHES}
     return Chain(
         np.column_stack([row["x_m"], row["y_m"]]), values, row["across_m"], row["vegetation"],
-        (row["sensor_x_m"], row["sensor_y_m"]), row["seen"], len(row["passes"]),
+        (row["sensor_x_m"], row["sensor_y_m"]), row["seen"], frozenset(row["passes"]),
         (row["first_epoch_gps_ns"] or 0, row["last_epoch_gps_ns"] or 0),
     )  # fmt: skip
 
@@ -284,6 +284,6 @@ def _linked(parts: list[Chain]) -> Chain:
         np.concatenate(xy), {name: np.concatenate(v) for name, v in values.items()},
         float(weights @ [p.across_m for p in parts]), float(weights @ [p.vegetation for p in parts]),
         (float(weights @ [p.sensor_xy_m[0] for p in parts]), float(weights @ [p.sensor_xy_m[1] for p in parts])),
-        sum(p.seen for p in parts), max(p.passes for p in parts),
+        sum(p.seen for p in parts), frozenset().union(*(p.passes for p in parts)),
         (min((e for e, _ in epochs), default=0), max((e for _, e in epochs), default=0)),
     )  # fmt: skip

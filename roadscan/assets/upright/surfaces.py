@@ -115,7 +115,8 @@ def as_object(
 ) -> AssetObject:
     """An object of a chain."""
     sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
+    passes = len(chain.passes)
     return AssetObject(
-        geometry, float(sigma), _GROUND_SIGMA_M, probability_of(chain), chain.seen, chain.passes, *chain.epochs_gps_ns,
+        geometry, float(sigma), _GROUND_SIGMA_M, probability_of(chain), chain.seen, passes, *chain.epochs_gps_ns,
         values, sigma_size_m,
     )  # fmt: skip

@@ -151,7 +151,12 @@ class Assets(Stage):
         tables = plan_tables(plan.kinds, manifest, key, context, pictures)
         due = len(pictures.due(manifest)) + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
         files = plan_files(plan.kinds, manifest, plan.config, context)
-        return due + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
+        due += sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
+        if due or plan.config.cross_sections is None:
+            return due
+        roads, _ = survey_roads(plan.survey, manifest)
+        sections = plan_sections(roads, plan.config.cross_sections, plan.grid, manifest, context)
+        return sum(not manifest.is_current(SECTIONS, unit, one.key) for one in sections for unit in one.units)
 
     def folders(self) -> Sequence[str]:
         """Evidence, objects, tables and files, classified points, bare earth."""

@@ -103,6 +103,39 @@ def test_a_median_has_width_and_height() -> None:
     assert not list(walks.objects(walks.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
 
 
+def walkway(ramp: bool) -> Scene:
+    """A road that rises by 3 % with a kerb of 12 cm to its left, 2.5 m of a walkway that rises by 2 % away from the
+    road, and a wall behind it; with a ramp, the kerb is 2 cm high for 4 m.
+    """
+    rng = np.random.default_rng(6)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 24.0, 0.05), np.arange(-5.0, 5.5, 0.05)))
+    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    step = np.where(ramp & (np.abs(x - 12.0) < 2.0), 0.02, 0.12)
+    z = 100.0 + 0.03 * x + np.where(y > 3.0, step + 0.02 * (y - 3.0), -0.02 * np.abs(y) + 0.06)
+    wall_x, wall_z = (a.ravel() for a in np.meshgrid(np.arange(0.0, 24.0, 0.05), np.arange(0.0, 3.0, 0.05)))
+    wall_z += 100.17 + 0.03 * wall_x
+    x, y, z = np.append(x, wall_x), np.append(y, np.full(wall_x.size, 5.55)), np.append(z, wall_z)
+    z += rng.normal(0.0, 0.004, z.size)
+    sensor = np.column_stack([x, np.zeros(x.size), np.full(x.size, 102.4)])
+    returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
+    drive = np.column_stack([np.arange(0.0, 24.0), np.zeros(24), np.full(24, 102.4), np.ones(24)])
+    box = Box(0.0, -5.0, 24.0, 6.0)
+    return make_scene(returns, box, box, drive)
+
+
+@pytest.mark.parametrize("ramp", [False, True])
+def test_a_sidewalk_has_slopes_a_kerb_and_a_ramp_where_its_kerb_is_dropped(ramp: bool) -> None:
+    kind = Sidewalk()
+    pieces = kind.evidence(walkway(ramp), SidewalkOptions()).pieces
+    one = max(kind.objects(pieces, SidewalkOptions(), {}), key=lambda o: o.geometry.area)
+    assert one.attributes["width_m"] == pytest.approx(2.5, abs=0.2)
+    assert one.attributes["kerb_height_m"] == pytest.approx(0.12, abs=0.01)
+    assert one.attributes["cross_slope"] == pytest.approx(0.02, abs=0.006)
+    assert one.attributes["ramp"] is ramp
+    if not ramp:
+        assert abs(one.attributes["running_slope"]) == pytest.approx(0.03, abs=0.006)
+
+
 def test_a_road_may_have_edges_on_one_side_alone() -> None:
     kind = RoadEdge()
     pieces = kind.evidence(island(2.4, 0.15), RoadEdgeOptions()).pieces
@@ -112,6 +145,13 @@ def test_a_road_may_have_edges_on_one_side_alone() -> None:
             "right" if right else "left"
         }
     assert len(pieces)
+    kerbs = [o for o in kind.objects(pieces, RoadEdgeOptions(), {}) if o.attributes["type"] == "kerb"]
+    assert sum(o.attributes["length_m"] for o in kerbs) > 27.0
+    assert {o.attributes["side"] for o in kerbs} == {"left"}
+    # The edge is that of the carriageway: it lies at the foot of the kerb of 15 cm.
+    places = np.concatenate([np.array(o.geometry.coords)[:-1] for o in kerbs])
+    foot = 100.0 + 0.01 * places[:, 0] - 0.02 * np.abs(places[:, 1])
+    assert np.abs(places[:, 2] - foot).max() < 0.015
 
 
 def street_with_walks() -> Scene:

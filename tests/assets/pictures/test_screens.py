@@ -6,6 +6,8 @@ import numpy as np
 import shapely
 
 from roadscan.assets import classes
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.pictures.reader import sight_of
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, GroundModel, Scene
 from roadscan.assets.screens import ALWAYS, EDGE_M, screens_of
@@ -88,3 +90,16 @@ def test_lines_of_sight_are_hidden_where_they_cross_boxes_of_shapely():
 
 def test_a_tile_without_returns_hides_nothing():
     assert screens_of(scene_of([(np.zeros((0, 3)), 1, 0)])).num_rows == 0
+
+
+def test_a_lamp_post_behind_a_parked_car_is_seen_over_it():
+    car = patch((7.0, 9.0), (4.0, 6.0), (0.4, 1.5))
+    screens = screens_of(scene_of([(car, classes.VEHICLE, 0), (car, classes.VEHICLE, 10**6)]))
+    foot, east, north = np.array([10.5, 5.0, 0.0]), *CORNER
+    lamp = AssetObject(
+        shapely.Point(east + 10.5, north + 5.0, 0.0), 0.01, 0.01, 0.9, 9, 1, 0, 1, {"asset_height_m": 6.0}
+    )
+    place = sight_of("lighting", lamp).places_m[0] - [east, north, 0.0]
+    eyes, epochs = np.tile([3.0, 5.0, 2.4], (2, 1)), np.full(2, 500_000, np.int64)
+    assert hidden(screens, eyes, np.stack([foot, place]), epochs).tolist() == [True, False]
+    assert place.tolist() == [10.5, 5.0, 2.0]

@@ -40,6 +40,8 @@ def test_each_shaft_is_found_where_it_stands_as_what_it_is() -> None:
             assert abs(one.geometry.z - thing.height_m) < 0.08
             assert one.probability > 0.6 and one.returns > 50 and one.passes == 1
     lamps = {lamp.attributes["type"]: lamp.attributes["arm_m"] for lamp in objects_of(scene, "lighting")}
+    for lamp in objects_of(scene, "lighting"):
+        assert lamp.attributes["lamp_height_m"] == pytest.approx(6.0 - 0.1, abs=0.1)
     assert lamps["arm"] == pytest.approx(4.5, abs=0.3) and lamps["double_arm"] == pytest.approx(1.8, abs=0.3)
     assert {nearest(o, SHAFTS)[0].kind for o in objects_of(scene, "tree")} == {"tree"}
 

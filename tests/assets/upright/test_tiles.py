@@ -10,7 +10,7 @@ import pytest
 
 from roadscan.assets.kind import AssetObject, asset_kinds
 from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.lines import PIECE_SCHEMA, chains_of
+from roadscan.assets.upright.lines import PIECE_SCHEMA, STRETCHES, chains_of
 from tests.assets.upright.scene import objects_of, simulated
 
 TILE_M, HALO_M = 20.0, 8.0
@@ -75,3 +75,18 @@ def test_a_chain_is_the_same_whatever_order_its_pieces_come_in() -> None:
             (a.values[n] == b.values[n])[~np.isnan(a.values[n])].all() for n in a.values
         )
     assert chains_of(PIECE_SCHEMA.empty_table()) == []
+
+
+def test_a_chain_was_seen_by_the_passes_of_all_its_pieces() -> None:
+    """Two pieces of a fence end to end: one seen by passes 1 and 2, the next by 2 and 3."""
+
+    def piece(start_m: float, passes: list[int]) -> dict[str, object]:
+        values = {name: [0.0] for name in STRETCHES} | {"high_m": [1.5], "length_m": [5.0]}
+        return {
+            "x_m": [start_m, start_m + 5.0], "y_m": [0.0, 0.0], **values, "across_m": 0.01, "vegetation": 0.0,
+            "sensor_x_m": 0.0, "sensor_y_m": 9.0, "seen": 100, "passes": passes,
+            "first_epoch_gps_ns": passes[0], "last_epoch_gps_ns": passes[-1],
+        }  # fmt: skip
+
+    (chain,) = chains_of(pa.Table.from_pylist([piece(0.0, [1, 2]), piece(5.0, [2, 3])], schema=PIECE_SCHEMA))
+    assert (len(chain.passes), chain.seen, chain.epochs_gps_ns) == (3, 200, (1, 3))

@@ -18,6 +18,9 @@ Each compilation has a number of its own in the names of its machine code, which
 from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
 name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
 (numba/numba, issue 10486).
+
+What a function of Numba answers for the types of its arguments is kept. Numba asks all of an operator's templates anew
+at each place where it stands, and words an error for each that does not fit: a sixth of the time of a compilation.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ import secrets
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 import llvmlite.binding
 import numba
@@ -37,6 +41,8 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
+from numba.core.targetconfig import ConfigStack
+from numba.core.types.functions import BaseFunction
 
 from roadscan.private_folder import check_private, make_private
 
@@ -217,6 +223,23 @@ def _number_apart() -> None:
     FunctionIdentity._unique_ids = iter(lambda: secrets.randbits(63), None)
 
 
+def _keep_answers_of_types() -> None:
+    """Let a function of Numba keep the signature that it found for types of arguments, under the options of now."""
+    find_signature: Callable[..., Any] = BaseFunction.get_call_type
+    kept_answers: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
+
+    def kept(function: Any, context: Any, types: tuple[Any, ...], named: dict[str, Any]) -> Any:
+        options = ConfigStack.top_or_none()
+        key = context, tuple(types), tuple(sorted(named.items())), options and repr(options._values)
+        answers = kept_answers.setdefault(function, {})
+        if key not in answers:
+            answers[key] = find_signature(function, context, types, named)
+        return answers[key]
+
+    BaseFunction.get_call_type = kept  # type: ignore[method-assign, assignment]
+
+
 _use_whole_registers()
 _number_apart()
 _read_parts_as_bitcode()
+_keep_answers_of_types()

@@ -11,10 +11,11 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Self
 
 import pyarrow as pa
 import shapely
+from pydantic import model_validator
 
 from roadscan.assets.scene import Scene
 from roadscan.model.strict import Strict
@@ -25,6 +26,19 @@ ENTRY_POINT_GROUP: Final = "roadscan.asset_kinds"
 
 class NoOptions(Strict):
     """A kind without settings."""
+
+
+class KindOptions(Strict):
+    """Settings of a kind: what is named least or lowest may not exceed what is named greatest or highest."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        values = self.model_dump()
+        for name, value in values.items():
+            other = name.replace("least_", "greatest_").replace("lowest_", "highest_")
+            if other != name and other in values and value > values[other]:
+                raise ValueError(f"{name} = {value:g} is more than {other} = {values[other]:g}")
+        return self
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from pydantic import Field
 from roadscan.assets.edges.along_drive import road_edges
 from roadscan.assets.edges.line_pieces import dense
 from roadscan.assets.edges.strips import ribbon
-from roadscan.assets.kind import AssetKind, AssetObject, Evidence
+from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 
@@ -27,7 +26,7 @@ GAP_NODES = 6
 """So many nodes between two dashes of a line are bridged."""
 
 
-class ShoulderOptions(Strict):
+class ShoulderOptions(KindOptions):
     """Settings of shoulders."""
 
     least_width_m: float = Field(default=0.5, gt=0.0)
@@ -45,7 +44,7 @@ class Shoulder(AssetKind):
     title: ClassVar[str] = "shoulders: paved strips beyond the outer lane line"
     curve: ClassVar[str] = "products"
     """It is the product of what is stated of its edge and of its line."""
-    options: ClassVar[type[Strict]] = ShoulderOptions
+    options: ClassVar[type[KindOptions]] = ShoulderOptions
     after: ClassVar[Sequence[str]] = ("lane_line", "road_edge")
     piece_schema: ClassVar[pa.Schema] = pa.schema(
         [pa.field(name, pa.float64(), nullable=False) for name in ("easting_m", "northing_m")]

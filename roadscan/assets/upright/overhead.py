@@ -11,12 +11,12 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
+from roadscan.assets.kind import KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import passes_of
 from roadscan.assets.upright.places import ground_light
 from roadscan.assets.upright.slices import usable
 from roadscan.kernels.assets.corridors import mark_corridor
-from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -37,7 +37,7 @@ PIECE_SCHEMA: Final = pa.schema(
 """A row a cell of a drive's corridor with something above it."""
 
 
-class ClearanceOptions(Strict):
+class ClearanceOptions(KindOptions):
     """Where clearance is looked for."""
 
     corridor_m: float = Field(default=3.0, gt=0.5, le=20.0)

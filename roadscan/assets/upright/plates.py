@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.assets.kind import KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
 from roadscan.assets.upright.line_ends import misses_beside
@@ -19,7 +20,6 @@ from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.shafts import shafts_of
 from roadscan.assets.upright.slices import usable
-from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -37,7 +37,7 @@ _ENOUGH_BRIGHT: Final = 60
 """So many bright returns tell the outline by themselves."""
 
 
-class SignOptions(Strict):
+class SignOptions(KindOptions):
     """What counts as a sign."""
 
     intensity_ratio: float = Field(default=2.0, gt=1.0)

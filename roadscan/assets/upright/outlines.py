@@ -8,6 +8,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import expit
+
+from roadscan.assets.upright.plate_beams import Beams
 
 Float64 = npt.NDArray[np.float64]
 
@@ -16,8 +19,21 @@ _TRIMMED: Final = 0.0005
 _BEYOND: Final = 0.35
 """The edge lies past the outermost return by this share of the mean distance from return to return: none of evenly
 spread returns would make it 0, a grid of them 0.5."""
+_LEAST_M: Final = 0.02
 _SQUARE: Final = 0.08
 """Sides that differ by less than this share make a square."""
+_CLOSE: Final = 2.0
+"""Shapes whose misfit is at most this multiple of the best one are held against the beams."""
+_BLURS_M: Final = (0.015, 0.006)
+"""So unsharp is an edge between what it stops and what goes by, first and at last."""
+_WELL_INSIDE: Final = 0.25
+"""Returns so far within an edge tell nothing of it, as a share of the plate."""
+_NEAR_EDGE_M: Final = (-0.05, 0.6)
+"""Two beams that go by so far beyond a side bound it."""
+_LINES: Final = 5
+"""So many outermost lines tell how far the next one would have lain from them."""
+_HOLD: Final = 0.002
+"""Pull towards the first solution, where nothing else holds (1/m)."""
 
 
 @dataclass(frozen=True)
@@ -33,36 +49,102 @@ class Outline:
     """Root mean square distance of the returns' hull from it."""
 
 
-def outline_of(points: Float64) -> Outline:
+def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
     """Best of rectangle, disc, octagon, diamond and triangles about points (n, 2) of a plane, second axis upwards.
 
     A convex shape is known by how far it reaches in each direction (its support function), which is linear in its place
-    and its size; each template is fitted by least squares.
+    and its size; each template is fitted by least squares. Where beams are known, the shapes that fit best are then set
+    between those that they stopped and those that went by; the one that parts them best is taken.
     """
-    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
-    ways = np.column_stack([np.cos(angle), np.sin(angle)])
-    reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
-    best = None
-    for shape, templates in _TEMPLATES.items():
-        columns = np.column_stack([ways, *[t(ways) for t in templates]])
-        solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
-        misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
-        if (solution[2:] > 0.02).all() and (best is None or misfit < best[0]):
-            best = (misfit, shape, solution)
-    if best is None:
+    hulls = _hulls(points)
+    if not hulls:
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
         wide, tall = map(float, high - low)
         return Outline("other", (float(middle[0]), float(middle[1])), wide, tall, math.inf)
-    misfit, shape, solution = best
+    misfit, shape, solution = hulls[0]
+    if beams is not None:
+        parted = []
+        for other, name, first in hulls:
+            if other <= _CLOSE * misfit:
+                loss, fitted = _parting(name, first, beams)
+                if (fitted[2:] > _LEAST_M).all():
+                    parted.append((loss, other, name, fitted))
+        if parted:
+            _, misfit, shape, solution = min(parted, key=lambda p: p[0])
     width, height = float(solution[2]), float(solution[-1])
-    beyond = _BEYOND * math.sqrt(width * height / len(points))
-    width, height = width + 2.0 * beyond, height + 2.0 * beyond
     if shape.startswith("triangle"):
         height = width * math.sqrt(3.0) / 2.0
     if shape == "rectangle" and abs(width - height) < _SQUARE * max(width, height):
         shape = "square"
     return Outline(shape.split()[0], (float(solution[0]), float(solution[1])), width, height, misfit)
+
+
+def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
+    """Misfit, name, and place and size of each template about points, the best first."""
+    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+    ways = np.column_stack([np.cos(angle), np.sin(angle)])
+    reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
+    found = []
+    for shape, templates in _TEMPLATES.items():
+        columns = np.column_stack([ways, *[t(ways) for t in templates]])
+        solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
+        misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
+        if (solution[2:] > _LEAST_M).all():
+            solution[2:] += 2.0 * _BEYOND * math.sqrt(solution[2] * solution[-1] / len(points))
+            found.append((misfit, shape, solution))
+    return sorted(found, key=lambda f: f[0])
+
+
+def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64]:
+    """Loss, and place and size of the template that parts beams that hit from those that passed, from a first solution.
+
+    The loss is logistic in how far a beam lies beyond the nearest side or within it. It grows straight with that on the
+    wrong side, so single wrong beams do little, and leaves the edge in the middle between both on the right one.
+    """
+    from scipy.optimize import minimize
+
+    angle = np.deg2rad(_SIDES[shape])
+    ways = np.column_stack([np.cos(angle), np.sin(angle)])
+    columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
+    within, beyond = beams.hits @ ways.T, beams.passed @ ways.T
+    within = within[(within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()]
+    beyond = np.concatenate([beyond, _expected(first, ways, columns @ first, beams) @ ways.T])
+
+    def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
+        value, slope = 0.5 * _HOLD * float(((solution - first) ** 2).sum()), _HOLD * (solution - first)
+        for side, along in ((1.0, within), (-1.0, beyond)):
+            past = along - columns @ solution
+            nearest = past.argmax(axis=1)
+            past = side * past[np.arange(len(past)), nearest] / blur
+            value += blur * float(np.logaddexp(0.0, past).sum())
+            slope = slope - side * (expit(past) @ columns[nearest])
+        return value, slope
+
+    solution, value = first, 0.0
+    for blur in _BLURS_M:
+        found = minimize(loss, solution, (blur,), method="BFGS", jac=True, options={"maxiter": 60, "gtol": 1e-4})
+        solution, value = found.x, float(found.fun)
+    return value, solution
+
+
+def _expected(first: Float64, ways: Float64, reach: Float64, beams: Beams) -> Float64:
+    """Places (k, 2) beyond sides that no beam passed by near: as far from the outermost line as the side is within.
+
+    The side lies as far beyond that line, in the mean, as lines lie from one another.
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(beams.line) != 0))
+    out = [np.zeros((0, 2))]
+    for k in range(0, len(ways), max(1, len(ways) // 8)):
+        way = ways[k]
+        past = beams.passed @ way - reach[k]
+        aside = np.abs((beams.passed - first[:2]) @ [-way[1], way[0]])
+        near = (past > _NEAR_EDGE_M[0]) & (past < _NEAR_EDGE_M[1]) & (aside < 0.45 * first[2:].max())
+        if near.sum() < 2:
+            lines = np.sort(np.maximum.reduceat(beams.hits @ way, starts))[-_LINES:]
+            gap = (lines[-1] - lines[0]) / max(lines.size - 1, 1)
+            out.append((first[:2] + way * (lines[-1] + 2.0 * gap - first[:2] @ way))[None])
+    return np.concatenate(out)
 
 
 def _disc(ways: Float64) -> Float64:
@@ -101,3 +183,12 @@ _TEMPLATES: Final = {
     "triangle down": (_triangle_down,),
 }
 """Support functions for a width, or a width and a height, of 1."""
+_SIDES: Final = {
+    "rectangle": 90.0 * np.arange(4),
+    "round": 5.0 * np.arange(72),
+    "octagon": 45.0 * np.arange(8),
+    "diamond": 45.0 + 90.0 * np.arange(4),
+    "triangle": 120.0 * np.arange(3) - 90.0,
+    "triangle down": 120.0 * np.arange(3) + 90.0,
+}
+"""Directions that the sides look to (degrees from the first axis)."""

@@ -24,14 +24,14 @@ _SQUARE: Final = 0.08
 """Sides that differ by less than this share make a square."""
 _CLOSE: Final = 2.0
 """Shapes whose misfit is at most this multiple of the best one are held against the beams."""
-_BLURS_M: Final = (0.015, 0.006)
+_BLURS_M: Final = (0.02, 0.002)
 """So unsharp is an edge between what it stops and what goes by, first and at last."""
 _WELL_INSIDE: Final = 0.25
 """Returns so far within an edge tell nothing of it, as a share of the plate."""
 _NEAR_EDGE_M: Final = (-0.05, 0.6)
 """Two beams that go by so far beyond a side bound it."""
-_LINES: Final = 5
-"""So many outermost lines tell how far the next one would have lain from them."""
+_LEAST_GAP_M: Final = 0.005
+"""A gap between lines is taken for at least so wide."""
 _HOLD: Final = 0.002
 """Pull towards the first solution, where nothing else holds (1/m)."""
 
@@ -97,7 +97,7 @@ def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
 
 
 def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64]:
-    """Loss, and place and size of the template that parts beams that hit from those that passed, from a first solution.
+    """Loss, and place and size, of the template that parts beams that hit from those that passed.
 
     The loss is logistic in how far a beam lies beyond the nearest side or within it. It grows straight with that on the
     wrong side, so single wrong beams do little, and leaves the edge in the middle between both on the right one.
@@ -109,7 +109,8 @@ def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64]:
     columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
     within, beyond = beams.hits @ ways.T, beams.passed @ ways.T
     within = within[(within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()]
-    beyond = np.concatenate([beyond, _expected(first, ways, columns @ first, beams) @ ways.T])
+    lines = _half_gap(ways, beams)
+    beyond = np.concatenate([beyond, _expected(first, ways, columns, beams, lines) @ ways.T])
 
     def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
         value, slope = 0.5 * _HOLD * float(((solution - first) ** 2).sum()), _HOLD * (solution - first)
@@ -125,25 +126,49 @@ def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64]:
     for blur in _BLURS_M:
         found = minimize(loss, solution, (blur,), method="BFGS", jac=True, options={"maxiter": 60, "gtol": 1e-4})
         solution, value = found.x, float(found.fun)
+    if shape == "rectangle":
+        reach = columns @ solution
+        solution = solution + np.linalg.solve(columns, _to_sides(within - reach, beyond - reach, lines))
     return value, solution
 
 
-def _expected(first: Float64, ways: Float64, reach: Float64, beams: Beams) -> Float64:
-    """Places (k, 2) beyond sides that no beam passed by near: as far from the outermost line as the side is within.
+def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
+    """How far each side really lies beyond where it was put (m).
 
-    The side lies as far beyond that line, in the mean, as lines lie from one another.
+    It lies in the middle between the outermost line on the plate and the nearest beam that went by. Where no beam went
+    by as near as the lines lie from one another, it lies half of their widest gap beyond the outermost one.
+
+    Parameters
+    ----------
+    within, beyond : (n, sides) how far beams that hit and that passed lie past each side.
+    half_gap : (sides,) half the widest gap between lines (m).
     """
+    out = np.zeros(half_gap.size)
+    for k in range(out.size):
+        level = (np.delete(beyond, k, axis=1) < 0.0).all(axis=1)
+        last, following = within[within[:, k] <= 0.0, k], beyond[level & (beyond[:, k] >= 0.0), k]
+        if last.size and following.size:
+            out[k] = last.max() + min((following.min() - last.max()) / 2, half_gap[k])
+    return out
+
+
+def _half_gap(ways: Float64, beams: Beams) -> Float64:
+    """Half the widest gap between lines on a plate (k,), by how far they reach in some directions (k, 2)."""
     starts = np.flatnonzero(np.append(True, np.diff(beams.line) != 0))
-    out = [np.zeros((0, 2))]
+    reach = np.sort(np.maximum.reduceat(beams.hits @ ways.T, starts, axis=0), axis=0)
+    return np.asarray(np.diff(reach, axis=0).max(axis=0, initial=2.0 * _LEAST_GAP_M) / 2)
+
+
+def _expected(first: Float64, ways: Float64, columns: Float64, beams: Beams, lines: Float64) -> Float64:
+    """Places (n, 2) beyond sides that no beam passed by near: their widest gap beyond the outermost line."""
+    reach, out = columns @ first, [np.zeros((0, 2))]
+    farthest = (beams.hits @ ways.T).max(axis=0)
     for k in range(0, len(ways), max(1, len(ways) // 8)):
-        way = ways[k]
-        past = beams.passed @ way - reach[k]
-        aside = np.abs((beams.passed - first[:2]) @ [-way[1], way[0]])
+        past = beams.passed @ ways[k] - reach[k]
+        aside = np.abs((beams.passed - first[:2]) @ [-ways[k, 1], ways[k, 0]])
         near = (past > _NEAR_EDGE_M[0]) & (past < _NEAR_EDGE_M[1]) & (aside < 0.45 * first[2:].max())
         if near.sum() < 2:
-            lines = np.sort(np.maximum.reduceat(beams.hits @ way, starts))[-_LINES:]
-            gap = (lines[-1] - lines[0]) / max(lines.size - 1, 1)
-            out.append((first[:2] + way * (lines[-1] + 2.0 * gap - first[:2] @ way))[None])
+            out.append((first[:2] + ways[k] * (farthest[k] + 2.0 * lines[k] - first[:2] @ ways[k]))[None])
     return np.concatenate(out)
 
 

@@ -29,10 +29,9 @@ SHARES = (
 def test_a_whole_street(name: str, tmp_path: Path) -> None:
     missed = []
     for figure in figures_of(processed(SCENES[name](), tmp_path / name)):
-        bar = figure.other
         is_share = any(words in figure.what for words in SHARES)
-        if bar is not None and (figure.value < bar if is_share else figure.value > bar):
-            missed.append((figure.what, figure.value, bar))
+        if figure.other is not None and (figure.value < figure.other if is_share else figure.value > figure.other):
+            missed.append(figure)
     assert not missed
 
 

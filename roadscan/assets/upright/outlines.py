@@ -8,6 +8,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import expit
+
+from roadscan.assets.upright.plate_beams import Beams
 
 Float64 = npt.NDArray[np.float64]
 
@@ -16,15 +19,24 @@ _TRIMMED: Final = 0.0005
 _BEYOND: Final = 0.35
 """The edge lies past the outermost return by this share of the mean distance from return to return: none of evenly
 spread returns would make it 0, a grid of them 0.5."""
-_NEAR_EDGE_M, _REACH_M, _LEAST_REACH_M = 0.15, 0.25, 0.02
-"""Points so near to an edge tell where it is; it is looked for so far to both sides, at least so far in the end (m)."""
-_ROUNDS, _TRIED = 5, 41
-_SOFT_M: Final = 0.004
-"""Scale of the logistic distribution of how far returns of a plate lie off in it (m)."""
-_STRAY, _STOPPED = 1e-4, 0.05
-"""Share of the points that belong to something else, and of the lines that would have hit but for something before."""
+_LEAST_M: Final = 0.02
 _SQUARE: Final = 0.08
 """Sides that differ by less than this share make a square."""
+_CLOSE: Final = 2.0
+"""Shapes whose misfit is at most this multiple of the best one are held against the beams."""
+_BLURS_M: Final = (0.02, 0.002)
+"""So unsharp is an edge between what it stops and what goes by, first and at last."""
+_WELL_INSIDE: Final = 0.25
+"""Returns so far within an edge tell nothing of it, as a share of the plate."""
+_NEAR_EDGE_M: Final = (-0.05, 0.6)
+"""Two beams that go by so far beyond a side bound it."""
+_LEAST_GAP_M: Final = 0.005
+"""A gap between lines is taken for at least so wide."""
+_SIGMA_SHARE, _LEAST_SIGMA_M = 0.1, 0.002
+"""σ of the size as a share of half the widest gap between lines, and at least (m): 95 % of 172 drawn signs lie within
+2 σ."""
+_HOLD: Final = 0.002
+"""Pull towards the first solution, where nothing else holds (1/m)."""
 
 
 @dataclass(frozen=True)
@@ -39,100 +51,130 @@ class Outline:
     misfit_m: float
     """Root mean square distance of the returns' hull from it."""
     sigma_m: float = math.inf
-    """1 σ of width and height, the greater one, where lines that missed are known."""
+    """1 σ of its size, where beams are known."""
 
 
-def outline_of(points: Float64, misses: Float64 | None = None) -> Outline:
+def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
     """Best of rectangle, disc, octagon, diamond and triangles about points (n, 2) of a plane, second axis upwards.
 
     A convex shape is known by how far it reaches in each direction (its support function), which is linear in its place
-    and its size; each template is fitted by least squares. Its edges lie between the points and the lines that missed.
-
-    misses : (m, p, 2) lines past the plate, each as p places, that did not hit it.
+    and its size; each template is fitted by least squares. Where beams are known, the shapes that fit best are then set
+    between those that they stopped and those that went by; the one that parts them best is taken.
     """
-    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
-    ways = np.column_stack([np.cos(angle), np.sin(angle)])
-    reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
-    best = None
-    for shape, templates in _TEMPLATES.items():
-        columns = np.column_stack([ways, *[t(ways) for t in templates]])
-        solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
-        misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
-        if (solution[2:] > 0.02).all() and (best is None or misfit < best[0]):
-            best = (misfit, shape, solution)
-    if best is None:
+    hulls = _hulls(points)
+    if not hulls:
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
         wide, tall = map(float, high - low)
         return Outline("other", (float(middle[0]), float(middle[1])), wide, tall, math.inf)
-    misfit, shape, solution = best
+    (misfit, shape, solution), sigma = hulls[0], math.inf
+    if beams is not None:
+        parted = []
+        for other, name, first in hulls:
+            if other <= _CLOSE * misfit:
+                loss, fitted, room = _parting(name, first, beams)
+                if (fitted[2:] > _LEAST_M).all():
+                    parted.append((loss, other, name, fitted, room))
+        if parted:
+            _, misfit, shape, solution, sigma = min(parted, key=lambda p: p[0])
     width, height = float(solution[2]), float(solution[-1])
-    beyond = _BEYOND * math.sqrt(width * height / len(points))
-    width, height = width + 2.0 * beyond, height + 2.0 * beyond
-    middle, sigma = (float(solution[0]), float(solution[1])), math.inf
-    if misses is not None and len(misses):
-        middle, (width, height), sigma = _between(shape, (middle, (width, height)), points, misses)
     if shape.startswith("triangle"):
         height = width * math.sqrt(3.0) / 2.0
     if shape == "rectangle" and abs(width - height) < _SQUARE * max(width, height):
         shape = "square"
-    return Outline(shape.split()[0], middle, width, height, misfit, sigma)
+    return Outline(shape.split()[0], (float(solution[0]), float(solution[1])), width, height, misfit, sigma)
 
 
-def _between(
-    shape: str, start: tuple[tuple[float, float], tuple[float, float]], points: Float64, misses: Float64
-) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Middle, width and height of a shape between the points on it and the lines past it, and σ of its size.
+def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
+    """Misfit, name, and place and size of each template about points, the best first."""
+    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+    ways = np.column_stack([np.cos(angle), np.sin(angle)])
+    reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
+    found = []
+    for shape, templates in _TEMPLATES.items():
+        columns = np.column_stack([ways, *[t(ways) for t in templates]])
+        solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
+        misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
+        if (solution[2:] > _LEAST_M).all():
+            solution[2:] += 2.0 * _BEYOND * math.sqrt(solution[2] * solution[-1] / len(points))
+            found.append((misfit, shape, solution))
+    return sorted(found, key=lambda f: f[0])
 
-    Each parameter in turn becomes the mean of its distribution, given the others. Few points may lie outside, and some
-    lines may have been stopped before they came to the plate.
+
+def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, float]:
+    """Loss, place and size, and σ of the size, of the template that parts beams that hit from those that passed.
+
+    The loss is logistic in how far a beam lies beyond the nearest side or within it. It grows straight with that on the
+    wrong side, so single wrong beams do little, and leaves the edge in the middle between both on the right one.
     """
-    (x, y), (width, height) = start
-    is_box = shape == "rectangle"
-    at = np.array([x - width / 2, x + width / 2, y - height / 2, y + height / 2] if is_box else [x, y, width])
-    apart = math.sqrt(width * height / len(points))
-    outwards = np.array([-1.0, 1.0, -1.0, 1.0] if is_box else [0.0, 0.0, 0.5]) / apart
-    points = points[_outside(shape, at[None], points)[0] > -_NEAR_EDGE_M]
-    spread = np.full(at.size, _NEAR_EDGE_M)
-    for _ in range(_ROUNDS):
-        for k in range(at.size):
-            tried = np.repeat(at[None], _TRIED, axis=0)
-            tried[:, k] += np.linspace(-1.0, 1.0, _TRIED) * min(max(4.0 * float(spread[k]), _LEAST_REACH_M), _REACH_M)
-            odds = -tried @ outwards
-            odds += np.log(_STRAY + (1.0 - _STRAY) * _share(-_outside(shape, tried, points))).sum(axis=1)
-            missed = _outside(shape, tried, misses.reshape(-1, 2)).reshape(_TRIED, *misses.shape[:2]).min(axis=2)
-            odds += np.log(_STOPPED + (1.0 - _STOPPED) * _share(missed)).sum(axis=1)
-            weight = np.exp(odds - odds.max())
-            weight /= weight.sum()
-            at[k] = float(weight @ tried[:, k])
-            spread[k] = math.sqrt(float(weight @ (tried[:, k] - at[k]) ** 2))
-    if is_box:
-        sigma = max(math.hypot(spread[0], spread[1]), math.hypot(spread[2], spread[3]))
-        middle = float(at[0] + at[1]) / 2, float(at[2] + at[3]) / 2
-        return middle, (float(at[1] - at[0]), float(at[3] - at[2])), sigma
-    return (float(at[0]), float(at[1])), (float(at[2]), float(at[2])), float(spread[2])
+    from scipy.optimize import minimize
 
+    angle = np.deg2rad(_SIDES[shape])
+    ways = np.column_stack([np.cos(angle), np.sin(angle)])
+    columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
+    within, beyond = beams.hits @ ways.T, beams.passed @ ways.T
+    within = within[(within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()]
+    lines = _half_gap(ways, beams)
+    beyond = np.concatenate([beyond, _expected(first, ways, columns, beams, lines) @ ways.T])
 
-def _share(past_m: Float64) -> Float64:
-    """Probability that something lies on the right side of an edge, by how far it does."""
-    share: Float64 = 1.0 / (1.0 + np.exp(np.clip(-past_m / _SOFT_M, -50.0, 50.0)))
-    return share
+    def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
+        value, slope = 0.5 * _HOLD * float(((solution - first) ** 2).sum()), _HOLD * (solution - first)
+        for side, along in ((1.0, within), (-1.0, beyond)):
+            past = along - columns @ solution
+            nearest = past.argmax(axis=1)
+            past = side * past[np.arange(len(past)), nearest] / blur
+            value += blur * float(np.logaddexp(0.0, past).sum())
+            slope = slope - side * (expit(past) @ columns[nearest])
+        return value, slope
 
-
-def _outside(shape: str, tried: Float64, points: Float64) -> Float64:
-    """How far (g, n) points (n, 2) lie outside of shapes of g places and sizes; negative inside."""
-    x, y = points.T
+    solution, value = first, 0.0
+    for blur in _BLURS_M:
+        found = minimize(loss, solution, (blur,), method="BFGS", jac=True, options={"maxiter": 60, "gtol": 1e-4})
+        solution, value = found.x, float(found.fun)
     if shape == "rectangle":
-        left, right, low, high = tried.T[:, :, None]
-        box: Float64 = np.maximum(np.maximum(left - x, x - right), np.maximum(low - y, y - high))
-        return box
-    x, y, size = x - tried[:, :1], y - tried[:, 1:2], tried[:, 2:]
-    out: Float64 = np.hypot(x, y) - size / 2 if shape == "round" else np.full(x.shape, -math.inf)
-    for degrees in _SIDES.get(shape, ()):
-        way = np.array([[math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]])
-        reach = float(_TEMPLATES[shape][0](way)[0])
-        np.maximum(out, x * way[0, 0] + y * way[0, 1] - size * reach, out=out)
+        reach = columns @ solution
+        solution = solution + np.linalg.solve(columns, _to_sides(within - reach, beyond - reach, lines))
+    return value, solution, max(_SIGMA_SHARE * float(lines.max()), _LEAST_SIGMA_M)
+
+
+def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
+    """How far each side really lies beyond where it was put (m).
+
+    It lies in the middle between the outermost line on the plate and the nearest beam that went by. Where no beam went
+    by as near as the lines lie from one another, it lies half of their widest gap beyond the outermost one.
+
+    Parameters
+    ----------
+    within, beyond : (n, sides) how far beams that hit and that passed lie past each side.
+    half_gap : (sides,) half the widest gap between lines (m).
+    """
+    out = np.zeros(half_gap.size)
+    for k in range(out.size):
+        level = (np.delete(beyond, k, axis=1) < 0.0).all(axis=1)
+        last, following = within[within[:, k] <= 0.0, k], beyond[level & (beyond[:, k] >= 0.0), k]
+        if last.size and following.size:
+            out[k] = last.max() + min((following.min() - last.max()) / 2, half_gap[k])
     return out
+
+
+def _half_gap(ways: Float64, beams: Beams) -> Float64:
+    """Half the widest gap between lines on a plate (k,), by how far they reach in some directions (k, 2)."""
+    starts = np.flatnonzero(np.append(True, np.diff(beams.line) != 0))
+    reach = np.sort(np.maximum.reduceat(beams.hits @ ways.T, starts, axis=0), axis=0)
+    return np.asarray(np.diff(reach, axis=0).max(axis=0, initial=2.0 * _LEAST_GAP_M) / 2)
+
+
+def _expected(first: Float64, ways: Float64, columns: Float64, beams: Beams, lines: Float64) -> Float64:
+    """Places (n, 2) beyond sides that no beam passed by near: their widest gap beyond the outermost line."""
+    reach, out = columns @ first, [np.zeros((0, 2))]
+    farthest = (beams.hits @ ways.T).max(axis=0)
+    for k in range(0, len(ways), max(1, len(ways) // 8)):
+        past = beams.passed @ ways[k] - reach[k]
+        aside = np.abs((beams.passed - first[:2]) @ [-ways[k, 1], ways[k, 0]])
+        near = (past > _NEAR_EDGE_M[0]) & (past < _NEAR_EDGE_M[1]) & (aside < 0.45 * first[2:].max())
+        if near.sum() < 2:
+            out.append((first[:2] + ways[k] * (farthest[k] + 2.0 * lines[k] - first[:2] @ ways[k]))[None])
+    return np.concatenate(out)
 
 
 def _disc(ways: Float64) -> Float64:
@@ -172,9 +214,11 @@ _TEMPLATES: Final = {
 }
 """Support functions for a width, or a width and a height, of 1."""
 _SIDES: Final = {
-    "octagon": range(0, 360, 45),
-    "diamond": range(45, 360, 90),
-    "triangle": (30, 150, 270),
-    "triangle down": (90, 210, 330),
+    "rectangle": 90.0 * np.arange(4),
+    "round": 5.0 * np.arange(72),
+    "octagon": 45.0 * np.arange(8),
+    "diamond": 45.0 + 90.0 * np.arange(4),
+    "triangle": 120.0 * np.arange(3) - 90.0,
+    "triangle down": 120.0 * np.arange(3) + 90.0,
 }
-"""Directions of the sides' normals (degrees)."""
+"""Directions that the sides look to (degrees from the first axis)."""

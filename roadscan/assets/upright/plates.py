@@ -13,9 +13,9 @@ from pydantic import Field
 from roadscan.assets.kind import KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
-from roadscan.assets.upright.line_ends import misses_beside
 from roadscan.assets.upright.outlines import Outline, outline_of
 from roadscan.assets.upright.places import ground_light, places_of
+from roadscan.assets.upright.plate_beams import beams_of
 from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.shafts import shafts_of
@@ -168,8 +168,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)
     right, up = _axes(normal)
     placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
-    flat = np.column_stack([placed @ right, placed @ up])
-    outline = outline_of(flat, misses_beside(returns, edge, flat))
+    outline = outline_of(np.column_stack([placed @ right, placed @ up]))
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     ground = float(scene.ground.height_at(place[0], place[1]))
     above = float(place[2]) - ground
@@ -177,6 +176,11 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
         return None
     if _stands(scene, near, (place, normal), outline, ground):
         return None
+    beams = beams_of(scene, edge, rows, middle, (right, up))
+    if beams is not None:
+        outline = outline_of(np.column_stack([placed @ right, placed @ up]), beams)
+        place = middle + outline.middle[0] * right + outline.middle[1] * up
+        above = float(place[2]) - ground
     large = outline.width_m > options.greatest_size_m or outline.height_m > options.greatest_size_m
     share = float(bright[rows].mean())
     probability = logistic(

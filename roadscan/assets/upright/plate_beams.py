@@ -1,0 +1,185 @@
+"""Where beams meet the plane of a plate: those that it stopped, and those that went by."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.scene import Scene
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_LEAST_COSINE: Final = 0.3
+"""Beams that graze the plane tell little of where they meet it."""
+_SWEEP: Final = 100
+"""After so many firings of a laser without a return from the plate, the next one belongs to another sweep over it."""
+_AROUND: Final = 40
+"""So many returns before and after a sweep are looked at."""
+_ABOUT_M: Final = 0.6
+"""Beams that go by farther from the returns are left out."""
+_BEHIND_M: Final = 0.15
+"""What returns so far behind the plane went by."""
+_LEAST_GAP: Final = 1e-4
+"""Lasers nearer to one another draw the same line (rad)."""
+
+
+class Beams(NamedTuple):
+    """Beams on the plane of a plate: to the right as seen from the front, and up, from a point of it (m)."""
+
+    hits: Float64
+    """(n, 2)"""
+    line: Int64
+    """(n,) number of the line that one laser drew in one sweep, ascending."""
+    passed: Float64
+    """(m, 2)"""
+
+
+class _Fan(NamedTuple):
+    """Returns (k,) about a plate, by sweep, laser and epoch."""
+
+    rows: Int64
+    sensor: Float64
+    """(k, 3)"""
+    way: Float64
+    """(k, 3) unit vectors of the beams."""
+    range_m: Float64
+    on: Bool
+    """Which lie on the plane."""
+    sweep: Int64
+    laser: Int64
+    line: Int64
+    """Number of sweep and laser."""
+    step: Float64
+    """Epoch, in firings of a laser."""
+
+
+def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tuple[Float64, Float64]) -> Beams | None:
+    """Beams that meet the plane of a plate near it; None where lasers draw no lines on it.
+
+    Returns from behind the plane went by. Where nothing came back, two kinds of beams are told from their neighbours:
+    those of the firings next to a line on the plate, and those of the lasers next to the outermost lines.
+
+    Parameters
+    ----------
+    edge : rows of the returns that tell the outline. rows : of all that lie on the plane, ascending.
+    middle : a point of the plane. axes : unit vectors to the right and up.
+    """
+    normal = np.cross(*axes)
+    fan = _fan(scene, rows, normal)
+    if fan is None:
+        return None
+
+    def met(sensor: Float64, way: Float64) -> tuple[Float64, Float64]:
+        """Where beams meet the plane (n, 2), and how far from the sensor; NaN for those that graze it."""
+        rate = way @ normal
+        away = np.where(np.abs(rate) > _LEAST_COSINE, ((middle - sensor) @ normal) / rate, np.nan)
+        past = sensor + away[:, None] * way - middle
+        return np.column_stack([past @ axes[0], past @ axes[1]]), away
+
+    at, away = met(fan.sensor, fan.way)
+    hit = fan.on & np.isin(fan.rows, edge)
+    if not hit.any():
+        return None
+    single = scene.returns.number_of_returns[fan.rows] == 1
+    behind = ~fan.on & single & (away > 0.0) & (fan.range_m > away + _BEHIND_M)
+    passed = np.concatenate([at[behind], met(*_beside_lines(fan))[0], met(*_beside_lasers(fan))[0]])
+    low, high = at[hit].min(axis=0) - _ABOUT_M, at[hit].max(axis=0) + _ABOUT_M
+    return Beams(at[hit], fan.line[hit], passed[((passed > low) & (passed < high)).all(axis=1)])
+
+
+def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
+    """Returns of the sweeps over a plate, from rows on its plane that do not graze it."""
+    returns = scene.returns
+
+    def beam(rows: Int64) -> tuple[Float64, Float64, Float64]:
+        sensor = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows], returns.sensor_height_m[rows]])
+        way = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - sensor
+        length = np.sqrt((way**2).sum(axis=1))
+        return sensor, way / length[:, None], length
+
+    rows = rows[np.abs(beam(rows)[1] @ normal) > _LEAST_COSINE]
+    epoch, laser = returns.epoch_gps_ns[rows], returns.laser[rows].astype(np.int64)
+    device = returns.pass_id[rows].astype(np.int64) * 256 + returns.sensor[rows]
+    by_laser = np.lexsort((epoch, laser, device))
+    same = (np.diff(device[by_laser]) == 0) & (np.diff(laser[by_laser]) == 0)
+    apart = np.diff(epoch[by_laser])[same]
+    if not (apart > 0).any():
+        return None
+    period = float(np.quantile(apart[apart > 0], 0.1))
+    starts = np.flatnonzero(np.append(True, (np.diff(device) != 0) | (np.abs(np.diff(epoch)) > _SWEEP * period)))
+    first = np.maximum(rows[starts] - _AROUND, 0)
+    last = np.minimum(rows[np.append(starts[1:], rows.size) - 1] + _AROUND, len(returns) - 1)
+    sweep = np.repeat(np.arange(starts.size), last - first + 1)
+    about = np.concatenate([np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)])
+    laser, epoch = returns.laser[about].astype(np.int64), returns.epoch_gps_ns[about]
+    order = np.lexsort((epoch, laser, sweep))
+    about, sweep, laser = about[order], sweep[order], laser[order]
+    line = np.cumsum(np.append(0, (np.diff(sweep) != 0) | (np.diff(laser) != 0)))
+    step = (epoch[order] - epoch[order[0]]) / period
+    return _Fan(about, *beam(about), np.isin(about, rows), sweep, laser, line, step)
+
+
+def _beside_lines(fan: _Fan) -> tuple[Float64, Float64]:
+    """Sensor and way (n, 3) of the firings before and after each line on the plate that brought nothing back."""
+    on = np.flatnonzero(fan.on)
+    starts = np.flatnonzero(np.append(True, np.diff(fan.line[on]) != 0))
+    sensor, way = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for ends, inwards in ((starts, 1), (np.append(starts[1:], on.size) - 1, -1)):
+        long = np.append(starts[1:], on.size) - starts > 1
+        end, inner = on[ends[long]], on[ends[long] + inwards]
+        outer = np.clip(end - inwards, 0, fan.line.size - 1)
+        answered = (fan.line[outer] == fan.line[end]) & (np.abs(fan.step[outer] - fan.step[end]) < 1.5)
+        end, inner = end[~answered], inner[~answered]
+        steps = np.maximum(np.abs(fan.step[end] - fan.step[inner]), 0.5)
+        sensor.append(fan.sensor[end])
+        way.append(fan.way[end] + (fan.way[end] - fan.way[inner]) / steps[:, None])
+    return np.concatenate(sensor), np.concatenate(way)
+
+
+def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64]:
+    """Sensor and way (n, 3) of the lasers next to the outermost ones on the plate, in sweeps that they saw nothing in.
+
+    The angles between lasers are those of sweeps in which both saw something, on the plate or elsewhere.
+    """
+    lasers, laser = np.unique(fan.laser, return_inverse=True)
+    on = np.flatnonzero(fan.on)
+    starts = np.flatnonzero(np.append(True, np.diff(fan.line[on]) != 0))
+    ends = np.append(starts[1:], on.size) - 1
+    longest = np.lexsort((starts - ends, fan.sweep[on[starts]]))
+    longest = longest[np.append(True, np.diff(fan.sweep[on[starts[longest]]]) != 0)]
+    first, last = on[starts[longest]], on[ends[longest]]
+    drawn = fan.way[last] - fan.way[first]
+    across = np.cross(fan.way[first] + fan.way[last], drawn)
+    length = np.sqrt((across**2).sum(axis=1))
+    across /= np.where(length > 0.0, length, np.nan)[:, None]
+    late = np.abs(fan.step - (fan.step[first] + fan.step[last])[fan.sweep] / 2)
+    near = np.lexsort((late, fan.line))
+    near = near[np.append(True, np.diff(fan.line[near]) != 0)]
+    near = near[late[near] < 2.0]
+    angle = np.full((first.size, lasers.size), np.nan)
+    angle[fan.sweep[near], laser[near]] = np.arcsin((fan.way[near] * across[fan.sweep[near]]).sum(axis=1))
+    between = angle[:, None, :] - angle[:, :, None]
+    known = np.isfinite(between)
+    gaps = np.where(known, between, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+    met, answered = np.zeros(angle.shape, np.bool_), np.zeros(angle.shape, np.bool_)
+    met[fan.sweep[on], laser[on]] = True
+    answered[fan.sweep, laser] = True
+    sweeps = np.arange(len(angle))
+    sensor, way = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for side in (1.0, -1.0):
+        outermost = np.where(met & np.isfinite(angle), side * angle, -np.inf).argmax(axis=1)
+        apart = np.where(side * gaps > _LEAST_GAP, side * gaps, np.inf)[outermost]
+        following = apart.argmin(axis=1)
+        gap = apart[sweeps, following]
+        void = np.isfinite(gap) & ~answered[sweeps, following] & np.isfinite(angle[sweeps, outermost])
+        line = on[void[fan.sweep[on]] & (laser[on] == outermost[fan.sweep[on]])]
+        axis, turn = across[fan.sweep[line]], gap[fan.sweep[line]][:, None]
+        aside = axis - (fan.way[line] * axis).sum(axis=1)[:, None] * fan.way[line]
+        aside *= side / np.sqrt((aside**2).sum(axis=1))[:, None]
+        sensor.append(fan.sensor[line])
+        way.append(np.cos(turn) * fan.way[line] + np.sin(turn) * aside)
+    return np.concatenate(sensor), np.concatenate(way)

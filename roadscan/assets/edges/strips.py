@@ -115,8 +115,11 @@ def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
 
 
 def sigma_width_m(strip: Strip) -> float:
-    """Standard deviation (m) of the strip's outer edge, from how widths of neighbours differ; 5 cm at least."""
+    """Standard deviation (m) of the strip's outer edge, from how widths of neighbours differ.
+
+    It is 15 cm at least: cells that a wall shares with the strip are no part of it.
+    """
     width = strip.column("width_m")[strip.known]
     if width.size < 3:
         return 0.3
-    return math.hypot(0.05, 1.4826 * float(np.median(np.abs(np.diff(width)))) / math.sqrt(2.0))
+    return math.hypot(0.15, 1.4826 * float(np.median(np.abs(np.diff(width)))) / math.sqrt(2.0))

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
+import numpy as np
 import pyarrow as pa
 
 from roadscan.assets import classes
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.object_table import object_names
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 from roadscan.assets.upright.plates import Plate, SignOptions, plates_of
 
 _LEAST = 0.5
 _APART_M = 0.3
+_BESIDE_POST_M = 0.4
+"""A plate's middle stands so near before the axis of its post; of two posts of a board each stands within its width."""
+_BELOW_M = 0.3
+"""A post reaches to the plate's lower edge, or ends so far below it, as seen."""
 
 
 class Sign(AssetKind):
@@ -24,6 +32,7 @@ class Sign(AssetKind):
     title = "Road Signs/Boards"
     curve = "signs"
     options = SignOptions
+    after: ClassVar[Sequence[str]] = ("pole", "lighting", "signal")
     piece_schema = schema_of(
         ["width_m", "plate_height_m", "clearance_m", "facing_deg", "tilt_deg"], ["message", "type", "shape", "colour"]
     )
@@ -37,8 +46,24 @@ class Sign(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """An object a plate."""
-        return objects_at_places(pieces, _APART_M)
+        """An object a plate, with the post that carries it."""
+        posts = [(kind, one) for kind in self.after for one in others.get(kind, ())]
+        for sign in objects_at_places(pieces, _APART_M):
+            yield replace(sign, attributes={**sign.attributes, "post": _post_of(sign, posts)})
+
+
+def _post_of(sign: AssetObject, posts: Iterable[tuple[str, AssetObject]]) -> str | None:
+    """Name of the nearest post at a sign; None where none stands at it."""
+    plate, values = sign.geometry, sign.attributes
+    near: list[tuple[float, str]] = []
+    for kind, post in posts:
+        foot = post.geometry
+        away = math.hypot(foot.x - plate.x, foot.y - plate.y)
+        lean = math.tan(math.radians(post.attributes.get("lean_deg") or 0.0)) * (plate.z - foot.z)
+        reaches = (post.attributes.get("asset_height_m") or 0.0) >= values["clearance_m"] - _BELOW_M
+        if reaches and away <= max(_BESIDE_POST_M, values["width_m"] / 2) + lean:
+            near.append((away, object_names(kind, np.array([[foot.x, foot.y]]))[0]))
+    return min(near, default=(0.0, None))[1]
 
 
 def _place(plate: Plate) -> Place:

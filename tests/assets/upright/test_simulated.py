@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from roadscan.assets.kind import AssetObject
+from roadscan.assets.kind import AssetObject, asset_kinds
+from roadscan.assets.object_table import object_names
 from tests.assets.upright.scene import objects_of, simulated
 
 SHAFTS = ("pole", "lamp_post", "tree", "sign", "signal")
@@ -128,3 +129,20 @@ def test_clearance_under_the_arm_of_a_lamp() -> None:
     ground = float(scene.ground.height_at(*placed(one)))
     assert one.attributes["clearance_m"] == pytest.approx(one.geometry.z - ground, abs=1e-6)
     assert one.attributes["type"] == "structure"
+
+
+def test_signs_name_the_post_that_carries_them() -> None:
+    scene, _ = simulated()
+    sign, poles = asset_kinds()["sign"], objects_of(scene, "pole")
+    pieces = sign.evidence(scene, sign.options()).pieces
+    places = np.array([[p.geometry.x, p.geometry.y] for p in poles])
+    names = dict(zip(object_names("pole", places), poles, strict=True))
+    found = list(sign.objects(pieces, sign.options(), {"pole": poles}))
+    assert len(found) == 2
+    carrying = [names[one.attributes["post"]] for one in found]
+    for one, post in zip(found, carrying, strict=True):
+        assert nearest(post, ("pole", "sign"))[0].kind == "sign"
+        assert math.hypot(post.geometry.x - one.geometry.x, post.geometry.y - one.geometry.y) < 0.1
+    others = [p for p in poles if not any(p is post for post in carrying)]
+    alone = sign.objects(pieces, sign.options(), {"pole": others})
+    assert [one.attributes["post"] for one in alone] == [None, None]

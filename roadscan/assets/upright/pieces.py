@@ -84,7 +84,8 @@ def pieces_of(scene: Scene, places: Iterable[Place], schema: pa.Schema) -> pa.Ta
 def objects_at_places(pieces: pa.Table, apart_m: float) -> list[AssetObject]:
     """An object a piece, by easting and northing; of pieces nearer than `apart_m` the one with the most returns.
 
-    Two tiles that see one thing a little differently may both hold its foot.
+    Two tiles that see one thing a little differently may both hold its foot. Plates that face away from each other are
+    two.
     """
     rows = pieces.to_pylist()
     rows.sort(key=lambda r: (-r["returns"], r["easting_m"], r["northing_m"]))
@@ -93,7 +94,7 @@ def objects_at_places(pieces: pa.Table, apart_m: float) -> list[AssetObject]:
     for row in rows:
         cell = (int(row["easting_m"] // apart_m), int(row["northing_m"] // apart_m))
         about = [r for i in (-1, 0, 1) for j in (-1, 0, 1) for r in taken.get((cell[0] + i, cell[1] + j), ())]
-        if all(_distance(row, other) >= apart_m for other in about):
+        if all(_distance(row, other) >= apart_m or _back_to_back(row, other) for other in about):
             kept.append(row)
             taken.setdefault(cell, []).append(row)
     kept.sort(key=lambda r: (r["easting_m"], r["northing_m"], r["height_m"]))
@@ -103,6 +104,13 @@ def objects_at_places(pieces: pa.Table, apart_m: float) -> list[AssetObject]:
 
 def _distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:
     return float(np.sqrt(sum((first[name] - second[name]) ** 2 for name in ("easting_m", "northing_m", "height_m"))))
+
+
+def _back_to_back(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether two pieces that have a face look to opposite sides."""
+    if "facing_deg" not in first:
+        return False
+    return bool(abs((first["facing_deg"] - second["facing_deg"] + 180.0) % 360.0 - 180.0) > 90.0)
 
 
 def _object(row: Mapping[str, Any], names: Sequence[str]) -> AssetObject:

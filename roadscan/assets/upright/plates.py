@@ -33,6 +33,8 @@ _LEAST_BRIGHT: Final = 8
 _FOOT_M, _BAND_M, _BEHIND_M = 0.3, 0.3, 0.15
 """Below a plate, from this height above the ground, bands of this height are looked at, this far before and behind its
 plane (m)."""
+_BACK_TO_BACK_M: Final = 0.04
+"""Two plates on one post stand at least so far apart; the two sides of one plate do not."""
 _ENOUGH_BRIGHT: Final = 60
 """So many bright returns tell the outline by themselves."""
 
@@ -75,7 +77,8 @@ def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
     """Plates of which the scene's tile may hold a part, by their place."""
     bright = _bright(scene, options.intensity_ratio)
     rows = np.flatnonzero(bright & ~_in_large_planes(scene, options.greatest_board_m))
-    found = [_plate(scene, cluster, bright, options) for cluster in _clusters(scene, rows)]
+    clusters = [side for cluster in _clusters(scene, rows) for side in _sides(scene, cluster)]
+    found = [_plate(scene, cluster, bright, options) for cluster in clusters]
     return sorted((p for p in found if p is not None and not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
 
 
@@ -146,6 +149,20 @@ def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
     return middle, axes[2], float(np.sqrt(np.mean(away[kept] ** 2)))
 
 
+def _sides(scene: Scene, cluster: Int64) -> list[Int64]:
+    """A cluster, or its two sides: two plates back to back, each seen from its own front."""
+    returns = scene.returns
+    xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
+    sensor = np.column_stack([returns.sensor_x_m[cluster], returns.sensor_y_m[cluster]])
+    middle, normal, _ = _plane(xyh)
+    front = ((sensor - xyh[:, :2]) @ normal[:2]) > 0.0
+    if min(front.sum(), (~front).sum()) < _LEAST_BRIGHT:
+        return [cluster]
+    past = (xyh - middle) @ normal
+    apart = float(np.median(past[front]) - np.median(past[~front]))
+    return [cluster[front], cluster[~front]] if apart > _BACK_TO_BACK_M else [cluster]
+
+
 def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options: SignOptions) -> Plate | None:
     """The plate of a cluster of bright returns; None where it is none."""
     returns = scene.returns
@@ -164,6 +181,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     normal = normal if float(normal[:2] @ (seen - middle[:2])) > 0.0 else -normal
     near = places_of(scene).within(float(middle[0]), float(middle[1]), reach)
     inside, about = _on_plane(scene, near, middle, normal, xyh)
+    inside = inside[_in_front(scene, inside, middle, normal) | ~bright[inside]]
     rows = np.union1d(cluster, inside)
     edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)
     right, up = _axes(normal)
@@ -192,6 +210,14 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
     clearance = above - outline.height_m / 2
     return Plate(rows, tuple(map(float, place)), outline, facing, lean, clearance, residual, probability)  # type: ignore[arg-type]
+
+
+def _in_front(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> npt.NDArray[np.bool_]:
+    """Which returns were seen from the front of a plane."""
+    returns = scene.returns
+    sensor = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows]]) - middle[:2]
+    front: npt.NDArray[np.bool_] = ~(sensor @ normal[:2] < 0.0)
+    return front
 
 
 def _axes(normal: Float64) -> tuple[Float64, Float64]:

@@ -56,3 +56,28 @@ def test_a_plate_that_looks_up(scene: Scene) -> None:
     assert sign.attributes["width_m"] == pytest.approx(WIDE_M, abs=0.05)
     assert sign.attributes["plate_height_m"] == pytest.approx(TALL_M, abs=0.05)
     assert sign.attributes["shape"] == "rectangle"
+
+
+def test_plates_back_to_back_are_two_signs() -> None:
+    """Two plates on one post, 8 cm apart; drives on both sides see each its own. A plate whose back shines is one."""
+    rng = np.random.default_rng(9)
+    drive = np.column_stack([np.full(40, 10.0), np.linspace(-9.0, 9.0, 40), np.full(40, 2.0), np.ones(40)])
+    flat = np.column_stack([rng.uniform(0.0, 20.0, 60_000), rng.uniform(-10.0, 10.0, 60_000), np.zeros(60_000)])
+    parts, sensors = [flat], [drive[rng.integers(0, 40, len(flat)), :3]]
+    for east, apart in ((6.0, 0.04), (14.0, 0.002)):
+        for side in (-1.0, 1.0):
+            face = np.column_stack(
+                [rng.uniform(-0.4, 0.4, 700), np.full(700, side * apart), rng.uniform(-0.3, 0.3, 700)]
+            )
+            parts.append(np.array([east, 0.0, 2.6]) + face)
+            sensors.append(np.column_stack([np.full(700, 10.0), side * rng.uniform(3.0, 9.0, 700), np.full(700, 2.0)]))
+    places = np.concatenate(parts)
+    places += rng.normal(0.0, 0.003, places.shape)
+    light = np.repeat([1000.0, 6000.0], [len(flat), len(places) - len(flat)])
+    box = Box(0.0, -10.0, 20.0, 10.0)
+    scene = make_scene(
+        returns_of(places, light, np.arange(len(places)) * 1000, np.concatenate(sensors)), box, box, drive
+    )
+    signs = [(round(s.geometry.x), round(s.attributes["facing_deg"]) % 360) for s in objects_of(scene, "sign")]
+    assert sorted(signs)[:2] == [(6, 0), (6, 180)]
+    assert [east for east, _ in signs].count(14) == 1

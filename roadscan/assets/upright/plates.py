@@ -33,6 +33,8 @@ _LEAST_BRIGHT: Final = 8
 _FOOT_M, _BAND_M, _BEHIND_M = 0.3, 0.3, 0.15
 """Below a plate, from this height above the ground, bands of this height are looked at, this far before and behind its
 plane (m)."""
+_ITSELF: Final = 0.7
+"""A shaft of which a plate holds such a share is that plate."""
 _BACK_TO_BACK_M: Final = 0.04
 """Two plates on one post stand at least so far apart; the two sides of one plate do not."""
 _ENOUGH_BRIGHT: Final = 60
@@ -87,7 +89,8 @@ def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
     for shaft in shafts_of(scene):
         x, y = shaft.axis.at(plate.middle_m[2])
         away = math.hypot(float(x) - plate.middle_m[0], float(y) - plate.middle_m[1])
-        if away < shaft.axis.radius_m + 0.15 and plate.outline.width_m < 3.0 * shaft.axis.radius_m:
+        wider = plate.outline.width_m >= 3.0 * shaft.axis.radius_m
+        if away < shaft.axis.radius_m + 0.15 and not wider and np.isin(shaft.rows, plate.rows).mean() < _ITSELF:
             return True
     return False
 

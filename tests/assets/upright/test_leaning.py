@@ -81,3 +81,20 @@ def test_plates_back_to_back_are_two_signs() -> None:
     signs = [(round(s.geometry.x), round(s.attributes["facing_deg"]) % 360) for s in objects_of(scene, "sign")]
     assert sorted(signs)[:2] == [(6, 0), (6, 180)]
     assert [east for east, _ in signs].count(14) == 1
+
+
+@pytest.mark.parametrize("middle_m", [2.0, 2.4, 2.8])
+def test_a_low_plate_without_a_post_is_a_sign(middle_m: float) -> None:
+    """What ends 1.6 m above the ground could be a shaft by itself: 0.8 m wide and tall, seen from one place."""
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([rng.uniform(0.0, 12.0, (40_000, 2)), rng.normal(50.0, 0.005, 40_000)])
+    right, normal = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0]), np.array([math.sqrt(0.5), -math.sqrt(0.5), 0.0])
+    plate = np.array([6.0, 6.0, 50.0 + middle_m]) + rng.uniform(-0.4, 0.4, (600, 1)) * right
+    plate += rng.uniform(-0.4, 0.4, (600, 1)) * np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.004, (600, 1)) * normal
+    places = np.vstack([ground, plate])
+    light, sensor = np.repeat([2000.0, 40_000.0], [len(ground), 600]), np.tile([11.0, 1.0, 52.0], (len(places), 1))
+    drive = np.column_stack([np.linspace(8.0, 12.0, 9), np.ones(9), np.full(9, 52.0), np.zeros(9)])
+    box = Box(0.0, 0.0, 12.0, 12.0)
+    scene = make_scene(returns_of(places, light, np.arange(len(places)), sensor), box, box, drive)
+    (sign,) = objects_of(scene, "sign")
+    assert sign.geometry.z == pytest.approx(50.0 + middle_m, abs=0.02)

@@ -268,25 +268,48 @@ def _sizes(street: Street, kind: str, pairs: list[tuple[Any, Any]]) -> Iterator[
         wide = [abs(t.width_m - f.diameter_m) for t, f in pairs]
         yield Figure("pole: diameter, worst", 1000 * max(wide), "mm", 20.0)
     if kind == "sign":
-        described = {round(s.station_m, 2): s for s in _signs(street)}
-        off, size, turn = [], [], []
-        for thing, sign in pairs:
-            one = described[round(thing.station_m, 2)]
-            ahead = math.radians(thing.heading_deg - 90.0)
-            side = 1.0 if one.faces == "forward" else -1.0
-            tall = one.width_m * _HEIGHT_SHARE[one.shape] if one.shape in _HEIGHT_SHARE else one.height_m
-            middle = (
-                thing.easting_m + side * _PLATE_BEFORE_POST_M * math.sin(ahead),
-                thing.northing_m + side * _PLATE_BEFORE_POST_M * math.cos(ahead),
-                thing.height_m + one.clearance_m + tall / 2,
-            )
-            off.append(math.dist(middle, (sign.geometry.x, sign.geometry.y, sign.geometry.z)))
-            size.append(max(abs(sign.width_m - one.width_m), abs(sign.plate_height_m - tall)))
-            facing = math.degrees(ahead) + (0.0 if side > 0.0 else 180.0)
-            turn.append(abs((sign.facing_deg - facing + 180.0) % 360.0 - 180.0))
-        yield Figure("sign: centre, worst", 1000 * max(off), "mm", 30.0)
-        yield Figure("sign: size, worst", 1000 * max(size), "mm", 50.0)
-        yield Figure("sign: facing, worst", max(turn), "°", 5.0)
+        errors = list(_errors_of_signs(street, pairs))
+        yield Figure("sign: centre, worst", 1000 * max(e.centre_m for e in errors), "mm", 30.0)
+        yield Figure("sign: size, worst", 1000 * max(e.size_m for e in errors), "mm", 50.0)
+        yield Figure("sign: facing, worst", max(e.facing_deg for e in errors), "°", 5.0)
+
+
+class SignError(NamedTuple):
+    """How far off a sign is measured."""
+
+    centre_m: float
+    size_m: float
+    """The greater one of width and height."""
+    facing_deg: float
+    sigma_m: float
+    """Stated σ of the size."""
+
+
+def sign_errors(street: Street) -> list[SignError]:
+    """Errors of the signs that stand where one was found."""
+    some, found = true_points(street)["sign"], street.found("sign")
+    right = [(_nearest(some, g.x, g.y), i) for i, g in enumerate(found.geometry)]
+    return list(_errors_of_signs(street, [(some.iloc[k], found.iloc[i]) for (k, away), i in right if away <= NEAR_M]))
+
+
+def _errors_of_signs(street: Street, pairs: list[tuple[Any, Any]]) -> Iterator[SignError]:
+    """Of pairs of a thing of the truth and a sign that was found there."""
+    described = {round(s.station_m, 2): s for s in _signs(street)}
+    for thing, sign in pairs:
+        one = described[round(thing.station_m, 2)]
+        ahead = math.radians(thing.heading_deg - 90.0)
+        side = 1.0 if one.faces == "forward" else -1.0
+        tall = one.width_m * _HEIGHT_SHARE[one.shape] if one.shape in _HEIGHT_SHARE else one.height_m
+        middle = (
+            thing.easting_m + side * _PLATE_BEFORE_POST_M * math.sin(ahead),
+            thing.northing_m + side * _PLATE_BEFORE_POST_M * math.cos(ahead),
+            thing.height_m + one.clearance_m + tall / 2,
+        )
+        off = math.dist(middle, (sign.geometry.x, sign.geometry.y, sign.geometry.z))
+        size = max(abs(sign.width_m - one.width_m), abs(sign.plate_height_m - tall))
+        facing = math.degrees(ahead) + (0.0 if side > 0.0 else 180.0)
+        turn = abs((sign.facing_deg - facing + 180.0) % 360.0 - 180.0)
+        yield SignError(off, size, turn, float(sign.sigma_size_m))
 
 
 def _signs(street: Street) -> list[Any]:

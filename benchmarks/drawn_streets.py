@@ -44,6 +44,48 @@ def drawn_street(seed: int) -> Scene:
     )  # fmt: skip
 
 
+def street_of_signs(seed: int, *, divergence_deg: float = 0.0) -> Scene:
+    """A country road of 48 m with five signs: 0.4 to 4 m, 3 to 15 m beside the drive or above it, 30 to 90 km/h."""
+    random = np.random.default_rng([seed, 77])
+    speed = float(random.uniform(30, 90)) / 3.6
+    signs = [_large_or_small(random, station) for station in np.arange(6.0, 44.0, 9.0)]
+    return Scene.load("urban_street").changed(
+        id=f"signs-{seed}", seed=500 + seed, length_m=48.0,
+        passes=[{"lane": n + 1, "direction": "forward"} for n in range(int(random.integers(1, 3)))],
+        vehicle={"speed_m_per_s": speed, "standstill_s": 0.0},
+        lidar={"range_max_m": 36.0, "divergence_deg": divergence_deg},
+        noise={"lidar_range_m": float(random.uniform(0.008, 0.022)), "intensity": 5.0, "position_m": 0.0,
+               "attitude_deg": 0.0},
+        road={
+            "alignment": [{"kind": "straight", "length_m": 300.0}], "lead_m": 70.0, "kerbs": [],
+            "verge_width_m": 18.0, "verge_slope": float(random.uniform(-0.03, 0.05)), "humps": [], "crosswalks": [],
+            "stop_bars": [], "alligators": [], "cracks": [], "potholes": [], "patches": [], "stains": [],
+            "tyre_marks": [], "markings": [],
+        },
+        roadside={
+            **{kind: [] for kind in Scene.load("urban_street").roadside.model_dump()}, "signs": signs,
+            "facades": [{"offset_m": -20.0, "start_m": -20.0, "end_m": 70.0, "height_m": 8.0}] * (seed % 2),
+        },
+        **_OFF,
+    )  # fmt: skip
+
+
+def _large_or_small(random: np.random.Generator, station_m: float) -> dict[str, Any]:
+    shape = str(random.choice(["rectangle", "rectangle", "rectangle", "round", "octagon", "diamond", "triangle"]))
+    wide = tall = float(np.exp(random.uniform(np.log(0.5), np.log(1.5))))
+    if shape == "rectangle":
+        wide = float(np.exp(random.uniform(np.log(0.4), np.log(4.0))))
+        tall = float(np.clip(wide * np.exp(random.uniform(-0.7, 0.4)), 0.4, 3.0))
+    is_above = bool(random.random() < 0.15)
+    beside = float(random.choice([-1, 1]) * (3.0 + wide / 2 + random.uniform(0, 12)))
+    return {
+        "station_m": station_m + float(random.uniform(-2, 2)), "shape": shape, "width_m": wide, "height_m": tall,
+        "offset_m": float(random.uniform(-1.5, 1.5)) if is_above else beside,
+        "clearance_m": float(random.uniform(4.8, 5.5) if is_above else random.uniform(1.8, 3.2)),
+        "shade": float(random.uniform(180, 255)), "faces": "backward" if random.random() < 0.7 else "forward",
+    }  # fmt: skip
+
+
 def _crossing(random: np.random.Generator) -> list[dict[str, Any]]:
     if random.random() < 0.5:
         return []

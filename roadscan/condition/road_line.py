@@ -60,8 +60,7 @@ class RoadLine:
         """(n, 4) easting, northing (m), and the direction of the line (east, north) at stations and offsets (n,)."""
         station, offset = np.broadcast_arrays(np.asarray(station_m, np.float64), np.asarray(offset_m, np.float64))
         out = np.empty((station.size, 4))
-        s, o = np.ascontiguousarray(station.ravel()), np.ascontiguousarray(offset.ravel())
-        place(self.nodes_m, self.first_m, s, o, out)
+        place(self.nodes_m, self.first_m, station.flatten(), offset.flatten(), out)
         return out
 
     def along(self, places_m: Float64, guess_m: npt.ArrayLike) -> tuple[Float64, Float64]:

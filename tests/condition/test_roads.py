@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from roadscan.condition import road_line
 from roadscan.condition.cracks_on_lane import located
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
@@ -95,3 +96,11 @@ def test_settings_that_contradict_one_another_are_refused() -> None:
         ConditionConfig.parse({"reference": "layer"})
     with pytest.raises(Exception, match="same name"):
         ConditionConfig.parse({"lanes": [{"name": "1", "offset_m": 0.0, "width_m": 3.0}] * 2})
+
+
+def test_one_place_is_handed_to_the_kernel_as_an_array_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view of what NumPy broadcasts warns where the kernel asks whether it may be written to."""
+    handed: list[np.ndarray] = []
+    monkeypatch.setattr(road_line, "place", lambda *arrays: handed.extend(arrays[2:4]))
+    road_line.RoadLine("a", np.column_stack([np.arange(50.0), np.zeros(50)]), 0).places(np.array([5.0]), 0.0)
+    assert [a.flags.owndata for a in handed] == [True, True]

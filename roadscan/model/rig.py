@@ -39,6 +39,10 @@ class Mounting:
         return np.array(self.body_from_sensor), np.array(self.lever_arm_body_m)
 
 
+UNMOUNTED: Final = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+"""What measures in body axes, from the reference point."""
+
+
 @dataclass(frozen=True)
 class Mountings:
     """Mountings of one sensor, each from an epoch on: a head was taken off and put back, a calibration repeated."""

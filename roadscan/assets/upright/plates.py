@@ -156,9 +156,8 @@ def _sides(scene: Scene, cluster: Int64) -> list[Int64]:
     """A cluster, or its two sides: two plates back to back, each seen from its own front."""
     returns = scene.returns
     xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
-    sensor = np.column_stack([returns.sensor_x_m[cluster], returns.sensor_y_m[cluster]])
     middle, normal, _ = _plane(xyh)
-    front = ((sensor - xyh[:, :2]) @ normal[:2]) > 0.0
+    front = _in_front(scene, cluster, middle, normal)
     if min(front.sum(), (~front).sum()) < _LEAST_BRIGHT:
         return [cluster]
     past = (xyh - middle) @ normal

@@ -10,12 +10,12 @@ import numpy.typing as npt
 import pyarrow as pa
 import scipy.spatial
 
-from roadscan.jobs.assets.load_returns import UNMOUNTED
 from roadscan.jobs.assets.plan import AssetPlan
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.pose_sigma import pose_sigma
 from roadscan.jobs.plan.plan import trajectory_source
-from roadscan.jobs.readings import TrajectorySource, load_corrections, load_trajectory
+from roadscan.jobs.readings import TrajectorySource, load_trajectory
+from roadscan.model.rig import UNMOUNTED, Mountings
 from roadscan.points.sensor_places import sensor_places
 from roadscan.tables.held import held_path
 from roadscan.tables.store import bytes_digest
@@ -86,16 +86,15 @@ def load_drives(plan: AssetPlan) -> Drives:
         spans = [span for file in source.files for span in file.group_spans]
         whole = (min(first for first, _ in spans), max(last for _, last in spans))
         trajectory = load_trajectory(survey.store, source, [whole], survey.ground.max_gap_s)
-        epochs = trajectory.epochs_gps_ns
-        epochs = epochs[np.diff(epochs // _TICK_NS, prepend=-1) != 0]
+        knots = np.flatnonzero(np.diff(trajectory.epochs_gps_ns // _TICK_NS, prepend=-1))
+        epochs = trajectory.epochs_gps_ns[knots]
         if epochs.size < 2:
             continue
         sigma = pose_sigma(survey.store, survey.records, source, epochs, survey.survey.config.navigation.calibration)
-        corrections = load_corrections(survey.store, source.run)
-        adjusted = None if corrections is None else corrections.sigma_ned_m(epochs)
-        if adjusted is not None:
-            sigma[:, :3] = adjusted
-        places = sensor_places(trajectory, survey.ground.map, UNMOUNTED, epochs)[:, :2]
+        if trajectory.sigma_ned_m is not None:  # of the adjustment, where it states any
+            adjusted = trajectory.sigma_ned_m[knots]
+            sigma[:, :3] = np.where(np.isfinite(adjusted), adjusted, sigma[:, :3])
+        places = sensor_places(trajectory, survey.ground.map, Mountings.one(UNMOUNTED), epochs)[:, :2]
         known = np.isfinite(places).all(axis=1)
         parts.append((places[known], epochs[known], sigma[known]))
     if not parts:

@@ -18,7 +18,7 @@ from roadscan.jobs.readings import Placer, RawSlice, ReadingSource, TrajectorySo
 from roadscan.jobs.tiles.tile_plan import TileTask
 from roadscan.kernels.assets.buckets import rows_within
 from roadscan.model.ids import TileId
-from roadscan.model.rig import Mounting, Mountings
+from roadscan.model.rig import UNMOUNTED, Mountings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.points.centre_line import CentreLineBuffer
 from roadscan.points.cloud import QUANTA_PER_M, QUANTUM_M
@@ -37,7 +37,6 @@ _SCAN_COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
 _DRIVE_TICK_NS: Final = 50_000_000
 _DRIVE_STEP_M: Final = 0.25
 """A place of a drive is kept where it lies in another square of this edge than the one before."""
-UNMOUNTED: Final = Mountings.one(Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))))
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ class _Block:
         trajectory, source = self._trajectories[number], self._sources[number]
         if trajectory is None or trajectory.epochs_gps_ns.size < 2:
             return np.full((epochs_gps_ns.size, 3), np.nan)
-        mountings = UNMOUNTED if source.table == "cloud" else source.mountings
+        mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.mountings
         return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
 
     def _drives(self, own: _Columns, square: TileId) -> Float64:

@@ -30,7 +30,7 @@ from roadscan.jobs.readings import (
 from roadscan.model.errors import ConfigError, RunError
 from roadscan.model.gpstime import iso_from_gps_ns, utc_from_gps_ns
 from roadscan.model.ids import LanePass, RunId, of_run
-from roadscan.model.rig import Mounting, Mountings, Rig, Sensor
+from roadscan.model.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.model.survey import Survey
 from roadscan.points.place import HeightLimits
 from roadscan.sensors.base import log_formats
@@ -43,7 +43,6 @@ DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mountin
 
 _SAME_MOUNTING = 1e-3
 """Mountings that differ by less (m, or in the rotation's elements) are one."""
-_UNMOUNTED = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ def _sources(
                 continue
             trajectory = None if table == "cloud" else trajectory_source(record.run, records)
             sensor = survey.rig.sensors.get(record.sensor)
-            nominal = sensor.mounting() if sensor else _UNMOUNTED
+            nominal = sensor.mounting() if sensor else UNMOUNTED
             mountings = mountings_of(record.run, record.sensor, nominal, calibrated)
             clock = of_run(clocks, record.run, record.sensor)
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))

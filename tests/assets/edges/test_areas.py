@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pytest
 import shapely
@@ -23,6 +25,8 @@ from roadscan.simulate.surface import Surface
 from tests.assets.edges.simulated import SimulatedStreet, town_street
 from tests.assets.edges.streets import returns_of
 from tests.assets.edges.test_kerbs import truth_line
+
+Float64 = npt.NDArray[np.float64]
 
 FACADE_M = 9.2
 
@@ -78,18 +82,27 @@ def test_road_edges_lie_at_the_kerbs_on_their_sides(street: SimulatedStreet, tow
         assert {o.attributes["type"] for o in found} == {"kerb"}
 
 
-def island(width_m: float, height_m: float) -> Scene:
-    """A road of 16 m with a raised strip in its middle, seen by returns every 4 cm with 5 mm of noise."""
+def seen_surface(size_m: tuple[float, float, float], height_m: Callable[[Float64, Float64], Float64]) -> Scene:
+    """A surface of a length and half a width, seen from a drive at an offset: a return each 5 cm, 5 mm of noise."""
+    length, half, drive_y = size_m
     rng = np.random.default_rng(5)
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 30.0, 0.05), np.arange(-8.0, 8.0, 0.05)))
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, length, 0.05), np.arange(-half, half, 0.05)))
     x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
-    z = 100.0 + 0.01 * x - 0.02 * np.abs(y) + np.where(np.abs(y) < width_m / 2, height_m, 0.0)
-    z += rng.normal(0.0, 0.005, z.size)
-    sensor = np.column_stack([x, np.full(x.size, -4.0), np.full(x.size, 102.0)])
+    z = height_m(x, y) + rng.normal(0.0, 0.005, x.size)
+    sensor = np.column_stack([x, np.full(x.size, drive_y), np.full(x.size, 102.0)])
     returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
-    drive = np.column_stack([np.arange(0.0, 30.0), np.full(30, -4.0), np.full(30, 102.0), np.ones(30)])
-    box = Box(0.0, -8.0, 30.0, 8.0)
+    places = np.arange(0.0, length)
+    drive = np.column_stack([places, *(np.full(places.size, v) for v in (drive_y, 102.0, 1.0))])
+    box = Box(0.0, -half, length, half)
     return make_scene(returns, box, box, drive)
+
+
+def island(width_m: float, height_m: float) -> Scene:
+    """A road of 16 m with a raised strip in its middle."""
+    return seen_surface(
+        (30.0, 8.0, -4.0),
+        lambda x, y: 100.0 + 0.01 * x - 0.02 * np.abs(y) + np.where(np.abs(y) < width_m / 2, height_m, 0.0),
+    )
 
 
 def test_a_median_has_width_and_height() -> None:
@@ -159,19 +172,14 @@ def street_with_walks() -> Scene:
 
     The left kerb (y > 0) is lowered to 2 cm between x = 8 and 12; a metre behind it the sidewalk has its height again.
     """
-    rng = np.random.default_rng(5)
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-7.5, 7.5, 0.05)))
-    x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
-    behind = np.maximum(np.abs(y) - 4.0, 0.0)
-    z = 100.0 + 0.03 * x - 0.03 * np.minimum(np.abs(y), 4.0) + np.where(behind > 0.0, 0.12 + 0.02 * behind, 0.0)
-    lowered = (behind > 0.0) & (y > 0.0) & (x > 8.0) & (x < 12.0)
-    z -= np.where(lowered, 0.1 * np.maximum(1.0 - behind, 0.0), 0.0)
-    z += rng.normal(0.0, 0.005, z.size)
-    sensor = np.column_stack([x, np.full(x.size, -1.5), np.full(x.size, 102.0)])
-    returns = returns_of(np.column_stack([x, y, z]), np.full(x.size, 1000.0), np.arange(x.size), sensor)
-    drive = np.column_stack([np.arange(0.0, 20.0), np.full(20, -1.5), np.full(20, 102.0), np.ones(20)])
-    box = Box(0.0, -7.5, 20.0, 7.5)
-    return make_scene(returns, box, box, drive)
+
+    def height_m(x: Float64, y: Float64) -> Float64:
+        behind = np.maximum(np.abs(y) - 4.0, 0.0)
+        z = 100.0 + 0.03 * x - 0.03 * np.minimum(np.abs(y), 4.0) + np.where(behind > 0.0, 0.12 + 0.02 * behind, 0.0)
+        lowered = (behind > 0.0) & (y > 0.0) & (x > 8.0) & (x < 12.0)
+        return z - np.where(lowered, 0.1 * np.maximum(1.0 - behind, 0.0), 0.0)
+
+    return seen_surface((20.0, 7.5, -1.5), height_m)
 
 
 def test_sides_slopes_and_heights_beside_a_road_that_climbs() -> None:

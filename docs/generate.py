@@ -29,6 +29,7 @@ from pydantic.fields import FieldInfo
 
 from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.model.strict import meanings
+from roadscan.model.witness import Witness, witnesses
 from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
 from roadscan.sensors.base import LogFormat, log_formats
 from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
@@ -441,7 +442,29 @@ def mistakes(_: str) -> str:
     return markdown_table(("mistake", "what roadscan prints", "what to do"), rows)
 
 
+_TOLD: Final = {"error": "an error", "rejects": "rejects", "findings": "a finding"}
+
+
+def witness_list(_: str) -> str:
+    """A section for each kind of input: what can be wrong, who is asked, what the run does, where it is told."""
+    by_input: dict[str, list[Witness]] = {}
+    for one in witnesses().values():
+        by_input.setdefault(one.input, []).append(one)
+    parts = []
+    for kind, own in sorted(by_input.items()):
+        rows = [
+            f"| `{w.name}` | {w.fault} | {w.asks} | {w.does} | {', '.join(_TOLD[t] for t in w.told)} |" for w in own
+        ]
+        head = [
+            "| witness | what can be wrong | what is asked | what the run does | told as |",
+            "|---|---|---|---|---|",
+        ]
+        parts.append("\n".join([f"## {kind[0].upper()}{kind[1:]}", "", *head, *rows]))
+    return "\n\n".join(parts)
+
+
 DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
+    "witnesses": witness_list,
     "mistakes": mistakes,
     "fields": fields,
     "model": model,

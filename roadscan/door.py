@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from roadscan.jobs.tiles.selection import Selection
     from roadscan.model.gpstime import Clock
     from roadscan.model.survey import Survey
+    from roadscan.model.witness import Finding
     from roadscan.sensors.base import Reject
     from roadscan.tables.store import Store
     from roadscan.tiles.grid import Bounds
@@ -399,6 +400,8 @@ class LogTables(Mapping[str, "pa.Table"]):
     """What the rows need to be understood: scan geometry, world frame, CRS."""
     rejects: list[Reject]
     """Records that could not be read, with the reason."""
+    findings: list[Finding] = field(default_factory=list)
+    """What its reader doubts."""
 
     def __getitem__(self, name: str) -> pa.Table:
         """A table by name."""
@@ -451,8 +454,8 @@ def read_log(
         path=file, options=found.options.parse(dict(options or {}), file=file), clock=_clock(clock), sensor=None,
         crs=crs, height=height, geoid=None if geoid is None else Geoid(geoid), map=None,
     )  # fmt: skip
-    tables, attributes, rejects = read_tables(found, source)
-    return LogTables(file, found.name, tables, attributes, rejects)
+    tables, attributes, rejects, findings = read_tables(found, source)
+    return LogTables(file, found.name, tables, attributes, rejects, findings)
 
 
 class _Heard(Reporter):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from roadscan.tables.store import Store
 
 _MOST_REASONS = 10
+_MOST_FINDINGS = 20
 _WIDTH = 14
 _UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
@@ -46,6 +47,11 @@ def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
         yield from _of_tiles(found.tiles)
     for line in found.adjustment:
         yield "adjusted", line
+    for number, one in enumerate(found.findings):
+        if number == _MOST_FINDINGS:
+            yield "", f"… and {len(found.findings) - number:,} more findings (`roadscan status`, the report)"
+            break
+        yield "left out" if one.left_out else "doubtful", one.line
     for product, files in found.files.items():
         yield product, f"{counted(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
     for failure in found.failures:

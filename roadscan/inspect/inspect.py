@@ -25,7 +25,8 @@ from roadscan.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
 from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
-from roadscan.sensors.base import LogFormat, Rows, format_named
+from roadscan.model.witness import Finding
+from roadscan.sensors.base import Item, LogFormat, Rows, format_named
 
 QUICK_VALUES: Final = 1_000_000
 """Readings after which a quick look stops."""
@@ -214,8 +215,7 @@ def read_figures(
     try:
         for item in opened.format.read(source, opened.header):
             report.figures.take(item)
-            offset = item.first_offset if isinstance(item, Rows) else item.offset
-            progress(report.figures.rows, min(1.0, offset / size) if offset >= 0 and not item.file else None)
+            progress(report.figures.rows, _share_read(item, size))
             if quick and (report.figures.values >= QUICK_VALUES or report.figures.items >= QUICK_ITEMS):
                 return report, ""
     except RoadscanError as error:
@@ -224,6 +224,14 @@ def read_figures(
         return report, f"the reader of {opened.format.name} failed: {type(error).__name__}: {error}"
     report.complete = True
     return report, ""
+
+
+def _share_read(item: Item, size: int) -> float | None:
+    """Share of a log of `size` bytes that was read with an item; None where its place is not known."""
+    if isinstance(item, Finding) or item.file:
+        return None
+    offset = item.first_offset if isinstance(item, Rows) else item.offset
+    return min(1.0, offset / size) if offset >= 0 else None
 
 
 def _inspect(

@@ -19,7 +19,8 @@ import pyproj
 from roadscan.model.crs import LOCAL_WORLD, MapFrame, crs_from_text, geodetic_from_world
 from roadscan.model.errors import RoadscanError, SchemaError
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.sensors.base import LogHeader, Reject, Rows
+from roadscan.model.witness import Finding
+from roadscan.sensors.base import Item, LogHeader, Reject, Rows
 from roadscan.tables.schema import TableSchema, table_schema
 
 Float64 = npt.NDArray[np.float64]
@@ -353,17 +354,22 @@ class LogFigures:
         self.tables: dict[str, TableFigures] = {}
         self.rejects: dict[str, Fault] = {}
         """Lost records by reason."""
+        self.findings: list[Finding] = []
+        """What the reader doubts."""
         self.rows = 0
         self.items = 0
         self._header = header
         self._map = map_frame
         self._crs = crs
 
-    def take(self, item: Rows | Reject) -> None:
+    def take(self, item: Item) -> None:
         """Take what a reader yields next."""
         self.items += 1
         if isinstance(item, Reject):
             self._lose(item.reason, item.records, item.record, item.offset, item.file)
+            return
+        if isinstance(item, Finding):
+            self.findings.append(item)
             return
         schema = table_schema(item.table)
         if item.table not in self.tables:
@@ -399,7 +405,8 @@ class LogFigures:
     def faults(self) -> list[Fault]:
         """All that is wrong: lost records first, the most frequent reason first."""
         lost = sorted(self.rejects.values(), key=lambda f: -f.count)
-        return lost + [f for table in self.tables.values() for f in table.faults()]
+        doubts = [Fault(one.text, max(one.left_out, 1)) for one in self.findings]
+        return lost + doubts + [f for table in self.tables.values() for f in table.faults()]
 
     @property
     def span_gps_ns(self) -> tuple[int, int] | None:

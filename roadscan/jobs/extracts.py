@@ -19,6 +19,7 @@ from roadscan.model.crs import LOCAL_WORLD, add_grid_folder, geodetic_from_world
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
 from roadscan.model.ids import TileId
+from roadscan.model.witness import Finding
 from roadscan.sensors.base import LogFormat, LogSource, Reject
 from roadscan.tables.schema import table_schema
 from roadscan.tiles.blocks import Block
@@ -145,17 +146,23 @@ def points_of_tile(session: Session, tile: str) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(columns, values, strict=True)) | points.extra)
 
 
-def read_tables(log_format: LogFormat, source: LogSource) -> tuple[dict[str, pa.Table], dict[str, Any], list[Reject]]:
-    """Tables of a log by name, the attributes that its rows need, and the records that could not be read.
+def read_tables(
+    log_format: LogFormat, source: LogSource
+) -> tuple[dict[str, pa.Table], dict[str, Any], list[Reject], list[Finding]]:
+    """Tables of a log by name, the attributes that its rows need, the records that could not be read, and doubts.
 
     Rows that break a rule of their schema are rejects, as at ingest.
     """
     header = log_format.header(source)
     parts: dict[str, list[pa.RecordBatch]] = {}
     rejects: list[Reject] = []
+    findings: list[Finding] = []
     for item in log_format.read(source, header):
         if isinstance(item, Reject):
             rejects.append(item)
+            continue
+        if isinstance(item, Finding):
+            findings.append(item)
             continue
         schema = table_schema(item.table)
         batch = schema.conform(item.batch, header.list_size)
@@ -165,4 +172,4 @@ def read_tables(log_format: LogFormat, source: LogSource) -> tuple[dict[str, pa.
             rejects += [Reject(reason, item.first_record + int(row), file=item.file) for row in rows]
         parts.setdefault(item.table, []).append(batch.filter(pa.array(sound)))
     tables = {name: pa.Table.from_batches(batches) for name, batches in parts.items()}
-    return tables, dict(header.attributes), rejects
+    return tables, dict(header.attributes), rejects, findings

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from roadscan.jobs.calibrate.calibrate import PICTURE as CALIBRATION_PICTURE
 from roadscan.jobs.navigate.clock_tables import clock_picture_path, clock_unit, kept_estimates
@@ -14,8 +14,9 @@ from roadscan.jobs.navigate.navigation_pictures import picture_path
 from roadscan.model.errors import ConfigError, DamagedError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding, Witness
 from roadscan.tables.held import read_held
-from roadscan.tables.logs import LogRecord, has_log
+from roadscan.tables.logs import NAVIGATION, LogRecord, has_log
 from roadscan.tables.store import Store
 
 
@@ -36,11 +37,6 @@ class NavigationStatus:
         """True where no trajectory is due."""
         return all(one["state"] == "computed" for one in self.trajectories)
 
-    @property
-    def doubts(self) -> list[str]:
-        """In words, the trajectories of the store that their own measurements doubt."""
-        return [f"trajectory of run '{t['run']}' is doubtful: {d}" for t in self.trajectories for d in t["doubts"]]
-
     def lines(self) -> Iterator[str]:
         """A line for each of them."""
         for one in self.trajectories:
@@ -57,6 +53,26 @@ class NavigationStatus:
                 f"mounting of {one['sensor']} (runs {one['run']}): calibrated {one['estimated_at']} from "
                 f"{one['method']}, σ at most {1e3 * lever:.1f} mm and {angle:.3f}°{held}{_shown(one)}"
             )
+
+
+COMPUTED_POSES: Final = Witness(
+    "computed_poses",
+    input="gnss, imu, encoder",
+    fault="A measurement, its stated σ or a lever arm is wrong, and with it the trajectory that is computed of them.",
+    asks="each measurement's innovation and residual in the smoother, by kind",
+    does="outliers get no weight; a trajectory that its measurements contradict is kept, and named",
+    told=("findings",),
+)
+
+
+def trajectory_findings(records: Iterable[LogRecord]) -> list[Finding]:
+    """Computed trajectories that their own measurements doubt, each doubt by itself."""
+    return [
+        COMPUTED_POSES.finds(f"trajectory of run '{r.run}'", f"doubtful: {doubt}")
+        for r in records
+        if r.sensor == NAVIGATION
+        for doubt in r.attributes.get("doubts", ())
+    ]
 
 
 def navigation_status(

@@ -525,7 +525,7 @@ def _beginning(log: CheckedLog) -> _Beginning:
         for item in items:
             if isinstance(item, Reject):
                 reasons[item.reason] += item.records
-            elif item.batch.num_rows:
+            elif isinstance(item, Rows) and item.batch.num_rows:
                 return _Beginning(log, _place_of(item, str(log.header.attributes.get("world_frame", LOCAL_WORLD))))
     except OSError:  # it was opened just now; who reads it through tells of it
         return _Beginning(log)

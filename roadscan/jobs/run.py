@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from roadscan.jobs.engine.compute import damaged_file, rare_collections
+from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.session import Session
-from roadscan.jobs.stage import Stage, stages
+from roadscan.jobs.stage import Stage, findings_of, stages
 from roadscan.jobs.tiles.selection import SelectionError
 from roadscan.model.counted import counted
 from roadscan.model.errors import RoadscanError, RunError
@@ -50,6 +51,7 @@ def run_stage(session: Session, stage: Stage) -> None:
     try:
         with rare_collections():
             stage.run(session)
+        _tell_findings(session, stage)
     except SelectionError:
         raise
     except NothingToPlaceError as nothing:
@@ -64,6 +66,13 @@ def run_stage(session: Session, stage: Stage) -> None:
                 write_failures(session.store, [{"stage": stage.name, "unit": "as a whole", "reason": str(error)}])
             raise
         session.failed(stage.name, [("as a whole", error)])
+
+
+def _tell_findings(session: Session, stage: Stage) -> None:
+    listed = set(known_keys(session.survey, session.store, session.logs))
+    records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
+    for one in findings_of(session.survey, records, session.manifest, [stage]):
+        session.note(one.line)
 
 
 def _removed_words(paths: Sequence[str]) -> str:

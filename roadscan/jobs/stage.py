@@ -11,7 +11,10 @@ from typing import ClassVar, Final
 from roadscan.jobs.session import Session
 from roadscan.model.errors import ConfigError, RoadscanError, nearest
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
 from roadscan.plugins import found_kinds
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
 
 ENTRY_POINT_GROUP: Final = "roadscan.stages"
 
@@ -70,6 +73,13 @@ class Stage(ABC):
         """
         return StageState()
 
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What the witnesses of its inputs said: told during a run, in the summary, by `status` and in the report.
+
+        It comes from the records of the survey's logs and computed trajectories, and from the manifest, in no time.
+        """
+        return ()
+
     def folders(self) -> Sequence[str]:
         """Folders of the store that hold nothing but files that the manifest names: other files in them are removed."""
         return ()
@@ -78,6 +88,14 @@ class Stage(ABC):
     def word(self) -> str:
         """Its name on the command line."""
         return self.command or self.name
+
+
+def findings_of(
+    survey: Survey, records: Sequence[LogRecord], manifest: Manifest, chosen: Sequence[Stage] | None = None
+) -> list[Finding]:
+    """What the witnesses of stages (of all, where none are chosen) said, each finding once."""
+    said = (one for s in (stages() if chosen is None else chosen) for one in s.findings(survey, records, manifest))
+    return list(dict.fromkeys(said))
 
 
 @functools.cache

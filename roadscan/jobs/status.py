@@ -17,11 +17,12 @@ from roadscan.jobs.navigate.navigate import known_keys
 from roadscan.jobs.plan.plan import NothingToPlaceError
 from roadscan.jobs.preflight import preflight
 from roadscan.jobs.session import Session
-from roadscan.jobs.stage import StageState, stages
+from roadscan.jobs.stage import StageState, findings_of, stages
 from roadscan.jobs.tiles.footprints import PRODUCT
 from roadscan.jobs.tiles.tile_fates import told
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import RoadscanError, StoreError
+from roadscan.model.witness import Finding
 from roadscan.products.base import products
 from roadscan.tables.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
@@ -54,6 +55,8 @@ class Status:
     """Records of the store that are damaged; the next run mends them."""
     lost: list[Lost] = field(default_factory=list)
     """Ingested rows that the store holds no more, and that could not be read again."""
+    findings: list[Finding] = field(default_factory=list)
+    """What the witnesses of the inputs said."""
     note: str = ""
     """Why nothing can be said of tiles."""
     would_fail: list[str] = field(default_factory=list)
@@ -71,7 +74,8 @@ class Status:
     @property
     def notes(self) -> list[str]:
         """What the user should know, beside what is to do."""
-        return [*self.checked, *(note for state in self.stages.values() for note in state.notes)]
+        found = [one.line for one in self.findings]
+        return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
 
     @property
     def next_run(self) -> dict[str, int]:
@@ -102,6 +106,7 @@ def survey_status(session: Session) -> Status:
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
     status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
         try:
             status.stages[stage.name] = state = stage.state(session)

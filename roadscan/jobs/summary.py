@@ -18,11 +18,13 @@ import pyarrow.compute as pc
 
 from roadscan.jobs.adjust.outcome import known_lines
 from roadscan.jobs.navigate.navigate import known_keys
+from roadscan.jobs.stage import findings_of
 from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
 from roadscan.jobs.tiles.tile_fates import told
 from roadscan.jobs.tiles.tile_plan import TILE
 from roadscan.model.errors import StoreError
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
 from roadscan.tables.logs import LogRecord, read_log_records
 from roadscan.tables.manifest import Manifest, OutputRecord, read_failures
 from roadscan.tables.store import Store
@@ -95,6 +97,8 @@ class SurveySummary:
     """None before the tiles are made."""
     adjustment: list[str]
     """What the adjustment of the poses found, in words; empty where nothing was adjusted."""
+    findings: list[Finding]
+    """What the witnesses of the inputs said: what was left out, and what is doubtful."""
     files: dict[str, ProductFiles]
     """Files by product."""
     failures: list[dict[str, str]]
@@ -119,6 +123,7 @@ def survey_summary(survey: Survey, store: Store) -> SurveySummary:
         readings=told([*manifest.of(FOOTPRINTS).values(), *tiles]),
         tiles=_tiles(tiles, survey.config.tiles.cell_m) if tiles else None,
         adjustment=known_lines(manifest),
+        findings=findings_of(survey, logs, manifest),
         files=_files(manifest.table(), store),
         failures=read_failures(store),
     )

@@ -1,8 +1,9 @@
 """The contract of a raw format, and the registry that finds formats by themselves.
 
 A format is one file in this folder (or one entry point of the group ``roadscan.formats``) with one
-subclass of :class:`LogFormat`. It streams :class:`Rows` and :class:`Reject`; everything else
-(schemas, partitions, fingerprints, rejects table) is done for it.
+subclass of :class:`LogFormat`. It streams :class:`Rows`, :class:`Reject` for each damaged record, and a
+:class:`~roadscan.model.witness.Finding` for what is doubtful of the log; everything else (schemas, partitions,
+fingerprints, rejects table, where findings are told) is done for it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemE
 from roadscan.model.gpstime import Clock
 from roadscan.model.rig import Sensor, SensorKind
 from roadscan.model.strict import Strict
+from roadscan.model.witness import Finding
 from roadscan.plugins import found_kinds
 from roadscan.sensors.columns import Quantity
 
@@ -192,7 +194,7 @@ class LogHeader:
     """Readings a profile, for tables with fixed-size lists."""
 
 
-Item: TypeAlias = Rows | Reject
+Item: TypeAlias = Rows | Reject | Finding
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,8 @@ class LogFormat(ABC):
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream the log's records in bounded chunks.
 
-        A damaged record becomes a :class:`Reject`; only a fault of the whole log raises.
+        A damaged record becomes a :class:`Reject`, what is doubtful a :class:`Finding`; only a fault of the whole
+        log raises.
         """
 
     def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:

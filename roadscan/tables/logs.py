@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, Final
 
 from roadscan.model.errors import DamagedError, StoreError
+from roadscan.model.witness import Finding
 from roadscan.tables.sealed import seal, unseal
 from roadscan.tables.store import Store
 
@@ -63,6 +64,8 @@ class LogRecord:
     rejected: int
     """Records listed in the table ``rejects``."""
     reject_reasons: dict[str, int]
+    findings: tuple[Finding, ...] = ()
+    """What its reader, and the checks of its rows, doubt."""
 
     def span(self, table: str) -> tuple[int, int] | None:
         """First and last epoch (GPS ns) of the log's rows in a table."""
@@ -164,6 +167,7 @@ def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     try:
         raw = unseal(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
+        raw["findings"] = tuple(map(Finding.of, raw.get("findings", ())))
         record = LogRecord(**raw)
         if record.key != key:
             raise ValueError(f"it is the record of the log {record.key}")

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from roadscan.codecs.parquet.list_table import is_list_table, write_list_table
 from roadscan.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.witness import Finding
 from roadscan.tables.derived import with_derived
 from roadscan.tables.logs import DataFile, log_folder
 from roadscan.tables.merge import merged
@@ -47,6 +48,8 @@ class LogWriter:
         self._held = 0
         self.rows: Counter[str] = Counter()
         self.reject_reasons: Counter[str] = Counter()
+        self.findings: list[Finding] = []
+        """What is doubtful of the log; kept in its record."""
 
     def add(self, table: str, batch: pa.RecordBatch) -> list[tuple[npt.NDArray[np.int64], str]]:
         """Take rows of a table; returns the rows refused, with their reasons."""

@@ -186,8 +186,6 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[st
     session.manifest.add([OutputRecord(ADJUSTMENT, SOLUTION, own, "", 0, "", json.dumps(detail))])
     for line in lines:
         session.reporter.line(f"adjust: {line}")
-    for note in notes:
-        session.note(note)
 
 
 def _seen(work: Work, sightings: Sequence[Sighting]) -> str:

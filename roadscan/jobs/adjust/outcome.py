@@ -14,6 +14,7 @@ from roadscan.codecs.grey_picture import write_png
 from roadscan.jobs.adjust.figures import Rows
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import keep_file
+from roadscan.model.witness import Finding, Witness
 from roadscan.products.pictures.adjustment import AdjustmentPicture, draw_adjustment
 from roadscan.products.pictures.seams import ShownSeam, draw_seams
 from roadscan.tables.manifest import Manifest, OutputRecord
@@ -41,10 +42,20 @@ def known_lines(manifest: Manifest) -> list[str]:
     return [] if record is None else list(record.figures()["lines"])
 
 
-def known_notes(manifest: Manifest) -> list[str]:
+CONTROL: Final = Witness(
+    "control",
+    input="control points",
+    fault="The survey of a point, its datum or its target is wrong.",
+    asks="all other points and passes, by the prediction of the adjustment without it",
+    does="a point that contradicts all other evidence does not count",
+    told=("findings",),
+)
+
+
+def known_findings(manifest: Manifest) -> list[Finding]:
     """What it found wrong."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
-    return [] if record is None else list(record.figures()["notes"])
+    return [] if record is None else [CONTROL.finds("adjust", note) for note in record.figures()["notes"]]
 
 
 def keep_tables(store: Store, manifest: Manifest, key: str, tables: Mapping[str, Rows]) -> None:

@@ -17,7 +17,8 @@ from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
-from roadscan.sensors.base import LogHeader, Reject, Rows
+from roadscan.model.witness import Finding
+from roadscan.sensors.base import Item, LogHeader, Reject
 from roadscan.tables.logs import (
     DataFile,
     LogRecord,
@@ -138,6 +139,7 @@ def record_of(
         rows=sum(n for t, n in writer.rows.items() if t != "rejects"),
         rejected=sum(writer.reject_reasons.values()),
         reject_reasons=dict(writer.reject_reasons),
+        findings=tuple(one if one.subject else replace(one, subject=str(log.config.path)) for one in writer.findings),
     )
 
 
@@ -246,7 +248,7 @@ def _widen(spans: dict[str, tuple[int, int]], record: LogRecord) -> None:
         spans[record.run] = (min(before[0], span[0]), max(before[1], span[1]))
 
 
-def _items(log: PlannedLog, header: LogHeader) -> Iterator[Rows | Reject]:
+def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
     try:
         yield from log.format.read(log.source, header)
     except RoadscanError as error:
@@ -257,7 +259,10 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Rows | Reject]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Rows | Reject) -> None:
+def _take(writer: LogWriter, item: Item) -> None:
+    if isinstance(item, Finding):
+        writer.findings.append(item)
+        return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return

@@ -8,6 +8,7 @@ from typing import Final
 from roadscan.jobs.ingest.overlap import Fault
 from roadscan.model.errors import TimeSystemError
 from roadscan.model.gpstime import iso_from_gps_ns
+from roadscan.model.witness import Finding, Witness
 from roadscan.tables.logs import LogRecord
 
 _STAMPED: Final = ("scans", "imu", "encoder", "gnss")
@@ -19,11 +20,24 @@ def one_stamp_logs(records: Sequence[LogRecord]) -> list[Fault]:
     return [_fault(r, table) for r in records for table in _STAMPED if _share(r, table) == 1.0]
 
 
-def one_stamp_notes(records: Sequence[LogRecord], share: float) -> list[str]:
-    """What to say of logs of which more than a share of the rows, and not all, have the stamp of their neighbours."""
+ONE_STAMP: Final = Witness(
+    "one_stamp",
+    input="any log with a stamp a row",
+    fault="The clock that stamps the rows stands still: all that they measured lies on one line.",
+    asks="the stamps of neighbouring rows",
+    does="a log of one stamp fails; one of which more than checks.lost_share shares a stamp is named, and used",
+    told=("error", "findings"),
+)
+
+
+def one_stamp_findings(records: Sequence[LogRecord], share: float) -> list[Finding]:
+    """Logs of which more than a share of the rows, and not all, have the stamp of their neighbours."""
     return [
-        f"{r.path}: {own:.0%} of its {table} carry the stamp of all others about them, and would lie on one line; see "
-        "to what stamps them"
+        ONE_STAMP.finds(
+            r.path,
+            f"{own:.0%} of its {table} carry the stamp of all others about them, and would lie on one line; see "
+            "to what stamps them",
+        )
         for r in records
         for table in _STAMPED
         if share < (own := _share(r, table)) < 1.0

@@ -29,6 +29,7 @@ from roadscan.model.gpstime import (
 )
 from roadscan.model.ids import of_run
 from roadscan.model.survey import ClockConfig, Survey
+from roadscan.model.witness import Finding, Witness
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.tables.logs import NAVIGATION, LogRecord
 
@@ -107,10 +108,22 @@ def _reasons(reject_reasons: Mapping[str, int]) -> str:
     return "; ".join(words) + (f"; and {more} more reasons" if more > 0 else "")
 
 
-def reject_notes(records: Sequence[LogRecord], share: float) -> list[str]:
+REJECTED_SHARE: Final = Witness(
+    "rejected_share",
+    input="any log",
+    fault="Much of a log is damaged, or it is read as what it is not.",
+    asks="the reader and the rules of the table's columns, record by record",
+    does="rejected records are left out; where they are more than checks.lost_share of the log, the log is named",
+    told=("rejects", "findings"),
+)
+
+
+def reject_findings(records: Sequence[LogRecord], share: float) -> list[Finding]:
     """Logs of which more than a share of the records was rejected, and rows are left."""
     return [
-        f"{r.path}: {r.rejected:,} records were rejected beside {r.rows:,} rows: {reject_words(r)}"
+        REJECTED_SHARE.finds(
+            r.path, f"{r.rejected:,} records were rejected beside {r.rows:,} rows: {reject_words(r)}", r.rejected
+        )
         for r in records
         if r.rows and r.rejected > share * (r.rows + r.rejected)
     ]

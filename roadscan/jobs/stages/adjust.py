@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.adjust.adjustment import adjust_survey, is_current, withdraw
-from roadscan.jobs.adjust.outcome import FOLDER, TABLES, known_lines, known_notes
+from roadscan.jobs.adjust.outcome import FOLDER, TABLES, known_findings, known_lines
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.footprints import index_footprints
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
 from roadscan.tables.schema import table_schema
 
 
@@ -46,11 +49,15 @@ class Adjust(Stage):
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""
         due = int(not is_current(session.plan, session.manifest))
-        notes = known_notes(session.manifest)
+        notes = []
         if due and session.survey.config.adjust.on:
-            notes = [*notes, "the adjustment is due: it may make more tiles stale than these"]
+            notes = ["the adjustment is due: it may make more tiles stale than these"]
         lines = known_lines(session.manifest)
         return StageState(1 - due, due, next_run={self.name: due}, notes=notes, lines=lines)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What the last solution doubts."""
+        return known_findings(manifest)
 
     def folders(self) -> Sequence[str]:
         """Evidence, tables of the outcome, pictures."""

@@ -5,14 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.ingest.ingest import DATA_TABLES, ingest, survey_records
-from roadscan.jobs.ingest.one_stamp import one_stamp_logs, one_stamp_notes
-from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs, can_be_placed, empty_logs, reject_notes
+from roadscan.jobs.ingest.one_stamp import one_stamp_findings, one_stamp_logs
+from roadscan.jobs.ingest.overlap import (
+    Fault,
+    NothingPlacedError,
+    apart_logs,
+    can_be_placed,
+    empty_logs,
+    reject_findings,
+)
 from roadscan.jobs.products import wanted_products
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.surfaces.surface_colours import check_cameras
 from roadscan.jobs.tile_work import BYTES_PER_READING, WORKER_BASE_BYTES
+from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
 from roadscan.tables.logs import LogRecord, has_log
+from roadscan.tables.manifest import Manifest
 from roadscan.tables.salvage import read_lost
 
 
@@ -37,8 +47,6 @@ class Ingest(Stage):
         if faults and has_readings and not can_be_placed(records, faults, DATA_TABLES):
             raise NothingPlacedError.of(faults)
         session.failed(self.name, [fault.told for fault in faults])
-        for note in _notes(session, records):
-            session.note(note)
 
     def state(self, session: Session) -> StageState:
         """Logs that wait to be read."""
@@ -46,8 +54,7 @@ class Ingest(Stage):
         waiting = [log for log in planned if not has_log(session.store, log.key)]
         if not waiting and not unplanned:
             records = survey_records(session.survey, session.store, session.logs)
-            notes = _notes(session, records)
-            return StageState(len(planned), notes=notes, faults=[fault.told for fault in _empty(session, records)])
+            return StageState(len(planned), faults=[fault.told for fault in _empty(session, records)])
         most = session.survey.config.tiles.max_block_readings
         doing = {
             "logs": len(waiting),
@@ -56,10 +63,11 @@ class Ingest(Stage):
         }
         return StageState(len(planned) - len(waiting), len(waiting) + len(unplanned), next_run=doing, hides_rest=True)
 
-
-def _notes(session: Session, records: Sequence[LogRecord]) -> list[str]:
-    share = session.survey.config.checks.lost_share
-    return [*reject_notes(records, share), *one_stamp_notes(records, share)]
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What readers and checks of rows doubt, and logs of which much was rejected or stands under one stamp."""
+        share = survey.config.checks.lost_share
+        own = [one for record in records for one in record.findings]
+        return [*own, *reject_findings(records, share), *one_stamp_findings(records, share)]
 
 
 def _empty(session: Session, records: Sequence[LogRecord]) -> list[Fault]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from roadscan.jobs.calibrate.calibrate import renew_reports
 from roadscan.jobs.navigate.clock_tables import set_damaged_clocks_aside
 from roadscan.jobs.navigate.clocks import estimate_clocks
 from roadscan.jobs.navigate.navigate import navigate
-from roadscan.jobs.navigation_status import navigation_status
+from roadscan.jobs.navigation_status import navigation_status, trajectory_findings
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
-from roadscan.tables.logs import read_log_records
+from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
+from roadscan.tables.logs import LogRecord, read_log_records
+from roadscan.tables.manifest import Manifest
 
 
 class Navigate(Stage):
@@ -42,4 +47,8 @@ class Navigate(Stage):
         found = navigation_status(session.survey, session.store, own, held)
         waiting = sum(one["state"] != "computed" for one in found.trajectories)
         lines = list(found.lines())
-        return StageState(len(found.trajectories) - waiting, waiting, notes=found.doubts, lines=lines)
+        return StageState(len(found.trajectories) - waiting, waiting, lines=lines)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What computed trajectories, held against their own measurements, are doubted for."""
+        return trajectory_findings(records)

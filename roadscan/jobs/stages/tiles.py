@@ -11,11 +11,15 @@ from roadscan.jobs.stages.footprints import faults_of_plan
 from roadscan.jobs.surfaces.surface_colours import check_colours
 from roadscan.jobs.tile_work import memory_of, plan_tile_work
 from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
-from roadscan.jobs.tiles.tile_fates import fate_words, lost_notes, of_all, told_by_log
+from roadscan.jobs.tiles.tile_fates import fate_words, lost_findings, of_all, told_by_log
 from roadscan.jobs.tiles.tile_files import tile_file_names
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.jobs.tiles.tiles import compute_tiles, run_tasks
 from roadscan.model.ids import TileId
+from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
 
 
 class Tiles(Stage):
@@ -66,9 +70,6 @@ class Tiles(Stage):
             )
             reason = f"no tile holds a reading: {why}; check the settings that leave them out"
             session.failed(self.name, [("as a whole", reason)])
-        share = session.survey.config.checks.lost_share
-        for note in lost_notes(logs, session.records, share) if chosen else ():
-            session.note(note)
 
     def state(self, session: Session) -> StageState:
         """Tiles, tasks and memory."""
@@ -83,9 +84,12 @@ class Tiles(Stage):
             "worker_memory_bytes": memory_of(tasks),
         }
         empty = len(session.manifest.without_file(TILE) - stale)
-        logs = told_by_log([*session.manifest.of(FOOTPRINTS).values(), *session.manifest.of(TILE).values()])
-        notes = lost_notes(logs, session.records, session.survey.config.checks.lost_share)
-        return StageState(current, len(stale), empty, next_run=doing, notes=notes)
+        return StageState(current, len(stale), empty, next_run=doing)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Logs of which many readings have no pose."""
+        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *manifest.of(TILE).values()])
+        return lost_findings(logs, records, survey.config.checks.lost_share)
 
     def folders(self) -> Sequence[str]:
         """Files a tile, those of surfaces too."""

@@ -11,11 +11,12 @@ import numpy.typing as npt
 
 from roadscan.kernels.georeferencing.readings import KEPT, OUTSIDE
 from roadscan.model.ids import TileId
+from roadscan.model.witness import Finding, Witness
 from roadscan.points.place import COUNTED_FATES, FATE_NAMES
 from roadscan.tables.logs import LogRecord, log_of
 from roadscan.tables.manifest import OutputRecord
 
-_MOST_NOTES: Final = 10
+_MOST_NOTED: Final = 10
 """Logs that are named."""
 
 
@@ -90,21 +91,34 @@ def fate_words(fates: Mapping[str, int]) -> str:
     return "; ".join(f"{count:,} {FATE_WORDS.get(name, f'are {name}')}" for name, count in lost)
 
 
-def lost_notes(logs: Mapping[str, Mapping[str, int]], records: Iterable[LogRecord], share: float) -> list[str]:
-    """What to say of each log of which more than a share of the readings has no pose.
+NO_POSE: Final = Witness(
+    "no_pose",
+    input="lidar, profiler",
+    fault="Readings were taken when the run has no pose: a gap, or a clock that is off.",
+    asks="the trajectory at each reading's epoch",
+    does="such a reading is left out and counted; where they are more than checks.lost_share, the log is named",
+    told=("findings",),
+)
+
+
+def lost_findings(
+    logs: Mapping[str, Mapping[str, int]], records: Iterable[LogRecord], share: float
+) -> list[Finding]:  # fmt: skip
+    """Logs of which more than a share of the readings has no pose.
 
     Parameters
     ----------
     logs : readings by fate, by the key of their log.
     records : of the logs.
     """
-    found: list[str] = []
+    found: list[Finding] = []
     for record in records:
         fates = logs.get(record.key, {})
         readings, lost = sum(fates.values()), fates.get("no_pose", 0)
         if readings and lost > share * readings:
-            found.append(
-                f"{record.path}: {lost:,} of {readings:,} readings ({lost / readings:.0%}) {FATE_WORDS['no_pose']}"
-            )
-    more = len(found) - _MOST_NOTES
-    return found if more <= 0 else [*found[:_MOST_NOTES], f"of {more:,} more logs, too, as many readings have no pose"]
+            words = f"{lost:,} of {readings:,} readings ({lost / readings:.0%}) {FATE_WORDS['no_pose']}"
+            found.append(NO_POSE.finds(record.path, words, lost))
+    if more := found[_MOST_NOTED:]:
+        words = "as many readings of each of these, too, have no pose"
+        found[_MOST_NOTED:] = [NO_POSE.finds(f"{len(more):,} more logs", words, sum(one.left_out for one in more))]
+    return found

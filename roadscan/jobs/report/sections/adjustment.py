@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from roadscan.jobs.adjust.outcome import FOLDER, PICTURES, known_lines, known_notes
+from roadscan.jobs.adjust.outcome import FOLDER, PICTURES, known_findings, known_lines
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
@@ -31,8 +31,8 @@ class Adjustment(Section):
         """Figures in words, what was found wrong, accuracy, seams before and after, control points, targets."""
         session = material.session
         store, manifest = session.store, session.manifest
-        for note in known_notes(manifest):
-            yield Paragraph(note, is_warning=True)
+        for one in known_findings(manifest):
+            yield Paragraph(one.text, is_warning=True)
         for line in known_lines(manifest):
             yield Paragraph(line)
         yield from _pictures(store, [f"{FOLDER}/adjustment.png"], "Control residuals on the map and as histograms")

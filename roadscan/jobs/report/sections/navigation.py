@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from roadscan.jobs.navigation_status import NavigationStatus, navigation_status
+from roadscan.jobs.navigation_status import NavigationStatus, navigation_status, trajectory_findings
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture
 from roadscan.jobs.report.section import Material, Section
 
@@ -20,8 +20,8 @@ class Navigation(Section):
         """A line for each of them, doubts, and the recorded pictures."""
         store = material.session.store
         found = navigation_status(material.session.survey, store, material.logs, material.records)
-        for doubt in found.doubts:
-            yield Paragraph(doubt, is_warning=True)
+        for one in trajectory_findings(material.logs):
+            yield Paragraph(one.line, is_warning=True)
         for line in found.lines():
             yield Paragraph(line)
         for path, caption in _pictures(found).items():

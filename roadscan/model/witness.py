@@ -1,0 +1,89 @@
+"""Witnesses: what a run asks whether an input is true; and findings: what it was told."""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, Final, Literal
+
+Told = Literal["error", "rejects", "findings"]
+"""Where a fault is told: ``error`` ends the command or the log with a message; ``rejects`` counts the records in the
+summary and lists each in the table `rejects`; ``findings`` is a line of the summary, of `status` and of the report."""
+
+
+@dataclass(frozen=True)
+class Witness:
+    """One way to see that an input is wrong. `docs/witnesses.md` lists all of them; each is a constant of the module
+    that asks it, and a test names it with ``@pytest.mark.witness("name")``.
+    """
+
+    name: str
+    """Lower case with underscores, such as ``pose_leap``."""
+    input: str
+    """Kind of input: ``trajectory``, ``lidar``, ``profiler``, ``control points``, …"""
+    fault: str
+    """What can be wrong with it: one sentence."""
+    asks: str
+    """The witness: what the input is compared with."""
+    does: str
+    """What the run does where they contradict: what is left out, refused or kept."""
+    told: tuple[Told, ...]
+    """Where that is told."""
+
+    def finds(self, subject: str, text: str, left_out: int = 0) -> Finding:
+        """What this witness said of an input.
+
+        Parameters
+        ----------
+        subject : log (its path in the survey file), control point or run; "" for the log that is being read.
+        text : what arrived, what contradicts it, by how much, and what the run did with it: whole sentences.
+        left_out : how many records, readings or points were left out; 0 where all are used.
+        """
+        return Finding(self.name, subject, text, left_out)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a witness said of an input of this survey."""
+
+    witness: str
+    """Name of the witness."""
+    subject: str
+    """Log (its path in the survey file), control point or run."""
+    text: str
+    """What arrived, what contradicts it, by how much, and what the run did with it."""
+    left_out: int = field(default=0)
+    """How many records, readings or points were left out; 0 where all are used."""
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Finding:
+        """A finding from the JSON object in which a record keeps it."""
+        return cls(**stored)
+
+    @property
+    def line(self) -> str:
+        """Subject and text, as the summary prints them."""
+        return f"{self.subject}: {self.text}" if self.subject else self.text
+
+
+_PACKAGE: Final = "roadscan"
+
+
+def witnesses() -> dict[str, Witness]:
+    """All witnesses by name, sorted: the constants of this class in all modules of roadscan (imports each of them).
+
+    Raises
+    ------
+    ValueError
+        where two have one name.
+    """
+    package, found = import_module(_PACKAGE), dict[str, Witness]()
+    for module in pkgutil.walk_packages(package.__path__, f"{_PACKAGE}."):
+        if module.name.endswith("__main__"):
+            continue
+        for value in vars(import_module(module.name)).values():
+            if isinstance(value, Witness) and found.setdefault(value.name, value) != value:
+                raise ValueError(f"two witnesses are named {value.name}")
+    return dict(sorted(found.items()))

@@ -44,3 +44,12 @@ def recordings() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}: set ROADSCAN_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def faults(recordings: Path) -> Path:
+    """Folder of inputs that are wrong, beside that of the recordings; the test is skipped where it is absent."""
+    folder = recordings.parent / "faults"
+    if not folder.is_dir():
+        pytest.skip(f"no wrong inputs at {folder}")
+    return folder

@@ -155,7 +155,7 @@ def test_doubt_stays_in_status(driven: tuple[Path, Path], tmp_path: Path) -> Non
     assert "doubtful: run 'run-1'" in place.said and "are outliers (at most 10%)" in place.said
     for _ in range(2):  # another run computes nothing, and still says so
         assert place.do("status") == 0
-        assert "note: trajectory of run 'run-1' is doubtful" in place.said
+        assert "note: trajectory of run 'run-1': doubtful" in place.said
         assert place.do("run", "--workers", "0") == 0
         assert "known: run-1/navigation" in place.said and "doubtful: run 'run-1'" in place.said
 

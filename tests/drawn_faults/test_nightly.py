@@ -1,0 +1,22 @@
+"""Fifty faults drawn into the demo's logs: how many change a figure beyond its σ, and nothing is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.drawn_faults.__main__ import show
+from tests.drawn_faults.trial import trials
+
+COUNT = 50
+SEED = 1
+MOST_SILENT = 0
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(7_200)
+def test_no_fault_is_silent(tmp_path: Path) -> None:
+    """Each fault is named, or changes no product by more than its σ allows."""
+    silent = [f"{one.kind}: {one.words}: {one.changed}" for one in show(trials(tmp_path, COUNT, SEED)) if one.is_silent]
+    assert len(silent) <= MOST_SILENT, "\n".join(silent)

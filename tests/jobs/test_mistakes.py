@@ -297,6 +297,7 @@ def test_an_older_list_of_logs_is_read(tmp_path: Path) -> None:
 # --- stamps and mountings ---------------------------------------------------------------------------
 
 
+@pytest.mark.witness("one_stamp")
 def test_a_log_of_one_stamp_fails_beside_others(tmp_path: Path) -> None:
     log = '[[runs.logs]]\npath = "more.parquet"\nsensor = "profiler"\n\n'
     scans = '[[runs.logs]]\npath = "scans'
@@ -330,6 +331,7 @@ def damage(folder: Path, lines: slice) -> None:
     file.write_text("\n".join(rows) + "\n")
 
 
+@pytest.mark.witness("rejected_share")
 def test_reasons_of_rejects_are_printed(tmp_path: Path) -> None:
     changed(tmp_path, make=lambda f: damage(f, slice(2, 8)))
     code, text = said(tmp_path, "ingest", "--workers", "0")
@@ -357,6 +359,7 @@ def test_a_log_whose_records_are_all_rejected_fails(tmp_path: Path) -> None:
     assert re.search(r"scans\.parquet: not one of its 30 records can be used: 30 × .*table `rejects`", text)
 
 
+@pytest.mark.witness("no_pose")
 def test_readings_without_poses_are_warned_of(tmp_path: Path) -> None:
     """Of profiles over 0.3 s, the last 0.2 s come after the last pose."""
     changed(tmp_path, ('id = "street"', 'id = "street"\nproducts.make = ["geotiff"]'))
@@ -365,7 +368,14 @@ def test_readings_without_poses_are_warned_of(tmp_path: Path) -> None:
     assert code == 0
     note = r"note: scans\.parquet: \d+ of 1,200 readings \(6\d%\) have no pose"
     assert re.search(note, text)
+    assert re.search(note.replace("note:", r"left out\s+"), text)  # the summary
     assert re.search(note, said(tmp_path, "status")[1])
+    (report,) = tmp_path.rglob("report.html")
+    assert re.search(r"scans\.parquet</td><td[^>]*>\d+ of 1,200 readings \(6\d%\) have no pose", report.read_text())
+    code, text = said(tmp_path, "run", "--json", "--workers", "0")
+    (found,) = json.loads(text[text.index("{") :])["findings"]
+    assert (found["witness"], found["subject"]) == ("no_pose", "scans.parquet")
+    assert f"{found['left_out']} of 1,200 readings" in found["text"]
 
 
 def test_a_log_that_loses_most_readings_is_named_beside_larger_ones(tmp_path: Path) -> None:

@@ -136,6 +136,7 @@ def test_status_tells_of_the_trajectory(alone: Place) -> None:
     assert "not doubted" in line and line.endswith(f"picture {PICTURE}")
 
 
+@pytest.mark.witness("computed_poses")
 def test_doubt_stays_in_status(driven: tuple[Path, Path], tmp_path: Path) -> None:
     """Heights that scatter five times more than their σ says, and are believed."""
     raw, rig = driven

@@ -13,12 +13,13 @@ import numpy.typing as npt
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, grid_folder, plan_logs
+from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
-from roadscan.sensors.base import Item, LogHeader, Reject
+from roadscan.sensors.base import Item, LogHeader, Reject, Rows
 from roadscan.tables.logs import (
     DataFile,
     LogRecord,
@@ -148,9 +149,12 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     if task.grids is not None:
         add_grid_folder(task.grids)
     header = task.log.format.header(task.log.source)
-    writer = LogWriter(folder, header.list_size)
+    writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
     for item in _items(task.log, header):
+        if isinstance(item, Rows) and item.table == "scans":
+            repeats.take(item.batch)
         _take(writer, item)
+    writer.findings += [found] if (found := repeats.finding()) else []
     writer.finish()
     _check_unchanged(task.log)
     return writer, header

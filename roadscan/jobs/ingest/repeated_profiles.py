@@ -77,7 +77,7 @@ class RepeatedProfiles:
 def _equal_rows(before: npt.NDArray[np.generic], after: npt.NDArray[np.generic]) -> npt.NDArray[np.bool_]:
     """Rows (n,) of two arrays (n, k) that are equal and show something: readings that are not all the same."""
     columns = np.linspace(0, after.shape[1] - 1, _SAMPLED).astype(int)
-    same = (before[:, columns] == after[:, columns]).all(axis=1)
+    same: npt.NDArray[np.bool_] = (before[:, columns] == after[:, columns]).all(axis=1)
     rows = np.flatnonzero(same)
     same[rows] = (before[rows] == after[rows]).all(axis=1) & (after[rows] != after[rows, :1]).any(axis=1)
     return same

@@ -9,6 +9,7 @@ each other is left out, and where two long pieces do not fit, both stay: nothing
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -51,6 +52,10 @@ _LEAST_LEAP_RAD: Final = float(np.radians(0.3))
 """The same of angles."""
 _NOISE_TIMES: Final = 8.0
 """So many times the median of what links usually contradict is no leap."""
+_JITTER_TIMES: Final = 4.0
+"""Stamps are wrong by at most so many times the median of what steps of time differ from the usual one."""
+_IRREGULAR: Final = 0.1
+"""Where the steps of time usually differ by more than this share, a short one may be a late stamp."""
 _SIGMA_TIMES: Final = 3.0
 """So many times the stated σ is no leap."""
 _NOISE_LINKS: Final = 128
@@ -187,8 +192,14 @@ class _Links:
         noise_m = _noise(np.linalg.norm(_mean(before_m, after_m), axis=1)[:, None])[:, 0]
         noise_rad = _noise(np.abs(_mean(before_rad, after_rad)))
         both = np.isfinite(before_m[:, 0]) & np.isfinite(after_m[:, 0])
-        bound_m = _bound_m(elapsed, both) + _NOISE_TIMES * noise_m
-        bound_rad = _bound_rad(elapsed, both) + _NOISE_TIMES * noise_rad
+        usual = _medians(elapsed[:, None])[:, 0]
+        jitter = _noise(np.abs(elapsed - usual)[:, None])[:, 0]
+        late_s = _JITTER_TIMES * jitter
+        reach = np.where(jitter > _IRREGULAR * usual, _longest_of_three(elapsed), elapsed)
+        noise_m += late_s * _slower(shift, elapsed) / _NOISE_TIMES
+        noise_rad += (late_s * _slower(turn, elapsed) / _NOISE_TIMES)[:, None]
+        bound_m = _bound_m(reach, both) + _NOISE_TIMES * noise_m
+        bound_rad = _bound_rad(reach, both) + _NOISE_TIMES * noise_rad
         up = _up(track)
         leap_m = np.maximum(
             _leap_sizes(before_m, after_m, bound_m[:, None], whole=True),
@@ -211,10 +222,8 @@ class _Links:
 
     def step(self, before: int, after: int) -> Step:
         """The step between two poses."""
-        link = slice(before, after)
-        sigma = float(max(self.track.sigma_m[before], self.track.sigma_m[after]))
-        sizes = (float(np.max(values[link])) for values in self.leap)
-        return Step(before, after, *sizes, sigma)
+        shift, turn = (float(np.max(values[before:after])) for values in self.leap)
+        return Step(before, after, shift, turn, float(max(self.track.sigma_m[before], self.track.sigma_m[after])))
 
 
 def _against_neighbours(steps: Float64, elapsed_s: Float64, gap: Bool) -> tuple[Float64, Float64]:
@@ -234,16 +243,41 @@ def _mean(before: Float64, after: Float64) -> Float64:
     return mean
 
 
-def _noise(contradiction: Float64) -> Float64:
-    """Usual contradiction (k, c) about each link: the greatest of three neighbouring medians."""
-    count = len(contradiction)
+def _longest_of_three(elapsed_s: Float64) -> Float64:
+    """The longest (k,) of each link and its two neighbours."""
+    padded = np.concatenate([elapsed_s[:1], elapsed_s, elapsed_s[-1:]])
+    return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
+
+
+def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
+    """Speed (k,) of the slower one of the links before and after: what leaps is not the measure of itself."""
+    speed = np.linalg.norm(steps, axis=1) / elapsed_s
+    padded = np.concatenate([[np.inf], speed, [np.inf]])
+    slower = np.minimum(padded[:-2], padded[2:])
+    return np.where(np.isfinite(slower), slower, 0.0)
+
+
+def _block_medians(values: Float64) -> Float64:
+    """Medians (b, c) of values (k, c) by block of links."""
+    count = len(values)
     starts = np.arange(0, count, _NOISE_LINKS)
-    medians = np.array([np.median(contradiction[s : s + _NOISE_LINKS], axis=0) for s in starts])
+    medians = np.array([np.median(values[s : s + _NOISE_LINKS], axis=0) for s in starts])
     if len(medians) > 1 and count - starts[-1] < _NOISE_LINKS // 2:
         medians[-1] = medians[-2]  # of so few links a burst is the half
+    return medians
+
+
+def _medians(values: Float64) -> Float64:
+    """Median (k, c) of values (k, c) about each link."""
+    return np.asarray(_block_medians(values)[np.arange(len(values)) // _NOISE_LINKS])
+
+
+def _noise(contradiction: Float64) -> Float64:
+    """Usual contradiction (k, c) about each link: the greatest of three neighbouring medians."""
+    medians = _block_medians(contradiction)
     padded = np.concatenate([medians[:1], medians, medians[-1:]])
     wide = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.asarray(wide[np.arange(count) // _NOISE_LINKS])
+    return np.asarray(wide[np.arange(len(contradiction)) // _NOISE_LINKS])
 
 
 def _bound_m(elapsed_s: Float64, both: Bool) -> Float64:
@@ -426,7 +460,7 @@ def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: 
         out[segments[k].first : segments[k].last + 1] = False
     shift, turn = (_beside_links(values, out) for values in links.leap)
     steps = list[Step]()
-    for i, j in zip(kept[:-1], kept[1:], strict=True):
+    for i, j in itertools.pairwise(kept):
         a, b = segments[i], segments[j]
         link = links.step(a.last, b.first)
         if (j == i + 1 and (link.shift_m > 0 or link.turn_rad > 0)) or (j > i + 1 and not _bridge(links, a, b)[0]):

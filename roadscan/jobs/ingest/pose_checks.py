@@ -31,7 +31,7 @@ VERSION: Final = 1
 POSE_LEAP: Final = Witness(
     "pose_leap",
     input="trajectory",
-    fault="Single poses, or some in a row, lie elsewhere or are turned: a false fix, a pose at latitude 0, longitude 0.",
+    fault="Some poses lie elsewhere or are turned: a false fix, a pose at latitude 0, longitude 0.",
     asks="the poses before and after, the stated σ, and the speed, acceleration and turning of which a vehicle is able",
     does="a pose that all of them exclude is left out; those about it bridge the gap up to navigation.max_gap_s",
     told=("rejects", "findings"),
@@ -41,7 +41,7 @@ POSE_STEP: Final = Witness(
     input="trajectory",
     fault="Positions or angles step to another level and go on there, as where a fix is lost or found again.",
     asks="the motion before and after, the stated σ, and the acceleration and turning of which a vehicle is able",
-    does="the step is named with its size and the stated σ; all poses are used, since nothing shows which side is right",
+    does="the step is named with its size and σ; all poses are used, since nothing shows which side is right",
     told=("findings",),
 )
 
@@ -131,16 +131,19 @@ class _Found:
         record_of = {epoch: record for _, record, _, epoch in told}
         for reason, (size, epoch) in sorted(self.largest.items()):
             count = sum(self.reasons[one] == reason for *_, one in told)
-            what, by = ("lie", f"{size:,.2f} m") if reason == _ELSEWHERE else ("are turned", f"{np.degrees(size):.2f}°")
+            is_place = reason == _ELSEWHERE
+            who = _poses(count, "lies", "lie") if is_place else _poses(count, "is turned", "are turned")
+            by = f"{size:,.2f} m" if is_place else f"{np.degrees(size):.2f}°"
             text = (
-                f"{count:,} poses {what} up to {by} off the motion of the poses before and after them, the worst at "
-                f"{iso_from_gps_ns(epoch)} (record {record_of[epoch]:,}); they are left out, and the others bridge "
-                "the gap up to navigation.max_gap_s"
+                f"{who} up to {by} off the motion of the poses before and after, the worst at "
+                f"{iso_from_gps_ns(epoch)} (record {record_of[epoch]:,}); left out, and bridged by the others where "
+                "these are within navigation.max_gap_s"
             )
             found.append(POSE_LEAP.finds("", text, count))
         if no_fix := len(told) - sum(one in self.reasons for *_, one in told):
-            text = f"{no_fix:,} poses lie at latitude 0, longitude 0 (record {_first_other(told, self.reasons):,} first)"
-            found.append(POSE_LEAP.finds("", text + ": there was no fix, and they are left out", no_fix))
+            first = next(record for _, record, _, epoch in told if epoch not in self.reasons)
+            text = f"{_poses(no_fix, 'lies', 'lie')} at latitude 0, longitude 0, the first in record {first:,}: there "
+            found.append(POSE_LEAP.finds("", f"{text}was no fix; left out", no_fix))
         if self.steps:
             end = "and go on there; which side is right nothing shows, and all poses are used"
             found.append(POSE_STEP.finds("", f"{_step_words(self.steps)}, {end}"))
@@ -150,8 +153,9 @@ class _Found:
         return found
 
 
-def _first_other(told: Sequence[tuple[str, int, int, int]], reasons: dict[int, str]) -> int:
-    return next(record for _, record, _, epoch in told if epoch not in reasons)
+def _poses(count: int, one: str, many: str) -> str:
+    """How many poses, with the verb that fits."""
+    return f"{count:,} {f'pose {one}' if count == 1 else f'poses {many}'}"
 
 
 def _step_words(steps: Sequence[tuple[int, Step]]) -> str:
@@ -186,20 +190,17 @@ def _judged(writer: LogWriter, world: str, no_fix: Int64) -> Iterator[tuple[Int6
     """Epochs and leaps of each file of poses, looked at together with poses of the files before and after it."""
     window: list[pa.Table] = []
     for rows in [*writer.tables(_TABLE), None]:
-        window.append(rows if rows is None else rows)
-        if len(window) >= 2 and window[-2] is not None:
-            before = window[-3].slice(max(window[-3].num_rows - _BESIDE, 0)) if len(window) > 2 else None
-            after = None if rows is None else rows.slice(0, _BESIDE)
-            yield _judge([before, window[-2], after], world, no_fix)
-        window = window[-2:]
+        if len(window) > 0:
+            before = [one.slice(max(one.num_rows - _BESIDE, 0)) for one in window[:-1]]
+            after = [] if rows is None else [rows.slice(0, _BESIDE)]
+            yield _judge(window[-1], pa.concat_tables([*before, window[-1], *after]), world, no_fix)
+        window = [*window[-1:], *([] if rows is None else [rows])]
 
 
-def _judge(parts: Sequence[pa.Table | None], world: str, no_fix: Int64) -> tuple[Int64, Leaps]:
-    """Leaps of the middle one of three tables."""
-    own = parts[1]
-    assert own is not None
+def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[Int64, Leaps]:
+    """Leaps of the poses of a table, looked at together with those around it."""
     first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
-    track = _track(pa.concat_tables([part for part in parts if part is not None]), world, no_fix)
+    track = _track(rows, world, no_fix)
     found, epochs = find_leaps(track), track.epochs_gps_ns
     inside = (epochs >= first) & (epochs <= last)
     steps, covered = (

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.model.crs import LOCAL_WORLD, Geoid, MapFrame
@@ -157,6 +159,8 @@ class Rows:
     """Byte offset of the first row, −1 where there is none."""
     record_bytes: int = 0
     """Bytes from one row to the next, 0 where it varies."""
+    records: npt.NDArray[np.int64] | None = None
+    """(n,) record number of each row, where they do not follow one another."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -86,6 +87,26 @@ class LogWriter:
         for (table, start), held in sorted(self._bins.items()):
             if _overlap(held.parts):
                 held.parts = self._merge(table, start, held)
+
+    def tables(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Rows of a finished table, file by file, in order of time."""
+        for key in sorted(key for key in self._bins if key[0] == table):
+            for path, _, _ in self._bins[key].parts:
+                yield pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
+
+    def leave_out(self, table: str, epochs_gps_ns: npt.NDArray[np.int64]) -> None:
+        """Take the rows of some epochs out of a finished table."""
+        schema = table_schema(table)
+        for key in sorted(key for key in self._bins if key[0] == table):
+            parts, self._bins[key].parts = self._bins[key].parts, []
+            for path, first, last in parts:
+                rows = pq.read_table(path, partitioning=None)
+                kept = ~np.isin(rows.column("epoch_gps_ns").to_numpy(), epochs_gps_ns)
+                path.unlink()
+                if kept.any():
+                    write_parquet(path, rows.filter(pa.array(kept)), schema)
+                    self._bins[key].parts.append((path, first, last))
+                self.rows[table] -= int((~kept).sum())
 
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
         """Move the finished tables into the store, each at once."""

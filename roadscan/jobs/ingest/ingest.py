@@ -13,6 +13,7 @@ import numpy.typing as npt
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, grid_folder, plan_logs
+from roadscan.jobs.ingest.pose_checks import PoseRecords, check_poses
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.crs import add_grid_folder
@@ -149,13 +150,16 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     if task.grids is not None:
         add_grid_folder(task.grids)
     header = task.log.format.header(task.log.source)
-    writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
+    writer, poses, repeats = LogWriter(folder, header.list_size), PoseRecords(), RepeatedProfiles()
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
-        _take(writer, item)
+        _take(writer, item, poses)
     writer.findings += [found] if (found := repeats.finding()) else []
     writer.finish()
+    if writer.rows["trajectory"]:
+        check_poses(writer, str(header.attributes["world_frame"]), poses)
+        writer.finish()
     _check_unchanged(task.log)
     return writer, header
 
@@ -263,14 +267,16 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item) -> None:
+def _take(writer: LogWriter, item: Item, poses: PoseRecords) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    for rows, reason in writer.add(item.table, item.batch):
+    refused = writer.add(item.table, item.batch)
+    poses.take(item, [rows for rows, _ in refused])
+    for rows, reason in refused:
         for first, count in _consecutive(rows):
             offset = -1 if item.first_offset < 0 or not item.record_bytes else (
                 item.first_offset + first * item.record_bytes

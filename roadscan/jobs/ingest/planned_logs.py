@@ -9,6 +9,7 @@ from typing import Final, TypeAlias
 
 from roadscan.jobs.engine.fingerprint import grid_digest, key_of
 from roadscan.jobs.ingest.clock_pairs import log_clock
+from roadscan.jobs.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.jobs.ingest.sources import Known, Sources, open_sources
 from roadscan.model.crs import Geoid, add_grid_folder
 from roadscan.model.errors import ConfigError, RoadscanError
@@ -159,6 +160,7 @@ def _plan_log(
         config.crs, config.height, grid_digest(config.geoid), run, sensor, schemas,
         [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)] if source.map else None,
         *([source.defaults] if source.defaults != SourceDefaults() else []),
+        *([["poses", POSE_CHECKS]] if "trajectory" in format_.yields else []),
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size, stamp)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from roadscan.jobs.publish.layer import SiteLayer, Style
 from roadscan.jobs.publish.material import Box, Material
-from roadscan.jobs.publish.parts.rasters import images_of
+from roadscan.jobs.publish.parts.rasters import Images, images_of
 from roadscan.jobs.publish.parts.vectors import site_layers
 from roadscan.products.site_rasters import Place
 
@@ -67,17 +67,22 @@ def _ground(material: Material, corner: tuple[float, float], pixel_m: float, sha
     tile_m = own_m * edge
     columns = range(int(corner[0] // tile_m), int((corner[0] + shape[1] * pixel_m) // tile_m) + 1)
     rows = range(int((corner[1] - shape[0] * pixel_m) // tile_m), int(corner[1] // tile_m) + 1)
-    places = [Place(level, c, r) for r in rows for c in columns if images.pyramid.holds(Place(level, c, r))]
+    places = _pictures(images, level, columns, rows)
     finest = 16 ** max(0, level - images.pyramid.stored_levels + 1)
     if not places or len(places) * finest > _MOST_PICTURES:
         return out
-    whole = np.full((len(rows) * edge, len(columns) * edge, 3), _GROUND, np.uint8)
     with TemporaryDirectory(prefix="thumbnail-") as folder:
-        for place in places:
-            left, top = (place.column - columns[0]) * edge, (rows[-1] - place.row) * edge
-            grey = np.asarray(Image.open(_made(material, place, Path(folder)), formats=("PNG",)))
-            part = whole[top : top + edge, left : left + edge]
-            part[grey[..., 1] > 0] = grey[grey[..., 1] > 0][:, :1]
+        greys = {place: _grey(_made(material, place, Path(folder))) for place in places}
+    if len(columns) * len(rows) > _MOST_PICTURES:  # sites far apart, of which the coarsest level is too fine for this
+        for place, grey in greys.items():
+            left_px = (place.column * tile_m - corner[0]) / pixel_m
+            _shrink(out, grey, left_px, (corner[1] - (place.row + 1) * tile_m) / pixel_m, tile_m / pixel_m)
+        return out
+    whole = np.full((len(rows) * edge, len(columns) * edge, 3), _GROUND, np.uint8)
+    for place, grey in greys.items():
+        left, top = (place.column - columns[0]) * edge, (rows[-1] - place.row) * edge
+        part = whole[top : top + edge, left : left + edge]
+        part[grey[..., 1] > 0] = grey[grey[..., 1] > 0][:, :1]
     # Pixel (x, y) of the thumbnail from those of the pictures, whose first line is the northmost.
     zoom = pixel_m / own_m
     east_px = (corner[0] - columns[0] * tile_m) / own_m + (zoom - 1) / 2
@@ -88,6 +93,31 @@ def _ground(material: Material, corner: tuple[float, float], pixel_m: float, sha
     method = cv2.WARP_INVERSE_MAP | (cv2.INTER_LINEAR if zoom > 0.5 else cv2.INTER_NEAREST)
     drawn: UInt8 = cv2.warpAffine(whole, turn, shape[::-1], flags=method, borderValue=_GROUND).astype(np.uint8)
     return drawn
+
+
+def _pictures(images: Images, level: int, columns: range, rows: range) -> list[Place]:
+    """Pictures of a level that there are in some columns and rows; far fewer than these may be."""
+    if len(columns) * len(rows) <= _MOST_PICTURES:
+        return [Place(level, c, r) for r in rows for c in columns if images.pyramid.holds(Place(level, c, r))]
+    known = images.pyramid.places(level)
+    column, row = known[:, 0], known[:, 1]
+    seen = (column >= columns[0]) & (column <= columns[-1]) & (row >= rows[0]) & (row <= rows[-1])
+    return [Place(level, c, r) for c, r in known[seen].tolist()]
+
+
+def _grey(path: Path) -> UInt8:
+    """Grey and opacity (edge, edge, 2) of a picture."""
+    with Image.open(path, formats=("PNG",)) as image:
+        return np.asarray(image)
+
+
+def _shrink(out: UInt8, grey: UInt8, left_px: float, top_px: float, edge_px: float) -> None:
+    """Draw a picture as the mean of its known pixels over the pixels of `out` that it covers, over one at least."""
+    known = grey[..., 1] > 0
+    if known.any():
+        left, top = (max(0, int(at)) for at in (left_px, top_px))
+        right, bottom = (max(low + 1, round(at + edge_px)) for low, at in ((left, left_px), (top, top_px)))
+        out[top:bottom, left:right] = round(float(grey[..., 0][known].mean()))
 
 
 def _made(material: Material, place: Place, folder: Path) -> Path:

@@ -422,6 +422,7 @@ def block_rows(
         first_record=int(records[0]),
         first_offset=int(offsets[0]),
         record_bytes=record_bytes if unbroken else 0,
+        records=None if unbroken else records,
     )
 
 

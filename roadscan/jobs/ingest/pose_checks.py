@@ -1,0 +1,236 @@
+"""Poses of a log that no vehicle can have taken are left out of its rows, by record; steps of its positions are named.
+
+It is done when all rows of the log are read and lie in order of time: readers stream, and a pose shows to be wrong by
+those that follow it. No row is changed; one that is left out is a reject of its record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.model.crs import LOCAL_WORLD
+from roadscan.model.gpstime import iso_from_gps_ns
+from roadscan.model.witness import Finding, Witness
+from roadscan.navigation.leaps import Leaps, PoseTrack, Step, find_leaps
+from roadscan.sensors.base import Rows
+from roadscan.tables.writer import LogWriter
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+VERSION: Final = 1
+"""Raised when other poses are left out, so that trajectory logs are read again."""
+
+POSE_LEAP: Final = Witness(
+    "pose_leap",
+    input="trajectory",
+    fault="Some poses lie elsewhere or are turned: a false fix, a pose at latitude 0, longitude 0.",
+    asks="the poses before and after, the stated σ, and the speed, acceleration and turning of which a vehicle is able",
+    does="a pose that all of them exclude is left out; those about it bridge the gap up to navigation.max_gap_s",
+    told=("rejects", "findings"),
+)
+POSE_STEP: Final = Witness(
+    "pose_step",
+    input="trajectory",
+    fault="Positions or angles step to another level and go on there, as where a fix is lost or found again.",
+    asks="the motion before and after, the stated σ, and the acceleration and turning of which a vehicle is able",
+    does="the step is named with its size and σ; all poses are used, since nothing shows which side is right",
+    told=("findings",),
+)
+
+_TABLE: Final = "trajectory"
+_BESIDE: Final = 4_000
+"""Poses of the files before and after that are looked at together with those of a file."""
+_NO_FIX_SHARE: Final = 0.5
+"""Where more poses than that lie at latitude 0, longitude 0, it is the place of the survey (a simulated one)."""
+_NO_FIX_M: Final = 1e-3
+_NAMED: Final = 3
+"""So many steps are named, the largest."""
+
+_ELSEWHERE: Final = "the position leaps away from the poses before and after it, as no vehicle moves"
+_TURNED: Final = "the attitude leaps away from the poses before and after it, as no vehicle turns"
+_NO_FIX: Final = "the position is latitude 0, longitude 0, or the centre of the Earth: there was no fix"
+
+
+@dataclass
+class PoseRecords:
+    """Which records the poses of a log come from."""
+
+    _parts: list[tuple[str, Int64, Int64, Int64]] = field(default_factory=list)
+
+    def take(self, item: Rows, refused: Sequence[Int64]) -> None:
+        """Remember the epochs and records of rows of poses, but those that were refused."""
+        if item.table != _TABLE or not item.batch.num_rows:
+            return
+        count = item.batch.num_rows
+        kept = np.ones(count, dtype=bool)
+        for rows in refused:
+            kept[rows] = False
+        records = item.first_record + np.arange(count) if item.records is None else item.records
+        offsets = np.full(count, -1, np.int64)
+        if item.first_offset >= 0 and item.record_bytes:
+            offsets = item.first_offset + np.arange(count) * item.record_bytes
+        epochs = item.batch.column("epoch_gps_ns").to_numpy()
+        self._parts.append((item.file, epochs[kept], np.asarray(records)[kept], offsets[kept]))
+
+    def of(self, epochs: Int64) -> Iterator[tuple[str, int, int, int]]:
+        """File, record, offset and epoch of each pose that has one of these epochs, in the order of the log."""
+        for file, own, records, offsets in self._parts:
+            for k in np.flatnonzero(np.isin(own, epochs)).tolist():
+                yield file, int(records[k]), int(offsets[k]), int(own[k])
+
+
+def check_poses(writer: LogWriter, world: str, records: PoseRecords) -> None:
+    """Leave out of a finished log's rows the poses that no vehicle can have taken; they become rejects and findings."""
+    found = _Found()
+    no_fix = _without_fix(writer, world)
+    for epochs, leaps in _judged(writer, world, no_fix):
+        found.add(epochs, leaps)
+    out = np.union1d(no_fix, np.array(sorted(found.reasons), dtype=np.int64))
+    told = list(records.of(out))
+    for file, record, offset, epoch in told:
+        writer.reject(file, record, offset, 1, found.reasons.get(epoch, _NO_FIX))
+    if out.size:
+        writer.leave_out(_TABLE, out)
+    writer.findings += found.findings(told)
+
+
+@dataclass
+class _Found:
+    """What is wrong with the poses of a log, from all of its files."""
+
+    reasons: dict[int, str] = field(default_factory=dict)
+    """Epoch (GPS ns) of each pose to leave out, and why."""
+    largest: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """Size (m, rad) and epoch of the largest leap by reason."""
+    steps: list[tuple[int, Step]] = field(default_factory=list)
+    covered: list[tuple[int, Step]] = field(default_factory=list)
+
+    def add(self, epochs: Int64, leaps: Leaps) -> None:
+        """Take what was found in a file."""
+        for mask, size, reason in (
+            (leaps.position, leaps.shift_m, _ELSEWHERE),
+            (leaps.attitude, leaps.turn_rad, _TURNED),
+        ):
+            for k in np.flatnonzero(mask).tolist():
+                self.reasons[int(epochs[k])] = reason
+                self.largest[reason] = max(self.largest.get(reason, (0.0, 0)), (float(size[k]), int(epochs[k])))
+        self.steps += [(int(epochs[one.after]), one) for one in leaps.steps]
+        self.covered += [(int(epochs[one.after]), one) for one in leaps.covered]
+
+    def findings(self, told: Sequence[tuple[str, int, int, int]]) -> list[Finding]:
+        """One for the poses that were left out, one for each kind of steps."""
+        found: list[Finding] = []
+        record_of = {epoch: record for _, record, _, epoch in told}
+        for reason, (size, epoch) in sorted(self.largest.items()):
+            count = sum(self.reasons[one] == reason for *_, one in told)
+            is_place = reason == _ELSEWHERE
+            who = _poses(count, "lies", "lie") if is_place else _poses(count, "is turned", "are turned")
+            by = f"{size:,.2f} m" if is_place else f"{np.degrees(size):.2f}°"
+            text = (
+                f"{who} up to {by} off the motion of the poses before and after, the worst at "
+                f"{iso_from_gps_ns(epoch)} (record {record_of[epoch]:,}); left out, and bridged by the others where "
+                "these are within navigation.max_gap_s"
+            )
+            found.append(POSE_LEAP.finds("", text, count))
+        if no_fix := len(told) - sum(one in self.reasons for *_, one in told):
+            first = next(record for _, record, _, epoch in told if epoch not in self.reasons)
+            text = f"{_poses(no_fix, 'lies', 'lie')} at latitude 0, longitude 0, the first in record {first:,}: there "
+            found.append(POSE_LEAP.finds("", f"{text}was no fix; left out", no_fix))
+        if self.steps:
+            end = "and go on there; which side is right nothing shows, and all poses are used"
+            found.append(POSE_STEP.finds("", f"{_step_words(self.steps)}, {end}"))
+        if self.covered:
+            end = "which a vehicle does not do, and the stated σ allows; all poses are used"
+            found.append(POSE_STEP.finds("", f"{_step_words(self.covered)}, {end}"))
+        return found
+
+
+def _poses(count: int, one: str, many: str) -> str:
+    """How many poses, with the verb that fits."""
+    return f"{count:,} {f'pose {one}' if count == 1 else f'poses {many}'}"
+
+
+def _step_words(steps: Sequence[tuple[int, Step]]) -> str:
+    """How often poses step, and the largest steps."""
+    largest = sorted(steps, key=lambda one: (-one[1].shift_m, -one[1].turn_rad, one[0]))[:_NAMED]
+    words = ", ".join(f"by {_size_words(one)} at {iso_from_gps_ns(epoch)}" for epoch, one in largest)
+    if len(steps) == 1:
+        return f"the poses step {words}"
+    more = f", and {len(steps) - _NAMED:,} times more" if len(steps) > _NAMED else ""
+    return f"the poses step {len(steps):,} times: {words}{more}"
+
+
+def _size_words(step: Step) -> str:
+    size = f"{step.shift_m:,.2f} m" if step.shift_m else f"{np.degrees(step.turn_rad):.2f}°"
+    return size + (f" (stated σ {step.sigma_m:.2f} m)" if step.sigma_m and step.shift_m else "")
+
+
+def _without_fix(writer: LogWriter, world: str) -> Int64:
+    """Epochs of poses at latitude 0, longitude 0, or at the centre of the Earth."""
+    if world == LOCAL_WORLD:
+        return np.zeros(0, np.int64)
+    found, total = list[Int64](), 0
+    for rows in writer.tables(_TABLE, ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m"]):
+        x, y, z = (rows.column(f"{axis}_world_m").to_numpy() for axis in "xyz")
+        found.append(rows.column("epoch_gps_ns").to_numpy()[(np.hypot(y, z) < _NO_FIX_M) & (x > -_NO_FIX_M)])
+        total += rows.num_rows
+    epochs = np.concatenate([np.zeros(0, np.int64), *found])
+    return epochs if epochs.size <= _NO_FIX_SHARE * total else np.zeros(0, np.int64)
+
+
+def _judged(writer: LogWriter, world: str, no_fix: Int64) -> Iterator[tuple[Int64, Leaps]]:
+    """Epochs and leaps of each file of poses, looked at together with poses of the files before and after it."""
+    window: list[pa.Table] = []
+    for rows in [*writer.tables(_TABLE), None]:
+        if len(window) > 0:
+            before = [one.slice(max(one.num_rows - _BESIDE, 0)) for one in window[:-1]]
+            after = [] if rows is None else [rows.slice(0, _BESIDE)]
+            yield _judge(window[-1], pa.concat_tables([*before, window[-1], *after]), world, no_fix)
+        window = [*window[-1:], *([] if rows is None else [rows])]
+
+
+def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[Int64, Leaps]:
+    """Leaps of the poses of a table, looked at together with those around it."""
+    first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
+    track = _track(rows, world, no_fix)
+    found, epochs = find_leaps(track), track.epochs_gps_ns
+    inside = (epochs >= first) & (epochs <= last)
+    steps, covered = (
+        tuple(one for one in each if inside[one.after]) for each in (found.steps, found.covered)
+    )  # fmt: skip
+    return epochs, Leaps(
+        found.position & inside, found.attitude & inside, found.shift_m, found.turn_rad, steps, covered
+    )
+
+
+def _track(rows: pa.Table, world: str, no_fix: Int64) -> PoseTrack:
+    """Poses of rows, the first of each epoch, without those that have no fix."""
+    epochs = rows.column("epoch_gps_ns").to_numpy()
+    order = np.argsort(epochs, kind="stable")
+    fresh = np.concatenate([[True], np.diff(epochs[order]) > 0])
+    own = order[fresh & ~np.isin(epochs[order], no_fix)]
+
+    def columns(*names: str) -> Float64:
+        values = [rows.column(name).to_numpy(zero_copy_only=False) for name in names]
+        return np.stack(values, axis=-1).astype(np.float64)[own]
+
+    quaternion = columns("qw", "qx", "qy", "qz")
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    position = np.linalg.norm(np.nan_to_num(columns("sigma_north_m", "sigma_east_m", "sigma_down_m")), axis=1)
+    angles = np.nan_to_num(columns("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg"))
+    return PoseTrack(
+        epochs[own],
+        columns("x_world_m", "y_world_m", "z_world_m"),
+        quaternion / np.where(length > 0, length, 1.0),
+        position,
+        np.radians(np.linalg.norm(angles, axis=1)),
+        world == LOCAL_WORLD,
+    )

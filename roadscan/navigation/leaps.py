@@ -1,0 +1,483 @@
+"""Poses of a log that no vehicle can have taken: those that leap away and back, and steps after which it goes on.
+
+Three things must exclude a pose together: its neighbours, the motion of a vehicle, and the σ that the log states. Each
+link between two poses is compared with the velocities just before and just after it. A link that contradicts both is
+cut, and what lies between two cuts is a segment. The explanation of least cost says which segments are the drive: to
+leave out a pose costs 1, to believe that positions step costs `STEP_COST`. So a short burst between two pieces that fit
+each other is left out, and where two long pieces do not fit, both stay: nothing shows which of them is right.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.model.gpstime import NS_PER_S
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+FASTEST_M_PER_S: Final = 70.0
+"""No survey vehicle is faster (252 km/h)."""
+FAR_M: Final = 10.0
+"""What goes beyond the way of the fastest vehicle by more is no error of a good fix but a wrong place."""
+_FASTEST_TURN_RAD_PER_S: Final = 3.5
+"""No survey vehicle turns faster (200°/s)."""
+_FAR_RAD: Final = float(np.radians(30.0))
+"""What goes beyond the turn of the fastest vehicle by more is no error of a good attitude but a wrong one."""
+STEP_COST: Final = 20.5
+"""Poses that may be left out to avoid one step: bursts at an end are no longer than 20, between two pieces 40."""
+END_POSES: Final = 5
+"""At an end of a piece only so many are left out for a near leap, which could be a step that is real."""
+
+_ACCELERATION_M_PER_S2: Final = 12.0
+"""More than the tyres of a car hold (1.2 g)."""
+_TURN_RAD_PER_S2: Final = np.array([30.0, 30.0, 10.0])
+"""Roll and pitch over a pothole; heading of a vehicle that swerves."""
+_MOST_TURN_RAD: Final = np.radians([10.0, 10.0, 60.0])
+"""However far apart in time two poses are, a road turns a vehicle by no more beyond its even turning."""
+_STEEPEST: Final = 0.3
+"""Metres that a vehicle rises or falls in a metre of its way, beyond its even slope."""
+_UNCLEAR_COST: Final = 3.0
+"""Poses that may be left out to avoid a bridge that does not fit far better than what it leaves out."""
+_LEAST_LEAP_M: Final = 0.10
+"""Filters of navigation shift their positions by centimetres where a fix comes in."""
+_LEAST_LEAP_RAD: Final = float(np.radians(0.3))
+"""The same of angles."""
+_NOISE_TIMES: Final = 8.0
+"""So many times the median of what links usually contradict is no leap."""
+_JITTER_TIMES: Final = 4.0
+"""Stamps are wrong by at most so many times the median of what steps of time differ from the usual one."""
+_IRREGULAR: Final = 0.1
+"""Where the steps of time usually differ by more than this share, a short one may be a late stamp."""
+_SIGMA_TIMES: Final = 3.0
+"""So many times the stated σ is no leap."""
+_NOISE_LINKS: Final = 128
+"""Links of which one median is taken."""
+_GAP_STEPS: Final = 5.0
+"""A link longer than so many usual ones, and than a second, is a gap: velocities say little of it."""
+_LEAST_GAP_S: Final = 1.0
+_VELOCITY_LINKS: Final = 3
+"""Links over which the velocity at the end of a segment is taken."""
+_MOST_SHARE: Final = 0.25
+"""Where more poses than that would be left out, it is no leap but how this log is."""
+_MOST_SEGMENTS: Final = 1_000
+"""So many segments, where they are shorter than 50 poses in the mean, are noise."""
+_LOOK_BACK: Final = 44
+"""Segments that are left out together at most."""
+
+
+class PoseTrack(NamedTuple):
+    """Poses of a log in order of time."""
+
+    epochs_gps_ns: Int64
+    """(n,) strictly ascending."""
+    position_world_m: Float64
+    """(n, 3)."""
+    quaternion: Float64
+    """(n, 4) world from body, unit, scalar first."""
+    sigma_m: Float64
+    """(n,) stated 1 σ of the position; 0 where none is stated."""
+    sigma_rad: Float64
+    """(n,) stated 1 σ of the attitude; 0 where none is stated."""
+    is_local: bool
+    """True where z of the world frame points up; else it is geocentric."""
+
+
+class Step(NamedTuple):
+    """A link after which poses go on at another level."""
+
+    before: int
+    """Row of the pose before it."""
+    after: int
+    """Row of the pose after it."""
+    shift_m: float
+    """By how much the position contradicts the velocities about it."""
+    turn_rad: float
+    """The same of the attitude."""
+    sigma_m: float
+    """Stated 1 σ of the positions there, 0 where none is stated."""
+
+
+@dataclass(frozen=True)
+class Leaps:
+    """What is wrong with the poses of a track."""
+
+    position: Bool
+    """(n,) poses to leave out for their position."""
+    attitude: Bool
+    """(n,) poses to leave out for their attitude alone."""
+    shift_m: Float64
+    """(n,) by how much the position of such a pose leaps, 0 for the others."""
+    turn_rad: Float64
+    """(n,) the same of the attitude."""
+    steps: tuple[Step, ...]
+    """Steps of which nothing shows which side is right; the stated σ excludes them."""
+    covered: tuple[Step, ...]
+    """Leaps of position that a vehicle excludes and the stated σ does not."""
+
+
+def find_leaps(track: PoseTrack) -> Leaps:
+    """Poses that leap and steps of a track; nothing of one of fewer than three poses."""
+    n = track.epochs_gps_ns.size
+    if n < 3:
+        none = np.zeros(n, dtype=bool)
+        return Leaps(none, none, np.zeros(n), np.zeros(n), (), ())
+    links = _Links.of(track)
+    segments = _segments(links, n)
+    kept = _kept(links, segments)
+    return _leaps(links, segments, kept, n)
+
+
+def rotation_vectors(before: Float64, after: Float64) -> Float64:
+    """Turns (k, 3) in rad, about body axes, from attitudes (k, 4) to others: the shorter way round."""
+    w1, v1 = before[:, :1], before[:, 1:]
+    w2, v2 = after[:, :1], after[:, 1:]
+    scalar = w1 * w2 + np.sum(v1 * v2, axis=1, keepdims=True)
+    vector = w1 * v2 - w2 * v1 - np.cross(v1, v2)
+    vector = np.where(scalar < 0, -vector, vector)
+    sine = np.linalg.norm(vector, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    turned: Float64 = vector * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0)
+    return turned
+
+
+class _Misfit(NamedTuple):
+    """How a link contradicts the motion about it."""
+
+    shift_m: Float64
+    """(k,) position."""
+    turn_rad: Float64
+    """(k,) attitude."""
+
+
+@dataclass(frozen=True)
+class _Links:
+    """Links between neighbouring poses, and which of them no vehicle explains."""
+
+    track: PoseTrack
+    elapsed_s: Float64
+    """(n − 1,)."""
+    gap: Bool
+    """(n − 1,) longer than velocities reach."""
+    far: Bool
+    """(n − 1,) farther, or turned by more, than the fastest vehicle comes or turns."""
+    leap: _Misfit
+    """(n − 1,) size of the leap, 0 where there is none."""
+    covered: Bool
+    """(n − 1,) leaps of position within the stated σ."""
+    noise_m: Float64
+    """(n − 1,) usual contradiction of the positions there."""
+    noise_rad: Float64
+    """(n − 1, 3) usual contradiction of the attitudes there, about body axes."""
+
+    @classmethod
+    def of(cls, track: PoseTrack) -> _Links:
+        """Compare each link with the velocities before and after it."""
+        elapsed = np.diff(track.epochs_gps_ns) / NS_PER_S
+        shift = np.diff(track.position_world_m, axis=0)
+        turn = rotation_vectors(track.quaternion[:-1], track.quaternion[1:])
+        gap = elapsed > max(_LEAST_GAP_S, _GAP_STEPS * float(np.median(elapsed)))
+        length = np.linalg.norm(shift, axis=1)
+        far = length > FASTEST_M_PER_S * elapsed + FAR_M
+        turned = np.linalg.norm(turn, axis=1) > _FASTEST_TURN_RAD_PER_S * elapsed + _FAR_RAD
+        before_m, after_m = _against_neighbours(shift, elapsed, gap)
+        before_rad, after_rad = _against_neighbours(turn, elapsed, gap)
+        noise_m = _noise(np.linalg.norm(_mean(before_m, after_m), axis=1)[:, None])[:, 0]
+        noise_rad = _noise(np.abs(_mean(before_rad, after_rad)))
+        both = np.isfinite(before_m[:, 0]) & np.isfinite(after_m[:, 0])
+        usual = _medians(elapsed[:, None])[:, 0]
+        jitter = _noise(np.abs(elapsed - usual)[:, None])[:, 0]
+        late_s = _JITTER_TIMES * jitter
+        reach = np.where(jitter > _IRREGULAR * usual, _longest_of_three(elapsed), elapsed)
+        noise_m += late_s * _slower(shift, elapsed) / _NOISE_TIMES
+        noise_rad += (late_s * _slower(turn, elapsed) / _NOISE_TIMES)[:, None]
+        bound_m = _bound_m(reach, both) + _NOISE_TIMES * noise_m
+        bound_rad = _bound_rad(reach, both) + _NOISE_TIMES * noise_rad
+        up = _up(track)
+        leap_m = np.maximum(
+            _leap_sizes(before_m, after_m, bound_m[:, None], whole=True),
+            _leap_sizes(*_rises(before_m, after_m, up), _slope_bound_m(shift, up) + _NOISE_TIMES * noise_m[:, None]),
+        )
+        leap_rad = _leap_sizes(before_rad, after_rad, bound_rad)
+        leap_m, leap_rad = np.where(gap, 0.0, leap_m), np.where(gap, 0.0, leap_rad)
+        leap_m = np.where(far, np.maximum(leap_m, length), leap_m)
+        sigma_m, sigma_rad = (np.maximum(s[:-1], s[1:]) for s in (track.sigma_m, track.sigma_rad))
+        covered = (leap_m > 0) & (leap_m <= bound_m + _SIGMA_TIMES * sigma_m) & (sigma_m > 0)
+        leap_rad = np.where(leap_rad <= _SIGMA_TIMES * sigma_rad, 0.0, leap_rad)
+        leap = _Misfit(np.where(covered, 0.0, leap_m), leap_rad)
+        sizes = np.where(covered, leap_m, 0.0)
+        return cls(track, elapsed, gap, (far & ~covered) | turned, leap, sizes > 0, noise_m, noise_rad)
+
+    @property
+    def cut(self) -> Bool:
+        """(n − 1,) links that no vehicle explains, and gaps."""
+        return (self.leap.shift_m > 0) | (self.leap.turn_rad > 0) | self.gap
+
+    def step(self, before: int, after: int) -> Step:
+        """The step between two poses."""
+        shift, turn = (float(np.max(values[before:after])) for values in self.leap)
+        return Step(before, after, shift, turn, float(max(self.track.sigma_m[before], self.track.sigma_m[after])))
+
+
+def _against_neighbours(steps: Float64, elapsed_s: Float64, gap: Bool) -> tuple[Float64, Float64]:
+    """What links (k, 3) have beyond an even motion with the velocity before, and after; NaN without one."""
+    velocity = np.where(gap[:, None], np.nan, steps / elapsed_s[:, None])
+    none = np.full((1, 3), np.nan)
+    before = steps - elapsed_s[:, None] * np.concatenate([none, velocity[:-1]])
+    after = steps - elapsed_s[:, None] * np.concatenate([velocity[1:], none])
+    return before, after
+
+
+def _mean(before: Float64, after: Float64) -> Float64:
+    """Mean of both, or the one that there is; 0 without any."""
+    total = np.nan_to_num(before) + np.nan_to_num(after)
+    count = np.isfinite(before).astype(float) + np.isfinite(after)
+    mean: Float64 = total / np.maximum(count, 1.0)
+    return mean
+
+
+def _longest_of_three(elapsed_s: Float64) -> Float64:
+    """The longest (k,) of each link and its two neighbours."""
+    padded = np.concatenate([elapsed_s[:1], elapsed_s, elapsed_s[-1:]])
+    return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
+
+
+def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
+    """Speed (k,) of the slower one of the links before and after: what leaps is not the measure of itself."""
+    speed = np.linalg.norm(steps, axis=1) / elapsed_s
+    padded = np.concatenate([[np.inf], speed, [np.inf]])
+    slower = np.minimum(padded[:-2], padded[2:])
+    return np.where(np.isfinite(slower), slower, 0.0)
+
+
+def _block_medians(values: Float64) -> Float64:
+    """Medians (b, c) of values (k, c) by block of links."""
+    count = len(values)
+    starts = np.arange(0, count, _NOISE_LINKS)
+    medians = np.array([np.median(values[s : s + _NOISE_LINKS], axis=0) for s in starts])
+    if len(medians) > 1 and count - starts[-1] < _NOISE_LINKS // 2:
+        medians[-1] = medians[-2]  # of so few links a burst is the half
+    return medians
+
+
+def _medians(values: Float64) -> Float64:
+    """Median (k, c) of values (k, c) about each link."""
+    return np.asarray(_block_medians(values)[np.arange(len(values)) // _NOISE_LINKS])
+
+
+def _noise(contradiction: Float64) -> Float64:
+    """Usual contradiction (k, c) about each link: the greatest of three neighbouring medians."""
+    medians = _block_medians(contradiction)
+    padded = np.concatenate([medians[:1], medians, medians[-1:]])
+    wide = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.asarray(wide[np.arange(len(contradiction)) // _NOISE_LINKS])
+
+
+def _bound_m(elapsed_s: Float64, both: Bool) -> Float64:
+    """What a vehicle's acceleration explains (m), with velocities on both sides or on one."""
+    return _LEAST_LEAP_M + np.where(both, 0.5, 1.0) * _ACCELERATION_M_PER_S2 * elapsed_s**2
+
+
+def _bound_rad(elapsed_s: Float64, both: Bool) -> Float64:
+    """What a vehicle's turning explains (k, 3) in rad about body axes."""
+    physical = np.where(both, 0.5, 1.0)[:, None] * _TURN_RAD_PER_S2 * elapsed_s[:, None] ** 2
+    bound: Float64 = _LEAST_LEAP_RAD + np.minimum(physical, _MOST_TURN_RAD)
+    return bound
+
+
+def _up(track: PoseTrack) -> Float64:
+    """Unit vector (3,) that points up where the track lies; up of a sphere is close enough."""
+    if track.is_local:
+        return np.array([0.0, 0.0, 1.0])
+    middle = np.median(track.position_world_m, axis=0)
+    return np.asarray(middle / max(float(np.linalg.norm(middle)), 1.0))
+
+
+def _rises(before: Float64, after: Float64, up: Float64) -> tuple[Float64, Float64]:
+    """Vertical part (k, 1) of contradictions."""
+    return (before @ up)[:, None], (after @ up)[:, None]
+
+
+def _slope_bound_m(shift: Float64, up: Float64) -> Float64:
+    """What the slopes of roads explain of a rise (k, 1), in m: of the way of each link and of its neighbours."""
+    level = np.linalg.norm(shift - (shift @ up)[:, None] * up, axis=1)
+    padded = np.concatenate([level[:1], level, level[-1:]])
+    bound: Float64 = _LEAST_LEAP_M + _STEEPEST * (level + 0.5 * (padded[:-2] + padded[2:]))
+    return bound[:, None]
+
+
+def _leap_sizes(before: Float64, after: Float64, bound: Float64, *, whole: bool = False) -> Float64:
+    """Sizes (k,) of links that contradict the motion before and after by more than a bound (k, c); 0 of the others.
+
+    Parameters
+    ----------
+    whole : judge the length of the vectors by a bound (k, 1), instead of each component.
+    """
+
+    def beyond(values: Float64) -> Bool:
+        if whole:
+            over: Bool = np.linalg.norm(values, axis=1) > bound[:, 0]
+            return over
+        return np.asarray((np.abs(values) > bound).any(axis=1))
+
+    known_before, known_after = np.isfinite(before[:, 0]), np.isfinite(after[:, 0])
+    first = np.where(known_before[:, None], before, after)
+    second = np.where(known_after[:, None], after, before)
+    leaps = (known_before | known_after) & beyond(first) & beyond(second) & beyond(_mean(first, second))
+    size = np.minimum(np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1))
+    return np.where(leaps, size, 0.0)
+
+
+class _Segment(NamedTuple):
+    """Poses that fit one another."""
+
+    first: int
+    last: int
+
+    @property
+    def poses(self) -> int:
+        """How many."""
+        return self.last - self.first + 1
+
+
+def _segments(links: _Links, n: int) -> list[_Segment]:
+    ends = np.flatnonzero(links.cut)
+    return [_Segment(f, e) for f, e in zip([0, *(ends + 1).tolist()], [*ends.tolist(), n - 1], strict=True)]
+
+
+def _kept(links: _Links, segments: Sequence[_Segment]) -> list[int]:
+    """Numbers of the segments that are the drive: the explanation of least cost."""
+    count, poses = len(segments), sum(s.poses for s in segments)
+    everything = list(range(count))
+    if count == 1 or (count > _MOST_SEGMENTS and count * 50 > poses):
+        return everything
+    totals = np.cumsum([0, *(s.poses for s in segments)])
+    best = np.full(count, np.inf)
+    previous = np.full(count, -1)
+    for j in everything:
+        best[j] = _end_cost(links, segments, 0, j - 1, j)
+        for i in range(j - 1, max(j - 2 - _LOOK_BACK, -1), -1):
+            cost = best[i] + _cost(links, segments, i, j, int(totals[j] - totals[i + 1]))
+            if cost < best[j]:
+                best[j], previous[j] = cost, i
+    ends = [best[j] + _end_cost(links, segments, j + 1, count - 1, j) for j in everything]
+    kept, at = list[int](), int(np.argmin(ends))
+    while at >= 0:
+        kept.append(at)
+        at = int(previous[at])
+    lost = poses - sum(segments[k].poses for k in kept)
+    return kept[::-1] if lost <= _MOST_SHARE * poses else everything
+
+
+def _cost(links: _Links, segments: Sequence[_Segment], i: int, j: int, skipped: int) -> float:
+    """Cost of going from segment i to j without what lies between, of `skipped` poses."""
+    a, b = segments[i], segments[j]
+    if j == i + 1:
+        link = a.last
+        is_leap = links.leap.shift_m[link] > 0 or links.leap.turn_rad[link] > 0
+        return STEP_COST if is_leap else 0.0
+    if 2 * skipped > a.poses + b.poses and skipped > 1:
+        return float("inf")
+    fits, clearly = _bridge(links, a, b)
+    inner = [segments[i + 1].first - 1, segments[j - 1].last]
+    hard = all(links.far[link] for link in inner)
+    if clearly and skipped < 2 * STEP_COST:
+        return float(skipped)
+    if fits and hard and skipped < min(a.poses, b.poses):
+        return min(float(skipped), 2 * STEP_COST - 0.5)
+    near_end = skipped <= END_POSES or (skipped < STEP_COST and any(links.far[link] for link in inner))
+    return skipped + (_UNCLEAR_COST if fits else STEP_COST) if near_end else float("inf")
+
+
+def _end_cost(links: _Links, segments: Sequence[_Segment], first: int, last: int, beside: int) -> float:
+    """Cost of leaving out segments `first` to `last` at an end of the track, next to the segment `beside`."""
+    if first > last:
+        return 0.0
+    skipped = sum(segments[k].poses for k in range(first, last + 1)) if last - first < _LOOK_BACK else STEP_COST
+    link = segments[last].last if last < beside else segments[beside].last
+    is_leap = links.leap.shift_m[link] > 0 or links.leap.turn_rad[link] > 0
+    if not is_leap or 2 * skipped > segments[beside].poses:
+        return float("inf")
+    if skipped <= END_POSES or (skipped < STEP_COST and links.far[link]):
+        return float(skipped)
+    return float("inf")
+
+
+def _bridge(links: _Links, a: _Segment, b: _Segment) -> tuple[bool, bool]:
+    """Whether a vehicle can go from segment a to b, and whether they fit far better than what lies between."""
+    track = links.track
+    elapsed = np.array([(track.epochs_gps_ns[b.first] - track.epochs_gps_ns[a.last]) / NS_PER_S])
+    shift = track.position_world_m[b.first] - track.position_world_m[a.last]
+    turn = rotation_vectors(track.quaternion[a.last][None], track.quaternion[b.first][None])
+    if np.linalg.norm(shift) > FASTEST_M_PER_S * elapsed[0] + FAR_M:
+        return False, False
+    before, after = _velocity(track, a, at_end=True), _velocity(track, b, at_end=False)
+    known = [one for one in (before, after) if one is not None]
+    if not known:
+        return True, False
+    both = np.array([len(known) == 2])
+    inside = slice(a.last, b.first)
+    wider = 1.0 + float(elapsed[0] / np.median(links.elapsed_s[inside]))
+    miss_m = float(np.linalg.norm(shift - elapsed * np.mean([v for v, _ in known], axis=0)))
+    miss_rad = np.abs(turn[0] - elapsed * np.mean([w for _, w in known], axis=0))
+    sigma_m = float(max(track.sigma_m[a.last], track.sigma_m[b.first]))
+    sigma_rad = float(max(track.sigma_rad[a.last], track.sigma_rad[b.first]))
+    most_m = float(_bound_m(elapsed, both)[0]) + _NOISE_TIMES * wider * float(links.noise_m[inside].max())
+    most_rad = _bound_rad(elapsed, both)[0] + _NOISE_TIMES * wider * links.noise_rad[inside].max(axis=0)
+    fits = miss_m <= most_m + _SIGMA_TIMES * sigma_m and bool((miss_rad <= most_rad + _SIGMA_TIMES * sigma_rad).all())
+    return fits, fits and _far_better(links, inside, miss_m, float(np.linalg.norm(miss_rad)))
+
+
+def _far_better(links: _Links, inside: slice, miss_m: float, miss_rad: float) -> bool:
+    """Whether a bridge misses by less than half of what the links at its two ends leap."""
+    ends = [inside.start, inside.stop - 1]
+    shift, turn = min(links.leap.shift_m[ends]), min(links.leap.turn_rad[ends])
+    return bool((shift > 0 and miss_m < 0.5 * shift) or (turn > 0 and miss_rad < 0.5 * turn))
+
+
+def _velocity(track: PoseTrack, segment: _Segment, *, at_end: bool) -> tuple[Float64, Float64] | None:
+    """Velocity (3,) and turn rate (3,) at an end of a segment; None of a single pose."""
+    over = min(_VELOCITY_LINKS, segment.poses - 1)
+    if not over:
+        return None
+    a, b = (segment.last - over, segment.last) if at_end else (segment.first, segment.first + over)
+    elapsed = (track.epochs_gps_ns[b] - track.epochs_gps_ns[a]) / NS_PER_S
+    turn = rotation_vectors(track.quaternion[a][None], track.quaternion[b][None])[0]
+    return (track.position_world_m[b] - track.position_world_m[a]) / elapsed, turn / elapsed
+
+
+def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: int) -> Leaps:
+    """What was left out and which steps remain."""
+    out = np.ones(n, dtype=bool)
+    for k in kept:
+        out[segments[k].first : segments[k].last + 1] = False
+    shift, turn = (_beside_links(values, out) for values in links.leap)
+    steps = list[Step]()
+    for i, j in itertools.pairwise(kept):
+        a, b = segments[i], segments[j]
+        link = links.step(a.last, b.first)
+        if (j == i + 1 and (link.shift_m > 0 or link.turn_rad > 0)) or (j > i + 1 and not _bridge(links, a, b)[0]):
+            steps.append(link)
+    moved = shift > 0
+    covered = tuple(
+        Step(k, k + 1, float(np.linalg.norm(np.diff(links.track.position_world_m[k : k + 2], axis=0))), 0.0,
+             float(max(links.track.sigma_m[k], links.track.sigma_m[k + 1])))
+        for k in np.flatnonzero(links.covered).tolist()
+    )  # fmt: skip
+    return Leaps(out & moved, out & ~moved, shift, turn, tuple(steps), covered)
+
+
+def _beside_links(sizes: Float64, out: Bool) -> Float64:
+    """The greatest leap (n,) of each run of poses that are left out, at its ends; 0 elsewhere."""
+    found = np.zeros(out.size)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
+    for first, end in edges.reshape(-1, 2).tolist():
+        found[first:end] = sizes[max(first - 1, 0) : end].max(initial=0.0)
+    return found

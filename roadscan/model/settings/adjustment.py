@@ -31,7 +31,29 @@ class SolverSettings(Strict):
         return self
 
 
-class AdjustmentSettings(SolverSettings):
+DatumOffset = Literal["judge", "follow", "estimate", "leave_out"]
+"""What becomes of control that is off as a whole."""
+
+
+class ControlRules(Strict):
+    """How the surveys of control points are judged."""
+
+    false_alarm: float = Field(default=0.01, ge=0.0, le=0.2)
+    """Chance that right control is found wrong: that one of all points is, and that all are off together. A point whose
+    leave-one-out residual exceeds the quantile of the normal distribution that follows (3.3 σ for ten heights) is named,
+    and its height or place does not count. 0: nothing is found wrong."""
+    datum_offset: DatumOffset = "judge"
+    """What is done where all points are off together, in height or in place, by more than σ and correlation time of the
+    poses explain. `judge`: up to `adjust.solver.reject_beyond` σ the control is followed and the σ that is published
+    holds the offset; beyond it, the offset is estimated. `follow`: the control is followed, and σ holds the offset.
+    `estimate`: the offset is always estimated: poses say where the survey lies, and control says its shape. `leave_out`:
+    control that is off does not count."""
+    sigma_datum_m: float = Field(default=0.0, ge=0.0, le=10.0)
+    """1 σ of an offset that all points have in common, on each axis (m): of the datum that the control was surveyed in
+    against that of the poses."""
+
+
+class AdjustmentSettings(SolverSettings, ControlRules):
     """What is adjusted, and how."""
 
     mode: Literal["joint", "each_pass", "vertical"] = "joint"

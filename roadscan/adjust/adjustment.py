@@ -92,16 +92,14 @@ class Adjustment:
     active: Bool
     """(runs, 6) components that were estimated."""
     response: tuple[Float64, ...]
-    """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north, east,
-    down."""
+    """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north,
+    east, down."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
         """(k, 6) 1 σ of each run's knots, with that of an offset of the control."""
         shared = [np.einsum("kia,ab,kib->ki", r, self.applied.covariance_m2, r) for r in self.response]
-        return tuple(
-            np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True)
-        )
+        return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
 
     def corrections(self, run: str) -> Corrections:
         """A run's corrections as navigation takes them."""

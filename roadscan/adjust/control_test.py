@@ -66,6 +66,8 @@ class WrongSurvey:
     """`height` or `place`."""
     sigmas: float
     """Length of its normalised leave-one-out residual."""
+    limit: float
+    """Length from which on a point is wrong."""
     alternatives: tuple[int, ...] = ()
     """Points that may be the wrong ones in its stead: what is known does not tell which of them is."""
 
@@ -141,7 +143,7 @@ def judged(errors: SurveyErrors, rules: ControlRules) -> ControlVerdict:
 
     Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
     fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
-    `rules.false_alarm`, for points and for the offset each.
+    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`.
     """
     false_alarm, datum = rules.false_alarm, rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
     errors = replace(errors, covariance_m2=errors.covariance_m2 + datum)
@@ -149,7 +151,7 @@ def judged(errors: SurveyErrors, rules: ControlRules) -> ControlVerdict:
     at_once = common_offset(errors, _kept(errors, fixed))
     free = _snooped(errors, false_alarm, free=True)
     freely = common_offset(errors, _kept(errors, free))
-    limits = {name: quantile(false_alarm, len(COMPONENTS), len(axes)) for name, axes in COMPONENTS.items()}
+    limits = {name: quantile(rules.datum_false_alarm, len(COMPONENTS), len(axes)) for name, axes in COMPONENTS.items()}
     doubted = {name: [one.sigmas(name) > limits[name] for one in (at_once, freely)] for name in COMPONENTS}
     offsets = sum(late for _, late in doubted.values())
     simpler = offsets > 0 and (len(free) + offsets < len(fixed) or any(early for early, _ in doubted.values()))
@@ -194,14 +196,17 @@ def _snooped(errors: SurveyErrors, false_alarm: float, *, free: bool) -> list[Wr
     while True:
         kept = _kept(errors, wrong)
         squares = _explained(errors, parts, kept, free=free)
-        excess = np.array([_excess(s, r.size, false_alarm, len(parts)) for s, (_, _, r) in zip(squares, parts, strict=True)])
+        excess = np.array(
+            [_excess(s, r.size, false_alarm, len(parts)) for s, (_, _, r) in zip(squares, parts, strict=True)]
+        )
         if excess.max() <= 1.0:
             break
         worst = int(excess.argmax())
         alike = [k for k in np.flatnonzero(excess > 1.0) if k != worst and parts[k][1] == parts[worst][1]]
         others = tuple(parts[k][0] for k in alike if squares[worst] - squares[k] < _APART)
-        point, component, _ = parts[worst]
-        wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), others))
+        point, component, rows = parts[worst]
+        limit = quantile(false_alarm, len(parts), rows.size)
+        wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), limit, others))
     return _without_the_right(errors, parts, wrong, false_alarm, free=free)
 
 
@@ -234,7 +239,12 @@ def _explained(errors: SurveyErrors, parts: list[tuple[int, str, Int64]], kept: 
 
 
 def _without_the_right(
-    errors: SurveyErrors, parts: list[tuple[int, str, Int64]], wrong: list[WrongSurvey], false_alarm: float, *, free: bool
+    errors: SurveyErrors,
+    parts: list[tuple[int, str, Int64]],
+    wrong: list[WrongSurvey],
+    false_alarm: float,
+    *,
+    free: bool,
 ) -> list[WrongSurvey]:
     """Points that fit once the worse ones are left out count again: a wrong neighbour had spoiled what they are held
     against. Each gets its normalised residual against all that counts.

@@ -1,8 +1,8 @@
 """The rounds of an adjustment: solve, judge each observation by the others, weigh anew.
 
-The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control_test`): here they
-count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one another, and
-no weight that both get round by round tells which of them is wrong.
+The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control_test`): here
+they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
+another, and no weight that both get round by round tells which of them is wrong.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Rounds:
 
     def __init__(self, problem: Problem, settings: AdjustmentSettings) -> None:
         self.problem, self.settings = problem, settings
-        self._estimating = settings.estimate_variance_components
+        self._estimating = bool(settings.estimate_variance_components)
         self._surveyed = problem.kind == SURVEY
         self._survey_weight = np.zeros(int(self._surveyed.sum()))
         self._observed = problem.observed.copy()
@@ -105,7 +105,7 @@ class Rounds:
             if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
                 break
         estimate = self._rounds(done)
-        if not self._estimating and self._is_understated(estimate):
+        if self.settings.estimate_variance_components is None and self._is_understated(estimate):
             self._estimating = True
             estimate = self._rounds(estimate.rounds)
         return estimate
@@ -176,7 +176,7 @@ class Rounds:
         return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
 
     def _moved_to(self, weight: Float64) -> float:
-        """Weights of the next round; one that has all but gone is none, so that what does not count has a weight of 0."""
+        """Weights of the next round; one that has all but gone is 0, so that 0 says that a row does not count."""
         weight = np.where(weight < _SETTLED, 0.0, weight)
         weight[self._surveyed] = self._survey_weight
         moved = float(np.abs(weight - self._weight).max(initial=0.0))
@@ -199,7 +199,9 @@ class Rounds:
             return True
         kinds, processes = self._kinds.copy(), self._processes.copy()
         own = self._own()
-        self._new_factors(estimate.solution, estimate.inverse, estimate.residual, estimate.without, own, estimate.weight)
+        self._new_factors(
+            estimate.solution, estimate.inverse, estimate.residual, estimate.without, own, estimate.weight
+        )
         found, self._kinds, self._processes = self._processes, kinds, processes
         return bool((found > _UNDERSTATED).any())
 

@@ -4,7 +4,8 @@ Corrections are piecewise linear between knots in time. Each component of each r
 process as prior (:mod:`roadscan.adjust.process`); ties and control are observations; what solves them is one sparse
 least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing changes
 (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
-share its error, and a wrong one is told by all of them.
+share its error. Surveys are first left aside, and judged by what poses and ties say of them
+(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.control_test import COMPONENTS as SURVEYED
+from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
 from roadscan.adjust.process import RunPrior, line_variance
@@ -80,15 +83,23 @@ class Adjustment:
     rounds: int
     settled: bool
     """False where weights still changed in the last round."""
+    verdict: ControlVerdict
+    """What the surveys of the control points are worth."""
+    applied: AppliedOffset
+    """Offset that the surveys were taken to have in common."""
     priors: tuple[RunPrior, ...]
     """As they came in."""
     active: Bool
     """(runs, 6) components that were estimated."""
+    response: tuple[Float64, ...]
+    """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north,
+    east, down."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
-        """(k, 6) 1 σ of each run's knots."""
-        return tuple(np.sqrt(np.einsum("kii->ki", c)) for c in self.covariance)
+        """(k, 6) 1 σ of each run's knots, with that of an offset of the control."""
+        shared = [np.einsum("kia,ab,kib->ki", r, self.applied.covariance_m2, r) for r in self.response]
+        return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
 
     def corrections(self, run: str) -> Corrections:
         """A run's corrections as navigation takes them."""
@@ -142,7 +153,11 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
     unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components)
     unknowns.check(observations)
-    estimate = Rounds(_problem(unknowns, chosen), settings).run()
+    rounds = Rounds(_problem(unknowns, chosen), settings)
+    alone = rounds.without_surveys()
+    verdict = judged(_survey_errors(unknowns, alone, rounds), settings)
+    applied = applied_offset(verdict, settings, settings.reject_beyond)
+    estimate, response = _with_control(unknowns, alone, rounds, verdict, applied)
     values, covariance, with_next = _of_knots(unknowns, estimate)
     told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
     back = np.empty(order.size, np.int64)
@@ -154,7 +169,7 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n), {k: float(v) for k, v in factors.items()},
-        estimate.rounds, estimate.settled, tuple(priors), unknowns.sigmas > 0.0,
+        estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.sigmas > 0.0, response,
     )  # fmt: skip
 
 
@@ -201,18 +216,55 @@ def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
     )
 
 
+def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
+    """Control point, axis and σ (m,) of each surveyed coordinate, in the order of their unknowns."""
+    point, axis = np.nonzero(unknowns.of_control >= 0)
+    return point.astype(np.int64), axis.astype(np.int64), unknowns.control.sigma_m[point, axis]
+
+
+def _survey_errors(unknowns: Unknowns, alone: Estimate, rounds: Rounds) -> SurveyErrors:
+    """What poses and ties say of the surveys."""
+    point, axis, sigma = _surveyed(unknowns)
+    if not point.size:
+        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)))
+    away = alone.solution[unknowns.of_control[point, axis]] * sigma
+    unit = rounds.survey_covariance() + np.eye(sigma.size)
+    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma)
+
+
+def _with_control(
+    unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
+) -> tuple[Estimate, tuple[Float64, ...]]:
+    """The solution with surveys that are right, and by how much each knot follows an offset of all of them."""
+    point, axis, sigma = _surveyed(unknowns)
+    left_out = verdict.left_out
+    component = {a: name for name, axes in SURVEYED.items() for a in axes}
+    names = [component[a] for a in axis.tolist()]
+    counts = [n not in applied.refused and (p, n) not in left_out for p, n in zip(point.tolist(), names, strict=True)]
+    weight = np.array(counts, np.float64)
+    if not weight.any():
+        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
+    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, alone.rounds)
+    moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
+    return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+
+
+def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
+    """Corrections (k, 6) of each run's knots."""
+    numbers = [unknowns.of_run(run) for run in range(len(unknowns.priors))]
+    return [np.where(n >= 0, solution[n], 0.0) * s for n, s in zip(numbers, unknowns.sigmas, strict=True)]
+
+
 def _of_knots(
     unknowns: Unknowns, estimate: Estimate
 ) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
     """Values, covariances, and those with the next knot, of each run."""
-    values, covariance, with_next = [], [], []
+    covariance, with_next = [], []
     for run, sigma in enumerate(unknowns.sigmas):
         numbers = unknowns.of_run(run)
-        there = numbers >= 0
-        values.append(np.where(there, estimate.solution[numbers], 0.0) * sigma)
         covariance.append(_blocks(estimate, numbers, numbers, sigma))
         with_next.append(_blocks(estimate, numbers[:-1], numbers[1:], sigma))
-    return tuple(values), tuple(covariance), tuple(with_next)
+    return tuple(_of_solution(unknowns, estimate.solution)), tuple(covariance), tuple(with_next)
 
 
 def _blocks(estimate: Estimate, first: Int64, second: Int64, sigma: Float64) -> Float64:

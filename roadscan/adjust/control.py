@@ -24,7 +24,8 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]
-"""`height`: no target is looked for, the height alone was measured; `unseen`: not even that."""
+"""`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see
+the road where the target is looked for."""
 
 _NEAR_M: Final = 3.0
 _LONGEST_NS: Final = 20 * NS_PER_S
@@ -74,7 +75,8 @@ class Sighting:
     covariance_m2: Float64
     """(2, 2) of easting and northing, without that of the poses."""
     height_m: float
-    """Of the road at the target, or at the surveyed place where none was found."""
+    """Of the road at the target; at the surveyed place where none is looked for or none was found; NaN where there are
+    several, and with them several heights."""
     sigma_height_m: float
     slope_east: float
     slope_north: float
@@ -90,8 +92,10 @@ class Sighting:
 
     @property
     def is_placed(self) -> bool:
-        """Whether the place was measured, and not the height alone."""
-        return self.status in ("found", "picked")
+        """Whether the place was measured, and not the height alone: a target that lies elsewhere than surveyed counts
+        where it lies, and the adjustment judges its survey.
+        """
+        return self.status in ("found", "moved", "picked")
 
     @property
     def observed(self) -> int:
@@ -163,12 +167,15 @@ def sight(
         )
         find = find_target(readings, expected, settings)
         status, why_not = find.status, find.why_not
-        if find.found:
+        if status in ("found", "moved"):
             place, covariance = np.array([find.easting_m, find.northing_m]), find.covariance_m2
     at = place if np.isfinite(place).all() else np.array([point.easting_m, point.northing_m])
     height = height_at(readings, float(at[0]), float(at[1]), settings)
-    if not np.isfinite(height.height_m) and status == "height":
+    if not np.isfinite(height.height_m) and status in ("height", "missed"):
         status, why_not = "unseen", height.why_not
+    if status == "doubled":
+        nowhere = float("nan")
+        height = replace(height, height_m=nowhere, sigma_m=nowhere, slope_east=nowhere, slope_north=nowhere)
     return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
 
 

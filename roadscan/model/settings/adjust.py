@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.settings.adjustment import SolverSettings
+from roadscan.model.settings.adjustment import ControlRules, SolverSettings
 from roadscan.model.settings.tie_settings import PlaceSettings, TieSettings
 from roadscan.model.strict import Strict
 
@@ -73,7 +73,7 @@ class TargetsConfig(TargetConfig):
         return self.codes.get(code or "", self)
 
 
-class ControlUse(Strict):
+class ControlUse(ControlRules):
     """How control points count."""
 
     on: bool = True

@@ -24,8 +24,8 @@ from roadscan.condition.of_sections.wheel_paths import (
     wheel_paths,
     without_noise,
 )
-from roadscan.condition.quarter_car import RULES
-from roadscan.condition.ride import ride
+from roadscan.condition.quarter_car import RULES, SEVERE_M
+from roadscan.condition.ride import Ride, ride
 from roadscan.condition.segments import Segments
 
 
@@ -89,10 +89,30 @@ def _told(path: WheelPath) -> _Told:
         return told
     most = greatest_of(rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside])
     told.local, told.sigma_local = float(most[0]), spread_of(most)
-    told.reason = on.notes(path.ends)[0][0]
-    if "start" in told.reason:
-        told.reason = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
+    told.reason = _remarks(on, path)
     return told
+
+
+def _remarks(on: Ride, path: WheelPath) -> str:
+    """What to know of a value that there is."""
+    noted = on.notes(path.ends)[0][0]
+    found = []
+    if "start" in noted:
+        found.append(f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins")
+    station, way = path.profile.station_m, path.profile.distance_m
+    for word, places, done in (
+        (
+            "jump",
+            on.breaks[0].jump_m,
+            f"more than {RULES.highest_step_m:g} m, which no car rolls over, and is left out",
+        ),
+        ("step", on.breaks[0].severe_m, f"more than {SEVERE_M:g} m as at a kerb, and is kept"),
+    ):
+        if word in noted:
+            own = places[(places >= path.ends.from_m[0]) & (places <= path.ends.to_m[0])]
+            at = ", ".join(f"{one:.1f}" for one in np.interp(own, way, station)[:3])
+            found.append(f"at station {at} the road steps by {done}")
+    return "; ".join(found)
 
 
 def _half_car(left: WheelPath, right: WheelPath) -> tuple[float, float]:

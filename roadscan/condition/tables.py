@@ -95,8 +95,8 @@ def localised_roughness(
 
     Returns
     -------
-    A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km and note: `step`, one of more than 0.1 m lies within it.
-    A step of more than 0.5 m has a row of its own without a peak and with the note `jump`: the car does not roll over it.
+    A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km and note: `step` where one of more than 0.1 m lies in
+    it. A step of more than 0.5 m has a row without a peak and with the note `jump`: the car does not roll over it.
     """
     import pandas as pd
 
@@ -106,14 +106,15 @@ def localised_roughness(
     found = stretches_above(on.x_m, rolling_iri(on, length_m).mean(axis=0), limit_m_per_km)
     severe = np.concatenate([broken.severe_m for broken in on.breaks])
     half = 0.5 * length_m
-    rows: list[tuple[float, float, float, float, str]] = [
-        (*one, "step" if ((severe >= one.from_m - half) & (severe <= one.to_m + half)).any() else "") for one in found
-    ]
-    jumps = np.unique(np.concatenate([broken.jump_m for broken in on.breaks])).tolist()
-    rows += [(at - half, at + half, at, np.nan, "jump") for at in jumps]
+    rows: list[tuple[float, float, float, float, str]] = []
+    for one in found:
+        stepped = bool(((severe >= one.from_m - half) & (severe <= one.to_m + half)).any())
+        rows.append((one.from_m, one.to_m, one.peak_m, one.peak, "step" if stepped else ""))
+    jumps = np.unique(np.concatenate([broken.jump_m for broken in on.breaks]))
+    rows += [(at - half, at + half, at, np.nan, "jump") for at in jumps.tolist()]
     names = ["from_m", "to_m", "peak_station_m", "peak_m_per_km"]
-    table = pd.DataFrame(sorted(rows, key=lambda row: row[:3]), columns=[*names, "note"])
-    return table.astype(dict.fromkeys(names, float))
+    table = pd.DataFrame(rows, columns=[*names, "note"]).astype(dict.fromkeys(names, float))
+    return table.sort_values("from_m", kind="stable", ignore_index=True)
 
 
 def mpd(

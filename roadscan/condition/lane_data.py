@@ -108,6 +108,8 @@ class LaneData:
     """Standard deviation of the vehicle's roll as the poses state it."""
     sigma_pose_height_m: float = 0.0
     """The same of its height."""
+    wander_m2_per_m: float = 0.0
+    """Variance a metre of travel by which the heights of the poses wander at random."""
     edges: EdgesOnLane | None = None
     """Edges of the road beside the lane; None where none are sought."""
     window_m2: float = 0.0

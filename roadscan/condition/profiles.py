@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.condition.quarter_car import COARSEST_M, SEVERE_M
 from roadscan.kernels.condition.quarter_car import Rules
 from roadscan.model.errors import ProfileError
 
@@ -14,6 +15,10 @@ Floats = npt.NDArray[np.float64]
 
 STEEPEST = 0.3
 """A profile whose slope over 250 mm is steeper than this in half of its places is no road (a ratio)."""
+
+
+FINEST_CLASS_M = 0.25
+"""Widest step of the World Bank's class 1 (Technical Paper 46, section 2.2: sample intervals of 250 mm or less; m)."""
 
 
 class Breaks(NamedTuple):
@@ -24,7 +29,11 @@ class Breaks(NamedTuple):
     gap_to_m: Floats
     """First samples behind them."""
     jump_m: Floats
-    """Middles of steps that are too high."""
+    """Middles of steps that are too high: nothing rolls over them."""
+    severe_m: Floats
+    """Middles of steps that are high and kept, as those of kerbs."""
+    wide_m: Floats
+    """Middles of steps of more than 0.25 m that are no gap."""
 
 
 def stations_of(x_m: npt.ArrayLike) -> Floats:
@@ -75,8 +84,11 @@ def breaks_of(x_m: Floats, height_m: Floats, rules: Rules) -> Breaks:
     xs, hs = x_m[there], height_m[there]
     step = np.diff(xs)
     gap = step > rules.longest_step_m
-    jump = (np.abs(np.diff(hs)) > rules.highest_step_m) & ~gap
-    return Breaks(xs[:-1][gap], xs[1:][gap], xs[:-1][jump] + 0.5 * step[jump])
+    rise, middle = np.abs(np.diff(hs)), xs[:-1] + 0.5 * step
+    jump = (rise > rules.highest_step_m) & ~gap
+    severe = (rise > SEVERE_M) & ~gap & ~jump
+    wide = (step > FINEST_CLASS_M + 1e-9) & ~gap
+    return Breaks(xs[:-1][gap], xs[1:][gap], middle[jump], middle[severe], middle[wide])
 
 
 def fault_of(x_m: Floats, height_m: Floats, rules: Rules) -> str:
@@ -87,8 +99,8 @@ def fault_of(x_m: Floats, height_m: Floats, rules: Rules) -> str:
         return f"{xs.size} of {x_m.size} samples have a height"
     step = np.diff(xs)
     usual = float(np.median(step))
-    if usual > rules.longest_step_m:
-        return f"a sample each {usual:g} m; the coarsest that can be judged is one each {rules.longest_step_m:g} m"
+    if usual > COARSEST_M:
+        return f"a sample each {usual:g} m; the coarsest that can be judged is one each {COARSEST_M:g} m"
     if xs[-1] - xs[0] < rules.start_m:
         return f"{xs[-1] - xs[0]:g} m long; the shortest that can be judged is {rules.start_m:g} m"
     stride = max(1, round(rules.envelope_m / usual))

@@ -11,19 +11,54 @@ They are linear: the slopes of z_s and z_u follow from the slope of h by the sam
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.kernels.condition.quarter_car import QuarterCar, Rules
+
+Floats = npt.NDArray[np.float64]
 
 SPEED_M_PER_S = 80.0 / 3.6
 """Speed of all ride indices: 80 km/h."""
 
-RULES = Rules(envelope_m=0.25, start_m=11.0, longest_step_m=0.306, highest_step_m=0.1)
+RULES = Rules(envelope_m=0.25, ahead_m=0.0, start_m=11.0, longest_step_m=0.5, highest_step_m=0.5)
 """Moving average of 250 mm and a start of 11 m, as World Bank Technical Paper 46 and ASTM E1926 have them.
 
-A sample a foot is the coarsest that is in use, its stations rounded to a millimetre. Between two samples no road climbs
-0.1 m: that is a fault of the data.
+A step of 0.5 m is the widest of the World Bank's class 2: a wider one is a gap. Kerbs rise by 0.15 m and potholes are
+0.3 m deep: between two samples no road climbs 0.5 m, which is a fault of the data.
 """
+COARSEST_M = 0.306
+"""A sample a foot is the coarsest that is in use, its stations rounded to a millimetre (m)."""
+SEVERE_M = 0.1
+"""A step between neighbours that is higher is kept and noted: a kerb, a pothole's edge, or a fault of the data (m)."""
+_EVEN: Final = 0.02
+"""Steps of even spacing differ from the usual one by this share of it at the most, or by a rounded millimetre."""
+_EVEN_M: Final = 0.0011
+_EVEN_SHARE: Final = 0.9
+"""Share of the steps that have the usual length where spacing is even: lost samples leave some that are longer."""
+
+
+def usual_step_m(x_m: Floats) -> float:
+    """The usual distance between stations (m), or NaN where they are not evenly spaced."""
+    step = np.diff(x_m)
+    usual = float(np.median(step))
+    alike = np.abs(step - usual) <= max(_EVEN * usual, _EVEN_M)
+    return usual if np.mean(alike) >= _EVEN_SHARE else float("nan")
+
+
+def rules_at(usual_m: float) -> Rules:
+    """The rules for a profile with so many metres between its stations; NaN for uneven spacing.
+
+    ASTM E1926 averages over the whole number of steps that is nearest to 250 mm (Sayers 1995: from 167 mm on the slope
+    of the step itself counts). Its average of an even number of steps lies half a step ahead. For uneven spacing the
+    standard has no rule: the average is taken over 250 mm.
+    """
+    if not usual_m < RULES.envelope_m:
+        return RULES
+    count = max(int(RULES.envelope_m / usual_m + 0.5), 1)
+    return RULES._replace(envelope_m=count * usual_m, ahead_m=0.0 if count % 2 else 0.5 * usual_m)
 
 
 def quarter_car(k1: float, k2: float, c: float, mu: float) -> QuarterCar:

@@ -109,6 +109,8 @@ class Lane:
     """Standard deviation of the roll of its drives' poses, as the logs state it; the greatest of all."""
     sigma_height_m: float = 0.0
     """The same of their heights."""
+    wander_m2_per_m: float = 0.0
+    """Variance a metre of travel by which the heights of these poses wander at random, the greatest of all."""
 
     @property
     def last_m(self) -> int:
@@ -135,5 +137,5 @@ class Lane:
         end = min(int(np.ceil(to_m)) + 2 - self.first_m, len(self.offset_m))
         return Lane(
             self.road, self.name, self.sign, self.first_m + first, self.offset_m[first:end], self.width_m,
-            self.width_from, self.passes, self.sigma_roll_deg, self.sigma_height_m,
+            self.width_from, self.passes, self.sigma_roll_deg, self.sigma_height_m, self.wander_m2_per_m,
         )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.profiles import heights_of, raise_fault, stations_of
-from roadscan.condition.quarter_car import RULES
+from roadscan.condition.quarter_car import COARSEST_M, RULES
 from roadscan.model.errors import ProfileError
 
 Floats = npt.NDArray[np.float64]
@@ -113,7 +113,7 @@ def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
     """Stations and heights between gaps and jumps."""
     there = np.isfinite(height)
     xs, hs = x[there], height[there]
-    broken = (np.diff(xs) > RULES.longest_step_m) | (np.abs(np.diff(hs)) > RULES.highest_step_m)
+    broken = (np.diff(xs) > COARSEST_M) | (np.abs(np.diff(hs)) > RULES.highest_step_m)
     ends = [0, *(1 + np.flatnonzero(broken)).tolist(), xs.size]
     return [(xs[a:b], hs[a:b]) for a, b in pairwise(ends) if b - a > 1]
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.profiles import heights_of, stations_of
-from roadscan.condition.quarter_car import RULES
+from roadscan.condition.quarter_car import COARSEST_M
 from roadscan.kernels.condition.straightedge import roll_beam, roll_wheel
 from roadscan.model.errors import ProfileError
 
@@ -53,6 +53,6 @@ def straightedge_mm(
         xs, hs = x[there], heights[there]
         wheel, deviation = np.empty(xs.size), np.empty(xs.size)
         roll_wheel(xs, hs, wheel_radius_m, wheel)
-        roll_beam(xs, wheel, length_m, RULES.longest_step_m, deviation)
+        roll_beam(xs, wheel, length_m, COARSEST_M, deviation)
         found[there] = 1e3 * deviation
     return found

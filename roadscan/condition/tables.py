@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.condition.iri import LOCAL_M, half_car_ride, iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.mpd import mean_profile_depths
 from roadscan.condition.profiles import heights_of, raise_fault, stations_of
-from roadscan.condition.ride import Ride, ride
+from roadscan.condition.ride import NOTES, Ride, ride
 from roadscan.condition.ride_number import ride_number_of, ride_number_ride
 from roadscan.condition.rms_texture import rms_texture_mm
 from roadscan.condition.segments import Segments, segments_of
@@ -53,9 +53,10 @@ def iri(
     Returns
     -------
     A row a segment: from_m, to_m, iri_m_per_km (of several profiles one column each, `iri_NAME_m_per_km`; of two also
-    mri_m_per_km, their mean, and hri_m_per_km, the half car), ride_number, measured_share (the least of the profiles)
-    and note. Values are NaN where less than half of a segment was measured. Notes: `start`, `gap`, `jump`, `short`
-    (see :meth:`roadscan.condition.ride.Ride.notes`), and `flat` or `wild`, an IRI so low or high that no road has it.
+    mri_m_per_km, their mean, and hri_m_per_km, the half car), ride_number, measured_share (the least of the profiles),
+    accuracy_class (:meth:`roadscan.condition.ride.Ride.accuracy_class`) and note. Values are NaN where less than half
+    of a segment was measured. Notes: `start`, `gap`, `jump`, `step`, `uneven`, `short` (see
+    :meth:`roadscan.condition.ride.Ride.notes`), and `flat` or `wild`, an IRI so low or high that no road has it.
 
     Raises
     ------
@@ -76,6 +77,7 @@ def iri(
         columns["hri_m_per_km"] = iri_of(half_car_ride(on.x_m, heights[0], heights[1]), parts).iri_m_per_km[0]
     columns["ride_number"] = ride_number_of(ride_number_ride(on.x_m, heights), parts).ride_number
     columns["measured_share"] = shares.min(axis=0)
+    columns["accuracy_class"] = on.accuracy_class(parts)
     columns["note"] = _joined(on, parts, segment_m, found)
     return pd.DataFrame(columns)
 
@@ -93,7 +95,8 @@ def localised_roughness(
 
     Returns
     -------
-    A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km.
+    A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km and note: `step` where one of more than 0.1 m lies in
+    it. A step of more than 0.5 m has a row without a peak and with the note `jump`: the car does not roll over it.
     """
     import pandas as pd
 
@@ -101,9 +104,17 @@ def localised_roughness(
         raise ProfileError(f"a limit of {limit_m_per_km} m/km", expected="a finite number")
     on, _ = _sound_ride(x_m, height_m)
     found = stretches_above(on.x_m, rolling_iri(on, length_m).mean(axis=0), limit_m_per_km)
-    return pd.DataFrame(
-        [tuple(one) for one in found], columns=["from_m", "to_m", "peak_station_m", "peak_m_per_km"], dtype=float
-    )
+    severe = np.concatenate([broken.severe_m for broken in on.breaks])
+    half = 0.5 * length_m
+    rows: list[tuple[float, float, float, float, str]] = []
+    for one in found:
+        stepped = bool(((severe >= one.from_m - half) & (severe <= one.to_m + half)).any())
+        rows.append((one.from_m, one.to_m, one.peak_m, one.peak, "step" if stepped else ""))
+    jumps = np.unique(np.concatenate([broken.jump_m for broken in on.breaks]))
+    rows += [(at - half, at + half, at, np.nan, "jump") for at in jumps.tolist()]
+    names = ["from_m", "to_m", "peak_station_m", "peak_m_per_km"]
+    table = pd.DataFrame(rows, columns=[*names, "note"]).astype(dict.fromkeys(names, float))
+    return table.sort_values("from_m", kind="stable", ignore_index=True)
 
 
 def mpd(
@@ -172,6 +183,6 @@ def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -
     wild = np.atleast_1d((found > ROUGHEST_M_PER_KM).any(axis=0))
     joined = []
     for k in range(parts.from_m.size):
-        words = [word for word in ("start", "gap", "jump", "short") if any(word in notes[k] for notes in of_all)]
+        words = [word for word in NOTES if any(word in notes[k] for notes in of_all)]
         joined.append(", ".join(words + ["flat"] * bool(flat[k]) + ["wild"] * bool(wild[k])))
     return joined

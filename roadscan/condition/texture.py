@@ -23,7 +23,8 @@ Floats = npt.NDArray[np.float64]
 SEGMENT_MM = 100.0
 """Length of a segment (mm)."""
 HIGHEST_STEP_MM = 20.0
-"""What stands above its neighbour by more, when spikes are gone, is no texture (mm)."""
+"""Where the heights on both sides of a spike, or of a step, differ by more, the profile jumps: no texture is so deep
+(mm)."""
 COARSEST = 1.01
 """Spacing of samples over that of the resampled profile, at the most."""
 
@@ -95,9 +96,8 @@ def texture_segments(
     _check(along_mm, height_mm, chosen)
     place_mm, resampled_mm, read = _resample(along_mm, _bridged(along_mm, height_mm), chosen.resampled_mm)
     spike = _spikes(resampled_mm, chosen)
+    jump = _jumps(resampled_mm, spike)
     resampled_mm = _bridged(place_mm, np.where(spike, np.nan, resampled_mm))
-    jump = np.zeros(place_mm.size, bool)
-    jump[1:] = np.abs(np.diff(resampled_mm)) > HIGHEST_STEP_MM
     smooth_mm = _low_passed(resampled_mm, chosen)
     own, samples = _segment_of(along_mm), _segment_of(place_mm)
     dropout = ~np.isfinite(height_mm)
@@ -179,6 +179,19 @@ def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool
     spike[1:] |= steep
     spike[:-1] |= steep
     return spike
+
+
+def _jumps(height_mm: Floats, spike: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Samples between two sound ones whose heights differ too much, and these two.
+
+    Both samples beside a step are spikes: a line bridges them, which makes the step three times less steep. So the
+    heights on both sides of what was bridged are compared.
+    """
+    sound = np.flatnonzero(~spike)
+    jump = np.zeros(height_mm.size, np.bool_)
+    for k in np.flatnonzero(np.abs(np.diff(height_mm[sound])) > HIGHEST_STEP_MM).tolist():
+        jump[sound[k] : sound[k + 1] + 1] = True
+    return jump
 
 
 def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:

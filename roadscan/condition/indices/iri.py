@@ -18,14 +18,15 @@ from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.wheel_paths import (
     LEAD_M,
     NOISES,
+    Cleared,
     WheelPath,
     greatest_of,
     spread_of,
     wheel_paths,
     without_noise,
 )
-from roadscan.condition.quarter_car import RULES
-from roadscan.condition.ride import ride
+from roadscan.condition.quarter_car import RULES, SEVERE_M
+from roadscan.condition.ride import Ride, ride
 from roadscan.condition.segments import Segments
 
 
@@ -57,7 +58,7 @@ class Iri(ConditionIndex):
         left, right = found["left"], found["right"]
         share, reason = min(left.share, right.share), left.reason or right.reason
         mean = float(mean_roughness_index(np.array(left.iri), np.array(right.iri)))
-        spread = 0.5 * float(np.hypot(left.sigma, right.sigma))
+        spread = _sigma_of_mean(left.cleared, right.cleared)
         yield Value("mri_m_per_km", "section", from_m, to_m, mean, spread, share, reason)
         half, spread = _half_car(paths["left"], paths["right"]) if np.isfinite(mean) else (np.nan, np.nan)
         yield Value("hri_m_per_km", "section", from_m, to_m, half, spread, share, reason)
@@ -71,8 +72,17 @@ class _Told:
     """What the golden car says of a wheel path in a section."""
 
     def __init__(self, share: float, reason: str) -> None:
-        self.iri = self.sigma = self.local = self.sigma_local = np.nan
+        self.local = self.sigma_local = np.nan
+        self.cleared = Cleared(np.nan, np.nan, reason)
         self.share, self.reason = share, reason
+
+    @property
+    def iri(self) -> float:
+        return self.cleared.value
+
+    @property
+    def sigma(self) -> float:
+        return self.cleared.sigma
 
 
 def _told(path: WheelPath) -> _Told:
@@ -84,15 +94,40 @@ def _told(path: WheelPath) -> _Told:
     if np.isnan(rough[0]):
         told.reason = on.faults[0] or "a step that no road has"
         return told
-    told.iri, told.sigma, told.reason = without_noise(rough)
+    told.cleared = without_noise(rough)
+    told.reason = told.cleared.reason
     if told.reason:
         return told
     most = greatest_of(rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside])
     told.local, told.sigma_local = float(most[0]), spread_of(most)
-    told.reason = on.notes(path.ends)[0][0]
-    if "start" in told.reason:
-        told.reason = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
+    told.reason = _remarks(on, path)
     return told
+
+
+def _remarks(on: Ride, path: WheelPath) -> str:
+    """What to know of a value that there is."""
+    noted = on.notes(path.ends)[0][0]
+    found = []
+    if "start" in noted:
+        found.append(f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins")
+    station, way = path.profile.station_m, path.profile.distance_m
+    broken = on.breaks[0]
+    left_out = f"more than {RULES.highest_step_m:g} m, which no car rolls over, and is left out"
+    kept = f"more than {SEVERE_M:g} m, as at a kerb, and is kept"
+    for word, places, done in (("jump", broken.jump_m, left_out), ("step", broken.severe_m, kept)):
+        if word in noted:
+            own = places[(places >= path.ends.from_m[0]) & (places <= path.ends.to_m[0])]
+            at = ", ".join(f"{one:.1f}" for one in np.interp(own, way, station)[:3])
+            found.append(f"at station {at} the road steps by {done}")
+    return "; ".join(found)
+
+
+def _sigma_of_mean(left: Cleared, right: Cleared) -> float:
+    """Standard deviation of the mean of two wheel paths: their noises are independent, the poses' wander is not."""
+    if not np.isfinite(left.sigma + right.sigma):
+        return np.nan
+    spread = float(np.std(0.5 * (left.drawn + right.drawn), ddof=1))
+    return float(np.hypot(spread, 0.5 * np.hypot(left.rest, right.rest)))
 
 
 def _half_car(left: WheelPath, right: WheelPath) -> tuple[float, float]:

@@ -28,8 +28,12 @@ NOISES: Final = 12
 MOST_NOISE: Final = 0.75
 """Share of the power of an index that may be noise."""
 _SIGMA_NOISE: Final = 0.3
-"""Of the standard deviations of heights (share): regular readings err less than their scatter within cells says."""
+"""Standard deviation (share) of the power of the noise: that of heights comes from some nine cells each."""
 _ROUNDS: Final = 2
+_MARGIN: Final = 64
+"""Places beside a profile whose noise may reach into it."""
+_WANDER_STREAM: Final = 1000
+"""First stream of random numbers of the poses' wander; those of noise are below."""
 LEAST_M: Final = 20.0
 """Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
 
@@ -52,16 +56,23 @@ class WheelPath:
     cell_m: float
     window_m2: float
     """Variance of the window along the road that a height is a mean over."""
+    wander_m2_per_m: float = 0.0
+    """Variance a metre by which the heights of the poses wander at random, alike in both wheel paths."""
 
     def with_noise(self, first_stream: int = 0) -> Float64:
-        """(1 + 12, n) heights, and the same with noise added; NaN where nothing is known of it."""
-        height = self.profile.height_m[None]
-        return np.concatenate([height, height + noise(self.profile, self.spacing_m, self.cell_m, first_stream)])
+        """(1 + 12, n) heights, and the same with noise and wander added; NaN where nothing is known of the noise."""
+        height, errors = self.profile.height_m[None], noise(self.profile, self.spacing_m, self.cell_m, first_stream)
+        return np.concatenate([height, height + errors + self.wander()])
+
+    def wander(self) -> Float64:
+        """(12, n) random walks of the poses' heights, the same in both wheel paths and in every run."""
+        drawn = _drawn(_WANDER_STREAM, _numbers(self.profile, self.spacing_m), 0)
+        return np.cumsum(math.sqrt(self.wander_m2_per_m * self.spacing_m) * drawn, axis=1)
 
     def tried(self, first_stream: int = 0) -> Float64:
-        """(2 + 2 · 12, n) sharpened: heights, heights less so, heights with noise added, and the noise alone."""
+        """(2 + 2 · 12, n) sharpened: heights, heights less so, heights with all errors added, and the noise alone."""
         noisy = self.with_noise(first_stream)
-        alone = noisy[1:] - noisy[0]
+        alone = noise(self.profile, self.spacing_m, self.cell_m, first_stream)
         once = self.sharpened(noisy[:1], _ROUNDS - 1)
         sharp = self.sharpened(np.concatenate([noisy, alone]))
         return np.concatenate([sharp[:1], once, sharp[1:]])
@@ -91,7 +102,8 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
         inside = (part.station_m >= from_m - 1e-6) & (part.station_m <= to_m + 1e-6)
         share, reason = _judged(part, inside, (from_m, to_m), lane)
         ends = _ends(part, from_m, to_m) if not reason else Segments(np.zeros(0), np.zeros(0))
-        found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m, lane.window_m2)
+        found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m, lane.window_m2,
+                                lane.wander_m2_per_m)  # fmt: skip
     return found
 
 
@@ -112,6 +124,10 @@ class Cleared(NamedTuple):
     """NaN where noise makes more than three quarters of its power."""
     sigma: float
     reason: str
+    drawn: Float64 = np.zeros(0)
+    """(12,) values with errors added, less the mean of these."""
+    rest: float = 0.0
+    """What `sigma` holds beside the spread of these."""
 
 
 def without_noise(tried: Float64) -> Cleared:
@@ -126,8 +142,9 @@ def without_noise(tried: Float64) -> Cleared:
     clear = math.sqrt(value**2 - power)
     if not clear:
         return Cleared(0.0, 0.0, "")
-    spread = float(np.std(noisy, ddof=1)) * float(value) / clear
-    return Cleared(clear, math.hypot(spread, _SIGMA_NOISE * power / clear, float(value - once)), "")
+    drawn = (noisy - noisy.mean()) * float(value) / clear
+    rest = math.hypot(_SIGMA_NOISE * power / clear, float(value - once))
+    return Cleared(clear, math.hypot(float(np.std(drawn, ddof=1)), rest), "", drawn, rest)
 
 
 def bridged(profile: Profile, largest_gap_m: float) -> Profile:
@@ -175,16 +192,24 @@ def noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0)
 
     They are drawn from counters of the place, so a section has the same ones in every run.
     """
-    number = np.rint(part.station_m / spacing_m).astype(np.int64)
-    low, high = int(number.min()) - 64, int(number.max()) + 65
     _, window = _window(max(spacing_m, 1.5 * cell_m), spacing_m)
     window /= np.sqrt(np.sum(window * window))
-    sigma = part.known_sigma_m
+    return np.asarray(part.known_sigma_m * _drawn(first_stream, _numbers(part, spacing_m), _MARGIN, window))
+
+
+def _numbers(part: Profile, spacing_m: float) -> npt.NDArray[np.int64]:
+    """(n,) number of each place along the road."""
+    return np.rint(part.station_m / spacing_m).astype(np.int64)
+
+
+def _drawn(first_stream: int, number: npt.NDArray[np.int64], margin: int, window: Float64 | None = None) -> Float64:
+    """(12, n) normal numbers of places, each stream smoothed by a window that reaches no farther than the margin."""
+    low, high = int(number.min()) - margin, int(number.max()) + margin + 1
     out = np.empty((NOISES, number.size))
     for k in range(NOISES):
         drawn = np.concatenate([_normal(first_stream + k, block) for block in range(low // 1024, high // 1024 + 1)])
-        alike = np.convolve(drawn, window, mode="same")
-        out[k] = sigma * alike[number - low // 1024 * 1024]
+        alike = drawn if window is None else np.convolve(drawn, window, mode="same")
+        out[k] = alike[number - low // 1024 * 1024]
     return out
 
 

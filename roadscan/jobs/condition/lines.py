@@ -15,6 +15,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.code_reach import code_digest
+from roadscan.condition.pose_wander import height_wander
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.jobs.engine.fingerprint import key_of
@@ -119,18 +120,33 @@ def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[Out
 
 
 def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
-    """The lanes with the standard deviations of roll and height of their drives."""
+    """The lanes with the standard deviations of roll and height of their drives, and how these heights wander."""
     settings = plan.survey.config.navigation.calibration
-    known = {one.pass_id: usual_pose_sigma(plan.store, plan.records, source, settings) for one, source in _driven(plan)}
+    known = {
+        one.pass_id: (*usual_pose_sigma(plan.store, plan.records, source, settings), _wander(plan, one, source))
+        for one, source in _driven(plan)
+    }
 
     def greatest(lane: Lane, number: int) -> float:
         own = [known[PassId(p)] for p in lane.passes] or list(known.values())
         return max((float(sigma[number]) for sigma in own), default=0.0)
 
     return [
-        replace(lane, sigma_roll_deg=math.degrees(greatest(lane, 3)), sigma_height_m=greatest(lane, 2))
+        replace(
+            lane, sigma_roll_deg=math.degrees(greatest(lane, 3)), sigma_height_m=greatest(lane, 2),
+            wander_m2_per_m=greatest(lane, 6),
+        )
         for lane in lanes
-    ]
+    ]  # fmt: skip
+
+
+def _wander(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> float:
+    """Variance a metre of travel by which the heights of a pass's poses wander at random (m²/m)."""
+    rows = list(_rows(plan.store, one, source))
+    if not rows:
+        return 0.0
+    epoch, world = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    return height_wander(epoch, plan.ground.map.map_from_world(source.world, world))
 
 
 def check_layer(survey: Survey) -> None:
@@ -191,6 +207,16 @@ def _path_m(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> npt.ND
 
 
 def _positions(store: Store, one: LanePass, source: TrajectorySource) -> Iterator[npt.NDArray[np.float64]]:
+    for _, place in _rows(store, one, source):
+        moved = np.ones(len(place), bool)
+        moved[1:] = (np.diff(np.floor(place / _STEP_M), axis=0) != 0).any(axis=1)
+        yield place[moved]
+
+
+def _rows(
+    store: Store, one: LanePass, source: TrajectorySource
+) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+    """Epochs (n,) and positions (n, 3) in the world frame, row group by row group."""
     for file in sorted(source.files, key=lambda f: f.span or (0, 0)):
         if file.span is not None and (file.span[1] < one.start_gps_ns or file.span[0] >= one.end_gps_ns):
             continue
@@ -199,11 +225,8 @@ def _positions(store: Store, one: LanePass, source: TrajectorySource) -> Iterato
             epoch = rows.column("epoch_gps_ns").to_numpy()
             own = (epoch >= one.start_gps_ns) & (epoch < one.end_gps_ns)
             place = np.stack([rows.column(name).to_numpy()[own] for name in _POSITION[1:]], axis=-1)
-            if not len(place):
-                continue
-            moved = np.ones(len(place), bool)
-            moved[1:] = (np.diff(np.floor(place / _STEP_M), axis=0) != 0).any(axis=1)
-            yield place[moved]
+            if len(place):
+                yield epoch[own], place
 
 
 def _write_lines(
@@ -235,6 +258,7 @@ def _write_lanes(
         "offset_mean_m": [float(np.mean(lane.offset_m)) for lane in lanes],
         "sigma_roll_deg": [lane.sigma_roll_deg for lane in lanes],
         "sigma_height_m": [lane.sigma_height_m for lane in lanes],
+        "wander_m2_per_m": [lane.wander_m2_per_m for lane in lanes],
         "passes": [" ".join(map(str, lane.passes)) for lane in lanes],
         "offset_m": [lane.offset_m for lane in lanes],
     }
@@ -288,7 +312,7 @@ def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roa
         Lane(
             row["road"], row["lane"], 1 if row["direction"] == "forward" else -1, row["station_from_m"],
             np.array(row["offset_m"]), row["width_m"], row["width_from"], tuple(map(int, row["passes"].split())),
-            row["sigma_roll_deg"], row["sigma_height_m"],
+            row["sigma_roll_deg"], row["sigma_height_m"], row["wander_m2_per_m"],
         )
         for row in held.to_pylist()
     )  # fmt: skip

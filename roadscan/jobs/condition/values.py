@@ -125,6 +125,7 @@ def plan_groups(
                 lane.width_from,
                 lane.sigma_roll_deg,
                 lane.sigma_height_m,
+                lane.wander_m2_per_m,
                 own,
                 [(r.unit, r.digest) for name in OF_STRETCHES for r in read[name]],
                 cell_m,
@@ -258,6 +259,7 @@ def load_lane(task: GroupTask) -> LaneData:
         window_m2=window_m2(task.config, task.cell_m),
         sigma_roll_rad=math.radians(group.lane.sigma_roll_deg),
         sigma_pose_height_m=group.lane.sigma_height_m,
+        wander_m2_per_m=group.lane.wander_m2_per_m,
     )
 
 

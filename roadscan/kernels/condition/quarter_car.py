@@ -1,8 +1,8 @@
 """A linear quarter car over a profile of any spacing, solved exactly from sample to sample.
 
 The profile is linear between its samples. The tyre envelops it: the slope that the car feels over a step is that of the
-profile's moving average at the middle of the step, held over the step, as ASTM E1926 and World Bank Technical Paper 46
-(Sayers, Gillespie, Paterson 1986) have it for steps of 250 mm. Under a held slope s each of the car's two pairs of
+profile's moving average at the middle of the step, held over the step, as World Bank Technical Paper 46 (Sayers,
+Gillespie, Paterson 1986) has it for steps of 250 mm. Under a held slope s each of the car's two pairs of
 conjugate modes follows its own equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) − w·s.
 """
 
@@ -37,6 +37,8 @@ class Rules(NamedTuple):
 
     envelope_m: float
     """Length of the moving average (m)."""
+    ahead_m: float
+    """How far the middle of the moving average lies ahead of the middle of a step (m)."""
     start_m: float
     """The car begins at rest on the mean slope of so many metres; shorter pieces are left out."""
     longest_step_m: float
@@ -69,7 +71,7 @@ def _feel(xs, hs, rules, slope, grade):
     for i in range(1, n):
         slope[i] = grade[i - 1]
         if xs[i] - xs[i - 1] < rules.envelope_m:
-            middle = 0.5 * (xs[i] + xs[i - 1])
+            middle = 0.5 * (xs[i] + xs[i - 1]) + rules.ahead_m
             near, far = max(middle - half, first), min(middle + half, last)
             while xs[low + 1] < near:
                 low += 1

@@ -83,13 +83,18 @@ def stretched_wire(x, h, out):
 
 @inlined
 def width(x, gap, deepest):
-    """Extent around a place over which the depth is more than a tenth of that there (m)."""
-    first, last = deepest, deepest
-    while first > 0 and gap[first - 1] > 0.1 * gap[deepest]:
+    """Extent around a place over which the depth is more than a tenth of that there (m); depths are linear between."""
+    first, last, tenth = deepest, deepest, 0.1 * gap[deepest]
+    while first > 0 and gap[first - 1] > tenth:
         first -= 1
-    while last < x.size - 1 and gap[last + 1] > 0.1 * gap[deepest]:
+    while last < x.size - 1 and gap[last + 1] > tenth:
         last += 1
-    return x[last] - x[first]
+    begin, end = x[first], x[last]
+    if first > 0:
+        begin -= (x[first] - x[first - 1]) * (gap[first] - tenth) / (gap[first] - gap[first - 1])
+    if last < x.size - 1:
+        end += (x[last + 1] - x[last]) * (gap[last] - tenth) / (gap[last] - gap[last + 1])
+    return end - begin
 
 
 @kernel

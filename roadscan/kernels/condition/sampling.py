@@ -25,6 +25,8 @@ LEAST_SCALE_M = 0.0005
 GROSS_M = 0.01
 """The same before there is a surface: cells count from the window's median height (m)."""
 TERMS = 4
+LEAST_FREEDOM = 0.05
+"""Share of the weights of a window that its surface has to leave free: with less, residuals are rounding."""
 
 
 class CellTable(NamedTuple):
@@ -214,46 +216,47 @@ def residuals(found, count, base, surface, out):
 
 @kernel
 def sigma(found, count, size, away, told):
-    """Standard deviation of the height in the middle (m), from what the cells of the window say of their own errors.
+    """Standard deviation of the height in the middle (m), from how the cells of the window scatter about a surface.
 
-    A cell's variance is that of its readings over their number (all readings of the window have one variance), or that
-    of the cells about a surface where this is more: a cell's readings need not lie around its middle.
+    Cells are taken as measurements of one variance. Residuals of a weighted fit X, with A = (X'WX)⁻¹, have
+    E[Σ w r²] = σ² (Σ w − tr(A X'W²X)), whatever the weights. How the readings scatter within a cell says nothing of it:
+    the cell's height is robust, and one wrong reading makes this scatter many times larger.
     size : terms of the surface that the height is of; away : (count,) distances (m) from one of `told` terms.
     """
-    squares, freedom, spread, used = 0.0, 0.0, 0.0, 0.0
-    for k in range(count):
-        if found.weight[k] <= 0.0:
-            continue
-        used += 1.0
-        spread += away[k] * away[k]
-        if found.readings[k] > 1.0 and found.noise[k] >= 0.0:
-            squares += found.noise[k]
-            freedom += found.readings[k] - 1.0
-    if used <= told:
-        return np.nan
-    spread /= used - told
-    variance = squares / freedom if freedom >= 10.0 else 0.0
-    normal, factor = np.zeros((TERMS, TERMS)), np.zeros((TERMS, TERMS))
-    noise, terms, unit, row = np.zeros((TERMS, TERMS)), np.zeros(TERMS), np.zeros(TERMS), np.zeros(TERMS)
+    squares, weights = 0.0, 0.0
+    normal, factor, squared = np.zeros((TERMS, TERMS)), np.zeros((TERMS, TERMS)), np.zeros((TERMS, TERMS))
+    terms, column, row = np.zeros(TERMS), np.zeros(TERMS), np.zeros(TERMS)
     for k in range(count):
         w = found.weight[k]
         if w <= 0.0:
             continue
         fill_terms(found, k, terms)
-        own = max(variance / max(found.readings[k], 1.0), spread)
-        for i in range(size):
+        weights += w
+        squares += w * away[k] * away[k]
+        for i in range(told):
             for j in range(i + 1):
                 normal[i, j] += w * terms[i] * terms[j]
-                noise[i, j] += w * w * terms[i] * terms[j] * own
+                squared[i, j] += w * w * terms[i] * terms[j]
+                squared[j, i] = squared[i, j]
+    if factorise(normal, told, factor) < told:
+        return np.nan
+    freedom = weights
+    for j in range(told):
+        column[:] = squared[:, j]
+        solve(factor, told, column, row)
+        freedom -= row[j]
+    if freedom < LEAST_FREEDOM * weights:
+        return np.nan
+    column[:] = 0.0
+    column[0] = 1.0
     if factorise(normal, size, factor) < size:
         return np.nan
-    unit[0] = 1.0
-    solve(factor, size, unit, row)
+    solve(factor, size, column, row)
     total = 0.0
     for i in range(size):
         for j in range(size):
-            total += row[i] * row[j] * noise[max(i, j), min(i, j)]
-    return math.sqrt(total)
+            total += row[i] * row[j] * squared[i, j]
+    return math.sqrt(total * squares / freedom)
 
 
 @kernel
@@ -269,8 +272,8 @@ def sample(table, places, half_along, half_across, bend, out):
     places : (n, 4) float64, easting, northing (m), and the unit vector along the road.
     half_along, half_across : float64, half of a window's extents (m).
     bend : whether the surface may bend across the road.
-    out : (n, 3) float64, out: height (m), its standard deviation from the noise of the readings (m, NaN where it is
-        not known), and the share of the window that holds cells.
+    out : (n, 3) float64, out: height (m), its standard deviation from how the cells scatter (m, NaN where it is not
+        known), and the share of the window that holds cells.
     """
     room = np.empty((6, MOST_CELLS))
     found = Cells(room[0], room[1], room[2], room[3], room[4], room[5], np.empty(MOST_CELLS, np.int64))

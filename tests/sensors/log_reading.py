@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.model.witness import Finding
 from roadscan.sensors.base import LogSource, Reject, Rows, format_named
 from roadscan.tables.schema import table_schema
 
@@ -25,6 +26,7 @@ class Log:
     table: pa.Table
     rows: list[Rows]
     rejects: list[Reject]
+    findings: list[Finding] = field(default_factory=list)
 
     def column(self, name: str) -> np.ndarray:
         return self.table.column(name).to_numpy()
@@ -53,9 +55,12 @@ def read_log(name: str, path: Path, options: dict[str, Any] | None = None, **sta
     log_format = format_named(name)
     source = source_of(name, path, options, **stated)
     header = log_format.header(source)
-    rows, rejects, batches = [], [], []
+    rows, rejects, findings, batches = [], [], [], []
     schema = table_schema(log_format.yields[0])
     for item in log_format.read(source, header):
+        if isinstance(item, Finding):
+            findings.append(item)
+            continue
         if isinstance(item, Reject):
             rejects.append(item)
             continue
@@ -65,4 +70,4 @@ def read_log(name: str, path: Path, options: dict[str, Any] | None = None, **sta
         assert schema.faults(batch) == []
         rows.append(item)
         batches.append(batch)
-    return Log(header.attributes, pa.Table.from_batches(batches, schema.arrow()), rows, rejects)
+    return Log(header.attributes, pa.Table.from_batches(batches, schema.arrow()), rows, rejects, findings)

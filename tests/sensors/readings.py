@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from roadscan.model.witness import Finding
 from roadscan.sensors.base import LogSource, Reject, Rows, format_named
 from roadscan.tables.schema import table_schema
 
@@ -25,6 +26,7 @@ class Readings:
     table: pa.Table
     rows: list[Rows]
     rejects: list[Reject]
+    findings: list[Finding] = field(default_factory=list)
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.table.column(column).to_numpy()
@@ -58,8 +60,12 @@ def read(name: str, path: Path, options: dict[str, Any] | None = None, **stated:
     schema = table_schema(log_format.yields[0])
     rows: list[Rows] = []
     rejects: list[Reject] = []
+    findings: list[Finding] = []
     batches: list[pa.RecordBatch] = []
     for item in log_format.read(source, header):
+        if isinstance(item, Finding):
+            findings.append(item)
+            continue
         if isinstance(item, Reject):
             assert item.records > 0
             rejects.append(item)
@@ -71,4 +77,6 @@ def read(name: str, path: Path, options: dict[str, Any] | None = None, **stated:
         assert schema.faults(batch) == []
         rows.append(item)
         batches.append(batch)
-    return Readings(header.attributes, pa.Table.from_batches(batches, schema.arrow(header.list_size)), rows, rejects)
+    return Readings(
+        header.attributes, pa.Table.from_batches(batches, schema.arrow(header.list_size)), rows, rejects, findings
+    )

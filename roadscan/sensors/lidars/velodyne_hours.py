@@ -118,13 +118,15 @@ class Start:
     """What the beginning of a capture says of its time."""
 
     stamp_us: int
-    """Stamp of the first data packet."""
+    """Stamp of the first data packet that is on GPS time."""
     capture_ns: int
     """Its time by the recording computer's clock, POSIX ns."""
     fix: Fix | None
     """First valid sentence."""
     hours_to_fix: int
     """Hours from the first data packet's to that of the fix."""
+    hours_on: int = 0
+    """Hours from that of the capture's first data packet, where the clock steps in between."""
 
 
 def first_hour_unix_s(source: LogSource, stated: Literal["capture"] | int | None, start: Start) -> int | None:
@@ -189,7 +191,8 @@ def _stated_hour(path: Path, stated: Literal["capture"] | int | None, start: Sta
             file=path,
             missing=_DATED,
         )
-    return int(dt.datetime(date.year, date.month, date.day, stated, tzinfo=dt.UTC).timestamp())
+    first = int(dt.datetime(date.year, date.month, date.day, stated, tzinfo=dt.UTC).timestamp())
+    return first + HOUR_S * start.hours_on
 
 
 def _heard_hour(path: Path, start: Start, stated: int | None, date: dt.date | None) -> int:
@@ -240,6 +243,8 @@ class Hours:
     """Start of the first data packet's hour; None for a free-running clock."""
     previous_us: int | None = None
     """Last stamp, counted on from the first hour."""
+    capture_set_s: float = 0.0
+    """By how much the capture's clock was set forward on the way."""
     _capture_minus_stamp_s: float | None = None
     _has_sentences: bool = False
     _clock: Clock = field(init=False)
@@ -258,10 +263,15 @@ class Hours:
         epochs = self._clock.to_epoch_gps_ns(first_s * NS_PER_S + unrolled * 1000)
         return epochs if self.first_hour_unix_s is None else epochs - _early_leaps_ns(first_s, stamps_us, unrolled)
 
-    def check(self, packet: Datagram) -> None:
-        """Compare the hour with a position packet's sentence, if it has a valid one."""
-        fix = Fix.of(packet)
-        if fix is None or self.first_hour_unix_s is None or self.previous_us is None:
+    def resume(self, expected_us: int) -> None:
+        """Go on with a later part of the capture, from `expected_us` on, counted from the first hour."""
+        self.previous_us = expected_us
+        self._capture_minus_stamp_s = None
+        self.capture_set_s = 0.0
+
+    def check(self, fix: Fix, record: int) -> None:
+        """Compare the hour with a valid sentence in a position packet, whose record number is `record`."""
+        if self.first_hour_unix_s is None or self.previous_us is None:
             return
         self._has_sentences = True
         unrolled_us = int(unroll(np.array([fix.stamp_us]), self.previous_us)[0])
@@ -272,7 +282,7 @@ class Hours:
                 expected="no gap of half an hour or more in the capture",
                 change="split the capture at the gap",
                 file=self.source.path,
-                record=packet.number,
+                record=record,
             )
 
     def _watch_for_gap(self, unrolled_us: Int64, capture_ns: Int64) -> None:
@@ -280,7 +290,8 @@ class Hours:
         apart_s = capture_ns / NS_PER_S - unrolled_us / 1e6
         if self._capture_minus_stamp_s is None:
             self._capture_minus_stamp_s = float(np.median(apart_s[:_SOME_PACKETS]))
-        missing_s = float(np.median(apart_s[-_SOME_PACKETS:])) - self._capture_minus_stamp_s
+        later_s = float(np.median(apart_s[-_SOME_PACKETS:])) - self.capture_set_s
+        missing_s = later_s - self._capture_minus_stamp_s
         if abs(missing_s) > _SHORTEST_GAP_S and not self._has_sentences:
             raise TimeSystemError(
                 f"by the capture's clock {missing_s:+.0f} s are missing from the stamps",

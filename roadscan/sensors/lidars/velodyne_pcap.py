@@ -23,12 +23,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from roadscan.model.errors import ConfigError, FormatError, Missing
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.model.gpstime import NS_PER_S, TimeSystem
 from roadscan.model.strict import Strict
+from roadscan.model.witness import Finding, Witness
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, datagrams
-from roadscan.sensors.lidars.velodyne_hours import HOUR_US, Fix, Hours, Start, first_hour_unix_s, leaps, unroll
+from roadscan.sensors.lidars.velodyne_hours import Hours, Start, first_hour_unix_s, leaps
 from roadscan.sensors.lidars.velodyne_packets import (
     BLOCKS,
     DATA_BYTES,
@@ -42,14 +43,39 @@ from roadscan.sensors.lidars.velodyne_packets import (
     decode,
     faults,
 )
+from roadscan.sensors.lidars.velodyne_segments import (
+    STEPPED,
+    Parts,
+    StepWatch,
+    Verdict,
+    hours_later,
+    judged,
+    reference,
+)
+from roadscan.sensors.lidars.velodyne_sentences import SENTENCES, Sentences
 from roadscan.sensors.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
 _HEADER_PACKETS: Final = 1_000
-_FIRST_PACKETS: Final = 3
-"""Packets that tell whether the first one's stamp is sound."""
+_HEADER_CHUNK: Final = 500
+_HOUR_NS: Final = 3_600 * NS_PER_S
+_RECENT_PACKETS: Final = 64
+"""Packets behind which a copy of one arrives, by a mirrored port."""
+_FASTEST_DRIFT: Final = 6e-4
+"""NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
+_LEAST_DRIFT_S: Final = 0.05
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
 _OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x28: "VLP-32C", 0x31: "Velarray", 0xA1: "VLS-128"}
+
+
+TWICE: Final = Witness(
+    "lidar_packets_twice",
+    input="lidar",
+    fault="Packets stand twice in a capture, or out of order: a mirrored port, captures that were joined.",
+    asks="stamps and bytes of neighbouring data packets",
+    does="a packet counts once; packets out of order are put into the order of their stamps, and named",
+    told=("rejects", "findings"),
+)
 
 
 class VelodyneOptions(Strict):
@@ -105,7 +131,7 @@ class VelodynePcap(LogFormat):
         options = options_of(source, VelodyneOptions)
         known = _survey_capture(source.path, options)
         model = _model(source, options, known)
-        start = known.start()
+        start = known.start(_has_hours(source))
         first_hour = first_hour_unix_s(source, options.hour, start)
         attributes: dict[str, Any] = {
             "frame": "sensor",
@@ -118,6 +144,8 @@ class VelodynePcap(LogFormat):
         if first_hour is not None:
             first_s = first_hour + start.stamp_us / 1e6
             attributes["capture_minus_sensor_s"] = round(start.capture_ns / NS_PER_S - first_s, 6)
+        if len(known.parts.found) > 1:
+            attributes["clock_steps"] = len(known.parts.found) - 1
         return LogHeader(attributes)
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
@@ -125,7 +153,10 @@ class VelodynePcap(LogFormat):
         options = options_of(source, VelodyneOptions)
         model = next(m for m in MODELS if m.name == header.attributes["model"])
         sender = str(header.attributes["sender"])
-        decoder = _Decoder(model, options, Hours(source, header.attributes["first_hour_unix_s"]))
+        hours = Hours(source, header.attributes["first_hour_unix_s"])
+        decoder = _Decoder(model, options, hours, source, sender)
+        if "clock_steps" in header.attributes:
+            decoder.judge()
         packets: list[Datagram] = []
         positions: list[Datagram] = []
         for item in datagrams(source.path, _wanted(options, sender)):
@@ -139,6 +170,12 @@ class VelodynePcap(LogFormat):
                 yield from decoder.items(packets, positions)
                 packets, positions = [], []
         yield from decoder.items(packets, positions)
+        yield from decoder.findings()
+
+
+def _has_hours(source: LogSource) -> bool:
+    """False for a sensor without GPS, whose stamps count from no hour."""
+    return source.clock is None or source.clock.system is not TimeSystem.FREE
 
 
 @dataclass
@@ -148,32 +185,81 @@ class _Decoder:
     model: Model
     options: VelodyneOptions
     hours: Hours
+    source: LogSource
+    sender: str
+    """Address of the sensor."""
     _sweep: int = 0
     _azimuth: int = -1
+    _watch: StepWatch = field(default_factory=StepWatch)
+    _verdicts: list[Verdict] = field(default_factory=list)
+    """What was found of the capture's parts, once a step of the clock was seen."""
+    _left_out: Counter[int] = field(default_factory=Counter)
+    """Data packets that were left out, by part."""
+    _part: int = -1
+    """Part of the last packet that was used."""
+    _stamp_us: int | None = None
+    """Last sound stamp."""
+    _recent: dict[bytes, int] = field(default_factory=dict)
+    """Capture times (ns) of the last packets, by their bytes."""
+    _disordered: int = 0
+    _sentences: Sentences = field(default_factory=Sentences)
 
     def items(self, packets: list[Datagram], positions: list[Datagram]) -> Iterator[Item]:
         """Rows of sound data packets, and rejects for damaged ones; position packets confirm the hour."""
         if packets:
             yield from self._returns(packets)
         for packet in positions:
-            self.hours.check(packet)
+            if self._verdicts and not self._verdict_of(packet).kept:
+                continue
+            fix = self._sentences.take(packet)
+            if fix is not None:
+                self.hours.check(fix, packet.number)
+
+    def judge(self) -> None:
+        """Look through the whole capture for steps of the sensor's clock, and judge its parts."""
+        known = _survey_capture(self.source.path, self.options, whole_of=self.sender)
+        self._verdicts = judged(known.parts.found, _has_hours(self.source))
+
+    def findings(self) -> Iterator[Finding]:
+        """What is doubtful of the capture, once it is read."""
+        for number, verdict in enumerate(self._verdicts):
+            yield from verdict.findings(self._left_out[number])
+        for set_us in self._watch.set_us:
+            yield STEPPED.finds(
+                "",
+                f"the capture's own clock was set by {set_us / 1e6:+.1f} s while the packets went on evenly; the "
+                "stamps are used",
+            )
+        if _has_hours(self.source):
+            yield from self._sentences.findings()
+        gained_s, rate = self._watch.drift
+        if abs(rate) > _FASTEST_DRIFT and abs(gained_s) > _LEAST_DRIFT_S:
+            yield SENTENCES.finds(
+                "",
+                f"the stamps drift by {-gained_s:+.2f} s ({-rate * 1e6:+.0f} ppm) against the capture's clock; they "
+                "are used as they are",
+            )
+        if self._disordered:
+            yield TWICE.finds(
+                "",
+                f"{self._disordered:,} data packets stand out of order in the capture; they were put into the order of "
+                "their stamps",
+            )
 
     def _returns(self, packets: list[Datagram]) -> Iterator[Item]:
         raw = np.frombuffer(b"".join([p.payload for p in packets]), dtype=PACKET)
-        sieve = Sieve(len(packets))
-        for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
-            sieve.drop(bad, reason)
-        stamps_us = raw["stamp_us"].astype(np.int64)
-        leaping = np.zeros(len(packets), dtype=bool)
-        leaping[sieve.kept] = leaps(stamps_us[sieve.kept], self.hours.previous_us)
-        sieve.drop(leaping, "the stamp leaps out of the log's order and back")
         numbers = np.array([p.number for p in packets])
+        sieve = self._sifted(packets, raw, numbers)
         yield from sieve.rejects(numbers, np.array([p.offset for p in packets]))
         if not sieve.good.any():
             return
         raw, numbers = raw[sieve.kept], numbers[sieve.kept]
-        capture_ns = np.array([p.capture_ns for p in packets])
-        epochs = self.hours.epochs(stamps_us[sieve.kept], capture_ns[sieve.kept])
+        capture_ns = np.array([p.capture_ns for p in packets])[sieve.kept]
+        epochs = self._epochs(raw["stamp_us"].astype(np.int64), capture_ns, numbers)
+        if (epochs[1:] < epochs[:-1]).any():
+            self._disordered += int((epochs < np.maximum.accumulate(epochs)).sum())
+            order = np.argsort(epochs, kind="stable")
+            raw, numbers, epochs = raw[order], numbers[order], epochs[order]
         if self.options.stamp == "packet_end":
             epochs = epochs - self.model.slot_times_ns(dual=False)[-1, -1]
         sweeps = self._sweeps(raw["blocks"]["azimuth"])
@@ -184,6 +270,82 @@ class _Decoder:
                 rows = slice(None) if part.size == len(raw) else part
                 batch = decode(raw[rows], epochs[rows], sweeps[rows], self.model, dual)
                 yield Rows("returns", batch, first_record=int(numbers[part[0]]))
+
+    def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
+        """Which packets are sound, stand once, and are of a part of the capture that is on GPS time."""
+        sieve = Sieve(len(packets))
+        for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
+            sieve.drop(bad, reason)
+        stamps_us = raw["stamp_us"].astype(np.int64)
+        leaping = np.zeros(len(packets), dtype=bool)
+        leaping[sieve.kept] = leaps(stamps_us[sieve.kept], self._stamp_us)
+        sieve.drop(leaping, "the stamp leaps out of the log's order and back")
+        sieve.drop(self._copies(packets, stamps_us), "the packet stands twice in the capture")
+        if not sieve.good.any():
+            return sieve
+        sound = stamps_us[sieve.kept]
+        self._stamp_us = int(sound[-1])
+        capture_us = np.array([p.capture_ns for p in packets])[sieve.kept] // 1000
+        if self._watch.steps(sound, capture_us) and not self._verdicts:
+            self._judge_on_the_way()
+        if self._verdicts:
+            parts = self._part_of(numbers)
+            for number in np.unique(parts[sieve.kept]).tolist():
+                if not self._verdicts[number].kept:
+                    self._left_out[number] += int((sieve.good & (parts == number)).sum())
+                    sieve.drop(parts == number, self._verdicts[number].reason)
+        return sieve
+
+    def _judge_on_the_way(self) -> None:
+        """Judge the capture at the first step; packets before it were taken already."""
+        self.judge()
+        if self._verdicts and not self._verdicts[0].kept:
+            later = next((v.part for v in self._verdicts if v.part is v.base), self._verdicts[0].part)
+            raise TimeSystemError(
+                f"the sensor's clock steps at record {self._verdicts[1].part.first:,}; not the stamps before it but "
+                f"those from record {later.first:,} on are on GPS time ({self._verdicts[0].reason})",
+                expected="a capture that begins on GPS time",
+                change="split the capture there",
+                file=self.source.path,
+            )
+
+    def _verdict_of(self, position: Datagram) -> Verdict:
+        """Of the part to which a position packet belongs: the one in which it lies, or the next, by its stamp."""
+        part = int(self._part_of(np.array([position.number]))[0])
+        return min(self._verdicts[part : part + 2], key=lambda one: one.part.misses_us(position))
+
+    def _part_of(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Part (n,) of the capture in which records lie."""
+        firsts = [v.part.first for v in self._verdicts]
+        return np.clip(np.searchsorted(firsts, numbers, side="right") - 1, 0, None)
+
+    def _epochs(
+        self, stamps_us: npt.NDArray[np.int64], capture_ns: npt.NDArray[np.int64], numbers: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """GPS ns (n,) of the packets that are used."""
+        if not self._verdicts:
+            self.hours.capture_set_s = sum(self._watch.set_us) / 1e6
+            return self.hours.epochs(stamps_us, capture_ns)
+        parts = self._part_of(numbers)
+        out = np.empty(stamps_us.size, dtype=np.int64)
+        for number in np.unique(parts).tolist():
+            if number != self._part:
+                self.hours.resume(self._verdicts[number].start_us)
+                self._part = number
+            own = parts == number
+            out[own] = self.hours.epochs(stamps_us[own], capture_ns[own])
+        return out
+
+    def _copies(self, packets: list[Datagram], stamps_us: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Packets (n,) whose bytes stand just before already; in another hour they may mean another time."""
+        copies = np.zeros(len(packets), dtype=bool)
+        if not (stamps_us[1:] > stamps_us[:-1]).all() or packets[0].payload in self._recent:
+            seen = self._recent
+            for k, packet in enumerate(packets):
+                copies[k] = abs(packet.capture_ns - seen.get(packet.payload, -_HOUR_NS)) < _HOUR_NS // 2
+                seen[packet.payload] = packet.capture_ns
+        self._recent = {p.payload: p.capture_ns for p in packets[-_RECENT_PACKETS:]}
+        return copies
 
     def _sweeps(self, azimuth: npt.NDArray[np.uint16]) -> npt.NDArray[np.int32]:
         """(n, 12) sweep of each block: one more wherever the azimuth passes 360°."""
@@ -201,42 +363,21 @@ class _Known:
     senders: Counter[str] = field(default_factory=Counter)
     products: Counter[int] = field(default_factory=Counter)
     modes: Counter[int] = field(default_factory=Counter)
-    fix: Fix | None = None
-    hours_to_fix: int = 0
-    _first: list[tuple[int, int]] = field(default_factory=list)
-    """Stamp (µs) and capture time (ns) of the first data packets."""
-    _previous_us: int | None = None
-
-    @property
-    def seen(self) -> int:
-        """Data packets seen."""
-        return sum(self.products.values())
+    parts: Parts = field(default_factory=Parts)
 
     def take(self, packet: Datagram) -> None:
         """Learn from a data packet that begins well."""
-        stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
         self.senders[packet.sender] += 1
         self.products[packet.payload[1205]] += 1
         self.modes[packet.payload[1204]] += 1
-        if len(self._first) < _FIRST_PACKETS:
-            self._first.append((stamp_us, packet.capture_ns))
-            if len(self._first) < _FIRST_PACKETS:
-                return
-            self._previous_us = self._first[self._first_sound()][0]
-        self._previous_us = int(unroll(np.array([stamp_us]), self._previous_us)[0])
+        stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
+        self.parts.data(packet.number, stamp_us, packet.capture_ns // 1000)
 
-    def start(self) -> Start:
-        """Time of the first sound packet, and of the first valid sentence."""
-        stamp_us, capture_ns = self._first[self._first_sound()]
-        previous = stamp_us if self._previous_us is None else self._previous_us
-        hours = 0
-        if self.fix is not None:
-            at_fix_us = int(unroll(np.array([self.fix.stamp_us]), previous)[0])
-            hours = (at_fix_us - self.fix.stamp_us) // HOUR_US
-        return Start(stamp_us, capture_ns, self.fix, hours)
-
-    def _first_sound(self) -> int:
-        return int(np.argmin(leaps(np.array([stamp for stamp, _ in self._first]), None)))
+    def start(self, sentences: bool) -> Start:
+        """Time of the first packet that is on GPS time, and of a sentence that belongs to it."""
+        found = self.parts.found
+        base = reference(found, sentences)
+        return Start(base.stamp_us, base.capture_us * 1000, base.fix, base.fix_hours, hours_later(found[0], base))
 
 
 def _wanted(options: VelodyneOptions, sender: str | None) -> Wanted:
@@ -252,19 +393,30 @@ def _has_data_packet(start: bytes) -> bool:
     return False
 
 
-def _survey_capture(path: Path, options: VelodyneOptions) -> _Known:
-    """Look at the first packets, and on to the first valid GPRMC unless the hour is stated."""
+def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None = None) -> _Known:
+    """Look at the first packets, and on to a GPRMC that agrees unless the hour is stated; at all where the clock steps.
+
+    Parameters
+    ----------
+    whole_of : look at all packets of this sender in any case.
+    """
     known = _Known()
-    for item in datagrams(path, _wanted(options, options.sender)):
+    for item in datagrams(path, _wanted(options, whole_of or options.sender)):
         if isinstance(item, Reject):
             continue
         if item.port == options.position_port:
-            known.fix = known.fix or Fix.of(item)
+            known.parts.position(item)
         elif _begins_well(item.payload):
             known.take(item)
-        if known.seen >= _HEADER_PACKETS and (known.fix is not None or options.hour is not None):
-            break
-    if not known.seen:
+            if known.parts.seen % _HEADER_CHUNK:
+                continue
+            known.parts.flush()
+            found = known.parts.found
+            heard = options.hour is not None or any(p.confirmed for p in found)
+            if whole_of is None and known.parts.seen >= _HEADER_PACKETS and heard and len(found) == 1:
+                break
+    known.parts.flush(last=True)
+    if not known.parts.seen:
         raise FormatError(
             f"no Velodyne data packet was sent to port {options.port}",
             expected=f"UDP packets of {DATA_BYTES} bytes",

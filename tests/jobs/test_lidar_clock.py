@@ -1,0 +1,48 @@
+"""A lidar's clock that steps inside a capture, through the command line: no reading lies where it was not measured."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+from typer.testing import CliRunner
+
+from roadscan.cli import app
+from roadscan.door import open_survey
+from tests.sensors.test_velodyne_clock import NO_PPS, Packets, heard, piece
+from tests.sensors.test_velodyne_pcap import capture
+
+
+def survey_of(folder: Path, faults: Path, packets: Packets | None = None) -> Path:
+    """The survey of the wrong input, with its capture or another: 1 m/s north from 09:00:00 UTC on."""
+    shutil.copytree(faults / "lidar_clock_step", folder, copy_function=shutil.copyfile)
+    folder.chmod(0o755)
+    if packets is not None:
+        capture(folder / "l.pcap", packets)
+    return folder / "SURVEY.toml"
+
+
+def northing_m(file: Path) -> np.ndarray:
+    """From where the drive began to each point of the tiles' clouds."""
+    survey = open_survey(file)
+    _, start_m = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform(9.0, 48.0)
+    points = [survey.points(tile)["northing_m"] for tile in survey.table("tiles").tile]
+    return np.concatenate(points) - start_m
+
+
+@pytest.mark.witness("lidar_clock_step")
+@pytest.mark.parametrize("case", ["restart", "lock_midway"])
+def test_readings_of_a_clock_that_stepped_are_left_out_and_named(tmp_path: Path, faults: Path, case: str) -> None:
+    midway = piece(600.0, 40.0) + heard(600.1, 40.1, NO_PPS, "V") + heard(600.2, 600.2) + piece(600.2, 600.2)
+    file = survey_of(tmp_path / "s", faults, None if case == "restart" else midway)
+    done = CliRunner().invoke(app, ["run", str(file), "--workers", "0"])
+    assert done.exit_code == 0, done.output
+    assert "its 100 data packets were left out" in " ".join(done.output.split())
+    assert len(open_survey(file).table("returns")) == 100 * 384
+    north_m = northing_m(file)
+    assert north_m.size
+    assert north_m.min() >= 594.0
+    assert north_m.max() <= 607.0

@@ -20,10 +20,31 @@ from roadscan.model.errors import FormatError, Missing, RoadscanError
 from roadscan.model.toml_text import toml
 from roadscan.sensors.base import LogFormat, log_formats
 from roadscan.sensors.columns import Likeness, likeness
-from roadscan.sensors.text_table import TextOptions, first_words
+from roadscan.sensors.text_table import TextOptions, first_words, text_layout
 
 UNPACKED_BYTES: Final = 16 << 20
 """Of a compressed file so much is unpacked to see what is inside."""
+
+_KNOWN_OTHERS: Final = {
+    "picture": (
+        "one picture is no log",
+        "the folder of a camera's pictures, with their stamps",
+        'list the folder with format = "images", and a table with the columns file and time (options.stamps), or the '
+        "pattern of the stamps in the pictures' names (options.pattern)",
+    ),
+    "GPX": (
+        "its positions have no attitude and no σ, and are mostly those of a phone or a watch",
+        "the log of a survey's receiver",
+        "export the receiver's log as RTKLIB .pos or NMEA, or the trajectory with roll, pitch and heading as "
+        "trajectory_csv",
+    ),
+    "UBX": (
+        "the receiver's binary messages are not read",
+        "positions",
+        "compute them with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NMEA",
+    ),
+}
+"""By a word of the kind of a file that is no log: why not, what a log would be, and what to do."""
 
 _TRIALS: Final = 15
 _ITEMS: Final = 20
@@ -105,8 +126,12 @@ def diagnose(path: Path, stated: Stated | None = None) -> FormatError:
     if path.is_dir():
         change = "list the logs in it one by one; `roadscan init` looks through a folder and finds them"
         return FormatError("the folder is of no known raw format", change=change, file=path)
+    words = kind_of(path).words
+    known = next((one for kind, one in _KNOWN_OTHERS.items() if kind in words), None)
+    if known is not None:
+        return FormatError(f"{words}: {known[0]}", expected=known[1], change=known[2], file=path)
     return FormatError(
-        f"{kind_of(path).words}: the content is of no known raw format",
+        f"{words}: the content is of no known raw format",
         change="`roadscan formats` lists those that are read; if it is one of them, state format = … for this log",
         file=path,
     )
@@ -184,8 +209,10 @@ def _columns(path: Path, stated: Stated) -> FormatError | None:
     """What the columns of a text lack to be of the format that they come nearest to."""
     try:
         _, names = first_words(path, TextOptions())
-    except RoadscanError:
-        return None
+        text_layout(path, TextOptions())
+    except RoadscanError as error:
+        is_asked = isinstance(error, FormatError) and error.missing and kind_of(path).words.startswith("text")
+        return _of_text(error, path) if is_asked else None
     if len(names) < 2:
         return None
     tables = [f for f in log_formats().values() if f.column_sets and issubclass(f.options, TextOptions)]
@@ -200,7 +227,27 @@ def _columns(path: Path, stated: Stated) -> FormatError | None:
         )
     likes = [(likeness(columns, names), f) for f in tables for columns in f.column_sets]
     like, nearest = max(likes, key=lambda one: one[0].rank)
+    if like.is_near and not like.unitless and not like.absent:
+        return _refused(nearest, path, stated)
     return _lacking(like, nearest, path) if like.is_near else None
+
+
+def _of_text(error: RoadscanError, path: Path) -> FormatError:
+    """What has to be stated before a text can be read at all, and the format with it."""
+    change = f'{error.change}, and format = "…" for this log (`roadscan formats` lists them)'
+    return FormatError(error.arrived, expected=error.expected, change=change, file=path)
+
+
+def _refused(nearest: LogFormat, path: Path, stated: Stated) -> FormatError:
+    """What the reader says of a text that has all columns of its format, and that its content test does not claim."""
+    opened, refusal = try_open(nearest, path, stated, _TRIALS)
+    said = f", and its reader says: {refusal.removeprefix(f'{path.resolve()}: ')}" if opened is None else ""
+    return FormatError(
+        f"the columns are those of {nearest.name}, but its content test does not claim the file{said}",
+        change=f'state format = "{nearest.name}" for this log',
+        file=path,
+        missing=Missing("format", nearest.name),
+    )
 
 
 def _lacking(like: Likeness, nearest: LogFormat, path: Path) -> FormatError:
@@ -231,7 +278,7 @@ def _named(path: Path, stated: Stated) -> FormatError | None:
             opened, refusal = try_open(candidate, path, stated, _TRIALS)
             if opened is None:
                 said = refusal.removeprefix(f"{path.resolve()}: ")
-                return FormatError(f"by its name it is {candidate.name}, by its content not: {said}", file=path)
+                return FormatError(f"by its name it is {candidate.name}, and its reader refuses it: {said}", file=path)
     return None
 
 

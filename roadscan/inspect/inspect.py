@@ -122,7 +122,12 @@ class LogReport:
     def header(self) -> dict[str, Any]:
         """Attributes that the log itself, or the user, states; what was assumed is left out."""
         assumed = {need.key.removeprefix("options.") for need in self.opened.needs}
-        hidden = {"clock": {"time_system"}, "crs": {"world_frame", "crs"}, "height": {"height"}, "unit": {"unit_m"}}
+        hidden = {
+            "clock": {"time_system"},
+            "crs": {"world_frame", "crs", "height", "horizontal_unit_m", "vertical_unit_m"},
+            "height": {"height"},
+            "unit": {"unit_m"},
+        }
         dropped = assumed.union(*(hidden.get(key, set()) for key in assumed))
         return {k: v for k, v in self.opened.header.attributes.items() if k not in dropped and v not in _EMPTY}
 

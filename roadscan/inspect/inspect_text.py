@@ -113,10 +113,9 @@ def _time(time: TimeSpan) -> Iterator[str]:
         yield f"starts {rest / NS_PER_S:,.3f} s into GPS week {week}"
         return
     unit = time.assumed.unit
-    digits = 6 if unit == "s" else 0
     of = " of the GPS week" if time.assumed.system is TimeSystem.GPS_WEEK else ""
     of = " past the full UTC hour" if time.is_past_the_hour else of
-    first, last = (f"{stamp:,.{digits}f}" for stamp in time.raw)
+    first, last = (f"{stamp:,.6f}" if unit == "s" else f"{round(stamp):,}" for stamp in time.raw)
     yield f"not known: stamps run from {first} to {last} {unit}{of}, {_duration(time.duration_s)}"
     for system, moment in time.would_be().items():
         yield f"  as {system} the first would be {moment}"
@@ -133,7 +132,8 @@ def _extent(extent: Extent, table: TableFigures, opened: OpenedLog) -> Iterator[
         box = ", ".join(
             f"{axis} {low:,.3f} to {high:,.3f}" for axis, low, high in zip("xyz", extent.low, extent.high, strict=True)
         )
-        unit = "in a unit that is not stated," if opened.needs_key("options.unit") else "m"
+        is_unknown = opened.needs_key("options.unit") or (opened.needs_key("crs") and extent.frame == LOCAL_WORLD)
+        unit = "in a unit that is not stated," if is_unknown else "m"
         yield f"{box} {unit} {frame}"
     if table.path_m:
         yield f"a way of {table.path_m:,.3f} m"

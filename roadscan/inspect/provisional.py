@@ -54,6 +54,9 @@ SENSOR_KINDS: Final[dict[str, SensorKind]] = {
 LOOKING_MAP_CRS: Final = "EPSG:3395"
 """Map that points in degrees are shown through; they are turned back into degrees."""
 
+_LOOKING_WEEK: Final = 1024
+"""GPS week that seconds of an unknown week are looked at in: the days before and after it are possible times, too."""
+
 MOST_TRIALS: Final = 120
 _MOST_REJECTS: Final = 50
 _ANY_DATUM_ERROR_M: Final = 1e9
@@ -171,12 +174,15 @@ def open_log(log_format: LogFormat, path: Path, stated: Stated, trials: int = MO
     Raises
     ------
     RoadscanError
-        if nothing that may be assumed opens the log: the reader's first refusal of the file itself, or its first one.
+        if nothing that may be assumed opens the log: the reader's first refusal of the file itself, or the first that
+        no assumption answers.
     """
     search = _Search(log_format, path, stated, trials)
     found = search.run(stated, {})
     if found is None:
-        raise search.fault or search.first_error or FormatError("the log cannot be read", file=path)
+        raise (
+            search.fault or search.unanswered or search.first_error or FormatError("the log cannot be read", file=path)
+        )
     return found
 
 
@@ -195,6 +201,8 @@ class _Search:
         self._trials = trials
         self._seen: set[Hashable] = set()
         self.first_error: RoadscanError | None = None
+        self.unanswered: RoadscanError | None = None
+        """The first refusal that nothing that may be assumed answers."""
         self.fault: FormatError | None = None
         """What is wrong with the file itself, whatever is stated."""
 
@@ -226,6 +234,7 @@ class _Search:
             found = self.run(changed, {dimension: error} | asked)
             if found is not None:
                 return found
+        self.unanswered = self.unanswered or error
         return None
 
     def _look(self, trial: Stated) -> tuple[LogSource, LogHeader]:
@@ -293,10 +302,10 @@ class _Search:
         units = sorted(UNIT_NS, key=lambda u: (u != unit, -UNIT_NS[u]))
         systems = [TimeSystem.FREE, *(s for s in TimeSystem if s == proposed.get("system")), *TimeSystem]
         if proposed.get("system") == TimeSystem.GPS_WEEK:  # only as such are stamps counted on over the week's end
-            yield dataclasses.replace(trial, clock=Clock(TimeSystem.GPS_WEEK, week=0))
+            yield dataclasses.replace(trial, clock=Clock(TimeSystem.GPS_WEEK, week=_LOOKING_WEEK))
         for system in dict.fromkeys(systems):
             if system is not TimeSystem.UTC_HOUR:
-                week = 0 if system is TimeSystem.GPS_WEEK else None
+                week = _LOOKING_WEEK if system is TimeSystem.GPS_WEEK else None
                 yield from (dataclasses.replace(trial, clock=_clock(system, u, week)) for u in units)
 
     def _frames(self, trial: Stated) -> Iterator[Stated]:
@@ -335,19 +344,33 @@ class _Search:
             for name in _options_of(error):
                 if name in self._format.options.model_fields and name not in trial.options:
                     yield Need(f"options.{name}", f'options.{name} = "????"', _reason(error), is_of_time=True)
+        of_file = self._refusal_of_file(trial, reasons)
         if trial.crs != self._stated.crs:
             without = dataclasses.replace(trial, crs=self._stated.crs)
-            yield Need("crs", 'crs = "????"', _reason(asked.get("crs") or self._refusal(without) or fallback))
+            reason = of_file or asked.get("crs") or self._refusal(without) or fallback
+            yield Need("crs", 'crs = "????"', _reason(reason))
         if trial.sensor != self._stated.sensor:
             yield Need("sensor", 'sensor = "????"', _reason(asked.get("sensor", fallback)))
         if trial.height != self._stated.height:
             yield Need("height", f'height = "{trial.height}"', _reason(asked.get("height", fallback)))
         answered: set[str] = set()
         for name, error in reasons.items():
-            if name not in answered:
-                need, names = self._option_need(name, error, trial)
+            of_crs = of_file if isinstance(error, CrsError) else None
+            is_consequence = of_crs is not None and name not in _options_of(of_crs)
+            if name not in answered and not is_consequence:
+                need, names = self._option_need(name, of_crs or error, trial)
                 answered |= names
                 yield need
+
+    def _refusal_of_file(self, trial: Stated, reasons: dict[str, RoadscanError]) -> RoadscanError | None:
+        """What the reader says of the CRS that the file itself names, where a setting is assumed beside a CRS: the
+        user states nothing that could contradict the file.
+        """
+        names = [name for name, error in reasons.items() if isinstance(error, CrsError)]
+        if trial.crs == self._stated.crs or not names:
+            return None
+        kept = {name: value for name, value in trial.options.items() if name not in names}
+        return self._refusal(dataclasses.replace(trial, crs=self._stated.crs, options=kept))
 
     def _option_need(self, name: str, error: RoadscanError, trial: Stated) -> tuple[Need, set[str]]:
         """The line for a setting, and all settings that it answers for: those that exclude each other are one need."""
@@ -363,7 +386,8 @@ class _Search:
         said = any(one.choices for one in error.asks_for(f"options.{name}"))
         choices = "" if said else " or ".join(toml(value) for value in option_choices(self._format, name))
         reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
-        return Need(f"options.{name}", f'options.{name} = "????"', reason, is_of_time), {name}
+        value = next((one.proposed for one in error.asks_for(f"options.{name}") if one.proposed is True), "????")
+        return Need(f"options.{name}", f"options.{name} = {toml(value)}", reason, is_of_time), {name}
 
 
 def sensor_kind(log_format: LogFormat) -> SensorKind | None:

@@ -223,18 +223,24 @@ def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, plain_units
     spellings = _spellings(quantity)
     fitting = [n for n in names if n.lower() in spellings]
     if len(fitting) > 1:
-        raise FormatError(
-            f"columns '{fitting[0]}' and '{fitting[1]}' both hold the {quantity.name}",
-            change=f'state which: columns = {{ {quantity.name} = {{ name = "{fitting[0]}" }} }}',
-            file=file,
-        )
+        raise _twice(quantity, fitting, file)
     if fitting:
         unit = spellings[fitting[0].lower()]
         return Found(fitting[0], UNITS[quantity.dimension][unit], unit)
     plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    if plain[1:] and quantity.name in plain_units:
+        raise _twice(quantity, plain, file)
     if plain and quantity.name in plain_units:
         return Found(plain[0], plain_units[quantity.name], "as stated")
     return None
+
+
+def _twice(quantity: Quantity, columns: list[str], file: Path) -> FormatError:
+    return FormatError(
+        f"columns '{columns[0]}' and '{columns[1]}' both hold the {quantity.name}",
+        change=f'state which: columns = {{ {quantity.name} = {{ name = "{columns[0]}" }} }}',
+        file=file,
+    )
 
 
 def _by_option(quantity: Quantity, option: ColumnOption, names: tuple[str, ...], file: Path) -> Found:

@@ -6,6 +6,7 @@ written. Both are counted in nanoseconds from 1970 on that scale, and the clock 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,17 +17,29 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from roadscan.model.errors import Missing, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.model.errors import FormatError, Missing, TimeSystemError
+from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
 from roadscan.sensors.records import Sieve
-from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, first_fields, stamp_kind
+from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, first_fields, is_number, stamp_kind
 
+Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-TIME: Final = Quantity("time", "time", ("timestamp", "stamp", "gps_time", "utc_time", "unix_time", "gpst_unix"))
+TIME: Final = Quantity(
+    "time", "time", ("timestamp", "stamp", "datetime", "date_time", "gps_time", "utc_time", "unix_time", "gpst_unix")
+)
 """Column of time stamps by its common names."""
+DATES: Final = ("date", "date_utc", "utc_date")
+"""Names of a column that holds the date where the column of stamps holds the time of day alone."""
+_TIME_OF_DAY: Final = re.compile(r"T?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?(?:Z|[+-]\d{2}:?\d{2})?")
+_UNIT_STAMPS: Final = 50
+"""Stamps that a unit is proposed by."""
+_OF_OUR_TIME_S: Final = (4.75e8, 2.524e9)
+"""Seconds from 1970 or 1980 that give a date between 1985 and 2060."""
+_SLOWEST_STEP_NS: Final = 2 * NS_PER_S
+"""Sensors of a survey write at least every two seconds."""
 CALENDAR_SCALES: Final = (TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TAI)
 """Scales that a calendar time without a zone can be written in."""
 
@@ -41,6 +54,13 @@ class StampColumn:
     """Clock of the numbers that :meth:`stamps` gives."""
     zoned: bool
     """Calendar times carry a zone."""
+    date: str | None = None
+    """Column of the date, where `column` holds the time of day alone."""
+
+    @property
+    def kinds(self) -> dict[str, Kind]:
+        """Kind of each column that the stamps are read from."""
+        return {self.column: self.kind} | ({} if self.date is None else {self.date: "text"})
 
     @classmethod
     def of(cls, source: LogSource, file: Path, layout: TextLayout, found: Found) -> Self:
@@ -54,19 +74,54 @@ class StampColumn:
         clock = source.any_clock
         kind = stamp_kind(file, layout, found.column, "s" if clock is None else clock.unit)
         if kind != "text":
-            clock = source.need_clock("gps", unit="s")
+            clock = source.need_clock("gps", unit=first_unit(file, layout, found))
             need_stamp_unit(found, clock, file)
             return cls(found.column, kind, clock, zoned=False)
         word = _first_word(file, layout, found.column)
+        date = _date_column(word, found.column, layout, file)
+        if date is not None:
+            word = f"{_first_word(file, layout, date)}T{word}"
         zoned = parse_calendar([word], zoned=True) is not None
+        named_utc = any("utc" in name.lower().split("_") for name in (found.column, date or ""))
+        is_utc = zoned or (named_utc and clock is None)
         stated = source.clock if zoned else clock
-        return cls(found.column, kind, calendar_clock(stated, word, file, zoned=zoned), zoned)
+        return cls(found.column, kind, calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc), zoned, date)
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> npt.NDArray[np.generic]:
         """Stamps (n,) of a block, float64 or int64, in the unit of `clock`; faulty ones are dropped from `sieve`."""
-        if self.kind == "text":
-            return calendar_ns(block.text(self.column), sieve, zoned=self.zoned)
-        return block.stamps(self.column)
+        if self.kind != "text":
+            return block.stamps(self.column)
+        words = block.text(self.column)
+        if self.date is not None:
+            words = [f"{date}T{time}" for date, time in zip(block.text(self.date), words, strict=True)]
+        return calendar_ns(words, sieve, zoned=self.zoned)
+
+
+def first_unit(path: Path, layout: TextLayout, found: Found) -> str:
+    """Unit that the stamps of a text table seem to be in: that of the column's name, else by :func:`likely_unit`."""
+    if found.unit in UNIT_NS:
+        return found.unit
+    index = layout.names.index(found.column)
+    words = [fields[index].strip() for fields in first_fields(path, layout, _UNIT_STAMPS)]
+    return likely_unit(np.array([float(word) for word in words if is_number(word)]))
+
+
+def likely_unit(stamps: Float64) -> str:
+    """Unit in which stamps (n,) would be of our time or, for small counts, at least one in two seconds.
+
+    It is good for a proposal alone.
+    """
+    if stamps.size == 0 or not np.isfinite(stamps).all():
+        return "s"
+    of_our_time = next(
+        (unit for unit, ns in UNIT_NS.items() if _OF_OUR_TIME_S[0] < stamps[0] * ns / NS_PER_S < _OF_OUR_TIME_S[1]), ""
+    )
+    steps = np.abs(np.diff(stamps))
+    steps = steps[steps > 0]
+    if of_our_time or steps.size == 0:
+        return of_our_time or "s"
+    units = sorted(UNIT_NS, key=lambda unit: -UNIT_NS[unit])
+    return next((unit for unit in units if np.median(steps) * UNIT_NS[unit] <= _SLOWEST_STEP_NS), units[-1])
 
 
 def _first_word(path: Path, layout: TextLayout, column: str) -> str:
@@ -75,8 +130,33 @@ def _first_word(path: Path, layout: TextLayout, column: str) -> str:
     return next((word for word in words if word), "")
 
 
-def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool) -> Clock:
+def _date_column(word: str, column: str, layout: TextLayout, file: Path) -> str | None:
+    """Column of the date that a time of day such as `word` belongs to; None where `word` is more than that.
+
+    Raises
+    ------
+    FormatError
+        if the file has no column of dates.
+    """
+    if not _TIME_OF_DAY.fullmatch(word):
+        return None
+    date = next((name for name in layout.names if name.lower() in DATES), None)
+    if date is None:
+        raise FormatError(
+            f"column '{column}' holds times of day such as '{word}', and no column holds the date",
+            expected="ISO 8601 text such as 2026-05-04T09:30:00.125Z, or a column 'date' such as 2026-05-04",
+            change="export the log with its date",
+            file=file,
+        )
+    return date
+
+
+def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, is_utc: bool = False) -> Clock:
     """Clock of calendar times such as `word`, counted in nanoseconds from 1970 on the scale they are written in.
+
+    Parameters
+    ----------
+    is_utc : the names of the columns say that the times are UTC, and no clock is stated.
 
     Raises
     ------
@@ -84,7 +164,7 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool) -
         if `word` is no calendar time, has a zone and the clock is not UTC, or has no zone and the
         clock does not say the scale.
     """
-    if zoned:
+    if zoned or (is_utc and parse_calendar([word], zoned=False) is not None):
         if clock is not None and clock.system is not TimeSystem.UNIX_UTC:
             raise TimeSystemError(
                 f"time '{word}' has a zone, so it is UTC, the clock says {clock.system}",
@@ -125,6 +205,7 @@ def parse_calendar(words: Sequence[str], *, zoned: bool) -> Int64 | None:
     """Nanoseconds (n,) from 1970 of ISO 8601 times that all have a zone, or all have none; None where one is not so."""
     kind = pa.timestamp("ns", "UTC") if zoned else pa.timestamp("ns")
     try:
-        return np.asarray(pc.cast(pa.array(words, pa.string()), kind).cast(pa.int64()), dtype=np.int64)
+        text = pc.replace_substring(pa.array(words, pa.string()), ",", ".")  # ISO 8601 allows a decimal comma
+        return np.asarray(pc.cast(text, kind).cast(pa.int64()), dtype=np.int64)
     except pa.ArrowInvalid:
         return None

@@ -2,19 +2,22 @@
 
 A record is one line. Blocks are parsed by Arrow; only a block in which Arrow stumbles is parsed
 line by line, which finds the lines at fault. Files compressed with gzip, bzip2 or xz are read as
-they are; offsets then count bytes of the text.
+they are; offsets then count bytes of the text. A text of UTF-16 with its byte order mark, or of lines
+that end with a carriage return alone, is read, too; offsets then count bytes of the same text in UTF-8.
 """
 
 from __future__ import annotations
 
 import bz2
+import codecs
 import csv
 import gzip
 import lzma
 import math
+import re
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final, Literal, TypeAlias, cast
 
@@ -23,7 +26,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from roadscan.model.errors import ConfigError, FormatError
+from roadscan.model.errors import ConfigError, FormatError, Missing
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Reject
 
@@ -43,6 +46,14 @@ Kind: TypeAlias = Literal["number", "integer", "text"]
 
 _ARROW_TYPES: Final[dict[Kind, pa.DataType]] = {"number": pa.float64(), "integer": pa.int64(), "text": pa.string()}
 _DELIMITERS: Final = (",", ";", "\t", "|")
+_UTF8: Final = "utf-8"
+_UTF16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
+"""Encodings by the byte order mark at a text's start."""
+_DECIMAL_LINES: Final = 200
+"""Lines of records whose numbers show the decimal mark."""
+_COMMA_NUMBER: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_MAY_BE_THOUSANDS: Final = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+"""A number whose comma may as well part the thousands: 648,500."""
 _DAMAGE: Final = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, OSError)
 
 
@@ -58,6 +69,43 @@ class TextOptions(Strict):
     """Lines above the line of column names."""
     names: list[str] | None = None
     """Names of the columns, for a file without a line of names."""
+    decimal: Literal[".", ","] | None = None
+    """Decimal mark of the numbers. Found from the first records where left out; it has to be stated where their commas
+    may part thousands as well."""
+    encoding: str | None = None
+    """Encoding of the text, such as "cp1252" (Windows, western Europe) or "latin-1". UTF-8, or UTF-16 with its byte
+    order mark, where left out."""
+
+
+@dataclass(frozen=True)
+class TextCoding:
+    """How the bytes of a text file become lines of UTF-8."""
+
+    encoding: str = _UTF8
+    """Name of Python's codec."""
+    ends_with_return: bool = False
+    """Lines end with a carriage return alone, as on an old Macintosh."""
+
+    @classmethod
+    def of(cls, head: bytes, encoding: str | None = None) -> TextCoding:
+        """Coding of the text that begins with `head`: by its byte order mark, or as stated."""
+        marked = next((name for mark, name in _UTF16.items() if head.startswith(mark)), None)
+        found = cls(encoding or marked or _UTF8)
+        text = found.decoded(head)
+        return replace(found, ends_with_return=b"\r" in text and b"\n" not in text)
+
+    def decoded(self, head: bytes) -> bytes:
+        """First bytes of a text as UTF-8 with line feeds; a character that is cut off at the end is left out."""
+        return b"".join(self.pieces([head]))
+
+    def pieces(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
+        """Pieces of the file's bytes as UTF-8 with line feeds. Bytes that are no text become U+FFFD."""
+        decode = None if self.encoding == _UTF8 else codecs.getincrementaldecoder(self.encoding)("replace").decode
+        for number, piece in enumerate(pieces):
+            data = piece if decode is None else decode(piece).encode("utf-8")
+            if number == 0 and decode is not None:
+                data = data.removeprefix(codecs.BOM_UTF8)
+            yield data.replace(b"\r", b"\n") if self.ends_with_return else data
 
 
 @dataclass(frozen=True)
@@ -70,6 +118,10 @@ class TextLayout:
     comment: str
     data_offset: int
     """Byte at which the first line behind the names starts."""
+    decimal: str = "."
+    """Decimal mark of the numbers."""
+    coding: TextCoding = TextCoding()
+    """How the file's bytes become lines of UTF-8."""
 
 
 @dataclass(frozen=True)
@@ -140,52 +192,143 @@ def text_layout(path: Path, options: TextOptions) -> TextLayout:
     ConfigError
         where an option is no single character.
     """
-    line, here, behind = _first_line(path, options)
-    delimiter = options.delimiter or _delimiter_of(line)
-    given = options.names
-    names = tuple(name.strip() for name in (_fields(line, delimiter) if given is None else given))
+    start = _start_of(path, options)
+    names = start.names if options.names is None else options.names
+    names = [name.strip() for name in names]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
         raise FormatError(f"two columns are called '{twice}'", change="rename one, or state names", file=path)
-    return TextLayout(names, delimiter, options.comment, behind if given is None else here)
+    offset = start.data_offset if options.names is None else start.offset
+    layout = TextLayout(tuple(names), start.delimiter, options.comment, offset, coding=start.coding)
+    return replace(layout, decimal=options.decimal or _decimal_of(path, layout))
 
 
 def first_words(path: Path, options: TextOptions) -> tuple[str, list[str]]:
-    """Delimiter and fields of the first line that counts, names or not. Raises as :func:`text_layout`."""
-    line, _, _ = _first_line(path, options)
-    delimiter = options.delimiter or _delimiter_of(line)
-    return delimiter, _fields(line, delimiter)
+    """Delimiter and fields of the line of names, or of the first record where no line names the columns.
+
+    Raises as :func:`text_layout`.
+    """
+    start = _start_of(path, options)
+    return start.delimiter, start.names
 
 
-def _first_line(path: Path, options: TextOptions) -> tuple[str, int, int]:
-    """First line that is neither skipped, blank nor a comment; the bytes where it starts and ends."""
+def first_record(path: Path, options: TextOptions) -> list[str]:
+    """Fields of the first line that is no comment, names or not. Raises as :func:`text_layout`."""
+    return _start_of(path, options).fields
+
+
+@dataclass(frozen=True)
+class _Start:
+    """The first line of a table that counts."""
+
+    fields: list[str]
+    names: list[str]
+    """Its fields, or those of the comment above it that names the columns."""
+    delimiter: str
+    offset: int
+    """Byte at which it starts."""
+    data_offset: int
+    """Byte at which the first record starts, if `names` are names."""
+    coding: TextCoding
+
+
+def _start_of(path: Path, options: TextOptions) -> _Start:
+    """First line that is neither skipped, blank nor a comment; with the comment above it that names its columns."""
     for name, value in (("delimiter", options.delimiter), ("comment", options.comment)):
         if value and (len(value) > 1 or not value.isascii() or value in '"\r\n'):
             raise ConfigError(f"{name} = {value!r}", expected="one character, no quote or line end", file=path)
-    head = head_of(path)
-    offset = 3 if head.startswith(b"\xef\xbb\xbf") else 0
-    skip = options.skip_lines
+    coding = _coding_of(path, options.encoding)
+    head = coding.decoded(head_of(path))
+    offset = 3 if head.startswith(codecs.BOM_UTF8) else 0
+    skip, above = options.skip_lines, ""
     for raw in head[offset:].splitlines(keepends=True) or [b"\x00"]:
         if b"\x00" in raw:
             raise FormatError("the file holds no text", expected="lines with columns", file=path)
         line = raw.strip()
         comment = bool(options.comment) and line.startswith(options.comment.encode())
         if skip <= 0 and line and not comment:
-            if offset + len(raw) >= HEAD_BYTES and not raw.endswith((b"\n", b"\r")):
+            behind = offset + len(raw)
+            if behind >= HEAD_BYTES and not raw.endswith((b"\n", b"\r")):
                 raise FormatError(
                     f"the line of column names does not end within {HEAD_BYTES:,} bytes", expected="names", file=path
                 )
-            try:
-                return line.decode("utf-8"), offset, offset + len(raw)
-            except UnicodeDecodeError as error:
-                raise FormatError("the line of column names is not UTF-8", expected="text", file=path) from error
+            text = _decoded_names(line, path)
+            delimiter = options.delimiter or _delimiter_of(text)
+            fields = _fields(text, delimiter)
+            named = _named_by_comment(above, fields, delimiter)
+            if named is not None:
+                return _Start(fields, named, delimiter, offset, offset, coding)
+            return _Start(fields, fields, delimiter, offset, behind, coding)
+        if comment and skip <= 0:
+            above = line.decode("utf-8", errors="replace").lstrip(options.comment)
         skip -= 1
         offset += len(raw)
     raise FormatError("the file holds no line of column names", expected="names, then records", file=path)
 
 
+def _coding_of(path: Path, encoding: str | None) -> TextCoding:
+    try:
+        "".encode(encoding or _UTF8)  # knows encodings of text only
+        return TextCoding.of(head_of(path), encoding)
+    except LookupError as error:
+        raise ConfigError(
+            f"options.encoding = {encoding!r} is no known encoding", expected='such as "cp1252"', file=path
+        ) from error
+
+
+def _decoded_names(line: bytes, path: Path) -> str:
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            f"byte {line[error.start]:#04x} of the line of column names is not UTF-8",
+            expected="UTF-8, or the encoding in options.encoding",
+            change='state options.encoding = "cp1252" if a Windows program of western Europe wrote it',
+            file=path,
+            missing=Missing("options.encoding", "cp1252"),
+        ) from error
+
+
+def _named_by_comment(comment: str, fields: list[str], delimiter: str) -> list[str] | None:
+    """Names of columns in the comment above the first record: as many words, one for each of its fields; else None."""
+    numbers = sum(not math.isnan(_number(field.strip().replace(",", "."))) for field in fields)
+    names = [name.strip() for name in _fields(comment.strip(), delimiter)]
+    if len(names) != len(fields) or len(names) < 2 or 2 * numbers < len(fields):
+        return None
+    is_named = all(names) and len(set(names)) == len(names) and all(math.isnan(_number(name)) for name in names)
+    return names if is_named else None
+
+
+def _decimal_of(path: Path, layout: TextLayout) -> str:
+    """Decimal mark of the first records' numbers.
+
+    Raises
+    ------
+    FormatError
+        where a comma in each of them may be a decimal mark, or part the thousands.
+    """
+    if layout.delimiter == ",":
+        return "."
+    words = [word.strip() for fields in first_fields(path, layout, _DECIMAL_LINES) for word in fields]
+    commas = [word for word in words if _COMMA_NUMBER.fullmatch(word)]
+    points = any("." in word and not math.isnan(_number(word)) for word in words)
+    if not commas or points:
+        return "."
+    if all(_MAY_BE_THOUSANDS.fullmatch(word) for word in commas):
+        raise FormatError(
+            f"the comma of '{commas[0]}' is a decimal mark, or parts the thousands: no number of the file tells which",
+            expected="options.decimal",
+            change='state options.decimal = "," if it is the decimal mark; export without it otherwise',
+            file=path,
+            missing=Missing("options.decimal", ",", (",", ".")),
+        )
+    return ","
+
+
 def _delimiter_of(line: str) -> str:
     counts = {delimiter: line.count(delimiter) for delimiter in _DELIMITERS}
+    if any(counts[one] for one in _DELIMITERS if one != ","):
+        counts[","] -= len(re.findall(r"(?<=\d),(?=\d)", line))  # decimal commas between another delimiter
     most = max(_DELIMITERS, key=lambda delimiter: counts[delimiter])
     return most if counts[most] else " "
 
@@ -193,13 +336,14 @@ def _delimiter_of(line: str) -> str:
 def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[str]]:
     """Fields of the first `lines` lines that have as many fields as there are names."""
     found: list[list[str]] = []
-    for raw in head_of(path, layout.data_offset + HEAD_BYTES)[layout.data_offset :].splitlines():
+    head = layout.coding.decoded(head_of(path, 2 * layout.data_offset + HEAD_BYTES))
+    for raw in head[layout.data_offset :].splitlines():
         if len(found) == lines:
             break
         text = raw.decode("utf-8", errors="replace").strip()
         fields = _fields(text, layout.delimiter)
         if len(fields) == len(layout.names) and not (layout.comment and text.startswith(layout.comment)):
-            found.append(fields)
+            found.append([_with_point(field, layout.decimal) for field in fields])
     return found
 
 
@@ -238,7 +382,7 @@ def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> It
     a block of some 1 MB of text.
     """
     record = 0
-    for offset, data in line_blocks(path, layout.data_offset):
+    for offset, data in line_blocks(path, layout.data_offset, coding=layout.coding):
         if isinstance(data, Reject):
             yield Reject(data.reason, record, offset)
             record += 1
@@ -276,7 +420,9 @@ def parse_lines(
         yield from _parse_singly(data, starts, ends, layout, kinds, records, offsets)
 
 
-def line_blocks(path: Path, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, bytes | Reject]]:
+def line_blocks(
+    path: Path, start: int = 0, limit: int | None = None, coding: TextCoding | None = None
+) -> Iterator[tuple[int, bytes | Reject]]:
     """Pieces of whole lines from byte `start` of the text on, each with its offset.
 
     A reject stands for a line without end, or for all that follows the break of a compressed stream.
@@ -284,9 +430,10 @@ def line_blocks(path: Path, start: int = 0, limit: int | None = None) -> Iterato
     Parameters
     ----------
     limit : bytes of the text after which no more is read.
+    coding : how the bytes become UTF-8; as they are where left out.
     """
     carry, offset, skipping = b"", 0, False
-    for chunk in byte_pieces(path):
+    for chunk in byte_pieces(path) if coding is None else _coded_pieces(path, coding):
         if isinstance(chunk, Reject):
             yield offset, chunk
             return
@@ -332,6 +479,20 @@ def byte_pieces(path: Path) -> Iterator[bytes | Reject]:
                 break
         if broken is not None:
             yield broken
+
+
+def _coded_pieces(path: Path, coding: TextCoding) -> Iterator[bytes | Reject]:
+    broken: list[Reject] = []
+
+    def sound() -> Iterator[bytes]:
+        for piece in byte_pieces(path):
+            if isinstance(piece, Reject):
+                broken.append(piece)
+                return
+            yield piece
+
+    yield from coding.pieces(sound())
+    yield from broken
 
 
 def _lines(data: bytes, comment: str) -> tuple[Int64, Int64]:
@@ -381,6 +542,7 @@ def _parse(data: bytes, layout: TextLayout, kinds: Mapping[str, Kind], lines: in
                 include_columns=list(kinds),
                 column_types={name: _ARROW_TYPES[kind] for name, kind in kinds.items()},
                 null_values=[""],
+                decimal_point=layout.decimal,
                 strings_can_be_null=False,
             ),
         )
@@ -409,9 +571,11 @@ def _parse_singly(
             fields = _fields(data[a:b].decode("utf-8").rstrip("\r\n"), layout.delimiter)
             if len(fields) != len(layout.names):
                 raise ValueError(f"{len(fields)} fields, expected {len(layout.names)}")
-            row = {name: _value(name, fields[where[name]], kind) for name, kind in kinds.items()}
+            row = {name: _value(name, fields[where[name]], kind, layout.decimal) for name, kind in kinds.items()}
         except UnicodeDecodeError:
-            yield Reject("the line is not UTF-8 text", int(records[i]), int(offsets[i]))
+            yield Reject(
+                "the line is not UTF-8 text, and options.encoding states no other", int(records[i]), int(offsets[i])
+            )
             continue
         except ValueError as error:
             yield Reject(str(error), int(records[i]), int(offsets[i]))
@@ -434,11 +598,16 @@ def _fields(line: str, delimiter: str) -> list[str]:
     return rows[0] if len(rows) == 1 else []
 
 
-def _value(name: str, word: str, kind: Kind) -> float | int | str | None:
+def _with_point(word: str, decimal: str) -> str:
+    """A number with a point for its decimal comma; any other word as it is."""
+    return word.replace(",", ".") if decimal == "," and _COMMA_NUMBER.fullmatch(word.strip()) else word
+
+
+def _value(name: str, word: str, kind: Kind, decimal: str) -> float | int | str | None:
     """One field, or ValueError saying what is wrong with it."""
     if kind == "text":
         return word
-    word = word.strip()
+    word = _with_point(word.strip(), decimal)
     if kind == "number":
         if not word:
             return None
@@ -449,6 +618,11 @@ def _value(name: str, word: str, kind: Kind) -> float | int | str | None:
     if not (word.isascii() and word.lstrip("+-").isdigit() and len(word) < 20 and -(2**63) <= int(word) < 2**63):
         raise ValueError(f"{name} '{word[:40]}' is not a whole number")
     return int(word)
+
+
+def is_number(word: str) -> bool:
+    """True for a number as written in data files."""
+    return math.isfinite(_number(word))
 
 
 def _number(word: str) -> float:

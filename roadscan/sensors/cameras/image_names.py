@@ -15,7 +15,7 @@ from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import Clock
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.records import Sieve
-from roadscan.sensors.stamps import calendar_clock, calendar_ns
+from roadscan.sensors.stamps import calendar_clock, calendar_ns, likely_unit
 
 _NUMBER: Final = r"(?P<stamp>\d{1,19}(?:\.\d{1,12})?)"
 _DIRECTIVES: Final = {
@@ -87,7 +87,7 @@ class NamePattern:
     def clock(self, source: LogSource, word: str) -> Clock:
         """Clock of the numbers that :meth:`stamps` gives; raises as the clock of a text column does."""
         if "stamp" in self.expression.groupindex:
-            return source.need_clock("unix_utc", unit="ns")
+            return source.need_clock("unix_utc", unit=likely_unit(np.array([float(word)])))
         return calendar_clock(source.clock, word, source.path, zoned="z" in self.expression.groupindex)
 
     def stamps(self, words: Sequence[str], sieve: Sieve) -> npt.NDArray[np.generic]:

@@ -17,7 +17,8 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
-from roadscan.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image
+from roadscan.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image, time_taken
+from roadscan.model.counted import counted
 from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.model.strict import Strict
@@ -196,7 +197,7 @@ class _StampTable:
     @property
     def kinds(self) -> dict[str, Kind]:
         """Columns to read, and their kinds."""
-        return {self.file_column: "text", self.stamps.column: self.stamps.kind}
+        return {self.file_column: "text"} | self.stamps.kinds
 
 
 def _table(path: Path, options: ImagesOptions) -> tuple[TextLayout, dict[str, Found]]:
@@ -216,10 +217,24 @@ def _only_table(folder: Path, options: ImagesOptions) -> tuple[Path, TextLayout,
         return found[0]
     names = " and ".join(path.name for path, _, _ in found)
     raise ConfigError(
-        f"the folder holds {len(found)} tables of stamps ({names})" if found else "the images' stamps are not stated",
+        f"the folder holds {len(found)} tables of stamps ({names})" if found else _without_stamps(folder),
         expected='options.stamps = "…csv" with columns file and time, or options.pattern for stamps in names',
         file=folder,
         missing=[Missing("options.stamps"), Missing("options.pattern")],
+    )
+
+
+def _without_stamps(folder: Path) -> str:
+    """What a folder without a table of stamps holds, and what its first image says of its time."""
+    images = _images(folder)
+    said = f"the folder holds {counted(len(images), 'image')}, and the images' stamps are not stated"
+    first = next(iter(images.values()), None)
+    taken = "" if first is None else time_taken(first)
+    if first is None or not taken:
+        return said
+    return (
+        f"{said}; the EXIF tags of {first.name} say {taken} on the camera's own clock, which is too coarse to find "
+        "the pose of a moving vehicle"
     )
 
 

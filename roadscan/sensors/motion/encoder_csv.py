@@ -340,7 +340,7 @@ def _plan(source: LogSource) -> _Plan:
     time, wheel_column, wheels = _columns(layout.names, options, source.path)
     stamps = StampColumn.of(source, source.path, layout, time)
     kinds: dict[str, Kind] = {found.column: "number" for wheel in wheels for found in wheel.columns.values()}
-    kinds[stamps.column] = stamps.kind
+    kinds |= stamps.kinds
     words = [] if wheel_column is None else [wheel_column]
     if options.direction is not None:
         words.append(named_column("the direction", options.direction.column, (), layout.names, source.path))

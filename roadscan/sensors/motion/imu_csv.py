@@ -183,7 +183,7 @@ def _plan(source: LogSource) -> _Plan:
     columns = _find(used, layout.names, options, source.path)
     stamps = StampColumn.of(source, source.path, layout, columns[TIME.name])
     kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
-    kinds[stamps.column] = stamps.kind
+    kinds |= stamps.kinds
     sign = -1.0 if options.reads_gravity else 1.0
     return _Plan(
         layout,

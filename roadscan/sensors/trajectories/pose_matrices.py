@@ -16,6 +16,7 @@ from roadscan.model.gpstime import Clock
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.columns import need_stamp_unit, stamp_column
 from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.stamps import first_unit
 from roadscan.sensors.text_table import (
     Kind,
     TextBlock,
@@ -117,8 +118,8 @@ def _plan(source: LogSource) -> _Plan:
             change="state the names of all columns, in their order, in options.names",
             file=source.path,
         )
-    clock = source.need_clock("unix_utc", unit="s")
     stamp = stamp_column(options.stamp, layout.names, STAMPS, source.path)
+    clock = source.need_clock("unix_utc", unit=first_unit(source.path, layout, stamp))
     need_stamp_unit(stamp, clock, source.path)
     kinds: dict[str, Kind] = dict.fromkeys((*MATRIX, *TRANSLATION), "number")
     kinds[stamp.column] = number_stamp_kind(source.path, layout, stamp.column, clock.unit)

@@ -13,15 +13,17 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.model.errors import FormatError
-from roadscan.model.gpstime import Clock
+from roadscan.model.gpstime import UNIT_NS, Clock
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.column_table import Lost, is_number, need_table
 from roadscan.sensors.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
 from roadscan.sensors.records import Sieve, options_of
+from roadscan.sensors.stamps import first_unit, likely_unit
 from roadscan.sensors.text_table import (
     Kind,
     TextOptions,
     first_fields,
+    first_record,
     first_words,
     number_stamp_kind,
     text_blocks,
@@ -127,7 +129,7 @@ def _plan(source: LogSource) -> _Plan:
     axes = options.axes
     if axes is None and source.path.name == AV2_NAME and set(table.names) == set(AV2_COLUMNS):
         axes = AV2_AXES
-    clock = source.need_clock("unix_utc", unit="ns")
+    clock = source.need_clock("unix_utc", unit=table.stamp_unit(stamp))
     need_stamp_unit(stamp, clock, source.path)
     return _Plan(
         table=table,
@@ -177,6 +179,10 @@ class _Table(ABC):
         """True if no column holds words, and numbers without names look like poses."""
 
     @abstractmethod
+    def stamp_unit(self, stamp: Found) -> str:
+        """Unit that the stamps seem to be in, to be proposed."""
+
+    @abstractmethod
     def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
         """Stream the columns of stamp (in `unit`), quaternion and translation."""
 
@@ -187,6 +193,8 @@ class _Text(_Table):
     def __init__(self, path: Path, options: TextOptions) -> None:
         self._path = path
         delimiter, words = first_words(path, options)
+        is_named = set(QUATERNION) <= set(words)
+        words = words if is_named else first_record(path, options)
         self._tum = options.names is None and delimiter == " " and len(words) == len(TUM_NAMES) and _are_numbers(words)
         named = options.model_copy(update={"names": list(TUM_NAMES)}) if self._tum else options
         self._layout = text_layout(path, named)
@@ -202,6 +210,9 @@ class _Text(_Table):
         with np.errstate(over="ignore"):
             length = np.linalg.norm(values[:, 4:], axis=1)
         return len(lines) > 0 and bool(np.all(np.abs(length - 1) < 1e-3))
+
+    def stamp_unit(self, stamp: Found) -> str:
+        return first_unit(self._path, self._layout, stamp)
 
     def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
         kinds: dict[str, Kind] = {columns[part]: "number" for part in (*QUATERNION, *TRANSLATION)}
@@ -231,6 +242,14 @@ class _Columnar(_Table):
 
     def looks_like_poses(self) -> bool:
         return all(is_number(field.type) for field in self._table.schema)
+
+    def stamp_unit(self, stamp: Found) -> str:
+        if stamp.unit in UNIT_NS:
+            return stamp.unit
+        first = next((part for _, part in self._table.parts(BATCH_ROWS, [stamp.column])), None)
+        if first is None or isinstance(first, Lost) or not is_number(first.schema.field(0).type):
+            return "s"
+        return likely_unit(np.asarray(first.column(0).cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)))
 
     def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
         for name in columns.values():

@@ -83,7 +83,7 @@ class TrajectoryCsv(LogFormat):
         """True if all columns of a trajectory are there with units in their names."""
         layout = sniff_layout(path)
         return layout is not None and any(
-            fits((TIME, *position, *ATTITUDE), layout.names) for position in (GEODETIC, GRID, LOCAL)
+            fits((TIME, *position, *ATTITUDE), layout.names, (TIME.name,)) for position in (GEODETIC, GRID, LOCAL)
         )
 
     def header(self, source: LogSource) -> LogHeader:
@@ -110,8 +110,9 @@ def _plan(source: LogSource) -> _Plan:
     placement = level_placement(source, options.heading)
     crs = source.need_crs()
     layout = text_layout(source.path, options)
-    columns = find_columns((TIME, *pose_quantities(crs)), layout.names, options.columns, source.path)
+    plain = {TIME.name: 1.0}  # the clock states its unit, or it is text
+    columns = find_columns((TIME, *pose_quantities(crs)), layout.names, options.columns, source.path, plain)
     stamps = StampColumn.of(source, source.path, layout, columns["time"])
     kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
-    kinds[stamps.column] = stamps.kind
+    kinds |= stamps.kinds
     return _Plan(layout, columns, crs, kinds, stamps, placement)

@@ -1,0 +1,218 @@
+"""Texts as other programs write them: calendar times, decimal commas, other encodings and line ends, commented names.
+
+Each is read where it can be understood without a guess, and named with the way out where it cannot. The epochs are
+those of `faults/README.md`: 2026-05-04T09:30:00Z is GPS ns 1461922218000000000.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+import roadscan as rs
+from tests.answers import roadscan
+
+FIRST_GPS_NS = 1_461_922_218_000_000_000
+NAMES = "time,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"
+SURVEY = """
+id = "x"
+map = {{ crs = "EPSG:32632" }}
+[[runs]]
+id = "one"
+[[runs.logs]]
+path = "{name}"
+format = "trajectory_csv"
+crs = "EPSG:4979"
+{clock}
+"""
+
+
+def poses(stamp: Callable[[int], str], names: str = NAMES) -> str:
+    rows = [f"{stamp(k)},48.{k:06d},9.0,300.{k},0.5,0,10" for k in range(20)]
+    return "\n".join([names, *rows, ""])
+
+
+def utc(k: int) -> str:
+    return f"2026-05-04T09:30:{k / 10:04.1f}Z"
+
+
+CSV = poses(utc)
+DATED = poses(lambda k: f"2026-05-04,09:30:{k / 10:04.1f}", NAMES.replace("time", "date,time_utc"))
+
+READ: dict[str, bytes] = {
+    "time": CSV.encode(),
+    "timestamp": CSV.replace("time", "timestamp", 1).encode(),
+    "datetime": CSV.replace("time", "DateTime", 1).encode(),
+    "time_s": CSV.replace("time", "time_s", 1).encode(),
+    "offset from UTC": poses(lambda k: utc(k).replace("T09", "T11").replace("Z", "+02:00")).encode(),
+    "date and time_utc": DATED.encode(),
+    "a byte order mark": b"\xef\xbb\xbf" + CSV.encode(),
+    "UTF-16 LE": b"\xff\xfe" + CSV.encode("utf-16-le"),
+    "UTF-16 BE": b"\xfe\xff" + CSV.encode("utf-16-be"),
+    "carriage returns": CSV.replace("\n", "\r").encode(),
+    "carriage returns and line feeds": CSV.replace("\n", "\r\n").encode(),
+    "names behind a #": ("# exported by a program\n# " + CSV).encode(),
+    "decimal commas": CSV.replace(",", ";").replace(".", ",").encode(),
+}
+
+
+@pytest.mark.parametrize("content", READ.values(), ids=READ)
+def test_a_survey_reads_what_other_programs_write(tmp_path: Path, content: bytes) -> None:
+    """The file is claimed by its content, asks for its CRS alone, and its poses have the times that it states."""
+    (tmp_path / "t.csv").write_bytes(content)
+    (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock=""))
+    (looked,) = json.loads(roadscan("inspect", tmp_path / "t.csv", "--json").stdout)
+    assert looked["formats"] == ["trajectory_csv"]
+    assert [need["key"] for need in looked["log"]["to_state"]] == ["crs"]
+    assert looked["faults"] == []
+    done = roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    table = rs.open_survey(tmp_path / "SURVEY.toml").table("trajectory")
+    assert table.epoch_gps_ns.tolist() == [FIRST_GPS_NS + 100_000_000 * k for k in range(20)]
+    assert np.allclose(np.ptp(table.z_world_m), 19e-6 * 111e3 * np.cos(np.radians(48)), atol=0.8)
+
+
+def test_files_of_the_faults(faults: Path) -> None:
+    for name, step_ns in (("iso_time", 100_000_000), ("iso_timestamp", 500_000_000), ("iso_z", 100_000_000)):
+        (found,) = json.loads(roadscan("inspect", faults / "iso_time_message" / f"{name}.csv", "--json").stdout)
+        time = found["log"]["time"]
+        assert (time["first_gps_ns"], time["last_gps_ns"]) == (FIRST_GPS_NS, FIRST_GPS_NS + step_ns), name
+
+
+def words_of(*arguments: str | Path) -> str:
+    return " ".join(roadscan("inspect", *arguments).output.split())
+
+
+def test_a_calendar_time_without_a_zone_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(CSV.replace("Z", ""))
+    assert "clock = { system = \"unix_utc\" } time '2026-05-04T09:30:00.0' has no zone" in words_of(path)
+    (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock='clock = { system = "unix_gps" }'))
+    assert roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0").exit_code == 0
+    table = rs.open_survey(tmp_path / "SURVEY.toml").table("trajectory")
+    assert table.epoch_gps_ns.min() == FIRST_GPS_NS - 18_000_000_000  # 18 leap seconds lie between UTC and GPS time
+
+
+POINTS = "name;easting;northing;height\n"
+NAMED: dict[str, tuple[bytes, list[str]]] = {
+    "a time of day alone": (
+        poses(lambda k: utc(k)[11:]).encode(),
+        ["column 'time' holds times of day such as '09:30:00.0Z', and no column holds the date"],
+    ),
+    "commas that may part thousands": (
+        (POINTS + "a;500,100;600,200;300,100\nb;501,100;600,200;300,000\n").encode(),
+        ["the comma of '500,100' is a decimal mark, or parts the thousands", 'options.decimal = ","'],
+    ),
+    "names in CP1252": (
+        "Punkt;Höhe_m\na;1,5\n".encode("cp1252"),
+        ["byte 0xf6 of the line of column names is not UTF-8", 'options.encoding = "cp1252"'],
+    ),
+    "two columns of time": (
+        CSV.replace("time,", "time,stamp,", 1).replace("Z,", "Z,1,").encode(),
+        ["columns 'time' and 'stamp' both hold the time", 'columns = { time = { name = "time" } }'],
+    ),
+}
+
+
+@pytest.mark.parametrize(("content", "said"), NAMED.values(), ids=NAMED)
+def test_what_cannot_be_understood_is_named_with_the_way_out(tmp_path: Path, content: bytes, said: list[str]) -> None:
+    (tmp_path / "t.csv").write_bytes(content)
+    words = words_of(tmp_path / "t.csv")
+    assert [part for part in said if part not in words] == [], words
+    assert "but ;" not in words
+    assert "such as ;" not in words
+
+
+def test_an_umlaut_of_windows_is_read_once_its_encoding_is_stated(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_bytes(
+        (
+            POINTS.replace("height", "height_m") + "Mühle;3500100,25;5400200,5;300,125\nb;3501100,1;5600200,5;300\n"
+        ).encode("cp1252")
+    )
+    assert "the line is not UTF-8 text, and options.encoding states no other" in words_of(path)
+    stated = ("--crs", "EPSG:25832", "--option", "role=gcp", "--option", "encoding=cp1252", "--json")
+    (found,) = json.loads(roadscan("inspect", path, *stated).stdout)
+    assert (found["error"], found["faults"]) == (None, [])
+    assert found["log"]["tables"]["control_points"]["rows"] == 2
+
+
+TUM = "\n".join(f"{1_305_031_102.175304 + k * 0.01:.6f} {k * 0.1:.4f} 0 0 0 0 0 1" for k in range(30)) + "\n"
+STAMPS: dict[str, tuple[str, str]] = {
+    "TUM in seconds": (TUM, "s"),
+    "TUM with a line of names": ("# ground truth\n# timestamp tx ty tz qx qy qz qw\n" + TUM, "s"),
+    "TUM in nanoseconds": (
+        "\n".join(f"{1_305_031_102_175_304_001 + k * 10**7} {k} 0 0 0 0 0 1" for k in range(9)),
+        "ns",
+    ),
+    "TUM from 0": ("\n".join(f"{k * 0.01:.2f} {k * 0.1:.4f} 0 0 0 0 0 1" for k in range(30)), "s"),
+    "milliseconds of a week": (poses(lambda k: f"{32_018_000 + 100 * k}"), "ms"),
+    "seconds of a Sunday": (poses(lambda k: f"{32_018 + k / 10:.1f}"), "s"),
+}
+
+
+@pytest.mark.parametrize(("content", "unit"), STAMPS.values(), ids=STAMPS)
+def test_the_unit_of_stamps_is_proposed_by_what_they_are(tmp_path: Path, content: str, unit: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(content)
+    (found,) = json.loads(roadscan("inspect", path, "--json").stdout)
+    needs = {need["key"]: need["line"] for need in found["log"]["to_state"]}
+    assert needs["clock"] == f'clock = {{ system = "????", unit = "{unit}" }}'
+    assert found["faults"] == []
+    rate_hz = next(iter(found["log"]["tables"].values()))["rate_hz"]
+    assert 9 < rate_hz < 101
+    if "Sunday" in str(found["log"]["time"]["would_be"]):
+        assert found["log"]["time"]["would_be"]["gps_week_seconds"] == "Sunday 08:53:38 GPS time" or unit == "s"
+
+
+def test_stamps_of_a_sunday_are_times(faults: Path) -> None:
+    """LAS keeps seconds of the GPS week; below 86,400 they are a Sunday's."""
+    (found,) = json.loads(roadscan("inspect", faults / "plane_week_seconds_sunday.laz", "--json").stdout)
+    assert found["faults"] == []
+    assert found["log"]["tables"]["cloud"]["rows"] == 28_185
+    assert found["log"]["time"]["would_be"]["gps_week_seconds"] == "Sunday 12:06:59 GPS time"
+
+
+def test_no_statement_is_blamed_that_nobody_made(faults: Path) -> None:
+    for name in ("autzen_dd_epsg4326.las", "mississippi_navd88_feet_keys.las"):
+        words = words_of(faults / name)
+        assert "the survey file says the points are in local" not in words
+        assert "neither the file nor the survey file says" not in words
+
+
+def pictures(folder: Path, taken: str = "") -> Path:
+    folder.mkdir()
+    for k in range(3):
+        path = folder / f"DSC_{k:04d}.jpg"
+        cv2.imwrite(str(path), np.full((48, 64, 3), 20 * k, np.uint8))
+        if taken:
+            exif = Image.Exif()
+            exif[ExifTags.Base.DateTime] = taken
+            Image.open(path).save(path, exif=exif)
+    return folder
+
+
+def test_a_folder_of_pictures_says_which_stamps_it_needs(tmp_path: Path) -> None:
+    words = words_of(pictures(tmp_path / "plain"))
+    assert "the folder holds 3 images, and the images' stamps are not stated" in words
+    assert "options.stamps" in words
+    assert "options.pattern" in words
+    assert "2026:05:04 11:30:00 on the camera's own clock" in words_of(
+        pictures(tmp_path / "dated", "2026:05:04 11:30:00")
+    )
+    assert "one picture is no log" in words_of(tmp_path / "plain" / "DSC_0000.jpg")
+
+
+def test_other_files_say_what_to_do(faults: Path) -> None:
+    said: dict[str, Any] = {"track.gpx": "a GPX track", "ublox_ubx_nmea_mixed.log": "u-blox"}
+    for name, part in said.items():
+        words = words_of(faults / name)
+        assert part in words
+        assert "NMEA" in words

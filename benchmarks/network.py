@@ -92,7 +92,7 @@ class Region:
             survey=survey,
             store=Store(str(folder / "store"), "region"),
             records=(),
-            ground=Ground(survey.config.map.frame(), grid, HeightLimits(), survey.config.navigation.max_gap_s),
+            ground=Ground(survey.frame(), grid, HeightLimits(), survey.config.navigation.max_gap_s),
             sources=tuple(sources),
             passes=tuple(passes),
             centre_lines=None,

@@ -68,6 +68,10 @@ class Mistake:
     """File that must not be read."""
 
 
+_PROJ_FOLDERS = " or ".join([*pyproj.datadir.get_data_dir().split(os.pathsep), pyproj.datadir.get_user_data_dir()])
+"""Where PROJ keeps grids, as messages name it."""
+
+
 def write_survey(folder: Path, mistake: Mistake) -> Path:
     """Write a survey with a mistake; returns its file."""
     write_poses(folder / "poses.csv", FIRST_GPS_S)
@@ -109,7 +113,7 @@ def printed(mistake: Mistake, folder: Path) -> tuple[int, str]:
     write_survey(folder, mistake)
     with contextlib.chdir(folder), _denied(mistake.denied):
         code, text = run(*mistake.command)
-    return code, text.replace(f"{folder.resolve()}{os.sep}", "").replace(pyproj.datadir.get_data_dir(), "PROJ's own")
+    return code, text.replace(f"{folder.resolve()}{os.sep}", "").replace(_PROJ_FOLDERS, "PROJ's own")
 
 
 def run(*arguments: str) -> tuple[int, str]:

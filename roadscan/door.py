@@ -452,7 +452,7 @@ def read_log(
     found = format_of(file) if format is None else format_named(format)
     source = LogSource(
         path=file, options=found.options.parse(dict(options or {}), file=file), clock=_clock(clock), sensor=None,
-        crs=crs, height=height, geoid=None if geoid is None else Geoid(geoid), map=None,
+        crs=crs, height=height, geoid=None if geoid is None else Geoid.found(geoid), map=None,
     )  # fmt: skip
     tables, attributes, rejects, findings = read_tables(found, source)
     return LogTables(file, found.name, tables, attributes, rejects, findings)

@@ -55,7 +55,7 @@ def lever_arms(lidar: Trajectory, other: Trajectory) -> pd.DataFrame:
 
 def height_differences(first: Trajectory, second: Trajectory, survey_file: Path, within_m: float = 1.0) -> Float64:
     """Height of the second pass above the first (n,) where its poses come within `within_m` of the first's."""
-    frame = Survey.load(survey_file).config.map.frame()
+    frame = Survey.load(survey_file).frame()
     a, b = (frame.map_from_world(t.world, t.position_world_m) for t in (first, second))
     distance, nearest = KDTree(a[:, :2]).query(b[:, :2])
     close = distance < within_m

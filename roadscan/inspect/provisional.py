@@ -72,7 +72,7 @@ class Stated:
     clock: Clock | None = None
     crs: str | None = None
     height: HeightKind = "ellipsoidal"
-    geoid: str | None = None
+    geoid: Geoid | None = None
     options: dict[str, Any] = field(default_factory=dict)
     sensor: Sensor | None = None
 
@@ -85,7 +85,7 @@ class Stated:
             sensor=self.sensor,
             crs=self.crs,
             height=self.height,
-            geoid=Geoid(self.geoid) if self.geoid else None,
+            geoid=self.geoid,
             map=_map_for(self.crs) if log_format.needs_map or "control_points" in log_format.yields else None,
         )
 

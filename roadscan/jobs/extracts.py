@@ -15,7 +15,7 @@ from roadscan.jobs.session import Session
 from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.tile_plan import TILE, TilePlan
 from roadscan.jobs.tiles.tile_points import load_points
-from roadscan.model.crs import LOCAL_WORLD, add_grid_folder, geodetic_from_world
+from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
 from roadscan.model.ids import TileId
@@ -48,8 +48,6 @@ def poses_on_map(session: Session, run: str, first_gps_ns: int | None, end_gps_n
     held = [f.span for f in source.files if f.span is not None]
     first = max(min(s[0] for s in held), first_gps_ns if first_gps_ns is not None else 0)
     last = min(max(s[1] for s in held), end_gps_ns - 1 if end_gps_ns is not None else 2**62)
-    if ground.grids is not None:
-        add_grid_folder(ground.grids)
     poses = load_trajectory(session.store, source, [(first, last)], ground.max_gap_s)
     own = (poses.epochs_gps_ns >= first) & (poses.epochs_gps_ns <= last)
     world, rotation = poses.position_world_m[own], rotation_from_quaternion(poses.quaternion_world_from_body[own])

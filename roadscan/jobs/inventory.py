@@ -54,7 +54,7 @@ def truth_of(session: Session) -> Inventory:
 def _opened(session: Session, home: Home) -> Inventory:
     settings, survey = session.survey.config.inventory, session.survey
     name = settings.name or survey.config.id
-    frame = survey.config.map.frame()
+    frame = survey.frame()
     rules = Rules(SeenByCells(session, _visibility(session)), settings.matching, frame.horizontal_unit_m)
     return Inventory(
         _truth(survey), home, name, rules, lambda: found_assets(session), frame.crs,
@@ -67,7 +67,7 @@ def _truth(survey: Survey) -> AssetTruth:
     settings, url = survey.config.inventory, survey.store_url
     if settings.store is not None:
         url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
-    frame = survey.config.map.frame()
+    frame = survey.frame()
     return AssetTruth(Store(url, settings.name or survey.config.id), (frame.horizontal_unit_m, frame.vertical_unit_m))
 
 
@@ -79,7 +79,7 @@ def inventory_faults(survey: Survey) -> list[str]:
 def home_of(session: Session, given: str | None = None) -> Home:
     """The home that the survey file states, or another one: a GeoPackage or the address of a PostGIS database."""
     settings, survey = session.survey.config.inventory, session.survey
-    crs = survey.config.map.frame().crs
+    crs = survey.frame().crs
     address = given if given is not None else os.environ.get(ADDRESS) or settings.postgis
     if address is not None and (given is None or "://" in given):
         from roadscan.inventory.homes.postgis import PostGis
@@ -98,7 +98,7 @@ def page_document(session: Session, name: str, content: bytes) -> PageDocument:
     HomeError
         where `content` is no such document.
     """
-    frame = session.survey.config.map.frame()
+    frame = session.survey.frame()
     units_m = frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m
     return PageDocument.parse(name, content, units_m)
 

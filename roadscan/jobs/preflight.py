@@ -8,6 +8,7 @@ itself is at fault, since another one tells that. Of a log its header is read, a
 from __future__ import annotations
 
 import datetime as dt
+import functools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ from roadscan.inspect.diagnosis import cannot_be_opened, claimed_format, is_ther
 from roadscan.jobs.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
 from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, no_row
-from roadscan.jobs.ingest.planned_logs import CONTROL_RUN, grid_folder, log_source
+from roadscan.jobs.ingest.planned_logs import CONTROL_RUN, log_source
 from roadscan.jobs.ingest.sources import listed_name, remembered_formats
 from roadscan.jobs.navigate.clocks import check_clocks
 from roadscan.jobs.plan.centre_line import CentreLines, load_buffer
@@ -34,9 +35,7 @@ from roadscan.jobs.surfaces.surface_plan import checked_surface
 from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.crs import (
     LOCAL_WORLD,
-    Geoid,
     MapFrame,
-    add_grid_folder,
     crs_from_text,
     geodetic_from_world,
     world_frame_of,
@@ -106,14 +105,12 @@ class Asked:
     def __init__(self, survey: Survey, store: Store) -> None:
         self.survey = survey
         self.store = store
-        if (grids := grid_folder(survey)) is not None:
-            add_grid_folder(grids)
 
     @cached_property
     def frame(self) -> MapFrame | None:
         """The map, None where its settings are at fault."""
         try:
-            return self.survey.config.map.frame()
+            return self.survey.frame()
         except RoadscanError:
             return None
 
@@ -172,7 +169,7 @@ Check: TypeAlias = Callable[[Asked], Iterator[RoadscanError]]
 
 def check_map(asked: Asked) -> Iterator[RoadscanError]:
     """A CRS that is known, projected and not compound, and a geoid where heights need one."""
-    yield from _faults(asked.survey.config.map.frame)
+    yield from _faults(asked.survey.frame)
 
 
 def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
@@ -180,8 +177,22 @@ def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
     config = asked.survey.config
     named = [config.map.geoid if config.map.height == "orthometric" else None]
     named += [log.config.geoid if log.config.height == "orthometric" else None for log in asked.logs]
-    for grid in dict.fromkeys(grid for grid in named if grid):
-        yield from _faults(Geoid(grid).check)
+    for geoid in (asked.survey.geoid(grid) for grid in dict.fromkeys(named)):
+        if geoid is not None:
+            yield from _faults(geoid.check)
+    yield from _uncovered(asked)
+
+
+def _uncovered(asked: Asked) -> Iterator[RoadscanError]:
+    """The error of the map's geoid where its grid does not cover the place where a log begins."""
+    geoid = None if asked.frame is None else asked.frame.geoid
+    if geoid is None or geoid.file is None:
+        return
+    for log, (longitude, latitude, *_), _ in asked.places:
+        faults = list(_faults(functools.partial(geoid.undulation_m, longitude, latitude)))
+        if faults:
+            yield faults[0].at(log.path)
+            return
 
 
 def check_logs(asked: Asked) -> Iterator[RoadscanError]:

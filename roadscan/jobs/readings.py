@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from roadscan.model.crs import MapFrame, add_grid_folder
+from roadscan.model.crs import Geoid, MapFrame
 from roadscan.model.errors import ConfigError, NavigationError, StoreError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.gpstime import NS_PER_S
@@ -87,6 +87,8 @@ class ReadingSource:
     road: RoadSegmentation | None = None
     """How the road is told in profiles, so that nothing else counts; None where all readings do. Not in `key`: it
     belongs to the keys of tiles."""
+    geoid: Geoid | None = None
+    """Grid that a cloud's orthometric heights count from."""
     allowance: Allowance = NO_CORRECTION
     """Corrections of the poses that footprints leave room for. Not in `key`: it belongs to the keys of footprints."""
 
@@ -111,8 +113,6 @@ class Ground:
     grid: TileGrid
     heights: HeightLimits
     max_gap_s: float
-    grids: str | None = None
-    """Folder with geoid grids."""
     marks: bool = False
     """Readings that a filter leaves out are placed too, with their classes."""
 
@@ -172,8 +172,6 @@ class Placer:
 
     def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice], *, recorded: bool = False) -> None:
         """`recorded`: with the poses as they were recorded, whatever corrections there are."""
-        if ground.grids is not None:
-            add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
         self._store = store
         self._ground = ground
         self._load = load_recorded if recorded else load_trajectory
@@ -379,7 +377,7 @@ def geometry_of(source: ReadingSource) -> ScanGeometry | None:
 
 def _cloud_frame(source: ReadingSource) -> CloudFrame:
     attributes = source.attribute
-    return CloudFrame(attributes["crs"], attributes["height"], attributes.get("geoid"))
+    return CloudFrame(attributes["crs"], attributes["height"], source.geoid)
 
 
 def _chunks(one: RawSlice) -> Iterator[list[int]]:

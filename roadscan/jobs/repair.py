@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from roadscan.jobs.ingest.ingest import IngestTask, read_log, record_of, with_span
-from roadscan.jobs.ingest.planned_logs import PlannedLog, grid_folder, plan_logs
+from roadscan.jobs.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.jobs.ingest.sources import is_unchanged
 from roadscan.jobs.navigate.navigate import keep_trajectory, plan_trajectories
 from roadscan.jobs.status import find_damage
@@ -95,7 +95,7 @@ def _mend_logs(
         try:
             log = _log_of(one.record, planned, [u.path for u in unplanned])
             _check_whole(survey, store, log)
-            task = IngestTask(store, with_span(log, spans.get(log.run)), (), grid_folder(survey))
+            task = IngestTask(store, with_span(log, spans.get(log.run)), ())
             done.lines += _read_again(task, one)
             done.lost = [lost for lost in done.lost if lost.log != one.record.key]
         except _LostLogError as error:

@@ -9,18 +9,19 @@ the CRS's own unit. PROJ's network access is off, and a geoid is applied only fr
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 import os
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 import pyproj
-import pyproj.datadir
 from pyproj.crs.crs import CompoundCRS
+from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError as ProjCrsError
 from pyproj.exceptions import ProjError
 from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
@@ -28,6 +29,7 @@ from pyproj.transformer import TransformerGroup
 
 from roadscan.model.errors import CrsError
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
+from roadscan.model.witness import Witness
 
 set_network_enabled(active=False)
 
@@ -102,38 +104,44 @@ def world_title(world: str) -> str:
     return "local frame" if world == LOCAL_WORLD else str(crs_from_text(world).name)
 
 
-_grid_folders: list[Path] = []
-
-
-def add_grid_folder(folder: str | Path) -> None:
-    """Look for geoid grids in `folder` too, in all threads of this process."""
-    known = Path(folder).resolve()
-    if known not in _grid_folders:
-        _grid_folders.append(known)
-
-
-def _grid_file(name: str) -> str:
-    # PROJ's own list of folders belongs to a thread; a full path holds in all of them.
-    found = (folder / name for folder in _grid_folders if (folder / name).is_file())
-    return str(next(found, name))
-
-
-def grid_folders() -> list[Path]:
-    """Folders in which a geoid grid is looked for, in their order."""
-    return [*_grid_folders, *(Path(p) for p in pyproj.datadir.get_data_dir().split(os.pathsep))]
+GEOID_GRID: Final = Witness(
+    name="geoid_grid",
+    input="heights",
+    fault="The geoid grid is missing, is that of another region or survey, or was replaced while a run went on.",
+    asks="the survey's own folder of grids, the grid's content when it is opened, and where the logs begin",
+    does="heights count from the grid of that content and from no other; without it, the run ends before it computes",
+    told=("error",),
+)
 
 
 @dataclass(frozen=True)
 class Geoid:
-    """A named geoid grid: orthometric = ellipsoidal − undulation."""
+    """A geoid grid, known by its file and by its content: orthometric = ellipsoidal − undulation.
+
+    Two grids of one name are two geoids, and so is a grid before and after it was replaced.
+    """
 
     grid: str
+    """Name as the survey file states it."""
+    file: Path | None
+    """Absolute path; None where there is no such file."""
+    content: str
+    """BLAKE2b-128 of the file's bytes, hexadecimal; "" where there is no such file."""
+    searched: tuple[str, ...] = field(default=(), compare=False)
+    """Folders in which it was looked for, in their order."""
+
+    @classmethod
+    def found(cls, grid: str, folder: Path | None = None) -> Self:
+        """The grid of a name: in `folder` (the survey's own), else in the folders that PROJ keeps grids in."""
+        folders = [*([] if folder is None else [folder.resolve()]), *_proj_folders()]
+        file = next((one / grid for one in folders if (one / grid).is_file()), None)
+        return cls(grid, file, "" if file is None else _content(file), tuple(map(str, folders)))
 
     def undulation_m(self, longitude_deg: npt.ArrayLike, latitude_deg: npt.ArrayLike) -> Float64:
         """Geoid height above the ellipsoid (m) at geodetic degrees, (n,)."""
         lon = np.atleast_1d(np.asarray(longitude_deg, dtype=np.float64))
         lat = np.atleast_1d(np.asarray(latitude_deg, dtype=np.float64))
-        _, _, shifted = self._transformer().transform(lon, lat, np.zeros_like(lon))
+        _, _, shifted = _vertical_shift(self).transform(lon, lat, np.zeros_like(lon))
         height = np.asarray(shifted, dtype=np.float64)
         if not np.all(np.isfinite(height)):
             bad = int(np.flatnonzero(~np.isfinite(height))[0])
@@ -146,18 +154,58 @@ class Geoid:
 
     def check(self) -> None:
         """Raise :class:`CrsError` unless the grid is there and can be read."""
-        self._transformer()
+        _vertical_shift(self)
 
-    def _transformer(self) -> pyproj.Transformer:
-        try:
-            return pyproj.Transformer.from_pipeline(f'+proj=vgridshift +grids="{_grid_file(self.grid)}" +multiplier=1')
-        except ProjError as error:
-            folders = " or ".join([*map(str, _grid_folders), pyproj.datadir.get_data_dir()])
+    def here(self) -> Path:
+        """Path of the grid on this machine, its content checked.
+
+        Raises
+        ------
+        CrsError
+            where there is none of that content: a worker's folders may differ from those of the run.
+        """
+        if self.file is None:
             raise CrsError(
                 f"geoid grid '{self.grid}' was not found",
-                expected=f"a file of that name in the folder map.grids; looked in {folders}",
+                expected=f"a file of that name in the folder map.grids; looked in {' or '.join(self.searched)}",
                 change="put the grid there (roadscan never downloads one), or use ellipsoidal heights",
-            ) from error
+            )
+        candidates = [self.file, *(folder / self.grid for folder in _proj_folders())]
+        there = [one for one in dict.fromkeys(candidates) if one.is_file()]
+        same = next((one for one in there if _content(one) == self.content), None)
+        if same is None:
+            state = "has changed since the run was planned" if self.file in there else "is not on this machine"
+            raise CrsError(
+                f"geoid grid '{self.grid}' ({self.file}) {state}",
+                expected="the file that the run was planned with, at that path on every worker",
+                change="run again, or put the grid where all workers see it",
+            )
+        return same
+
+
+def _proj_folders() -> list[Path]:
+    """Folders in which PROJ looks for grids."""
+    folders = [*get_data_dir().split(os.pathsep), get_user_data_dir()]
+    return [Path(folder) for folder in dict.fromkeys(folders)]
+
+
+def _content(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+@functools.lru_cache(maxsize=64)
+def _vertical_shift(geoid: Geoid) -> pyproj.Transformer:
+    """Transformation that adds a geoid's undulation to heights."""
+    file = geoid.here()
+    try:
+        return pyproj.Transformer.from_pipeline(f'+proj=vgridshift +grids="{file}" +multiplier=1')
+    except ProjError as error:
+        raise CrsError(
+            f"geoid grid '{geoid.grid}' ({file}) cannot be read",
+            expected="a grid that PROJ reads: GTX or GeoTIFF",
+            change="fetch it again, or use ellipsoidal heights",
+        ) from error
 
 
 @dataclass(frozen=True)

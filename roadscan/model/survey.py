@@ -73,8 +73,12 @@ class MapConfig(Strict):
             raise ValueError('say where the map is: crs = "EPSG:…" or [map.local]')
         return self
 
-    def frame(self) -> MapFrame:
-        """The map frame these settings describe."""
+    def geoid_named(self, name: str, folder: Path) -> Geoid:
+        """The geoid grid of a name, by the survey's `folder`: in the folder `grids`, else in those of PROJ."""
+        return Geoid.found(name, None if self.grids is None else folder / self.grids)
+
+    def frame(self, folder: Path) -> MapFrame:
+        """The map frame these settings describe, of a survey file in `folder`."""
         anchor = None
         if self.local is not None and self.local.anchor is not None:
             anchor = Anchor(**self.local.anchor.model_dump())
@@ -83,7 +87,7 @@ class MapConfig(Strict):
             local_name=self.local.name if self.local else "",
             anchor=anchor,
             height=self.height,
-            geoid=Geoid(self.geoid) if self.geoid and self.height == "orthometric" else None,
+            geoid=self.geoid_named(self.geoid, folder) if self.geoid and self.height == "orthometric" else None,
             vertical_crs=self.vertical_crs,
             max_datum_error_m=self.max_datum_error_m,
         )
@@ -485,6 +489,14 @@ class Survey:
     def resolve(self, path: Path) -> Path:
         """Absolute path of one that the survey file states relative to itself."""
         return (self.folder / path).resolve()
+
+    def frame(self) -> MapFrame:
+        """The survey's map, its geoid grid resolved."""
+        return self.config.map.frame(self.folder)
+
+    def geoid(self, name: str | None) -> Geoid | None:
+        """The geoid grid that the survey file or a log record names; None where it names none."""
+        return None if not name else self.config.map.geoid_named(name, self.folder)
 
     def sensor(self, name: str) -> Sensor:
         """Sensor of the rig by name."""

@@ -384,11 +384,12 @@ class CloudFrame:
 
     crs: str
     height: str
-    geoid: str | None = None
+    geoid: Geoid | None = None
+    """Grid that orthometric heights count from; None for the map's own, where that has the same kind of heights."""
 
     def to_map(self, xyz_m: Float64, frame: MapFrame) -> Float64:
         """Easting, northing, height (n, 3) in the survey's map, metres."""
-        same_height = self.height == frame.height
+        same_height = self.height == frame.height and not self._other_geoid(frame)
         if (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height:
             return xyz_m
         if self.height == "orthometric" and self.geoid is None:
@@ -400,10 +401,16 @@ class CloudFrame:
         own = MapFrame(
             crs=self.crs,
             height="orthometric" if self.height == "orthometric" else "ellipsoidal",
-            geoid=Geoid(self.geoid) if self.geoid else None,
+            geoid=self.geoid if self.height == "orthometric" else None,
         )
         world = world_frame_of(self.crs)
         return frame.map_from_world(world, own.world_from_map(world, xyz_m))
+
+    def _other_geoid(self, frame: MapFrame) -> bool:
+        """Whether the heights count from a grid whose content is not that of the map's."""
+        if self.height != "orthometric" or self.geoid is None or frame.geoid is None:
+            return False
+        return self.geoid.content != frame.geoid.content
 
 
 def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[np.uint16]:

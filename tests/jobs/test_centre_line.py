@@ -129,7 +129,7 @@ def test_what_the_survey_file_has_to_say(tmp_path: Path) -> None:
         changed = survey_of(tmp_path, **filters)
         stated = CentreLines.of(changed)
         assert stated is not None
-        return load_buffer(stated, changed.config.map.frame())
+        return load_buffer(stated, changed.frame())
 
     with pytest.raises(CrsError, match="neither the layer nor the survey file"):
         load()
@@ -146,7 +146,7 @@ def buffer_of(folder: Path, **filters: Any) -> CentreLineBuffer:
     survey = survey_of(folder, **filters)
     stated = CentreLines.of(survey)
     assert stated is not None
-    return load_buffer(stated, survey.config.map.frame())
+    return load_buffer(stated, survey.frame())
 
 
 @pytest.mark.parametrize("width", [900.0, -3.0, float("inf")])

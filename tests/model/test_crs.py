@@ -17,7 +17,6 @@ from roadscan.model.crs import (
     Anchor,
     Geoid,
     MapFrame,
-    add_grid_folder,
     crs_from_text,
     geodetic_from_world,
     grid_convergence_rad,
@@ -205,8 +204,7 @@ def plane_geoid(tmp_path: Path) -> Geoid:
     values = undulation(lon[None, :], lat[:, None]).astype(">f4")
     name = f"plane {tmp_path.name}.gtx"
     (tmp_path / name).write_bytes(header + values.tobytes())
-    add_grid_folder(tmp_path)
-    return Geoid(name)
+    return Geoid.found(name, tmp_path)
 
 
 def test_undulation_is_interpolated(plane_geoid: Geoid) -> None:
@@ -232,9 +230,8 @@ def test_a_folder_of_grids_serves_threads_that_already_used_proj(
 
 
 def test_a_missing_grid_is_named_with_the_place_to_put_it(tmp_path: Path) -> None:
-    add_grid_folder(tmp_path)
     with pytest.raises(CrsError) as caught:
-        Geoid("us_noaa_g2018u0.tif").undulation_m(-74.0, 40.7)
+        Geoid.found("us_noaa_g2018u0.tif", tmp_path).undulation_m(-74.0, 40.7)
     assert "geoid grid 'us_noaa_g2018u0.tif' was not found" in str(caught.value)
     assert str(tmp_path.resolve()) in str(caught.value)
 

@@ -80,12 +80,12 @@ def test_map_frame_of_the_settings() -> None:
             },
         )
     )
-    frame = config.map.frame()
+    frame = config.map.frame(Path())
     assert frame.geoid is not None
     assert (frame.crs, frame.geoid.grid) == ("EPSG:25832", "g.tif")
     assert frame.anchor is not None
     assert frame.anchor.heading_deg == 30.0
-    ellipsoidal = SurveyConfig.parse(changed("map", to={"crs": "EPSG:25832", "geoid": "g.tif"})).map.frame()
+    ellipsoidal = SurveyConfig.parse(changed("map", to={"crs": "EPSG:25832", "geoid": "g.tif"})).map.frame(Path())
     assert ellipsoidal.geoid is None
 
 

@@ -29,7 +29,7 @@ def geoid(folder: Path, undulation_m: float) -> Geoid:
         np.array([45.0, 5.0, 1.0, 1.0], dtype=">f8").tofile(stream)
         np.array([11, 11], dtype=">i4").tofile(stream)
         np.full(121, undulation_m, dtype=">f4").tofile(stream)
-    return Geoid(stream.name)
+    return Geoid.found(stream.name)
 
 
 def test_points_of_the_maps_own_crs_stay_where_they_are(tmp_path: Path) -> None:

@@ -239,7 +239,8 @@ def test_the_files_own_crs(tmp_path: Path) -> None:
     assert read("las", cloud(tmp_path / "wkt.las")).attributes["crs"] == UTM
     geotiff = cloud(tmp_path / "keys.las", version="1.2", point_format=1)
     assert read("las", geotiff).attributes["crs"] == UTM
-    assert read("las", geotiff, crs=UTM, height="orthometric", geoid=Geoid("g.tif")).attributes["geoid"] == "g.tif"
+    stated = read("las", geotiff, crs=UTM, height="orthometric", geoid=Geoid.found("g.tif"))
+    assert stated.attributes["geoid"] == "g.tif"
 
 
 def test_a_missing_crs_is_asked_for(tmp_path: Path) -> None:

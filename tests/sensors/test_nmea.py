@@ -211,7 +211,7 @@ def test_heights_without_a_separation(tmp_path: Path) -> None:
     path = write(tmp_path / "a.nmea", gga("093000.00", separation=""), rmc("093000.00", "040526"))
     with pytest.raises(CrsError, match=r"a\.nmea, record 0: GGA states no geoid separation"):
         read_log("nmea", path, **STATED)
-    flat = Geoid(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
+    flat = Geoid.found(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
     log = read_log("nmea", path, height="orthometric", geoid=flat, **STATED)
     np.testing.assert_allclose(log.positions[0], ecef(10, 50, 135.0), atol=1e-6)
     assert only(log)["undulation_m"] is None
@@ -223,7 +223,7 @@ def test_the_separation_of_the_log_goes_before_the_geoid(tmp_path: Path) -> None
     """The receiver subtracted its own; only epochs without one need the survey's."""
     lines = [gga("093000.00"), rmc("093000.00", "040526"), gga("093001.00", separation="")]
     path = write(tmp_path / "a.nmea", *lines)
-    flat = Geoid(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
+    flat = Geoid.found(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
     log = read_log("nmea", path, height="orthometric", geoid=flat, **STATED)
     np.testing.assert_allclose(log.positions, [ecef(10, 50, 140.0), ecef(10, 50, 135.0)], atol=1e-6)
     log = read_log("nmea", path, **STATED)
@@ -234,7 +234,7 @@ def test_the_separation_of_the_log_goes_before_the_geoid(tmp_path: Path) -> None
 def test_a_geoid_that_does_not_cover_the_place(tmp_path: Path) -> None:
     away = gga("093001.00", separation="").split("*")[0][1:].replace("5000.0", "1000.0")
     lines = [gga("093000.00", separation=""), rmc("093000.00", "040526"), checked(away)]
-    flat = Geoid(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
+    flat = Geoid.found(str(flat_geoid(tmp_path / "flat.gtx", 35.0)))
     stated = {"height": "orthometric", "geoid": flat} | STATED
     log = read_log("nmea", write(tmp_path / "a.nmea", *lines), **stated)
     assert log.table.num_rows == 1
@@ -244,7 +244,7 @@ def test_a_geoid_that_does_not_cover_the_place(tmp_path: Path) -> None:
     path = write(tmp_path / "b.nmea", lines[2], rmc("093000.00", "040526"))
     with pytest.raises(CrsError, match="does not cover"):
         read_log("nmea", path, **stated)
-    missing = STATED | {"height": "orthometric", "geoid": Geoid("absent.gtx")}
+    missing = STATED | {"height": "orthometric", "geoid": Geoid.found("absent.gtx")}
     with pytest.raises(CrsError, match=r"'absent\.gtx' was not found"):
         format_named("nmea").header(source_of("nmea", path, **missing))
 

@@ -144,7 +144,7 @@ def test_orthometric_heights_are_raised_by_the_named_geoid(tmp_path: Path, crs: 
     column = np.array(position)[:, None]
     north = "true"
     ellipsoidal, _ = level_placement(source(crs), north).place(column, attitude)
-    raised, _ = level_placement(source(crs, height="orthometric", geoid=Geoid(str(grid))), north).place(
+    raised, _ = level_placement(source(crs, height="orthometric", geoid=Geoid.found(str(grid))), north).place(
         column, attitude
     )
     assert np.linalg.norm(raised - ellipsoidal) == pytest.approx(47.5, abs=1e-5)

@@ -238,7 +238,7 @@ def test_geodetic_heights(tmp_path: Path) -> None:
         with pytest.raises(CrsError, match="header says geodetic heights"):
             header(source_of("rtklib_pos", path, **STATED, **stated))
     grid = flat_geoid(tmp_path / "flat.gtx", 40.0)
-    row = only(read_log("rtklib_pos", path, **STATED, height="orthometric", geoid=Geoid(str(grid))))
+    row = only(read_log("rtklib_pos", path, **STATED, height="orthometric", geoid=Geoid.found(str(grid))))
     np.testing.assert_allclose(position(row), ecef(10.0, 50.0, 140.0), atol=1e-6)
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from roadscan.assets.pictures.reader import CutOut, Recognition
 from roadscan.model.errors import ConfigError
 from roadscan.model.settings.asset_pictures import AssetPicturesSettings
+from roadscan.tables.store import file_digest
 
 Float32 = npt.NDArray[np.float32]
 
@@ -126,7 +127,7 @@ def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
 
 def recognition_of(text: bool, model: Path | None) -> Recognition:
     """What reads signs, loaded once a worker."""
-    return _recognition(text, model, 0 if model is None else model.stat().st_mtime_ns)
+    return _recognition(text, model, "" if model is None else file_digest(model))
 
 
 def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> None:
@@ -138,7 +139,7 @@ def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> No
 
 
 @functools.lru_cache(maxsize=2)
-def _recognition(text: bool, model: Path | None, _: int) -> Recognition:
+def _recognition(text: bool, model: Path | None, _content: str) -> Recognition:
     return SignRecognition(text, model)
 
 

@@ -235,7 +235,8 @@ def _reference_map(plan: SurveyPlan, entry: ReferenceEvidence) -> Float64:
     """
     path = plan.survey.resolve(entry.path)
     log_format = format_named(entry.format) if entry.format else claimed_format(path)
-    stated = Stated(None, entry.crs, entry.height, entry.geoid, dict(entry.options))
+    geoid = plan.survey.geoid(entry.geoid)
+    stated = Stated(None, entry.crs, entry.height, geoid, dict(entry.options))
     opened = open_log(log_format, path, stated)
     if opened.needs_key("clock"):
         opened = open_log(log_format, path, replace(stated, clock=_ANY_TIME))
@@ -254,7 +255,7 @@ def _reference_map(plan: SurveyPlan, entry: ReferenceEvidence) -> Float64:
         own = MapFrame(crs=None, local_name=frame.local_name, anchor=frame.anchor)
         world = own.world_from_map(own.anchor.world if own.anchor else LOCAL_WORLD, np.concatenate(parts))
         return frame.map_from_world(own.anchor.world if own.anchor else LOCAL_WORLD, world)
-    return CloudFrame(entry.crs, entry.height, entry.geoid).to_map(np.concatenate(parts), frame)
+    return CloudFrame(entry.crs, entry.height, geoid).to_map(np.concatenate(parts), frame)
 
 
 def _thinned(readings: Sequence[Readings], pieces: Pieces, most: int) -> Seen:

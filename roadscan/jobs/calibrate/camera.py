@@ -21,7 +21,6 @@ from roadscan.jobs.plan.plan import trajectory_source
 from roadscan.jobs.readings import load_trajectory, read_groups
 from roadscan.jobs.surfaces.taken_pictures import taken_pictures
 from roadscan.model.camera import Interior
-from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import ConfigError, FormatError, RunError, nearest
 from roadscan.model.frames import body_from_axes, rph_from_rotation
 from roadscan.model.rig import Mounting, Rig, Sensor
@@ -152,8 +151,6 @@ def resect_camera(
             change="state its mounting in the rig file as its maker or a survey of the vehicle gives it",
         )  # fmt: skip
     rig_file = _rig_file(survey) if write else None
-    if survey.config.map.grids is not None:
-        add_grid_folder(survey.resolve(survey.config.map.grids))
     records = records_with_trajectories(survey, store)
     pictures = _pictures(store, records, sensor)
     measured, runs = _measurements(measurements, pictures)
@@ -330,7 +327,7 @@ def _exposures(
 
 def _world_from_ned(survey: Survey, world: str, place_m: Float64) -> Float64:
     """Axes (3, 3) of the map at a place of the world: north, east, down."""
-    frame = survey.config.map.frame()
+    frame = survey.frame()
     middle = frame.map_from_world(world, place_m[None])
     steps = _DIFFERENCE_M * np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     ways = frame.world_from_map(world, middle + steps) - frame.world_from_map(world, middle - steps)
@@ -351,7 +348,7 @@ def _targets(
     if names:
         raise ConfigError(f"two control points are called '{names[0]}'", expected="a name of its own for each")
     enh = np.array([[row["easting_m"], row["northing_m"], row["height_m"]] for row in rows])
-    places = survey.config.map.frame().world_from_map(world, enh)
+    places = survey.frame().world_from_map(world, enh)
     targets: dict[str, list[Target]] = {"gcp": [], "check": []}
     for row, place in zip(rows, places, strict=True):
         horizontal = max(row["sigma_horizontal_m"] or 0.0, _LEAST_SIGMA_M)

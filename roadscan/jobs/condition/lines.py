@@ -23,7 +23,7 @@ from roadscan.jobs.navigate.pose_sigma import usual_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan, trajectory_source
 from roadscan.jobs.products import product_context
 from roadscan.jobs.readings import TrajectorySource, read_groups
-from roadscan.model.crs import MapFrame, add_grid_folder
+from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError
 from roadscan.model.ids import LanePass, PassId
 from roadscan.model.settings.condition import ConditionConfig
@@ -87,8 +87,6 @@ def _layer_file(plan: SurveyPlan, config: ConditionConfig) -> Path | None:
 
 def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
     """Find the lines and lanes: from the drives, or those of the layer that were driven."""
-    if plan.ground.grids is not None:
-        add_grid_folder(plan.ground.grids)
     drives = [Drive(one.pass_id, _path_m(plan, one, source), one.lane) for one, source in _driven(plan)]
     lines, lanes = find_roads(drives, stated_lines(plan, config), config)
     return Roads({line.road: line for line in lines}, tuple(_with_roll(plan, lanes)))
@@ -161,7 +159,7 @@ def check_layer(survey: Survey) -> None:
     if config is not None and config.layer is not None:
         path = survey.resolve(config.layer)
         layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
-        place_in_map(layer.crs, survey.config.map.frame(), path)
+        place_in_map(layer.crs, survey.frame(), path)
 
 
 def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:

@@ -86,7 +86,7 @@ def check_edge_polygons(survey: Survey) -> None:
     """
     config = survey.config.condition
     if config is not None and config.road_edges is not None and config.road_edges.polygons is not None:
-        settings, frame = config.road_edges, survey.config.map.frame()
+        settings, frame = config.road_edges, survey.frame()
         check_polygons(survey.resolve(config.road_edges.polygons), settings.polygons_crs, frame)
 
 

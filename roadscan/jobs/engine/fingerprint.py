@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import grid_folders
-from roadscan.tables.store import file_digest
+from roadscan.model.crs import Geoid
 
 
 def key_of(*parts: Any) -> str:
@@ -35,9 +33,6 @@ def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int
     return found
 
 
-def grid_digest(name: str | None) -> list[str] | None:
-    """Name and content of a geoid grid in the folders that PROJ looks in: a replaced grid is another grid."""
-    if name is None:
-        return None
-    found = [Path(folder) / name for folder in grid_folders()]
-    return [name, *(file_digest(f) for f in found if f.is_file())]
+def grid_key(geoid: Geoid | None) -> list[str] | None:
+    """Name and content of a geoid grid: a replaced grid is another grid."""
+    return None if geoid is None else [geoid.grid, geoid.content]

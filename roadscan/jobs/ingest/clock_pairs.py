@@ -20,6 +20,7 @@ from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem
 from roadscan.model.survey import ClockConfig, LogConfig, Survey
 from roadscan.navigation.clocks.pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs
 from roadscan.sensors.stamps import CALENDAR_SCALES, parse_calendar
+from roadscan.tables.store import file_digest
 
 Int64 = npt.NDArray[np.int64]
 
@@ -62,18 +63,18 @@ def log_pairs(survey: Survey, log: LogConfig) -> LogPairs | None:
         return None
     table = log.clock.pairs.table
     if table is None:
-        return _fitted(log.clock.model_dump_json(), None, 0, 0)
+        return _fitted(log.clock.model_dump_json(), None, "")
     path = survey.resolve(table)
     try:
-        stat = path.stat()
+        content = file_digest(path)
     except OSError as error:
         raise FormatError(f"the table of pairs cannot be opened: {error.strerror}", file=path) from error
-    return _fitted(log.clock.model_dump_json(), path, stat.st_size, stat.st_mtime_ns)
+    return _fitted(log.clock.model_dump_json(), path, content)
 
 
 @functools.lru_cache(maxsize=64)
-def _fitted(clock_json: str, path: Path | None, _size: int, _modified_ns: int) -> LogPairs:
-    """Fit of a clock's pairs, remembered from one stage to the next."""
+def _fitted(clock_json: str, path: Path | None, _content: str) -> LogPairs:
+    """Fit of a clock's pairs, remembered from one stage to the next for as long as the table's content stays."""
     clock = ClockConfig.model_validate_json(clock_json)
     if clock.pairs is None:
         raise ConfigError("the clock has no pairs")

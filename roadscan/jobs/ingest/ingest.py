@@ -12,11 +12,10 @@ import numpy.typing as npt
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.overlap import reject_words
-from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, grid_folder, plan_logs
+from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
 from roadscan.jobs.ingest.pose_checks import PoseRecords, check_poses
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.sources import stamp_of
-from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
@@ -57,8 +56,6 @@ class IngestTask:
     log: PlannedLog
     replaces: tuple[LogRecord, ...] = ()
     """The same bytes read before under other settings; no two tasks replace the same."""
-    grids: Path | None = None
-    """Folder of the survey's geoid grids."""
 
 
 def ingest(
@@ -91,7 +88,7 @@ def ingest(
     held = frozenset(key for key in listed if has_log(store, key))
     for first in (True, False):
         now = [with_span(p, spans.get(p.run)) for p in planned if p.is_trajectory == first]
-        tasks = _tasks(store, now, listed, held, grid_folder(survey))
+        tasks = _tasks(store, now, listed, held)
         for done in _ingested(tasks, held, compute or Inline()):
             if done.result is None:
                 failures.append(_reason(done))
@@ -147,8 +144,6 @@ def record_of(
 
 def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     """The rows of a log, finished in a scratch folder, and what its header says."""
-    if task.grids is not None:
-        add_grid_folder(task.grids)
     header = task.log.format.header(task.log.source)
     writer, poses, repeats = LogWriter(folder, header.list_size), PoseRecords(), RepeatedProfiles()
     for item in _items(task.log, header):
@@ -201,9 +196,7 @@ def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> li
     return read_log_records(store, [p.key for p in planned])
 
 
-def _tasks(
-    store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str], grids: Path | None
-) -> list[IngestTask]:
+def _tasks(store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str]) -> list[IngestTask]:
     """A task a log. What the survey file still lists (`listed` keys: two layers of one file, say) is not replaced."""
     missing = [log for log in logs if log.key not in held]
     older: dict[tuple[str, str, str], list[LogRecord]] = {}
@@ -211,7 +204,7 @@ def _tasks(
         if old.key not in listed:
             older.setdefault((old.run, old.sensor, old.content), []).append(old)
     replaced = {log.key: tuple(older.pop((log.run, log.sensor, log.content), ())) for log in missing}
-    return [IngestTask(store, log, replaced.get(log.key, ()), grids) for log in logs]
+    return [IngestTask(store, log, replaced.get(log.key, ())) for log in logs]
 
 
 def _ingested(

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from roadscan.jobs.engine.fingerprint import grid_digest, key_of
+from roadscan.jobs.engine.fingerprint import grid_key, key_of
 from roadscan.jobs.ingest.clock_pairs import log_clock
 from roadscan.jobs.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.jobs.ingest.sources import Known, Sources, open_sources
-from roadscan.model.crs import Geoid, add_grid_folder
 from roadscan.model.errors import ConfigError, RoadscanError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.model.rig import Sensor
@@ -64,9 +63,6 @@ def plan_logs(survey: Survey, store: Store) -> Logs:
 
     Bytes are read only to fingerprint them. A log that was ingested and then moved away keeps its fingerprint.
     """
-    grids = grid_folder(survey)
-    if grids is not None:
-        add_grid_folder(grids)
     listed: list[tuple[str, LogConfig | ControlConfig]] = [
         (run.id, log) for run in survey.config.runs for log in run.logs
     ]
@@ -101,12 +97,6 @@ def _check_mounting(format_: LogFormat, name: str, sensor: Sensor, path: Path) -
             "than the maker's frame, confirm it with mounts_vehicle_frame = true",
             file=path,
         )
-
-
-def grid_folder(survey: Survey) -> Path | None:
-    """Folder of the survey's geoid grids, where it has one of its own."""
-    grids = survey.config.map.grids
-    return None if grids is None else survey.resolve(grids)
 
 
 @dataclass(frozen=True)
@@ -152,13 +142,14 @@ def _plan_log(
     source = log_source(survey, config, path, format_, options)
     content, size, stamp = sources.end(path, format_, opened.files)
     sensor = config.sensor if isinstance(config, LogConfig) else None
+    map_grid = grid_key(survey.geoid(survey.config.map.geoid)) if source.map else None
     schemas = [
         [(c.name, c.type) for c in table_schema(t).columns] + [table_schema(t).partition_s] for t in format_.yields
     ]
     shaping = [
         format_.name, format_.version, content, options.model_dump(mode="json"), source.clock,
-        config.crs, config.height, grid_digest(config.geoid), run, sensor, schemas,
-        [survey.config.map.model_dump(mode="json"), grid_digest(survey.config.map.geoid)] if source.map else None,
+        config.crs, config.height, grid_key(source.geoid), run, sensor, schemas,
+        [survey.config.map.model_dump(mode="json"), map_grid] if source.map else None,
         *([source.defaults] if source.defaults != SourceDefaults() else []),
         *([["poses", POSE_CHECKS]] if "trajectory" in format_.yields else []),
     ]  # fmt: skip
@@ -191,7 +182,7 @@ def log_source(
         sensor=survey.sensor(sensor) if sensor else None,
         crs=config.crs,
         height=config.height,
-        geoid=Geoid(config.geoid) if config.geoid else None,
-        map=survey.config.map.frame() if format_.needs_map or not is_log else None,
+        geoid=survey.geoid(config.geoid),
+        map=survey.frame() if format_.needs_map or not is_log else None,
         defaults=_source_defaults(survey, config),
     )

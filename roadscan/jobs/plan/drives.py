@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import TrajectorySource, read_groups
-from roadscan.model.crs import MapFrame, add_grid_folder
+from roadscan.model.crs import MapFrame
 from roadscan.products.lane_direction import STEP_M, LaneDirections
 from roadscan.tables.store import Store
 
@@ -22,15 +22,13 @@ class Drives:
     """Trajectories of a survey's runs; it holds no data."""
 
     map: MapFrame
-    grids: str | None
-    """Folder with geoid grids."""
     trajectories: tuple[TrajectorySource, ...]
 
     @classmethod
     def of(cls, plan: SurveyPlan) -> Drives:
         """Of all runs with readings."""
         sources = dict.fromkeys(s.trajectory for s, _ in plan.sources if s.trajectory is not None)
-        return cls(plan.ground.map, plan.ground.grids, tuple(sources))
+        return cls(plan.ground.map, tuple(sources))
 
     def key(self) -> list[list[str]]:
         """What of them shapes a product."""
@@ -38,8 +36,6 @@ class Drives:
 
     def lanes(self, store: Store) -> LaneDirections:
         """Directions of travel, from positions as they were logged or computed; adjustments turn no lane."""
-        if self.grids is not None:
-            add_grid_folder(self.grids)
         steps = [LaneDirections(np.zeros((0, 2)), np.zeros(0))]
         steps += [LaneDirections.of_path(self.path_m(store, one)) for one in self.trajectories]
         return LaneDirections(

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from roadscan.code_reach import code_digest
-from roadscan.jobs.engine.fingerprint import grid_digest, key_of
+from roadscan.jobs.engine.fingerprint import grid_key, key_of
 from roadscan.jobs.ingest.ingest import DATA_TABLES
 from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs
@@ -118,11 +118,10 @@ def plan_survey(
         unlimited if f.above_body_max_m is None else f.above_body_max_m,
     )
     ground = Ground(
-        map=config.map.frame(),
+        map=survey.frame(),
         grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
         heights=heights,
         max_gap_s=config.navigation.max_gap_s,
-        grids=None if config.map.grids is None else str(survey.resolve(config.map.grids)),
         marks=f.keep_marked,
     )
     known = load_mountings(store) if calibrated is None else calibrated
@@ -210,6 +209,7 @@ def _sources(
             nominal = sensor.mounting() if sensor else UNMOUNTED
             mountings = mountings_of(record.run, record.sensor, nominal, calibrated)
             clock = of_run(clocks, record.run, record.sensor)
+            geoid = survey.geoid(record.attributes.get("geoid"))
             limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
             key = key_of(
                 asdict(mountings),
@@ -218,7 +218,7 @@ def _sources(
                 None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
                 record.attributes,
                 survey.config.map.model_dump(mode="json"),
-                [grid_digest(survey.config.map.geoid), grid_digest(record.attributes.get("geoid"))],
+                [grid_key(survey.geoid(survey.config.map.geoid)), grid_key(geoid)],
                 asdict(ground.heights),
                 ground.max_gap_s,
                 ground.grid.size_m,
@@ -228,7 +228,7 @@ def _sources(
             )
             source = ReadingSource(
                 record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
-                *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal),
+                *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal), geoid=geoid,
             )  # fmt: skip
             found.append((_with_room(source, corrections), files))
     check_road(survey.config.segmentation, [source for source, _ in found])

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from roadscan.codecs.image_files import ImageError, image_size
 from roadscan.jobs.surfaces.pictures import Pictures
-from roadscan.model.crs import add_grid_folder
 from roadscan.points.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
 
 UInt8 = npt.NDArray[np.uint8]
@@ -42,8 +41,6 @@ class ColourSource:
     """Gives points their colours. What a point gets depends on it and on the survey's pictures, on nothing else."""
 
     def __init__(self, pictures: Pictures) -> None:
-        if pictures.grids is not None:
-            add_grid_folder(pictures.grids)  # a worker's PROJ does not know it yet
         self._kept: OrderedDict[str, UInt8] = OrderedDict()
         self._unreadable: dict[str, str] = {}
 

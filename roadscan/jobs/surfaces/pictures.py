@@ -16,7 +16,7 @@ import shapely
 from roadscan.jobs.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.jobs.readings import TrajectorySource, load_mountings, load_trajectory
 from roadscan.jobs.surfaces.taken_pictures import TakenPictures, taken_pictures
-from roadscan.model.crs import MapFrame, add_grid_folder
+from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, RunError, nearest
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mountings, Rig, Sensor
@@ -51,8 +51,6 @@ class Pictures:
 
     rule: PictureRule
     map: MapFrame
-    grids: str | None
-    """Folder with geoid grids."""
     worlds: tuple[str, ...]
     """World frames that the views count."""
     views: Views
@@ -148,8 +146,6 @@ def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
     RunError
         where no picture is in the store, or none has a pose.
     """
-    if plan.ground.grids is not None:
-        add_grid_folder(plan.ground.grids)
     placed: list[_Placed] = []
     notes: list[str] = []
     for camera, taken in _camera_logs(plan, rule):
@@ -175,7 +171,7 @@ def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
         np.array([k for _, k in counted])[log], tuple(_lens(camera) for _, camera in cameras),
     )  # fmt: skip
     return Pictures(
-        rule, plan.ground.map, plan.ground.grids, worlds, views.picked(order),
+        rule, plan.ground.map, worlds, views.picked(order),
         np.concatenate([one.place_m for one in placed])[order], np.concatenate([one.reach_m for one in placed])[order],
         tuple(one.log for one in placed), log[order], epoch[order], tuple(files[i] for i in order.tolist()),
         _lens_key(cameras), tuple(notes),

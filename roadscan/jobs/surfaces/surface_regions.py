@@ -69,7 +69,7 @@ def stated_regions(survey: Survey) -> Regions | None:
     path = survey.resolve(stated.polygons)
     if not path.is_file():
         raise ConfigError("the layer of polygons does not exist", change="check surface.polygons", file=path)
-    return Regions(_placed(_shapes(path), _crs(path, stated.polygons_crs), survey.config.map.frame(), path))
+    return Regions(_placed(_shapes(path), _crs(path, stated.polygons_crs), survey.frame(), path))
 
 
 def _shapes(path: Path) -> npt.NDArray[Any]:

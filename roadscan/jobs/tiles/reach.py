@@ -12,7 +12,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.jobs.readings import Ground, RawSlice, ReadingSource, geometry_of, load_recorded
-from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import NavigationError, StoreError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.points.charts import charts_along
@@ -72,8 +71,6 @@ def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
 def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence[tuple[int, int]]) -> Reach | None:
     if source.trajectory is None:
         raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
-    if ground.grids is not None:
-        add_grid_folder(ground.grids)  # a worker's PROJ does not know it yet
     trajectory = load_recorded(store, source.trajectory, spans, ground.max_gap_s)
     if trajectory.epochs_gps_ns.size == 0:
         return None

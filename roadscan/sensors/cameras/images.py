@@ -412,7 +412,7 @@ class _VideoLog:
                 raise ConfigError(f"options.{name} is for a folder of images, and the log is a file", file=path)
         end_ns, clock = _end(source, options)
         stat = path.stat()
-        video = _look(path, stat.st_size, stat.st_mtime_ns)
+        video = _look(path, (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))
         constant = options.frame_times == "constant"
         times = frame_times(video, options.frame_count, constant_rate=constant, path=path)
         first_ns = end_ns - round(times.duration_s * NS_PER_S)
@@ -427,8 +427,11 @@ class _VideoLog:
 
 
 @functools.lru_cache(maxsize=4)
-def _look(path: Path, _size: int, _modified_ns: int) -> Video:
-    """A video as :func:`look_into` finds it, remembered from `header` to `read`."""
+def _look(path: Path, _state: tuple[int, ...]) -> Video:
+    """A video as :func:`look_into` finds it, remembered from `header` to `read`.
+
+    `_state` is size, times of the last changes of content and inode, and inode: copying keeps the first two.
+    """
     return look_into(path)
 
 

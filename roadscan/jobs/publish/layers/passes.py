@@ -27,7 +27,6 @@ from roadscan.jobs.publish.layer import (
 )
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.readings import TrajectorySource, read_groups
-from roadscan.model.crs import add_grid_folder
 from roadscan.model.gpstime import utc_from_gps_ns
 from roadscan.products.lane_direction import STEP_M
 
@@ -45,8 +44,6 @@ class Passes(LayerKind):
     def layers(self, material: Material) -> Iterator[SiteLayer]:
         """One layer; none where no pass has a trajectory."""
         plan = material.plan
-        if plan.ground.grids is not None:
-            add_grid_folder(plan.ground.grids)
         sources = dict.fromkeys(s.trajectory for s, _ in plan.sources if s.trajectory is not None)
         paths = {one.run: _path(material, one) for one in sources}
         shapes: list[Any] = []

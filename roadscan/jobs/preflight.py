@@ -548,7 +548,8 @@ def _place_of(rows: Rows, world: str) -> Place | None:
         return None
     middle = np.median(known, axis=0)  # one wrong pose, be it the first, is not where the drive begins
     nearest = known[np.argmin(np.linalg.norm(known - middle, axis=1))]
-    return geodetic_from_world(world, nearest[None])[0]
+    place: Place = geodetic_from_world(world, nearest[None])[0]
+    return place
 
 
 def _place_words(place: Place) -> str:

@@ -195,7 +195,7 @@ def _judged(writer: LogWriter, world: str, no_fix: Int64) -> Iterator[tuple[Int6
 def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[Int64, Leaps]:
     """Leaps of the poses of a table, looked at together with those around it."""
     first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
-    track = _track(rows, world, no_fix)
+    track = pose_track(rows, world, no_fix)
     found, epochs = find_leaps(track), track.epochs_gps_ns
     inside = (epochs >= first) & (epochs <= last)
     steps, covered = (
@@ -206,7 +206,7 @@ def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[In
     )
 
 
-def _track(rows: pa.Table, world: str, no_fix: Int64) -> PoseTrack:
+def pose_track(rows: pa.Table, world: str, no_fix: Int64) -> PoseTrack:
     """Poses of rows, the first of each epoch, without those that have no fix."""
     epochs = rows.column("epoch_gps_ns").to_numpy()
     order = np.argsort(epochs, kind="stable")

@@ -20,13 +20,14 @@ from roadscan.model.crs import LOCAL_WORLD, MapFrame, crs_from_text, geodetic_fr
 from roadscan.model.errors import RoadscanError, SchemaError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.witness import Finding
+from roadscan.navigation.leaps import FASTEST_M_PER_S
 from roadscan.sensors.base import Item, LogHeader, Reject, Rows
 from roadscan.tables.schema import TableSchema, table_schema
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-LEAP_SPEED_M_PER_S: Final = 70.0
+LEAP_SPEED_M_PER_S: Final = FASTEST_M_PER_S
 """A position that asks for more than this of a survey vehicle leaps."""
 LEAP_M: Final = 1.0
 """Shorter steps are noise, whatever the speed."""

@@ -23,6 +23,7 @@ from roadscan.inspect.diagnosis import cannot_be_opened, claimed_format, is_ther
 from roadscan.jobs.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
 from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, no_row
+from roadscan.jobs.ingest.place_checks import without_fix
 from roadscan.jobs.ingest.planned_logs import CONTROL_RUN, log_source
 from roadscan.jobs.ingest.sources import listed_name, remembered_formats
 from roadscan.jobs.navigate.clocks import check_clocks
@@ -517,7 +518,7 @@ def _segmented(asked: Asked) -> set[str]:
 
 @dataclass(frozen=True)
 class _Beginning:
-    """Where the positions of a log begin."""
+    """Where the first block of positions of a log lies."""
 
     log: CheckedLog
     place: Place | None = None
@@ -553,7 +554,13 @@ def _place_of(rows: Rows, world: str) -> Place | None:
         return None
     xyz = np.column_stack([rows.batch.column(f"{axis}_world_m").to_numpy(zero_copy_only=False) for axis in "xyz"])
     known = xyz[np.isfinite(xyz).all(axis=1)]
-    return geodetic_from_world(world, known[:1])[0] if len(known) else None
+    known = known[~without_fix(known)] if not without_fix(known).all() else known
+    if not len(known):
+        return None
+    middle = np.median(known, axis=0)  # one wrong pose, be it the first, is not where the drive begins
+    nearest = known[np.argmin(np.linalg.norm(known - middle, axis=1))]
+    place: Place = geodetic_from_world(world, nearest[None])[0]
+    return place
 
 
 def _place_words(place: Place) -> str:

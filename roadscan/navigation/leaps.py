@@ -420,7 +420,7 @@ def _bridge(links: _Links, a: _Segment, b: _Segment) -> tuple[bool, bool]:
         return False, False
     before, after = _velocity(track, a, at_end=True), _velocity(track, b, at_end=False)
     known = [one for one in (before, after) if one is not None]
-    if not known:
+    if not known or links.gap[a.last : b.first].any():  # over a gap, velocities say nothing
         return True, False
     both = np.array([len(known) == 2])
     inside = slice(a.last, b.first)
@@ -475,9 +475,10 @@ def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: 
 
 
 def _beside_links(sizes: Float64, out: Bool) -> Float64:
-    """The greatest leap (n,) of each run of poses that are left out, at its ends; 0 elsewhere."""
+    """The smaller leap (n,) at the two ends of each run of poses that are left out; 0 elsewhere."""
     found = np.zeros(out.size)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
     for first, end in edges.reshape(-1, 2).tolist():
-        found[first:end] = sizes[max(first - 1, 0) : end].max(initial=0.0)
+        ends = np.array([sizes[k] for k in (first - 1, end - 1) if 0 <= k < sizes.size])
+        found[first:end] = ends[ends > 0].min() if (ends > 0).any() else 0.0
     return found

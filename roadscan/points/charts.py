@@ -9,18 +9,23 @@ positions projected by PROJ. Within 300 m of a centre the expansion departs from
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.crs import LOCAL_WORLD, MapFrame
+from roadscan.model.errors import NavigationError
 
 Float64 = npt.NDArray[np.float64]
 
 BOX_M = 200.0
 STEP_M = 100.0
 """Step of the finite differences; truncation is far below PROJ's own 1 nm."""
+
+_MOST_BOXES = 1 << 27
+"""Boxes of the table at most (0.5 GB): the box of a drive over 100 km across all axes."""
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -52,6 +57,13 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     unique = np.unique((visited[:, None, :] + steps).reshape(-1, 3), axis=0)
     first = unique.min(axis=0)
+    if math.prod((unique.max(axis=0) - first + 1).tolist()) > _MOST_BOXES:
+        far_km = float(np.linalg.norm((unique.max(axis=0) - first) * BOX_M)) / 1000
+        raise NavigationError(
+            f"poses that are needed together lie {far_km:,.0f} km apart",
+            expected="a drive: poses of some minutes lie near one another",
+            change="`roadscan status` names the steps of the trajectory; take what is wrong out of its log",
+        )
     table = np.full(unique.max(axis=0) - first + 1, -1, dtype=np.int32)
     table[tuple((unique - first).T)] = np.arange(len(unique))
     made = [_chart(frame, world, (int(b[0]), int(b[1]), int(b[2]))) for b in unique]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
@@ -161,6 +161,29 @@ class Rows:
     """Bytes from one row to the next, 0 where it varies."""
     records: npt.NDArray[np.int64] | None = None
     """(n,) record number of each row, where they do not follow one another."""
+
+    @property
+    def numbers(self) -> npt.NDArray[np.int64]:
+        """(n,) record number of each row."""
+        return self.first_record + np.arange(self.batch.num_rows) if self.records is None else self.records
+
+    @property
+    def offsets(self) -> npt.NDArray[np.int64]:
+        """(n,) byte offset of each row, −1 where it is not known."""
+        if self.first_offset < 0 or not self.record_bytes:
+            return np.full(self.batch.num_rows, -1, np.int64)
+        return self.first_offset + (self.numbers - self.first_record) * self.record_bytes
+
+    def places(self, rows: npt.NDArray[np.int64]) -> list[tuple[int, int, int]]:
+        """Record number, byte offset and count of each run of neighbouring records among some rows (m,), ascending."""
+        numbers, offsets = self.numbers[rows], self.offsets[rows]
+        runs = np.split(np.arange(rows.size), np.flatnonzero(np.diff(numbers) != 1) + 1)
+        return [(int(numbers[run[0]]), int(offsets[run[0]]), run.size) for run in runs if run.size]
+
+    def without(self, rows: npt.NDArray[np.int64]) -> Rows:
+        """The same without some rows (m,)."""
+        kept = np.delete(np.arange(self.batch.num_rows), rows)
+        return replace(self, batch=self.batch.take(pa.array(kept)), records=self.numbers[kept])
 
 
 @dataclass(frozen=True)

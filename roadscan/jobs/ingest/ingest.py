@@ -12,9 +12,11 @@ import numpy.typing as npt
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.overlap import reject_words
+from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
 from roadscan.jobs.ingest.pose_checks import PoseRecords, check_poses
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
+from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.survey import Survey
@@ -149,12 +151,13 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
-        _take(writer, item, poses)
+        _take(writer, item, header, poses)
     writer.findings += [found] if (found := repeats.finding()) else []
     writer.finish()
     if writer.rows["trajectory"]:
         check_poses(writer, str(header.attributes["world_frame"]), poses)
         writer.finish()
+    writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header
 
@@ -260,27 +263,27 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item, poses: PoseRecords) -> None:
+def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
+    astray = place_faults(item.table, item.batch, header) if item.table in PLACED else []
+    _reject(writer, item, astray)
+    if astray:
+        item = item.without(np.concatenate([rows for rows, _ in astray]))
     refused = writer.add(item.table, item.batch)
     poses.take(item, [rows for rows, _ in refused])
-    for rows, reason in refused:
-        for first, count in _consecutive(rows):
-            offset = -1 if item.first_offset < 0 or not item.record_bytes else (
-                item.first_offset + first * item.record_bytes
-            )  # fmt: skip
-            writer.reject(item.file, item.first_record + first, offset, count, reason)
+    _reject(writer, item, refused)
 
 
-def _consecutive(rows: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Runs of consecutive row numbers as (first, count)."""
-    breaks = np.flatnonzero(np.diff(rows) != 1) + 1
-    return [(int(part[0]), int(part.size)) for part in np.split(rows, breaks)]
+def _reject(writer: LogWriter, item: Rows, faults: Sequence[tuple[npt.NDArray[np.int64], str]]) -> None:
+    """List the records of rows that were refused."""
+    for rows, reason in faults:
+        for record, offset, count in item.places(rows):
+            writer.reject(item.file, record, offset, count, reason)
 
 
 def with_span(log: PlannedLog, span: tuple[int, int] | None) -> PlannedLog:

@@ -9,6 +9,8 @@ from typing import Final, TypeAlias
 
 from roadscan.jobs.engine.fingerprint import grid_key, key_of
 from roadscan.jobs.ingest.clock_pairs import log_clock
+from roadscan.jobs.ingest.place_checks import PLACED
+from roadscan.jobs.ingest.place_checks import VERSION as PLACE_CHECKS
 from roadscan.jobs.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.jobs.ingest.sources import Known, Sources, open_sources
 from roadscan.model.errors import ConfigError, RoadscanError
@@ -152,6 +154,7 @@ def _plan_log(
         [survey.config.map.model_dump(mode="json"), map_grid] if source.map else None,
         *([source.defaults] if source.defaults != SourceDefaults() else []),
         *([["poses", POSE_CHECKS]] if "trajectory" in format_.yields else []),
+        *([["places", PLACE_CHECKS]] if set(PLACED) & set(format_.yields) else []),
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     return PlannedLog(run, name, config, format_, source, key_of(*shaping), content, size, stamp)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.jobs.ingest.place_checks import NO_FIX, without_fix
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.gpstime import iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
@@ -50,13 +51,11 @@ _BESIDE: Final = 4_000
 """Poses of the files before and after that are looked at together with those of a file."""
 _NO_FIX_SHARE: Final = 0.5
 """Where more poses than that lie at latitude 0, longitude 0, it is the place of the survey (a simulated one)."""
-_NO_FIX_M: Final = 1e-3
 _NAMED: Final = 3
 """So many steps are named, the largest."""
 
 _ELSEWHERE: Final = "the position leaps away from the poses before and after it, as no vehicle moves"
 _TURNED: Final = "the attitude leaps away from the poses before and after it, as no vehicle turns"
-_NO_FIX: Final = "the position is latitude 0, longitude 0, or the centre of the Earth: there was no fix"
 
 
 @dataclass
@@ -73,12 +72,8 @@ class PoseRecords:
         kept = np.ones(count, dtype=bool)
         for rows in refused:
             kept[rows] = False
-        records = item.first_record + np.arange(count) if item.records is None else item.records
-        offsets = np.full(count, -1, np.int64)
-        if item.first_offset >= 0 and item.record_bytes:
-            offsets = item.first_offset + np.arange(count) * item.record_bytes
         epochs = item.batch.column("epoch_gps_ns").to_numpy()
-        self._parts.append((item.file, epochs[kept], np.asarray(records)[kept], offsets[kept]))
+        self._parts.append((item.file, epochs[kept], item.numbers[kept], item.offsets[kept]))
 
     def of(self, epochs: Int64) -> Iterator[tuple[str, int, int, int]]:
         """File, record, offset and epoch of each pose that has one of these epochs, in the order of the log."""
@@ -96,7 +91,7 @@ def check_poses(writer: LogWriter, world: str, records: PoseRecords) -> None:
     out = np.union1d(no_fix, np.array(sorted(found.reasons), dtype=np.int64))
     told = list(records.of(out))
     for file, record, offset, epoch in told:
-        writer.reject(file, record, offset, 1, found.reasons.get(epoch, _NO_FIX))
+        writer.reject(file, record, offset, 1, found.reasons.get(epoch, NO_FIX))
     if out.size:
         writer.leave_out(_TABLE, out)
     writer.findings += found.findings(told)
@@ -179,8 +174,8 @@ def _without_fix(writer: LogWriter, world: str) -> Int64:
         return np.zeros(0, np.int64)
     found, total = list[Int64](), 0
     for rows in writer.tables(_TABLE, ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m"]):
-        x, y, z = (rows.column(f"{axis}_world_m").to_numpy() for axis in "xyz")
-        found.append(rows.column("epoch_gps_ns").to_numpy()[(np.hypot(y, z) < _NO_FIX_M) & (x > -_NO_FIX_M)])
+        position = np.stack([rows.column(f"{axis}_world_m").to_numpy() for axis in "xyz"], axis=-1)
+        found.append(rows.column("epoch_gps_ns").to_numpy()[without_fix(position)])
         total += rows.num_rows
     epochs = np.concatenate([np.zeros(0, np.int64), *found])
     return epochs if epochs.size <= _NO_FIX_SHARE * total else np.zeros(0, np.int64)
@@ -200,7 +195,7 @@ def _judged(writer: LogWriter, world: str, no_fix: Int64) -> Iterator[tuple[Int6
 def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[Int64, Leaps]:
     """Leaps of the poses of a table, looked at together with those around it."""
     first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
-    track = _track(rows, world, no_fix)
+    track = pose_track(rows, world, no_fix)
     found, epochs = find_leaps(track), track.epochs_gps_ns
     inside = (epochs >= first) & (epochs <= last)
     steps, covered = (
@@ -211,7 +206,7 @@ def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[In
     )
 
 
-def _track(rows: pa.Table, world: str, no_fix: Int64) -> PoseTrack:
+def pose_track(rows: pa.Table, world: str, no_fix: Int64) -> PoseTrack:
     """Poses of rows, the first of each epoch, without those that have no fix."""
     epochs = rows.column("epoch_gps_ns").to_numpy()
     order = np.argsort(epochs, kind="stable")

@@ -37,6 +37,10 @@ from roadscan.sensors.records import Sieve, UnorderedStamps, few_rejects, option
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
+_OVERFLOW: Final = "a coordinate overflowed to the least or largest whole number: outside the area of the survey"
+_LEAST_RAW: Final = -(2**31)
+_MOST_RAW: Final = 2**31 - 1
+"""Where a coordinate overflowed, its whole number is one of these."""
 _TOLERANCE_NS: Final = NS_PER_S
 _ADJUSTED_BIT: Final = 0x01
 _STORED: Final = frozenset(
@@ -139,13 +143,16 @@ def _points(
     columns = {"epoch_gps_ns": epochs} | _columns(points, cloud.names, units)
     for axis in "xyz":
         sieve.drop(~np.isfinite(columns[f"{axis}_m"]), "a coordinate is no number")
+        raw = np.asarray(points[axis.upper()])
+        sieve.drop((raw == _LEAST_RAW) | (raw == _MOST_RAW), _OVERFLOW)
     yield from few_rejects(list(sieve.rejects(records, cloud.offsets(records))))
     kept = sieve.kept
     if not sieve.good.any():
         return
     batch = pa.RecordBatch.from_pydict({k: pa.array(np.ascontiguousarray(v[kept])) for k, v in columns.items()})
     start = int(records[np.argmax(sieve.good)])
-    yield Rows("cloud", batch, "", start, int(cloud.offsets(np.array([start]))[0]), cloud.head.record_bytes_in_file)
+    at, step = int(cloud.offsets(np.array([start]))[0]), cloud.head.record_bytes_in_file
+    yield Rows("cloud", batch, "", start, at, step, None if sieve.good.all() else records[kept])
 
 
 def _columns(points: laspy.ScaleAwarePointRecord, names: frozenset[str], units: Float64) -> dict[str, npt.NDArray[Any]]:

@@ -158,4 +158,5 @@ def cloud_items(
     full |= {name: np.ascontiguousarray(values[kept]) for name, values in columns.items()}
     first = int(np.argmax(sieve.good))
     batch = pa.RecordBatch.from_pydict({name: pa.array(values) for name, values in full.items()})
-    yield Rows("cloud", batch, "", int(records[first]), int(offsets[first]), record_bytes)
+    own = None if sieve.good.all() else records[kept]
+    yield Rows("cloud", batch, "", int(records[first]), int(offsets[first]), record_bytes, own)

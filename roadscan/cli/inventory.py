@@ -44,6 +44,10 @@ def pull(
     who: Who = None,
     why: Why = "",
     sound: Annotated[bool, typer.Option("--sound", help="Take in sound rows where others are faulty.")] = False,
+    confirm: Annotated[
+        list[str] | None,
+        typer.Option(help="An asset whose unlikely place is right, as `pull` names it; `all`: each. May be repeated."),
+    ] = None,
 ) -> None:
     """Take in what people changed in the home."""
     from roadscan.jobs.inventory import edits_of_file, home_of, open_inventory, page_document
@@ -53,12 +57,14 @@ def pull(
     inventory = open_inventory(session)
     if home is not None and home.endswith(_PAGE_EDITS):
         document = page_document(session, home, edits_of_file(Path(home)))
-        done, _ = inventory.pull_page(document, who=who, why=why, sound=sound)
+        done, _ = inventory.pull_page(document, who=who, why=why, sound=sound, confirm=confirm or ())
     else:
         place = None if home is None else home_of(session, home)
-        done = inventory.pull(home=place, who=who, why=why, sound=sound)
+        done = inventory.pull(home=place, who=who, why=why, sound=sound, confirm=confirm or ())
     for fault in done.refused:
-        typer.echo(f"refused: {fault}")
+        typer.echo(f"{'asked' if fault.is_question else 'refused'}: {fault}")
+    for finding in done.findings:
+        typer.echo(f"doubtful: {finding.line}")
     assets = len({edit.asset_id for edit in done.edits})
     new = f"commit {done.commit}: {len(done.edits):,} values of {assets:,} assets" if done.commit else "nothing new"
     conflicts = f"; {done.conflicts} conflicts to settle" if done.conflicts else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ import shapely
 
 from roadscan.inventory.comparing import Change, Changes
 from roadscan.inventory.home import EditFault
+from roadscan.inventory.questions import questions_of
 from roadscan.inventory.state import State
 from roadscan.tables.asset_schema import AssetColumn, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
@@ -26,12 +27,14 @@ _AROUND_M: Final = 100.0
 _LEAST_HEIGHT_M: Final = 2.0
 
 
-def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditFault]:
-    """Faults of all changes, those that the comparison found first.
+def faults_of(changes: Changes, state: State, unit_m: float = 1.0, confirmed: Collection[str] = ()) -> list[EditFault]:
+    """Faults of all changes, those that the comparison found first; then what is asked about.
 
     Parameters
     ----------
-    state : the inventory that the changes are to be taken into; unit_m : metres of a unit of its map.
+    state : the inventory that the changes are to be taken into.
+    unit_m : metres of a unit of its map.
+    confirmed : records whose places a person confirmed; `all` stands for each.
     """
     found = list(changes.faults)
     drawn = {change.asset_id for change in changes.drawn}
@@ -44,6 +47,9 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0) -> list[EditF
     found += _at_zero(changes, state, unit_m)
     found += _circles(changes, state)
     found += _spans(changes, state)
+    faulty = {(fault.table, fault.record) for fault in found}
+    asked = questions_of(changes, state) if "all" not in confirmed else ()
+    found += [one for one in asked if one.record not in confirmed and (one.table, one.record) not in faulty]
     return found
 
 

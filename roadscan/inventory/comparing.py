@@ -9,17 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 
 from roadscan.inventory.home import FID, Content, EditFault
 from roadscan.inventory.identity import new_ids
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
+
+_STEP: Final = 1e-4
+"""Units of the map; coordinates of products have steps of 0.1 mm, and a way to another CRS and back costs less."""
 
 
 class Change(NamedTuple):
@@ -151,8 +155,8 @@ def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> 
         if one is not None or candidate is None or candidate in present:
             continue
         row, before = side.rows.slice(at, 1), side.before.slice(place[candidate], 1)
-        same_place = row[GEOMETRY].equals(before[GEOMETRY])
-        if same_place or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names):
+        stands_there = same_place(row[GEOMETRY][0].as_py(), before[GEOMETRY][0].as_py())
+        if stands_there or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names):
             found[at] = candidate
             present.add(candidate)
     return found
@@ -180,7 +184,7 @@ def _differences(side: _Side, rows: list[int], before: list[int], ids: list[str 
             continue
         for at in _differing(now[name], then[name]):
             old, new = _plain(then[name][at].as_py()), _plain(now[name][at].as_py())
-            if old != new:
+            if old != new and not (name == GEOMETRY and same_place(old, new)):
                 one = str(ids[rows[at]])
                 yield Change(side.kind, one, name, old, new, one, fids[at])
 
@@ -190,6 +194,21 @@ def _differing(now: pa.ChunkedArray, then: pa.ChunkedArray) -> npt.NDArray[np.in
     same = pc.fill_null(pc.equal(now, then), False)
     neither = pc.and_(pc.is_null(now), pc.is_null(then))
     return np.flatnonzero(~np.asarray(pc.or_(same, neither)))
+
+
+def same_place(one: bytes | None, other: bytes | None) -> bool:
+    """True for geometries whose corners are the same to the step of coordinates: what came back from another CRS."""
+    if one is None or other is None or one == other:
+        return one == other
+    first, second = shapely.from_wkb(one), shapely.from_wkb(other)
+    return bool(shapely.equals_exact(first, second, tolerance=_STEP)) and _same_heights(first, second)
+
+
+def _same_heights(first: Any, second: Any) -> bool:
+    if first.has_z != second.has_z:
+        return False
+    one, other = (shapely.get_coordinates(shape, include_z=True)[:, 2] for shape in (first, second))
+    return bool(np.allclose(one, other, rtol=0.0, atol=_STEP, equal_nan=True))
 
 
 def _plain(value: Any) -> Any:

@@ -82,6 +82,8 @@ class Folded:
     """Edits that met one in force which their maker had not seen, until a decision settles them."""
     created: dict[str, Edit] = field(default_factory=dict)
     """By asset: the edit that drew it, whatever was done to it since."""
+    settled: set[str] = field(default_factory=set)
+    """Names of edits of which a decision settled a conflict."""
 
     def take(self, edit: Edit) -> None:
         """Fold one more edit in."""
@@ -97,6 +99,7 @@ class Folded:
         else:
             self.in_force[edit.key] = edit
         settled = (edit.settles or "").split(",")
+        self.settled.update(settled)
         left = [e for e in self.waiting.pop(edit.key, []) if e.edit not in settled and e.new != edit.new]
         if left:
             self.waiting[edit.key] = left

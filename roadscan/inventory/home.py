@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -24,6 +24,8 @@ class EditFault(NamedTuple):
     record: str
     """Its id, or `fid` and the number of a row without one."""
     reason: str
+    is_question: bool = False
+    """True where it may be right: it is taken in once a person confirms it."""
 
     def __str__(self) -> str:
         return f"{self.table}, {self.record}: {self.reason}"
@@ -84,6 +86,8 @@ class Content:
     """Who changed values last since they were read, by kind, id (or `fid N`) and attribute; without one, of the row."""
     faults: Sequence[EditFault] = ()
     """What people wrote that no row can hold."""
+    confirmed: Collection[str] = ()
+    """Records whose unlikely places a person confirmed in the home."""
 
 
 class Sheet(NamedTuple):

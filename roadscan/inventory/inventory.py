@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import getpass
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,13 +20,14 @@ from roadscan.inventory.conflicts import Conflict, conflict_rows, conflicts_of
 from roadscan.inventory.diff import Differences, differences
 from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
-from roadscan.inventory.home import FID, Content, EditFault, Home, HomeError, Mark, Sheet
+from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument, PageEdits
-from roadscan.inventory.pulling import Pulling, new_edits, now_utc, refuse
+from roadscan.inventory.pulling import Pulling, clocked, new_edits, now_utc, refuse
 from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
 from roadscan.model.errors import ConfigError, nearest
+from roadscan.model.witness import Finding
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
 from roadscan.tables.inventory_schema import asset_table
@@ -62,6 +63,8 @@ class Pulled:
     refused: tuple[EditFault, ...]
     """Rows that were not taken in, where only sound ones were asked for."""
     conflicts: int
+    findings: tuple[Finding, ...] = ()
+    """What is doubtful of the edits that were taken in."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,10 @@ class Inventory:
         )
         return sheets
 
-    def pull(self, *, home: Home | None = None, who: str | None = None, why: str = "", sound: bool = False) -> Pulled:
+    def pull(
+        self, *, home: Home | None = None, who: str | None = None, why: str = "", sound: bool = False,
+        confirm: Collection[str] = (),
+    ) -> Pulled:  # fmt: skip
         """Take in what people changed in a home.
 
         Parameters
@@ -156,6 +162,7 @@ class Inventory:
         home : the survey's own where it is left out; a copy of it otherwise.
         who, why : of edits whose home does not tell.
         sound : take in sound rows where others are faulty; else nothing is taken in then.
+        confirm : ids of assets (`fid N` of drawn ones) whose unlikely places are right; `all` stands for each.
 
         Raises
         ------
@@ -168,25 +175,39 @@ class Inventory:
         with self.truth.alone():
             mark, changes, content = self._changes(place)
             now = state_at(self.truth)
-            faults = [*content.faults, *faults_of(changes, now, self.rules.unit_m)]
-            if faults and not sound:
-                raise refuse(faults, place.name)
+            odd = {(fault.table, fault.record) for fault in content.faults}
+            judged = faults_of(changes, now, self.rules.unit_m, {*confirm, *content.confirmed})
+            faults = [*content.faults, *(one for one in judged if (one.table, one.record) not in odd)]
             taken = _without(changes, faults)
             base = now if mark.commit == now.commit else state_at(self.truth, mark.commit)
-            pulling = Pulling(base, now, who or getpass.getuser(), why, place.name, content.authors, now_utc())
-            edits = new_edits(taken, content.decisions, pulling)
+            authors, findings = self._authors(content, mark, pulled_at := now_utc())
+            pulling = Pulling(base, now, who or getpass.getuser(), why, place.name, authors, pulled_at)
+            edits, undecided = new_edits(taken, content.decisions, pulling)
+            faults += undecided
+            if faults and not sound:
+                raise refuse(faults, place.name)
             commit = self._append(place, mark, edits, _as_read(changes, faults), why)
         waiting = len(conflicts_of(state_at(self.truth))) if commit is not None else len(conflicts_of(now))
-        return Pulled(place.name, commit, tuple(edits), tuple(faults), waiting)
+        return Pulled(place.name, commit, tuple(edits), tuple(faults), waiting, findings)
+
+    def _authors(
+        self, content: Content, mark: Mark, now: str
+    ) -> tuple[Mapping[tuple[str, str, str], Author], tuple[Finding, ...]]:
+        shown_at = self.truth.commits[mark.commit - 1].at if mark.commit else ""
+        if not shown_at:
+            return content.authors, ()
+        authors, findings = clocked(content.authors, shown_at, now)
+        return authors, tuple(findings)
 
     def pull_page(
-        self, document: PageDocument, *, who: str | None = None, why: str = "", sound: bool = False
-    ) -> tuple[Pulled, list[EditOutcome]]:
+        self, document: PageDocument, *, who: str | None = None, why: str = "", sound: bool = False,
+        confirm: Collection[str] = (),
+    ) -> tuple[Pulled, list[EditOutcome]]:  # fmt: skip
         """Take in edits that people made in the page of a survey; beside it, what became of each of them.
 
         Parameters
         ----------
-        who, why : of edits of which the document does not tell; sound : as :meth:`pull`.
+        who, why : of edits of which the document does not tell; sound, confirm : as :meth:`pull`.
 
         Raises
         ------
@@ -205,7 +226,7 @@ class Inventory:
                 file=document.name,
             )
         home = PageEdits(document, shown_content(self.state(commit)).rows)
-        pulled = self.pull(home=home, who=who, why=why, sound=sound)
+        pulled = self.pull(home=home, who=who, why=why, sound=sound, confirm=confirm)
         return pulled, home.outcomes(pulled.edits, pulled.refused, self.conflicts())
 
     def _append(self, place: Home, mark: Mark, edits: list[Edit], rows: Content, why: str) -> int | None:
@@ -288,7 +309,8 @@ class Inventory:
         mark, changes, content = self._changes(self.home)
         now = state_at(self.truth)
         pulling = Pulling(state_at(self.truth, mark.commit), now, "", "", "", {}, now_utc())
-        return len(new_edits(changes, content.decisions, pulling)) + len(changes.faults)
+        edits, undecided = new_edits(changes, content.decisions, pulling)
+        return len(edits) + len(undecided) + len(changes.faults) + len(content.faults)
 
     def status(self) -> Status:
         """How it stands, and what a pull and a publication would do."""

@@ -5,15 +5,27 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from roadscan.inventory.comparing import Changes
+from roadscan.inventory.conflicts import conflicts_of
 from roadscan.inventory.edits import REJECTED, Edit, Folded, named
-from roadscan.inventory.home import Author, Decision, FaultyEditsError
+from roadscan.inventory.home import Author, Decision, EditFault, FaultyEditsError
 from roadscan.inventory.state import State
-from roadscan.inventory.values import encoded
-from roadscan.model.errors import ConfigError
+from roadscan.inventory.values import decoded, encoded
+from roadscan.model.witness import Finding, Witness
 from roadscan.tables.inventory_schema import GEOMETRY
+
+CLOCK_OF_EDITS: Final = Witness(
+    name="clock_of_edits",
+    input="inventory edits",
+    fault="The clock of the computer on which a person edited is wrong.",
+    asks="the instants of the commit that was shown and of the pull",
+    does="the edit is taken in and dated by the pull; `pull` says so",
+    told=("findings",),
+)
+_CLOCKS: Final = dt.timedelta(minutes=5)
+"""Clocks of computers that ask no time server differ by minutes; what is more confuses the order of edits."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +42,20 @@ class Pulling:
     at: str
 
 
-def new_edits(changes: Changes, decisions: Sequence[Decision], pulling: Pulling) -> list[Edit]:
-    """Edits that the truth does not hold yet, one a value.
-
-    Raises
-    ------
-    ConfigError
-        where decisions on a value contradict one another, or a value that was written meanwhile.
+def new_edits(changes: Changes, decisions: Sequence[Decision], pulling: Pulling) -> tuple[list[Edit], list[EditFault]]:
+    """Edits that the truth does not hold yet, one a value; and decisions that cannot be taken: they contradict one
+    another or a value that was written meanwhile, or nothing is there to choose.
     """
     made = {e.key: e for e in _changed(changes, pulling) if not _is_held(e, pulling)}
+    faults = []
     for key, own in _open(decisions, pulling).items():
-        edit = _decided(key, own, made.get(key), pulling)
+        try:
+            edit = _decided(key, own, made.get(key), pulling)
+        except ValueError as error:
+            faults.append(EditFault("conflicts", f"{key[0]}, {key[1]}", str(error)))
+            continue
         made[edit.key] = edit
-    return [named(edit) for edit in made.values()]
+    return [named(edit) for edit in made.values()], faults
 
 
 def _is_held(edit: Edit, pulling: Pulling) -> bool:
@@ -81,11 +94,19 @@ def _edit(
 def _open(decisions: Sequence[Decision], pulling: Pulling) -> dict[tuple[str, str], list[Decision]]:
     """Decisions by asset and attribute; those that were settled since are left out."""
     found: dict[tuple[str, str], list[Decision]] = {}
+    standing: set[tuple[str, str, str]] | None = None
     for one in decisions:
         key = (one.asset_id, one.attribute)
         known = pulling.now.edits.in_force.get(key)
         names = [e.edit for e in (*pulling.now.edits.waiting.get(key, ()), *([known] if known else []))]
-        if one.edit in names and one.asset_id in pulling.now.kind_of:
+        if one.edit not in names or one.asset_id not in pulling.now.kind_of:
+            continue
+        if one.edit in pulling.now.edits.settled:  # its edit is in force still: the asset, or its parent, came back
+            if standing is None:
+                standing = {(c.asset_id, c.attribute, c.edit) for c in conflicts_of(pulling.now)}
+            if one[:3] in standing:
+                found.setdefault(key, []).append(one)
+        else:
             found.setdefault(key, []).append(one)
     return found
 
@@ -96,28 +117,27 @@ def _decided(key: tuple[str, str], decisions: Sequence[Decision], written: Edit 
     Parameters
     ----------
     written : a value that the person wrote beside the decisions.
+
+    Raises
+    ------
+    ValueError
+        where they contradict one another or that value, or nothing is there to choose.
     """
     known = pulling.now.edits.in_force.get(key)
     waiting = {e.edit: e for e in pulling.now.edits.waiting.get(key, ())}
-    record = f"conflicts, {key[0]}, {key[1]}"
     settles = ",".join(sorted(one.edit for one in decisions))
     ruling = {(one.choice, one.edit if one.choice == "other" else "") for one in decisions if one.choice != "edit"}
     if len(ruling) > 1 or (ruling and written is not None):
-        raise ConfigError(
-            "the decisions contradict one another" if written is None else "a decision contradicts the value written",
-            expected="one value: `edit` for what the row of the asset says",
-            record=record,
-        )
+        what = "the decisions contradict one another" if written is None else "a decision contradicts the value written"
+        raise ValueError(f"{what}: one value is expected, `edit` for what the row of the asset says")
     if written is not None:
         return written._replace(settles=settles)
     choice, edit = ruling.pop() if ruling else ("edit", decisions[0].edit)
-    rejection = pulling.now.edits.in_force.get((key[0], "status"))
-    if choice == "other" and edit not in waiting and rejection is not None and rejection.new == REJECTED:
-        key, known, choice = rejection.key, rejection, "evidence"  # whoever edited it holds: the asset is back
     if choice == "other" and edit not in waiting:
-        raise ConfigError(
-            "the decision is 'other', and no other edit waits", expected="edit or evidence", record=record
-        )
+        rejection = _rejection(key, known, pulling)
+        if rejection is None:
+            raise ValueError("the decision is 'other', and no other edit waits: edit or evidence is expected")
+        key, known, choice = rejection.key, rejection, "evidence"  # whoever edited it holds: the asset is back
     evidence = (pulling.now.row(key[0], evidence=True) or {}).get(key[1])
     old = known.new if known is not None else None
     if choice == "other":
@@ -132,19 +152,60 @@ def _decided(key: tuple[str, str], decisions: Sequence[Decision], written: Edit 
     )  # fmt: skip
 
 
+def _rejection(key: tuple[str, str], known: Edit | None, pulling: Pulling) -> Edit | None:
+    """The edit in force that rejected an asset, or the parent that a person gave it; None where neither was."""
+    in_force = pulling.now.edits.in_force
+    ids = [key[0]]
+    if known is not None and known.attribute == "parent":
+        ids.append(decoded(known.kind, known.attribute, known.new))
+    rejections = (in_force.get((one, "status")) for one in ids)
+    return next((one for one in rejections if one is not None and one.new == REJECTED), None)
+
+
 def now_utc() -> str:
     """Today's instant (UTC), ISO 8601 to the second."""
     return dt.datetime.now(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
-def refuse(faults: Sequence[Any], home: str) -> FaultyEditsError:
+def refuse(faults: Sequence[EditFault], home: str) -> FaultyEditsError:
     """The error that names all faulty rows of a home."""
     listed = "; ".join(str(fault) for fault in faults[:20])
     more = f"; and {len(faults) - 20} more" if len(faults) > 20 else ""
-    error = FaultyEditsError(
-        f"nothing was taken in: {len(faults)} rows are faulty: {listed}{more}",
-        change="mend these rows and pull again, or take the others in alone (`--sound`)",
-        file=home,
-    )
+    asked = [fault.record for fault in faults if fault.is_question]
+    what = f"{len(faults)} rows are faulty:" if len(asked) < len(faults) else "is this right?"
+    way = ["mend these rows and pull again, or take the others in alone (`--sound`)"]
+    if asked:
+        way.append(f"`--confirm '{asked[0]}'` takes in a place that is right as it stands (`--confirm all`: each)")
+    error = FaultyEditsError(f"nothing was taken in: {what} {listed}{more}", change="; ".join(way), file=home)
     error.faults = tuple(faults)
     return error
+
+
+def clocked(
+    authors: Mapping[tuple[str, str, str], Author], shown_at: str, now: str
+) -> tuple[dict[tuple[str, str, str], Author], list[Finding]]:
+    """Authors without instants that cannot be: before the commit that was shown, or after now; and what that says.
+
+    Parameters
+    ----------
+    shown_at, now : instants (UTC): of the commit whose state was edited, and of the pull.
+    """
+    first, last = dt.datetime.fromisoformat(shown_at) - _CLOCKS, dt.datetime.fromisoformat(now) + _CLOCKS
+    kept, odd = dict(authors), set()
+    for name, author in authors.items():
+        if author.at and not first <= _instant(author.at) <= last:
+            kept[name] = author._replace(at="")
+            odd.add((author.who, author.at))
+    return kept, [
+        CLOCK_OF_EDITS.finds(
+            who or "an edit",
+            f"it is dated {at}, and its state was shown at {shown_at} and is pulled at {now}: the clock of that "
+            "computer is wrong. The edit is dated by the pull.",
+        )
+        for who, at in sorted(odd)
+    ]
+
+
+def _instant(text: str) -> dt.datetime:
+    moment = dt.datetime.fromisoformat(text)
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=dt.UTC)

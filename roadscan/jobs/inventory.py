@@ -79,15 +79,17 @@ def inventory_faults(survey: Survey) -> list[str]:
 def home_of(session: Session, given: str | None = None) -> Home:
     """The home that the survey file states, or another one: a GeoPackage or the address of a PostGIS database."""
     settings, survey = session.survey.config.inventory, session.survey
-    crs = survey.frame().crs
+    frame = survey.frame()
+    crs = frame.crs
     address = given if given is not None else os.environ.get(ADDRESS) or settings.postgis
     if address is not None and (given is None or "://" in given):
         from roadscan.inventory.homes.postgis import PostGis
 
         srid = None if crs is None else crs_from_text(crs).to_epsg()
         home = survey.resolve(settings.home)
-        return PostGis(address, settings.schema_name, srid, project=home.with_name(f"{home.stem}-postgis.qgs"))
-    return GeoPackage(Path(given) if given is not None else survey.resolve(settings.home), crs)
+        project = home.with_name(f"{home.stem}-postgis.qgs")
+        return PostGis(address, settings.schema_name, srid, project=project, frame=frame)
+    return GeoPackage(Path(given) if given is not None else survey.resolve(settings.home), crs, frame=frame)
 
 
 def page_document(session: Session, name: str, content: bytes) -> PageDocument:

@@ -12,7 +12,6 @@ import shapely
 from roadscan.inventory.home import FaultyEditsError
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
-from roadscan.model.errors import ConfigError
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import (
     CRS,
@@ -81,7 +80,7 @@ def test_an_edit_that_waits_waits_until_it_is_decided(street: Inventory, tmp_pat
     assert sorted((c.in_force, c.other) for c in street.conflicts()) == [("4", "8"), ("4", "9")]
     street.publish()
     settle(street, ["other", "other"])
-    with pytest.raises(ConfigError, match="the decisions contradict one another"):
+    with pytest.raises(FaultyEditsError, match="the decisions contradict one another"):
         street.pull(who="boss")
     settle(street, ["edit", None])
     street.pull(who="boss")

@@ -9,10 +9,14 @@ from typing import Any
 import pytest
 import shapely
 
+import roadscan
 from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument
 from roadscan.inventory.inventory import Inventory
 from tests.inventory.streets import EAST, NORTH, asset, found, inventory, poles
+from tests.inventory.test_doubtful_edits import run, survey_file
+
+__all__ = ["survey_file"]
 
 
 @pytest.fixture
@@ -169,3 +173,28 @@ def test_a_document_that_is_none_of_this_inventory(street: Inventory, said: dict
 def test_what_is_no_document(content: bytes) -> None:
     with pytest.raises(HomeError, match="edits"):
         PageDocument.parse("edits.geojson", content, (1.0, 1.0, 1.0))
+
+
+def test_an_unlikely_place_is_asked_about_and_taken_in_once_it_is_confirmed(street: Inventory) -> None:
+    first = pole(street)
+    far = {"type": "Point", "coordinates": [EAST + 5000.0, NORTH, 100.0]}
+    pulled, told = street.pull_page(document(edit("change", first, geometry=far)), sound=True)
+    assert (pulled.commit, outcomes(told)) == (None, ["asked"])
+    assert told[0].reason.endswith("km from its former place, more than 100 m")
+    pulled, told = street.pull_page(document(edit("change", first, geometry=far, confirmed=True)))
+    assert (pulled.commit, outcomes(told)) == (2, ["accepted"])
+
+
+@pytest.mark.witness("clock_of_edits")
+def test_an_edit_of_a_computer_whose_clock_is_wrong_is_dated_by_the_pull(survey_file: Path) -> None:
+    run("publish", survey_file)
+    survey = roadscan.open_survey(survey_file)
+    one = str(survey.inventory.state().assets["pole"].ids[0])
+    head = {"type": "FeatureCollection", "coordinates": "map_m", "survey": "street", "inventory": "street", "commit": 1}
+    made = edit("confirm", one, edited_utc="1999-01-01T00:00:00Z")
+    file = survey_file.parent / "edits.geojson"
+    file.write_text(json.dumps({**head, "features": [made]}))
+    told = run("pull", survey_file, "--home", file)
+    assert "doubtful: eva: it is dated 1999-01-01T00:00:00Z" in told and "the clock of that computer is wrong" in told
+    (event,) = [e for e in roadscan.open_survey(survey_file).inventory.history(one) if e.who == "eva"]
+    assert not event.at.startswith("1999")

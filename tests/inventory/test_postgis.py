@@ -236,3 +236,18 @@ def test_a_foreign_schema_and_a_server_that_is_not_there_are_named(tmp_path: Pat
     with pytest.raises(ConfigError, match="the address of the PostGIS database is none") as wrong:
         PostGis("postgresql://admin:secret@[", "street")
     assert "secret" not in str(wrong.value)
+
+
+def test_a_table_that_was_altered_to_another_srid_is_brought_into_the_map(street: Inventory, address: str) -> None:
+    execute(address, "DROP VIEW street.poles_current")
+    execute(
+        address,
+        "ALTER TABLE street.poles ALTER COLUMN geom TYPE geometry(PointZ, 4326) USING ST_Transform(geom, 4326)",
+    )
+    assert street.pull().commit is None  # they are where they were
+    statement = (
+        "ALTER TABLE street.poles ALTER COLUMN geom TYPE geometry(PointZ, 31468) USING ST_Transform(geom, 31468)"
+    )
+    execute(address, statement)
+    with pytest.raises(HomeError, match="the layer 'poles' is in EPSG:31468"):
+        street.pull()

@@ -10,7 +10,7 @@ import { helpDialog } from './panels/help'
 import { layersPanel } from './panels/layers'
 import { Measurements } from './panels/measurements'
 import { RowPanel } from './panels/row'
-import { parseSearch } from './panels/search'
+import { findRows, layerOfKind, onMap, parseSearch } from './panels/search'
 import { TablePanel } from './panels/table'
 
 const TITLES: Record<ViewName, [Parameters<typeof icon>[0], string, string]> = {
@@ -34,6 +34,7 @@ export class App {
   readonly #layers = h('div')
   readonly #right = h('aside', { class: 'side right', 'aria-label': 'Details' })
   readonly #toast = h('div', { class: 'toast', role: 'status', hidden: true })
+  readonly #found = h('ul', { class: 'search-found', 'aria-label': 'What was found', hidden: true })
   readonly #help = helpDialog()
   readonly #rows: RowPanel
   readonly #table: TablePanel
@@ -121,8 +122,8 @@ export class App {
     const { survey } = this.desk
     const { crs } = survey
     const about = [crs.authority ?? crs.name ?? 'local frame', crs.height ? `${crs.height} heights` : null].filter(Boolean).join(' · ')
-    const search = h('input', { type: 'search', id: 'search', placeholder: 'Go to: E N, layer/row, @station', 'aria-label': 'Go to a place, a row or a station', autocomplete: 'off' })
-    const form = h('form', { class: 'search', role: 'search', onsubmit: (event: Event) => { event.preventDefault(); void this.#search(search.value) } }, icon('search'), search)
+    const search = h('input', { type: 'search', id: 'search', placeholder: 'Name, id, kind, E N, lat, lon, @station', 'aria-label': 'Go to a name, an id, a kind, a place, a row or a station', autocomplete: 'off' })
+    const form = h('form', { class: 'search', role: 'search', onsubmit: (event: Event) => { event.preventDefault(); void this.#search(search.value) } }, icon('search'), search, this.#found)
     return h(
       'header',
       { class: 'top' },
@@ -299,14 +300,58 @@ export class App {
   }
 
   async #search(text: string): Promise<void> {
-    const wanted = parseSearch(text)
+    this.#found.hidden = true
+    const wanted = parseSearch(text, this.desk.survey.extent_m)
     if (wanted.kind === 'place') {
       this.desk.place.value = { easting_m: wanted.easting_m, northing_m: wanted.northing_m, height_m: wanted.height_m, from: 'search' }
       this.desk.goTo({ ...wanted, across_m: 20 })
     } else if (wanted.kind === 'tile') this.#goToTile(wanted.tile)
     else if (wanted.kind === 'station' && this.desk.survey.strips) await this.parts.goToStation(wanted.station_m, null)
+    else if (wanted.kind === 'degrees') this.#goToDegrees(wanted.latitude_deg, wanted.longitude_deg)
     else if (wanted.kind === 'row' && (await this.#goToRow(wanted.layer, wanted.id))) return
-    else if (wanted.kind !== 'station') this.desk.complain(`“${text}” was not understood: give easting and northing in metres, a tile as COLUMN_ROW, a row as LAYER/ID, or a station as @METRES`)
+    else if (wanted.kind !== 'station') await this.#find(text.trim())
+  }
+
+  /** Go to latitude and longitude, and say what the numbers were taken for; the other way round where only that lies here. */
+  #goToDegrees(latitude_deg: number, longitude_deg: number): void {
+    const { degrees, crs } = this.desk.survey
+    if (!degrees) return this.desk.complain(`Latitude and longitude are not known on this map (${crs.authority ?? crs.name ?? 'a local frame'}): give easting and northing in metres.`)
+    const asGiven = onMap(degrees, longitude_deg, latitude_deg)
+    const place = asGiven ?? onMap(degrees, latitude_deg, longitude_deg)
+    const [lat, lon] = asGiven ? [latitude_deg, longitude_deg] : [longitude_deg, latitude_deg]
+    if (!place) return this.desk.complain(`Latitude ${latitude_deg}°, longitude ${longitude_deg}° (WGS 84) is more than 2 km outside of the survey.`)
+    const [easting_m, northing_m] = place
+    this.desk.place.value = { easting_m, northing_m, height_m: null, from: 'search', notes: [['Latitude', `${lat}°`], ['Longitude', `${lon}°`]] }
+    this.desk.goTo({ easting_m, northing_m, across_m: 20 })
+    this.desk.say(`Taken for latitude ${lat}°, longitude ${lon}° (WGS 84)${asGiven ? '' : ', in this order'}: E ${format.fixed(easting_m, 2)}, N ${format.fixed(northing_m, 2)}.`)
+  }
+
+  /** Look for a kind, or for rows by id, name and text; one is gone to, several are offered. */
+  async #find(text: string): Promise<void> {
+    if (!text) return
+    const kind = layerOfKind(this.map.layers, text)
+    if (kind) {
+      kind.setVisible(true)
+      this.map.look()
+      this.#drawLayers()
+      await this.#table.open(kind)
+      this.#openDock('table')
+      this.desk.say(`${kind.document.title}: ${format.fixed(kind.document.features, 0)}.`)
+      return
+    }
+    const { found, left } = await findRows(this.map.layers, text)
+    this.element.dataset['found'] = String(found.length)
+    const rest = left.length ? ` Not looked through, as they are large: ${left.join(', ')}.` : ''
+    if (!found.length) return this.desk.complain(`“${text}” is no name, id or kind here.${rest} Or give easting and northing in metres, latitude and longitude in degrees, a tile as COLUMN_ROW, a row as LAYER/ID, a station as @METRES.`)
+    const show = ({ layer, feature }: (typeof found)[number]): void => {
+      this.#found.hidden = true
+      layer.setVisible(true)
+      this.desk.selected.value = { layer: layer.document, feature }
+      this.#lookAt(feature)
+    }
+    if (found.length === 1) return show(found[0]!)
+    fill(this.#found, ...found.map((one) => h('li', {}, h('button', { type: 'button', onclick: () => show(one) }, one.text))))
+    this.#found.hidden = false
   }
 
   async #followHash(): Promise<void> {
@@ -329,7 +374,7 @@ export class App {
     const row = parseSearch(asked.get('row') ?? '') // an id may hold slashes, spaces and signs
     if (row.kind === 'row') await this.#goToRow(row.layer, row.id)
     const station = asked.get('station')
-    if (station && this.desk.survey.strips) await this.parts.goToStation(Number(station), asked.has('lane') ? Number(asked.get('lane')) : null)
+    if (station && this.desk.survey.strips) await this.parts.goToStationOf(asked.get('road'), asked.get('lane'), Number(station))
   }
 
   #key(event: KeyboardEvent): void {

@@ -265,14 +265,21 @@ export class ModelParts {
     if (place) this.desk.goTo({ ...place, across_m: 30 })
   }
 
-  /** Go to a station of a road, in a lane of it where one is named. */
-  async goToStationOf(road: string, lane: string | null, station_m: number): Promise<void> {
+  /** Go to a station of a road (null: of the open lane's), in a lane of it where one is named as all products name it. */
+  async goToStationOf(road: string | null, lane: string | null, station_m: number): Promise<void> {
     try {
-      const { lanes } = (await this.#openStripsOnce()).index
-      const own = lanes.filter((one) => one.road === road)
-      const found = own.find((one) => one.lane === lane) ?? own[0]
-      if (found) await this.goToStation(station_m, found.lane_id)
-      else this.desk.say(`The road ${road} has no strips.`)
+      const strips = await this.#openStripsOnce()
+      const { lanes } = strips.index
+      const wanted = road ?? strips.lane.road
+      const own = lanes.filter((one) => one.road === wanted)
+      const known = own.find((one) => one.lane === lane) ?? (road === null ? lanes.find((one) => one.lane === lane) : undefined)
+      // Links of older pages counted lanes from 0: that number is meant where no lane is called so.
+      const older = lane !== null && !known ? lanes.find((one) => String(one.lane_id) === lane) : undefined
+      const found = known ?? older ?? (lane === null && road === null ? strips.lane : own[0])
+      if (!found) return this.desk.say(`The road ${wanted} has no strips.`)
+      if (older) this.desk.say(`No lane is called ${lane}: taken for the number ${lane} of an older link, lane ${older.lane} of ${older.road}.`)
+      else if (lane !== null && !known) this.desk.say(`The road ${wanted} has no lane ${lane}: lane ${found.lane} is shown.`)
+      await this.goToStation(station_m, found.lane_id)
     } catch (error) {
       this.desk.complain(error)
     }

@@ -17,12 +17,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
 
-from roadscan.inventory.home import CHOICES, FID, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.home import CHOICES, FID, Content, Decision, EditFault, Home, HomeError, Mark, Sheet
+from roadscan.inventory.homes.added_tables import keep_added
+from roadscan.inventory.homes.map_crs import into_map
+from roadscan.inventory.homes.stored_values import OddValue, odd_values
 from roadscan.inventory.homes.value_lists import add_value_lists
 from roadscan.inventory.qgis.styles import add_styles
-from roadscan.inventory.values import iso_column
+from roadscan.inventory.values import iso_wkb
+from roadscan.model.crs import MapFrame
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
 from roadscan.tables.store import process_lives
@@ -31,15 +38,21 @@ MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"
 _VERSION: Final = {"VERSION": "1.3"}
 """Of the standard; programs of today's stable Linux systems warn of newer ones."""
+_WAIT_S: Final = 0.5
+"""Longer than the transaction of one edit that another program saves."""
 _FOREIGN: Final = "name another file, or move this one away"
 
 
 class GeoPackage(Home):
     """A GeoPackage file with a layer for each kind of assets, or for some kinds alone."""
 
-    def __init__(self, file: Path, crs: str | None, kinds: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, file: Path, crs: str | None, kinds: Sequence[str] | None = None, frame: MapFrame | None = None
+    ) -> None:
+        """Take a file, the CRS of its layers, and the map's frame where that says more (heights, largest error)."""
         self.file = file
         self.crs = crs
+        self.frame = frame or MapFrame(crs)
         self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
         self._as_read: tuple[int, int] | None = None
         """Size and time of the file when its rows were read."""
@@ -67,6 +80,7 @@ class GeoPackage(Home):
         try:
             layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            self._check_not_locked(error)
             raise HomeError(
                 f"the file is no GeoPackage that can be read: {error}", change=_FOREIGN, file=self.file
             ) from error
@@ -77,7 +91,7 @@ class GeoPackage(Home):
                 change=_FOREIGN,
                 file=self.file,
             )
-        _, table = pyogrio.read_arrow(self.file, layer=MARKS)
+        _, table = self._layer_rows(MARKS)
         rows = table.to_pylist()
         if not rows:
             raise HomeError(f"the table '{MARKS}' is empty", change=_FOREIGN, file=self.file)
@@ -92,11 +106,13 @@ class GeoPackage(Home):
 
         layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
         rows: dict[str, pa.Table] = {}
+        faults: list[EditFault] = []
         for kind in self.kinds:
             table = asset_schema(kind).table
             if table in layers:
                 rows[kind] = self._read_layer(kind, table)
-        content = Content(rows, self._decisions(layers))
+                faults += [EditFault(table, o.asset_id or f"fid {o.fid}", o.reason) for o in self._odd(kind, table)]
+        content = Content(rows, self._decisions(layers), faults=tuple(faults))
         self._as_read = self._stamp()
         return content
 
@@ -106,8 +122,15 @@ class GeoPackage(Home):
         held = self.file.stat()
         return held.st_size, held.st_mtime_ns
 
+    def _odd(self, kind: str, table: str) -> list[OddValue]:
+        try:
+            return odd_values(self.file, table, asset_table(kind))
+        except sqlite3.Error as error:
+            self._check_not_locked(error)
+            raise HomeError(f"the layer '{table}' cannot be read: {error}", file=self.file) from error
+
     def _read_layer(self, kind: str, table: str) -> pa.Table:
-        meta, found = _read(self.file, table)
+        meta, found = self._layer_rows(table)
         if meta["geometry_name"] in found.column_names:
             at = found.column_names.index(meta["geometry_name"])
             found = found.rename_columns([GEOMETRY if n == at else name for n, name in enumerate(found.column_names)])
@@ -127,15 +150,16 @@ class GeoPackage(Home):
                 change="keep what it says in `comments` and remove it: it would be lost",
                 file=self.file,
             )
-        return pa.table(
-            {FID: found[FID].cast(pa.int64())}
-            | {field.name: self._cast(found[field.name], field, table) for field in schema}
-        )
+        shapes = shapely.from_wkb(found[GEOMETRY].to_numpy(zero_copy_only=False))
+        placed = into_map(meta["crs"], self.frame, table, self.name)(np.asarray(shapes, dtype=object))
+        plain = {field.name: self._cast(found[field.name], field, table) for field in schema if field.name != GEOMETRY}
+        return pa.table({FID: found[FID].cast(pa.int64())} | plain | {GEOMETRY: pa.array(iso_wkb(placed), pa.binary())})
 
     def _cast(self, column: pa.ChunkedArray, field: pa.Field, table: str) -> pa.Array | pa.ChunkedArray:
         try:
-            if field.name == GEOMETRY:
-                return iso_column(column)
+            if pa.types.is_integer(field.type) and pa.types.is_floating(column.type):
+                column = pc.trunc(column)  # a number that is not whole is a fault of its row
+                return column.cast(field.type, safe=False)
             return column.cast(field.type)
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise HomeError(
@@ -147,7 +171,7 @@ class GeoPackage(Home):
     def _decisions(self, layers: set[str]) -> list[Decision]:
         if CONFLICTS not in layers:
             return []
-        _, table = _read(self.file, CONFLICTS)
+        _, table = self._layer_rows(CONFLICTS)
         if any(name not in table.column_names for name in (*Decision._fields[:3], "decision")):
             return []
         given = [row for row in table.to_pylist() if row["decision"]]
@@ -169,6 +193,8 @@ class GeoPackage(Home):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             with _dated(mark.at):
                 self._write_layers(scratch, content.rows, sheets, mark)
+            if self.file.exists():
+                keep_added(self.file, scratch)
             with scratch.open("rb+") as stream:
                 os.fsync(stream.fileno())
             self._check_unchanged()
@@ -223,6 +249,7 @@ class GeoPackage(Home):
             pyogrio.write_arrow(_mark_rows(mark), self.file, layer=MARKS, driver="GPKG", append=True)
             self._as_read = None
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, RuntimeError) as error:
+            self._check_not_locked(error)
             raise self._unwritable(error) from error
 
     def _check_unchanged(self) -> None:
@@ -240,17 +267,51 @@ class GeoPackage(Home):
     def _check_free(self) -> None:
         """HomeError while another program has the file open with changes that are not in it yet."""
         self._check_writable()
-        if not Path(f"{self.file}-wal").exists():
+        if not self.file.exists():
             return
         try:
-            with contextlib.closing(sqlite3.connect(self.file, timeout=0.5)) as connection:
-                connection.execute("PRAGMA journal_mode = DELETE").fetchall()
-        except sqlite3.Error as error:
-            raise HomeError(
-                f"another program has the GeoPackage open ({error})",
-                change="close it there (in QGIS remove its layers or close the project), then try again",
-                file=self.file,
-            ) from error
+            with contextlib.closing(sqlite3.connect(self.file, timeout=_WAIT_S, isolation_level=None)) as connection:
+                if Path(f"{self.file}-wal").exists():
+                    connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+                connection.execute("BEGIN IMMEDIATE")
+                connection.execute("ROLLBACK")
+        except sqlite3.DatabaseError as error:
+            raise self._held_open(error) from error
+
+    def _check_not_locked(self, cause: Exception) -> None:
+        """HomeError where a file could not be read or written because another program has locked it."""
+        try:
+            with contextlib.closing(sqlite3.connect(self.file, timeout=_WAIT_S, isolation_level=None)) as connection:
+                connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
+                connection.execute("BEGIN IMMEDIATE")
+                connection.execute("ROLLBACK")
+        except sqlite3.OperationalError as error:
+            if "locked" in str(error):
+                raise self._held_open(error) from cause
+        except sqlite3.DatabaseError:
+            return  # it is none: that is what the caller says
+
+    def _held_open(self, error: Exception) -> HomeError:
+        who = programs_with(self.file)
+        return HomeError(
+            f"another program has the GeoPackage open ({error})" + (f": {', '.join(who)}" if who else ""),
+            change="save or undo the edits there and close it (in QGIS remove its layers or close the project), then "
+            "try again; the file is as it was",
+            file=self.file,
+        )
+
+    def _layer_rows(self, layer: str) -> tuple[dict[str, Any], pa.Table]:
+        """What OGR says of a layer, and its rows."""
+        import pyogrio
+
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of heights and types that are checked here
+                meta, table = pyogrio.read_arrow(self.file, layer=layer, return_fids=True)
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            self._check_not_locked(error)
+            raise HomeError(f"the layer '{layer}' cannot be read: {error}", file=self.file) from error
+        return meta, table
 
     def _unwritable(self, error: Exception) -> HomeError:
         return HomeError(
@@ -260,16 +321,16 @@ class GeoPackage(Home):
         )
 
 
-def _read(file: Path, layer: str) -> tuple[dict[str, Any], pa.Table]:
-    import pyogrio
+def programs_with(file: Path) -> list[str]:
+    """Name and number of each other program of this computer that has a file open, as far as its user may see them."""
+    import psutil
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of heights and types that are checked here
-            meta, table = pyogrio.read_arrow(file, layer=layer, return_fids=True)
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-        raise HomeError(f"the layer '{layer}' cannot be read: {error}", file=file) from error
-    return meta, table
+    found = []
+    for process in psutil.process_iter(["name"]):
+        with contextlib.suppress(psutil.Error):
+            if process.pid != os.getpid() and any(Path(one.path) == file.resolve() for one in process.open_files()):
+                found.append(f"{process.info['name']} (process {process.pid})")
+    return sorted(found)
 
 
 def _told(kind: str) -> pa.Schema:

@@ -31,7 +31,7 @@ from roadscan.tables.inventory_schema import GEOMETRY, asset_table, kinds_by_tab
 LAYER: Final = "asset_"
 """Layers of the page are named so, followed by the table of their kind."""
 
-Outcome = Literal["accepted", "same", "conflict", "refused"]
+Outcome = Literal["accepted", "same", "conflict", "asked", "refused"]
 
 
 class EditProperties(Strict):
@@ -46,6 +46,8 @@ class EditProperties(Strict):
     comment: str = ""
     author: str = ""
     edited_utc: dt.datetime | None = None
+    confirmed: bool = False
+    """True where the person said that an unlikely place is right."""
 
 
 class EditFeature(Strict):
@@ -76,7 +78,8 @@ class EditOutcome(NamedTuple):
     """What became of one edit of a document."""
 
     outcome: Outcome
-    """`accepted`, `same`: the inventory says so already, `conflict`: it waits, or `refused`."""
+    """`accepted`, `same`: the inventory says so already, `conflict`: it waits, `asked`: it is taken in once it
+    is confirmed, or `refused`."""
     reason: str = ""
 
 
@@ -162,7 +165,12 @@ class PageEdits(Home):
         for place, (table, record) in enumerate(self.records):
             if not record:
                 self.records[place] = (table, records[kinds_by_table()[table]].pop(0))
-        return Content(rows, authors=self._authors, faults=tuple(self._faults))
+        confirmed = [
+            record
+            for (_, record), feature in zip(self.records, self.document.edits.features, strict=True)
+            if feature.properties.confirmed
+        ]
+        return Content(rows, authors=self._authors, faults=tuple(self._faults), confirmed=confirmed)
 
     def _edited(self, kind: str, rows: pa.Table, features: Sequence[EditFeature]) -> tuple[pa.Table, list[str]]:
         """Rows of a kind with edits, and the record of each edit."""
@@ -234,10 +242,11 @@ class PageEdits(Home):
         reasons: dict[tuple[str, str], list[str]] = {}
         for fault in refused:
             reasons.setdefault((fault.table, fault.record), []).append(fault.reason)
+        asked = {(fault.table, fault.record) for fault in refused if fault.is_question}
         told = []
         for feature, record in zip(self.document.edits.features, self.records, strict=True):
             if record in reasons:
-                told.append(EditOutcome("refused", "; ".join(reasons[record])))
+                told.append(EditOutcome("asked" if record in asked else "refused", "; ".join(reasons[record])))
                 continue
             own = [edit for edit in taken if self._is_of(edit, feature, record)]
             names = {edit.edit for edit in own}

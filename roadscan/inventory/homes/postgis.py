@@ -13,13 +13,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv
 import shapely
 
 from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
+from roadscan.inventory.homes.map_crs import into_map
 from roadscan.inventory.homes.postgis_schema import ROLES, statements
 from roadscan.inventory.values import iso_wkb
+from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError
 from roadscan.tables.asset_schema import asset_kind_names, asset_schema
 from roadscan.tables.inventory_schema import GEOMETRY, asset_table, kinds_by_table
@@ -39,6 +42,7 @@ class PostGis(Home):
     srid : EPSG number of the map; 0 for a local one.
     kinds : of assets that have a table each; all where they are left out.
     project : project file of QGIS that the first publication writes.
+    frame : the map's frame; that of `srid` where it is left out.
 
     Raises
     ------
@@ -48,7 +52,7 @@ class PostGis(Home):
 
     def __init__(
         self, address: str, schema: str = "inventory", srid: int | None = None, kinds: Sequence[str] | None = None,
-        project: Path | None = None,
+        project: Path | None = None, frame: MapFrame | None = None,
     ) -> None:  # fmt: skip
         try:
             import psycopg
@@ -67,6 +71,7 @@ class PostGis(Home):
         self.srid = srid or 0
         self.kinds = tuple(asset_kind_names() if kinds is None else kinds)
         self._project = project
+        self.frame = frame or MapFrame(f"EPSG:{srid}" if srid else None)
         self._seen: int | None = None
         """Last entry of the history when the rows were read."""
 
@@ -172,8 +177,17 @@ class PostGis(Home):
         return pa.table(
             {FID: read[FID]}
             | {f.name: read[f.name] for f in schema if f.name != GEOMETRY}
-            | {GEOMETRY: pa.array(iso_wkb(shapes), pa.binary())}
+            | {GEOMETRY: pa.array(iso_wkb(self._in_map(shapes, table)), pa.binary())}
         )
+
+    def _in_map(self, shapes: npt.NDArray[Any], table: str) -> npt.NDArray[Any]:
+        """Geometries in the map's CRS: a table whose column was altered holds those of another SRID."""
+        stated = shapely.get_srid(shapes)
+        out = shapes.copy()
+        for srid in sorted(set(stated[~shapely.is_missing(shapes)].tolist()) - {self.srid}):
+            of_it = (stated == srid) & ~shapely.is_missing(shapes)
+            out[of_it] = into_map(f"EPSG:{srid}" if srid else None, self.frame, table, self.name)(shapes[of_it])
+        return out
 
     def _as_owner(self, cursor: Any) -> None:
         """Go on as the owner of the schema, which all administrators are: tables are replaced by nobody else."""

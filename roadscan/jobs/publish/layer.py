@@ -28,6 +28,9 @@ BLUE, ORANGE, GREEN, RED, SKY, YELLOW, PURPLE, GREY = (
 )  # fmt: skip
 """Colours that all eyes tell apart (Okabe and Ito 2008), and a grey for what is not known."""
 
+BELOW_TO_ABOVE: Final = ("#2166ac", "#67a9cf", "#f7f7f7", "#ef8a62", "#b2182b")
+"""Five steps of a difference on both sides of zero that all eyes tell apart (ColorBrewer 2, RdBu)."""
+
 GOOD_TO_POOR: Final = ("#4575b4", "#91bfdb", "#fee090", "#fc8d59", "#d73027")
 """Five steps that all eyes tell apart (ColorBrewer 2, RdYlBu)."""
 
@@ -63,6 +66,10 @@ class Style:
     by: str = ""
     limits: tuple[float, ...] = ()
     """Limits between the classes, ascending; the colours are those of :data:`GOOD_TO_POOR`."""
+    shown_in: tuple[str, float] = ("", 1.0)
+    """Unit of the labels of classes, and how many of them a unit of the column has."""
+    is_difference: bool = False
+    """True for a difference, whose limits lie alike on both sides of zero: :data:`BELOW_TO_ABOVE`."""
     values: Mapping[str, str] = field(default_factory=dict)
     """Colour by value."""
 
@@ -74,7 +81,7 @@ class Style:
         told["none"] = {"colour": GREY, "label": "not known"}
         if self.values:
             return told | {"values": [{"value": v, "colour": c, "label": v} for v, c in self.values.items()]}
-        return told | {"classes": list(_classes(self.limits))}
+        return told | {"classes": list(_classes(self))}
 
     def colour_of(self, row: Mapping[str, Any]) -> str:
         """Colour of a row, as the page finds it."""
@@ -85,17 +92,20 @@ class Style:
             return self.values.get(str(value), GREY)
         if not isinstance(value, int | float) or math.isnan(value):
             return GREY
-        kinds = list(_classes(self.limits))
+        kinds = list(_classes(self))
         colour: str = kinds[bisect.bisect_right(self.limits, value)]["colour"]
         return colour
 
 
-def _classes(limits: Sequence[float]) -> Iterator[dict[str, Any]]:
+def _classes(style: Style) -> Iterator[dict[str, Any]]:
+    limits, (unit, factor) = style.limits, style.shown_in
+    colours = BELOW_TO_ABOVE if style.is_difference else GOOD_TO_POOR
     ends: list[float | None] = [None, *limits, None]
-    places = np.linspace(0, len(GOOD_TO_POOR) - 1, len(limits) + 1).round().astype(int).tolist()
+    places = np.linspace(0, len(colours) - 1, len(limits) + 1).round().astype(int).tolist()
     for low, high, place in zip(ends[:-1], ends[1:], places, strict=True):
-        label = f"below {high:g}" if low is None else f"{low:g} and above" if high is None else f"{low:g} to {high:g}"
-        yield {"from": low, "to": high, "colour": GOOD_TO_POOR[place], "label": label}
+        least, most = (None if end is None else f"{factor * end:g}".replace("-", "−") for end in (low, high))
+        label = f"below {most}" if least is None else f"{least} and above" if most is None else f"{least} to {most}"
+        yield {"from": low, "to": high, "colour": colours[place], "label": f"{label} {unit}".strip()}
 
 
 @dataclass(frozen=True)

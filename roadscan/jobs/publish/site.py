@@ -16,6 +16,7 @@ from typing import Any, Final
 from roadscan.code_reach import code_digest
 from roadscan.codecs import SOFTWARE
 from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.publish.degrees import degrees_on_map
 from roadscan.jobs.publish.document import Ask, Document, json_document
 from roadscan.jobs.publish.material import SHEET_M, Box, Material
 from roadscan.jobs.publish.part import site_parts
@@ -43,6 +44,7 @@ def entry(material: Material) -> Document:
         "layout": LAYOUT, "software": SOFTWARE, "id": context.survey_id, "title": context.title or context.survey_id,
         "crs": _crs(context.map), "origin_m": _origin(material), "extent_m": extent_m,
         "height_extent_m": _heights(material), "lon_lat": _longitude_latitude(context.map, extent_m),
+        "degrees": degrees_on_map(context.map, extent_m),
         "tile_m": context.grid.size_m, "cell_m": context.grid.cell_m, "sheet_m": SHEET_M,
         "report": REPORT_PAGE if _report(material) is not None else None,
     }  # fmt: skip
@@ -51,6 +53,7 @@ def entry(material: Material) -> Document:
     if extent_m is None:
         told["extent_m"] = box = _box_of(told["layers"])
         told["lon_lat"] = _longitude_latitude(context.map, box)
+        told["degrees"] = degrees_on_map(context.map, box)
     return json_document(ENTRY, told)
 
 

@@ -1,5 +1,6 @@
 /** The point cloud: drawing, picking and the tools that measure in it. */
 
+import { groundHeights } from './ground'
 import { Vector3 } from 'three'
 import type { Desk, Place, Target } from '../core/desk'
 import { fill, h, iconButton } from '../core/dom'
@@ -66,6 +67,10 @@ export class CloudView {
   #far = 60
   #meshes: Promise<SurfaceMeshes> | null = null
   #coloured = false
+  /** Heights of the ground, from robust percentiles; null until points are there. */
+  #ground: [number, number] | null = null
+  /** True once people have spread the scale themselves. */
+  #isSpread = false
   /** True once people have moved the eye. */
   #touched = false
   /** Where it looks, as long as the height of the ground there is a guess. */
@@ -111,7 +116,12 @@ export class CloudView {
     if (desk.target.value) this.#goTo(desk.target.value)
   }
 
+  /** The scale of heights: those of the ground, once points are there; until then all that the survey has. */
   #heights(): [number, number] {
+    return this.#ground ?? this.#allHeights()
+  }
+
+  #allHeights(): [number, number] {
     const [low, high] = [Math.min(...this.store.sheets.map((one) => one.bounds.min[2])), Math.max(...this.store.sheets.map((one) => one.bounds.max[2]))]
     return this.desk.survey.height_extent_m ?? [low, high]
   }
@@ -273,9 +283,13 @@ export class CloudView {
       this.#drawSettings()
     }
     if (!this.store.loading && this.#guessed) {
+      this.#findGround()
       this.#goTo(this.#guessed)
       this.#guessed = null
-    } else if (!this.store.loading) this.#redraw(true)
+    } else if (!this.store.loading) {
+      this.#findGround()
+      this.#redraw(true)
+    }
     else this.#pause ||= window.setTimeout(() => {
       this.#pause = 0
       this.#redraw(true)
@@ -338,7 +352,7 @@ export class CloudView {
 
   /** Height (m) of the loaded point that lies nearest to a place of the map. */
   groundAt(easting_m: number, northing_m: number): number {
-    let [least, height] = [Infinity, this.#heights()[0]]
+    let [least, height] = [Infinity, this.#allHeights()[0]]
     for (const node of this.store.ready()) {
       if (node.depth > 4) continue
       const { box, points, origin } = node
@@ -483,6 +497,19 @@ export class CloudView {
     this.#drawSettings()
   }
 
+  /** Let the scale show the ground, whatever stands on it: houses would leave the road one colour. Done once. */
+  #findGround(): void {
+    if (this.#ground) return
+    this.#ground = groundHeights([...this.store.ready()])
+    if (!this.#ground) return
+    const [from, to] = this.#ground
+    this.element.dataset['ground'] = `${from.toFixed(3)},${to.toFixed(3)}`
+    if (this.#look.colouring !== 'height' || this.#isSpread) return
+    this.#look = { ...this.#look, from, to }
+    this.#applyLook()
+    this.#drawSettings()
+  }
+
   /** Spread the scale over what is seen now: from the 2nd to the 98th percentile of the drawn points. */
   spread(): void {
     const values: number[] = []
@@ -500,6 +527,7 @@ export class CloudView {
     if (values.length < 10) return
     values.sort((a, b) => a - b)
     const [from, to] = [values[Math.floor(values.length * 0.02)]!, values[Math.floor(values.length * 0.98)]!]
+    this.#isSpread = true
     this.#look = { ...this.#look, from, to: Math.max(to, from + 1e-3) }
     this.#applyLook()
     this.#drawSettings()

@@ -2,6 +2,16 @@
 
 export type Bounds = [number, number, number, number]
 
+/** Easting and northing are sums of c · x^i · y^j over i + j ≤ degree, with x and y the degrees scaled to −1 to 1. */
+export interface Degrees {
+  middle: [number, number]
+  half: [number, number]
+  degree: number
+  easting: number[]
+  northing: number[]
+  error_m: number
+}
+
 export interface Unit {
   name: string
   m: number
@@ -26,6 +36,8 @@ export interface Survey {
   extent_m: Bounds
   height_extent_m: [number, number] | null
   lon_lat: [number, number] | null
+  /** Polynomials from degrees (WGS 84) to the map; null or missing where there are none. */
+  degrees?: Degrees | null
   tile_m: number
   cell_m: number
   sheet_m: number

@@ -30,18 +30,32 @@ interface Edit {
   geometry: { type: string; coordinates: unknown } | null
   comment: string
   edited_utc: string
+  /** Set where people said that an unlikely place is right. */
+  confirmed?: boolean
+}
+
+/** Edits that were not sent yet, as the browser keeps them. */
+interface Drafts {
+  edits: Edit[]
+  author: string
+  /** What they were made on. */
+  commit: number
+  kept_utc: string
 }
 
 /** What became of an edit that was sent. */
 interface Outcome {
-  outcome: 'accepted' | 'same' | 'conflict' | 'refused'
+  outcome: 'accepted' | 'same' | 'conflict' | 'asked' | 'refused'
   reason: string
 }
 
 const TITLES: Record<Action, string> = { confirm: 'confirmed', reject: 'rejected', change: 'changed', add: 'added' }
 const DRAWN = { point: 'Point', line: 'LineString', polygon: 'Polygon' } as const
 const HOW = { point: 'Click its place on the map.', line: 'Click its corners on the map; a double click ends it.', polygon: 'Click the corners of its outline on the map; a double click ends it.' } as const
-const OUTCOMES: Record<Outcome['outcome'], string> = { accepted: 'accepted', same: 'nothing new', conflict: 'conflict', refused: 'refused' }
+const OUTCOMES: Record<Outcome['outcome'], string> = { accepted: 'accepted', same: 'nothing new', conflict: 'conflict', asked: 'is this right?', refused: 'refused' }
+/** The status that an action gives. */
+const STATUS: Partial<Record<Action, string>> = { confirm: 'confirmed', reject: 'rejected' }
+const STAYS: readonly Outcome['outcome'][] = ['asked', 'refused']
 const TOKEN_HEADER = 'X-Roadscan-Edit'
 const KEPT_TOKEN = 'roadscan-edit'
 
@@ -69,6 +83,11 @@ export class Editing {
   #forms: Promise<EditForms> | null = null
   #kind = ''
   #author = ''
+  /** The commit that the edits here were made on, which may be older than the one that the page shows. */
+  #base: number
+  /** What to say of edits that the page was left with. */
+  #restored = ''
+  readonly #asked = new WeakSet<Edit>()
   #stop: (() => void) | null = null
 
   constructor(
@@ -85,8 +104,10 @@ export class Editing {
       if (!this.#body.childElementCount) this.#end() // what is being drawn stays
     })
     window.addEventListener('beforeunload', (event) => {
-      if (this.#edits.length) event.preventDefault()
+      if (this.#edits.length || this.#body.childElementCount) event.preventDefault()
     })
+    this.#base = rules.commit
+    this.#restore()
     this.#draw()
   }
 
@@ -273,32 +294,81 @@ export class Editing {
       return
     }
     const asset_id = String(feature.properties[layer.key ?? ''] ?? feature.id)
-    const before = this.#edits.findIndex((one) => one.layer === layer.name && one.asset_id === asset_id)
-    const merged = before >= 0 && action === 'change' && this.#edits[before]!.action === 'change' ? this.#edits[before]! : null
-    if (before >= 0) this.#edits.splice(before, 1)
-    this.#edits.push({
+    const at = this.#edits.findIndex((one) => one.layer === layer.name && one.asset_id === asset_id)
+    const before = at >= 0 ? this.#edits.splice(at, 1)[0]! : null
+    // What was said of the asset before stays: a correction, a new place, and that it was confirmed or rejected.
+    const status = STATUS[action] ?? attributes['status'] ?? (before && (STATUS[before.action] ?? before.attributes['status']))
+    const all = { ...before?.attributes, ...attributes, ...(status ? { status } : {}) }
+    const shape = geometry ?? before?.geometry ?? null
+    const said = (['confirm', 'reject'] as const).find((one) => STATUS[one] === status)
+    const isStatusAlone = said !== undefined && !shape && Object.keys(all).length === 1
+    const edit: Edit = {
       layer: layer.name,
-      action,
+      action: isStatusAlone ? said : 'change',
       asset_id,
-      attributes: { ...merged?.attributes, ...attributes },
-      geometry: geometry ?? merged?.geometry ?? null,
-      comment: comment || merged?.comment || '',
+      attributes: isStatusAlone ? {} : all,
+      geometry: shape,
+      comment: comment || before?.comment || '',
       edited_utc: new Date().toISOString(),
-    })
+    }
+    this.#edits.push(edit)
     this.#draw()
     this.desk.say(`${layer.title} ${asset_id}: ${TITLES[action]}.`)
   }
 
+  // ---- drafts ----
+
+  /** Drafts belong to a site, a survey and its inventory: pages of one host share what a browser keeps. */
+  get #keptAs(): string {
+    return `roadscan-edits ${location.pathname} ${this.desk.survey.id} ${this.rules.inventory}`
+  }
+
+  /** Keep the edits that were not sent for the next time; nothing where there is none. */
+  #keep(): void {
+    try {
+      if (!this.#edits.length) localStorage.removeItem(this.#keptAs)
+      else localStorage.setItem(this.#keptAs, JSON.stringify({ edits: this.#edits, author: this.#author, commit: this.#base, kept_utc: new Date().toISOString() } satisfies Drafts))
+    } catch {
+      // A browser may keep nothing: leaving the page asks.
+    }
+  }
+
+  /** Take up the edits that were here when the page was left, and say so. */
+  #restore(): void {
+    try {
+      const drafts = JSON.parse(localStorage.getItem(this.#keptAs) ?? 'null') as Drafts | null
+      if (!drafts?.edits.length || !drafts.edits.every((one) => one.action in TITLES && one.attributes)) return
+      this.#edits.push(...drafts.edits)
+      this.#author = drafts.author
+      this.#base = drafts.commit
+      for (const edit of drafts.edits.filter((one) => one.action === 'add' && one.geometry)) {
+        const feature = new Feature(geometryOf(edit.geometry)!)
+        this.#drawn.set(edit, feature)
+        this.#source.addFeature(feature)
+      }
+      const count = drafts.edits.length
+      this.element.dataset['restored'] = String(count)
+      const when = new Date(drafts.kept_utc).toLocaleString()
+      this.#restored = count === 1 ? `1 edit of ${when} that was not sent is here again.` : `${count} edits of ${when} that were not sent are here again.`
+      queueMicrotask(() => this.desk.say(this.#restored)) // once the page listens
+    } catch {
+      // What cannot be read is none of this page's edits.
+    }
+  }
+
   #draw(): void {
+    if (!this.#edits.length) [this.#base, this.#restored] = [this.rules.commit, '']
+    this.#keep()
     const { kinds } = this.rules
     const kind = h('select', { 'aria-label': 'Kind of the new asset', onchange: () => (this.#kind = kind.value) }, ...kinds.map((one) => h('option', { value: one.layer, selected: one.layer === this.#kind }, one.title)))
-    const author = h('input', { type: 'text', value: this.#author, placeholder: 'Your name', 'aria-label': 'Your name', oninput: () => (this.#author = author.value) })
+    const author = h('input', { type: 'text', value: this.#author, placeholder: 'Your name', 'aria-label': 'Your name', oninput: () => { this.#author = author.value; this.#keep() } })
     fill(
       this.element,
       h('h3', {}, 'Edits'),
       h('div', { class: 'actions' }, kind, h('button', { type: 'button', onclick: () => this.#drawNew(kinds.find((one) => one.layer === kind.value)!) }, icon('plus'), 'Draw a new one')),
       this.#body,
       this.#told.length > 0 && h('ul', { class: 'edit-told' }, ...this.#told.map(({ text, outcome }) => h('li', { 'data-outcome': outcome.outcome }, h('strong', {}, OUTCOMES[outcome.outcome]), ` ${text}`, outcome.reason && h('p', {}, outcome.reason)))),
+      this.#restored && h('p', { class: 'hint' }, this.#restored),
       this.#edits.length ? h('ul', { class: 'edit-list' }, ...this.#edits.map((edit) => this.#line(edit))) : h('p', { class: 'hint' }, 'No edit yet. Select a row to confirm, reject, correct or move it.'),
       this.#edits.length > 0 && h('div', { class: 'actions' }, author, h('button', { type: 'button', class: 'main', onclick: () => void this.#save() }, this.rules.post ? 'Send the edits' : 'Save the edits')),
     )
@@ -311,7 +381,11 @@ export class Editing {
   }
 
   #line(edit: Edit): HTMLElement {
-    return h('li', {}, h('span', {}, this.#text(edit)), iconButton('undo', 'Take this edit back', () => {
+    const right = this.#asked.has(edit) && !edit.confirmed && h('button', { type: 'button', onclick: () => {
+      edit.confirmed = true
+      this.#draw()
+    } }, 'It is right')
+    return h('li', {}, h('span', {}, `${this.#text(edit)}${edit.confirmed ? ', confirmed' : ''}`), right, iconButton('undo', 'Take this edit back', () => {
       this.#forget(edit)
       this.#draw()
     }, { class: 'icon-button small' }))
@@ -321,8 +395,8 @@ export class Editing {
   document(): string {
     const { survey } = this.desk
     const features = this.#edits.map(({ geometry, ...edit }) => ({ type: 'Feature', geometry, properties: { ...edit, author: this.#author } }))
-    const { inventory, commit } = this.rules
-    return JSON.stringify({ type: 'FeatureCollection', coordinates: 'map_m', survey: survey.id, crs: survey.crs.authority, software: survey.software, inventory, commit, features }, null, 1)
+    const { inventory } = this.rules
+    return JSON.stringify({ type: 'FeatureCollection', coordinates: 'map_m', survey: survey.id, crs: survey.crs.authority, software: survey.software, inventory, commit: this.#base, features }, null, 1)
   }
 
   async #save(): Promise<void> {
@@ -349,11 +423,13 @@ export class Editing {
     for (const [index, edit] of sent.entries()) {
       const outcome = outcomes[index]!
       this.#told.push({ text: this.#text(edit), outcome })
-      if (outcome.outcome !== 'refused') this.#forget(edit)
+      if (!STAYS.includes(outcome.outcome)) this.#forget(edit)
+      if (outcome.outcome === 'asked') this.#asked.add(edit)
     }
     await this.#renew()
+    this.#base = this.rules.commit // people have seen what became of them
     this.#draw()
-    const taken = outcomes.filter((one) => one.outcome !== 'refused').length
+    const taken = outcomes.filter((one) => !STAYS.includes(one.outcome)).length
     this.desk.say(`${taken} of ${sent.length} edits are in the inventory.`)
   }
 

@@ -67,7 +67,8 @@ function drawn(layer: Layer, colour: string, width_px: number, dark: boolean): O
   const edge = dark ? 'rgba(16, 18, 22, 0.9)' : 'rgba(255, 255, 255, 0.9)'
   if (layer.geometry === 'point') {
     const radius = Math.max(3.5, width_px / 2)
-    return [new OlStyle({ image: new CircleStyle({ radius, fill: new Fill({ color: css(colour) }), stroke: new Stroke({ color: edge, width: 1.5 }) }) })]
+    // Lettering gives way to lettering; a point is always drawn.
+    return [new OlStyle({ image: new CircleStyle({ radius, fill: new Fill({ color: css(colour) }), stroke: new Stroke({ color: edge, width: 1.5 }), declutterMode: 'none' }) })]
   }
   const stroke = new Stroke({ color: css(colour), width: width_px, lineCap: 'butt' })
   if (layer.geometry === 'polygon') return [new OlStyle({ stroke, fill: new Fill({ color: css(colour, 0.25) }) })]
@@ -104,7 +105,7 @@ function arrows(feature: FeatureLike, row: Row, columns: NonNullable<Layer['arro
     if (Math.hypot(dx, dy) < 2 * resolution) return
     styles.push(new OlStyle({ geometry: new LineString([foot, end]), stroke: new Stroke({ color: css(colour), width: headed ? 2 : 4, lineCap: 'butt' }) }))
     if (!headed) return
-    const head = new RegularShape({ points: 3, radius: 6, fill: new Fill({ color: css(colour) }), rotation: Math.atan2(dx, dy), rotateWithView: true })
+    const head = new RegularShape({ points: 3, radius: 6, fill: new Fill({ color: css(colour) }), rotation: Math.atan2(dx, dy), rotateWithView: true, declutterMode: 'none' })
     styles.push(new OlStyle({ geometry: new Point(end), image: head }))
   }
   const factor = columns.exaggeration

@@ -4,7 +4,7 @@ import uPlot from 'uplot'
 import type { Slice } from '../cloud/slice'
 import { along } from '../cloud/slice'
 import type { Desk } from '../core/desk'
-import { fill, h } from '../core/dom'
+import { fill, h, s } from '../core/dom'
 import * as format from '../core/format'
 import { css } from '../core/scales'
 
@@ -27,6 +27,7 @@ const DRAWN_POINTS = 40_000
 export class SectionPanel {
   readonly element = h('div', { class: 'section-panel' })
   readonly #chart = h('div', { class: 'chart' })
+  readonly #legend = h('ul', { class: 'section-legend', 'aria-label': 'Legend of the section' })
   readonly #read = h('span', { class: 'number', 'aria-live': 'off' })
   readonly #told = h('span', { class: 'hint' })
   #plot: uPlot | null = null
@@ -70,7 +71,22 @@ export class SectionPanel {
     fill(
       this.element,
       h('div', { class: 'section-head' }, h('h2', {}, title), h('label', { class: 'slider' }, 'Width (m)', width), h('button', { type: 'button', onclick: () => this.#save() }, 'Save as CSV'), this.#read, this.#told),
+      this.#legend,
       this.#chart,
+    )
+  }
+
+  /** What is drawn in which colour. */
+  #drawLegend(): void {
+    const { curve } = this.#request!
+    const colours = this.#colours()
+    const entry = (mark: SVGElement, text: string): HTMLElement => h('li', {}, s('svg', { viewBox: '0 0 16 10', class: 'key', 'aria-hidden': 'true' }, mark), h('span', {}, text))
+    const line = (colour: string, dash: string | null): SVGElement => s('path', { d: 'M0 5h16', stroke: css(colour), 'stroke-width': 2, 'stroke-dasharray': dash, fill: 'none' })
+    fill(
+      this.#legend,
+      entry(s('circle', { cx: 8, cy: 5, r: 2, fill: css(colours.point, 0.8) }), `points within ${format.length(this.#half)} of the line`),
+      entry(line(colours.median, null), 'median of the points'),
+      curve ? entry(line(colours.table, '5 3'), `${curve.title} of cross-sections`) : null,
     )
   }
 
@@ -110,6 +126,7 @@ export class SectionPanel {
     if (!slice || !this.#request) return
     const { begin_m, curve } = this.#request
     const colours = this.#colours()
+    this.#drawLegend()
     const tables: uPlot.AlignedData[] = [[slice.bins.map((bin) => bin.station_m + begin_m), slice.bins.map((bin) => bin.height_m)]]
     if (curve) tables.push([curve.station_m, curve.height_m])
     const data = tables.length > 1 ? uPlot.join(tables) : tables[0]!

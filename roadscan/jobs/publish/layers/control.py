@@ -15,6 +15,14 @@ from roadscan.jobs.publish.material import Material
 from roadscan.jobs.readings import read_groups
 
 _STYLE = Style("Role", 9, by="role", values={"gcp": BLUE, "check": RED})
+_RESIDUALS_M = (-0.010, -0.003, 0.003, 0.010)
+"""Within 3 mm is what an adjusted survey reaches; beyond 10 mm a point or a pass is to be looked at."""
+_RESIDUAL_STYLES = [
+    Style(f"Residual {title}, surveyed − measured (mm)", 9, by=column, limits=_RESIDUALS_M, shown_in=("mm", 1000.0),
+          is_difference=True)
+    for title, column in (("in height", "height_after_m"), ("to the east", "easting_after_m"),
+                          ("to the north", "northing_after_m"))
+]  # fmt: skip
 _ARROWS = {
     "east": "easting_after_m", "north": "northing_after_m", "up": "height_after_m", "exaggeration": 1000,
 }  # fmt: skip
@@ -45,7 +53,8 @@ def _layer(material: Material, table: str, rows: pa.Table, arrows: dict[str, Any
     columns = schema_columns(table, rows.column_names)
     shapes = np.asarray(shapely.points(east, north))
     return SiteLayer(
-        "control", "Control and check points", "control", "point", 500, shapes, rows.to_pylist(), columns, [_STYLE],
+        "control", "Control and check points", "control", "point", 500, shapes, rows.to_pylist(), columns,
+        [*_RESIDUAL_STYLES, _STYLE] if arrows else [_STYLE],
         key="name", label="name", arrows=arrows,
         evidence=[
             list(evidence.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []

@@ -93,6 +93,15 @@ def to_longitude_latitude(frame: MapFrame) -> Any:
     return places
 
 
+def from_longitude_latitude(frame: MapFrame) -> Any:
+    """Function of arrays (n, 2) of longitude and latitude (degrees, WGS 84) to easting and northing (m)."""
+    from pyproj import Transformer
+
+    turned = Transformer.from_crs("OGC:CRS84", crs_from_text(frame.crs or ""), always_xy=True)
+    unit_m = frame.horizontal_unit_m
+    return lambda lon_lat: np.stack(turned.transform(lon_lat[:, 0], lon_lat[:, 1]), axis=-1) * unit_m
+
+
 def _sheet_box(material: Material, tiles: Sequence[TileId]) -> tuple[float, float, float, float]:
     boxes = [material.context.grid.bounds(t) for t in tiles]
     return (

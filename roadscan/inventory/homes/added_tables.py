@@ -1,0 +1,140 @@
+"""What people added to a GeoPackage of the inventory: layers, tables, views, styles. A publication keeps it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sqlite3
+from pathlib import Path
+from typing import Final
+
+from roadscan.inventory.home import HomeError
+
+STYLES: Final = "layer_styles"
+_NAMES: Final = {
+    "gpkg_contents": "table_name", "gpkg_geometry_columns": "table_name", "gpkg_extensions": "table_name",
+    "gpkg_data_columns": "table_name", "gpkg_ogr_contents": "table_name", "gpkg_tile_matrix": "table_name",
+    "gpkg_tile_matrix_set": "table_name", "gpkg_metadata_reference": "table_name", "sqlite_sequence": "name",
+    "gpkg_data_column_constraints": "constraint_name", "gpkg_spatial_ref_sys": "srs_id",
+}  # fmt: skip
+"""Tables that describe others, and their column that names what is described."""
+_OF_OGR: Final = re.compile(r"(rtree|gpkg|trigger_(insert|delete)_feature_count)_")
+"""Triggers and indexes that a program makes for each layer: those of the published layers are made anew."""
+
+
+def keep_added(published: Path, new: Path) -> None:
+    """Copy what people added to a published GeoPackage into the one that takes its place.
+
+    A table, view, index or trigger is theirs where the new file has none of its name; a style, where it is another one
+    than the publication wrote. Rows of tables go over by SQLite alone: no trigger of a spatial index runs.
+
+    Raises
+    ------
+    HomeError
+        where it cannot be copied.
+    """
+    try:
+        with contextlib.closing(sqlite3.connect(new)) as connection:
+            connection.execute("ATTACH ? AS old", [f"{published}"])
+            with connection:
+                _copy(connection, published)
+    except sqlite3.Error as error:
+        raise HomeError(
+            f"what people added to the GeoPackage cannot be kept: {error}",
+            change="move their layers and tables into another file, and publish again; it is as it was",
+            file=published,
+        ) from error
+
+
+def _copy(connection: sqlite3.Connection, published: Path) -> None:
+    # A layer that was dropped through other programs may leave its describing rows: they are no one's.
+    objects = connection.execute(
+        """SELECT type, name, tbl_name, sql FROM old.sqlite_master
+           WHERE name NOT IN (SELECT name FROM main.sqlite_master) AND name NOT LIKE 'sqlite_%' ORDER BY rowid"""
+    ).fetchall()
+    published_tables = {name for (name,) in connection.execute("SELECT name FROM main.sqlite_master")}
+    shadows = {name for _, name, kind, *_ in connection.execute("PRAGMA old.table_list") if kind == "shadow"}
+    made = {name for kind, name, *_ in objects if kind == "table"} - shadows
+    for is_virtual in (False, True):
+        for kind, name, _, sql in objects:
+            if kind == "table" and name in made and sql.upper().startswith("CREATE VIRTUAL") == is_virtual:
+                connection.execute(sql)
+                _copy_rows(connection, name, name)
+    for name, column in _NAMES.items():
+        _copy_descriptions(connection, name, column, published, published_tables)
+    _copy_styles(connection)
+    for kind, name, table, sql in objects:
+        if kind != "table" and sql and not (table in published_tables and _OF_OGR.match(name)):
+            connection.execute(sql)
+
+
+def _columns(connection: sqlite3.Connection, schema: str, table: str) -> list[str]:
+    """Columns of a table that hold values; none where there is no such table."""
+    return [name for _, name, *_, hidden in connection.execute(f'PRAGMA {schema}.table_xinfo("{table}")') if not hidden]
+
+
+def _copy_rows(connection: sqlite3.Connection, table: str, name: str) -> None:
+    columns = ", ".join(f'"{one}"' for one in _columns(connection, "old", table))
+    try:
+        connection.execute(f'INSERT INTO main."{name}" (rowid, {columns}) SELECT rowid, {columns} FROM old."{table}"')
+    except sqlite3.OperationalError:  # a table without numbers of rows, or a virtual one
+        connection.execute(f'INSERT INTO main."{name}" ({columns}) SELECT {columns} FROM old."{table}"')
+
+
+def _copy_descriptions(
+    connection: sqlite3.Connection, table: str, column: str, published: Path, published_tables: set[str]
+) -> None:
+    """Rows that describe what people added, of a table that both files have."""
+    there = _columns(connection, "main", table)
+    shared = [one for one in _columns(connection, "old", table) if one in there and one != "id"]
+    if column not in shared:
+        return
+    if table == "gpkg_spatial_ref_sys":
+        _check_systems(connection, published)
+    names, values = ", ".join(f'"{one}"' for one in shared), ", ".join(f'o."{one}"' for one in shared)
+    same = " AND ".join(f'm."{one}" IS o."{one}"' for one in shared)
+    known = ", ".join("?" for _ in published_tables)
+    connection.execute(
+        f"""INSERT OR IGNORE INTO main."{table}" ({names}) SELECT {values} FROM old."{table}" o
+            WHERE (o."{column}" IS NULL OR o."{column}" NOT IN ({known}))
+            AND NOT EXISTS (SELECT 1 FROM main."{table}" m WHERE {same})
+            AND NOT EXISTS (SELECT 1 FROM main."{table}" m WHERE m."{column}" = o."{column}")""",
+        sorted(published_tables),
+    )
+
+
+def _check_systems(connection: sqlite3.Connection, published: Path) -> None:
+    """HomeError where one number names another CRS in the new file: only numbers that no authority gave can."""
+    clash = connection.execute(
+        """SELECT o.srs_id, o.srs_name FROM old.gpkg_spatial_ref_sys o JOIN main.gpkg_spatial_ref_sys m USING (srs_id)
+           WHERE o.organization_coordsys_id IS NOT m.organization_coordsys_id OR lower(o.organization) = 'none'
+           AND o.definition IS NOT m.definition"""
+    ).fetchone()
+    if clash is not None:
+        raise HomeError(
+            f"a layer that people added has the CRS {clash[0]} ({clash[1]}), which is another one in the new file",
+            change="move that layer into another file, and publish again; it is as it was",
+            file=published,
+        )
+
+
+def _copy_styles(connection: sqlite3.Connection) -> None:
+    """Styles that people wrote or changed: one of a publication bears the instant of its commit, QGIS sets another."""
+    if not _columns(connection, "old", STYLES):
+        return
+    theirs = connection.execute(
+        f"""SELECT o.id, m.id FROM old.{STYLES} o LEFT JOIN main.{STYLES} m
+            ON m.f_table_name = o.f_table_name AND m.styleName = o.styleName
+            WHERE o.owner IS NOT 'roadscan' OR julianday(o.update_time) NOT IN
+            (SELECT julianday(at) FROM old.roadscan_inventory)"""
+    ).fetchall()
+    there = _columns(connection, "main", STYLES)
+    names = ", ".join(f'"{one}"' for one in _columns(connection, "old", STYLES) if one in there and one != "id")
+    for old, new in theirs:
+        connection.execute(f"DELETE FROM main.{STYLES} WHERE id = ?", [new])
+        connection.execute(
+            f"""UPDATE main.{STYLES} SET useAsDefault = 0 WHERE (f_table_name, 1) IN
+                (SELECT f_table_name, useAsDefault FROM old.{STYLES} WHERE id = ?)""",
+            [old],
+        )
+        connection.execute(f"INSERT INTO main.{STYLES} ({names}) SELECT {names} FROM old.{STYLES} WHERE id = ?", [old])

@@ -18,6 +18,8 @@ NSSDA_VERTICAL: Final = 1.9600
 """95 % of normal errors lie within so many RMSE (FGDC-STD-007.3-1998, 3.2.1 and appendix 3-A)."""
 NSSDA_HORIZONTAL: Final = 1.7308
 """The same of a length in the plane whose two components are equally accurate (ibid.)."""
+NSSDA_CHECK_POINTS: Final = 20
+"""Check points that a statement of NSSDA takes at least (ibid., 3.2.2)."""
 ASPRS_CHECK_POINTS: Final = 30
 """Fewer check points do not make a statement after ASPRS (2023, 7.12); the figures are computed all the same."""
 DISTANCES_M: Final = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, float("inf"))

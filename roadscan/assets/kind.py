@@ -58,6 +58,8 @@ class Evidence:
     pieces: pa.Table
     """A row a piece, columns as the kind's `piece_schema`; coordinates are those of the map (easting, northing)."""
     marked: tuple[Marked, ...] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """What the record of the evidence keeps beside the number of pieces."""
 
 
 @dataclass(frozen=True, eq=False)

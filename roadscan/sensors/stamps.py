@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 
 from roadscan.model.errors import FormatError, Missing, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
+from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
 from roadscan.sensors.records import Sieve
@@ -42,6 +43,16 @@ _SLOWEST_STEP_NS: Final = 2 * NS_PER_S
 """Sensors of a survey write at least every two seconds."""
 CALENDAR_SCALES: Final = (TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TAI)
 """Scales that a calendar time without a zone can be written in."""
+
+
+SCALE_OF_TIMES: Final = Witness(
+    "scale_of_calendar_times",
+    "any text with calendar times",
+    "Calendar times stand without a zone, or without a date.",
+    "the first times of the file, the names of its columns and the stated clock",
+    "nothing is assumed: the log is refused until its clock states the scale; times of day without a date are refused",
+    ("error",),
+)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ import pyarrow.csv as pa_csv
 
 from roadscan.model.errors import ConfigError, FormatError, Missing
 from roadscan.model.strict import Strict
+from roadscan.model.witness import Witness
 from roadscan.sensors.base import Reject
 
 Int64 = npt.NDArray[np.int64]
@@ -55,6 +56,24 @@ _COMMA_NUMBER: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _MAY_BE_THOUSANDS: Final = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 """A number whose comma may as well part the thousands: 648,500."""
 _DAMAGE: Final = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, OSError)
+
+
+DECIMAL_MARK: Final = Witness(
+    "decimal_mark",
+    "any text",
+    "The commas of numbers are decimal marks, or part thousands.",
+    "all numbers of the first records: one that cannot have thousands tells the mark",
+    "decimal commas are read; where each comma may be either, the log is refused until options.decimal states it",
+    ("error",),
+)
+ENCODING: Final = Witness(
+    "text_encoding",
+    "any text",
+    "The text is neither UTF-8 nor UTF-16 with its byte order mark.",
+    "the bytes of the line of names, and of each line",
+    "a log whose names are not UTF-8 is refused until options.encoding states another; other such lines are left out",
+    ("error", "rejects"),
+)
 
 
 class TextOptions(Strict):

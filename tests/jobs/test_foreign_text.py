@@ -90,6 +90,7 @@ def words_of(*arguments: str | Path) -> str:
     return " ".join(roadscan("inspect", *arguments).output.split())
 
 
+@pytest.mark.witness("scale_of_calendar_times")
 def test_a_calendar_time_without_a_zone_is_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text(CSV.replace("Z", ""))
@@ -121,6 +122,7 @@ NAMED: dict[str, tuple[bytes, list[str]]] = {
 }
 
 
+@pytest.mark.witness("decimal_mark")
 @pytest.mark.parametrize(("content", "said"), NAMED.values(), ids=NAMED)
 def test_what_cannot_be_understood_is_named_with_the_way_out(tmp_path: Path, content: bytes, said: list[str]) -> None:
     (tmp_path / "t.csv").write_bytes(content)
@@ -130,6 +132,7 @@ def test_what_cannot_be_understood_is_named_with_the_way_out(tmp_path: Path, con
     assert "such as ;" not in words
 
 
+@pytest.mark.witness("text_encoding")
 def test_an_umlaut_of_windows_is_read_once_its_encoding_is_stated(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
     path.write_bytes(

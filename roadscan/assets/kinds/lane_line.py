@@ -38,7 +38,9 @@ class LaneLine(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Straight pieces of lines in the tile."""
         paint = paint_of(scene)
-        return Evidence(line_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.lines), MARKING),))
+        marked = Marked(rows_of_paint(paint.contrast, paint.lines), MARKING)
+        counts = {"dense_cells": paint.contrast.dense_cells, "rough_cells": paint.contrast.rough_cells}
+        return Evidence(line_pieces(scene, paint), (marked,), counts)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

@@ -29,7 +29,7 @@ _USUAL_STEP, _USUAL_SIZE = 3, 9
 """The usual brightness is a median over 13 m, of every third cell."""
 _DARKEST: Final = 0.9
 """Where the surroundings are darker than this share of the usual brightness (fresh bitumen, water), that counts."""
-_ROUGHEST_M: Final = 0.03
+ROUGHEST_M: Final = 0.03
 _ROUGH_M: Final = 0.12
 """Paved ground scatters less than this about its own mean height, weighted within this."""
 SMOOTH_M: Final = 0.06
@@ -67,6 +67,10 @@ class Contrast:
     """Contrast, as the weighted mean of the returns around each cell; 0 where there are none."""
     sigma: Float32
     """Its standard deviation; infinite where there are none."""
+    dense_cells: int = 0
+    """Cells in which enough returns lie on the ground."""
+    rough_cells: int = 0
+    """Those of them that scatter by more than `ROUGHEST_M`: no paint is sought there."""
 
     def cell_of(self, x_m: Float64, y_m: Float64) -> Int64:
         """Cell of points (n,) within the window."""
@@ -87,8 +91,9 @@ def contrast_of(scene: Scene) -> Contrast:
     contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
     shape = round((window.y_max_m - window.y_min_m) / CELL_M), round((window.x_max_m - window.x_min_m) / CELL_M)
     cell = np.maximum(cells_of(x, y, (grid[0], grid[1], CELL_M), shape), 0).astype(np.int64)
-    mean, sigma = _means(cell, contrast, noise, scene.above_ground_m[rows], shape)
-    return Contrast(rows, x, y, found.height_m[rows], contrast, noise, _lines(found, rows), cell, window, mean, sigma)
+    mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape)
+    heights = found.height_m[rows]
+    return Contrast(rows, x, y, heights, contrast, noise, _lines(found, rows), cell, window, mean, sigma, *counts)
 
 
 def _on_surface(scene: Scene, box: Box) -> Int64:
@@ -135,8 +140,11 @@ def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Fl
 
 def _means(
     cell: Int64, contrast: Float64, noise: Float64, height: Float32, shape: tuple[int, int]
-) -> tuple[Float32, Float32]:
-    """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough."""
+) -> tuple[Float32, Float32, tuple[int, int]]:
+    """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough.
+
+    The last are the numbers of cells with enough returns, and of rough ones among them.
+    """
     import cv2
 
     sums = np.zeros((shape[0] * shape[1], 5), np.float32)
@@ -151,9 +159,11 @@ def _means(
     weight = raster(number, SMOOTH_M)
     area = 4.0 * np.pi * (SMOOTH_M / CELL_M) ** 2
     known = weight >= _FEWEST_PER_M2 * CELL_M**2
+    dense = int(np.count_nonzero(known))
     near = np.maximum(raster(number, _ROUGH_M), 1e-9)
     middle = raster(high, _ROUGH_M) / near
-    known &= raster(squares, _ROUGH_M) / near - middle**2 <= _ROUGHEST_M**2
+    known &= raster(squares, _ROUGH_M) / near - middle**2 <= ROUGHEST_M**2
     mean = np.where(known, raster(contrasted, SMOOTH_M) / np.maximum(weight, 1e-9), 0.0)
     variance = raster(noisy, SMOOTH_M / np.sqrt(2.0)) / area / np.maximum(weight, 1e-9) ** 2
-    return mean.astype(np.float32), np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
+    sigma = np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
+    return mean.astype(np.float32), sigma, (dense, dense - int(np.count_nonzero(known)))

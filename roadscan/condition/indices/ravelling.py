@@ -74,7 +74,10 @@ def _squares(lane: LaneData, from_m: float, to_m: float) -> tuple[TextureSquares
 def _of_section(lane: LaneData, found: RavelledSection) -> Iterator[tuple[str, float, float, float, str]]:
     reason = found.reason
     if not reason and found.share < lane.config.least_share:
-        reason = f"the texture of {100 * found.share:.0f} % of the lane was measured"
+        reason = (
+            f"the texture of {100 * found.share:.0f} % of the lane was measured; ravelling takes "
+            f"{100 * lane.config.least_share:.0f} % (condition.least_share)"
+        )
     if reason:
         for one in Ravelling.quantities:
             yield one.name, math.nan, math.nan, found.share, reason

@@ -12,6 +12,7 @@ import numpy as np
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
 from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.control_work import (
     SIGHTINGS,
@@ -254,12 +255,19 @@ def _lines(
         if was and now:
             lines.append(
                 f"check points, {component}: RMSE {was['rmse_m'] * 1e3:.2f} mm before, {now['rmse_m'] * 1e3:.2f} mm "
-                f"after, 95 % within {now['nssda_95_m'] * 1e3:.2f} mm (NSSDA, {now['count']} points)"
+                f"after, {_statement(now['count'], now['nssda_95_m'])}"
             )
     left = by.get(("left_out", "height", "adjusted"))
     if left:
         lines.append(f"each GCP against all other evidence, height: RMSE {left['rmse_m'] * 1e3:.2f} mm")
     return [*lines, *solution.lines]
+
+
+def _statement(count: int, nssda_95_m: float) -> str:
+    """Accuracy after NSSDA, or that there are too few points for it."""
+    if count < NSSDA_CHECK_POINTS:
+        return f"of {count} points (NSSDA takes {NSSDA_CHECK_POINTS} at least)"
+    return f"95 % within {nssda_95_m * 1e3:.2f} mm (NSSDA, {count} points)"
 
 
 def _rms(values: Sequence[float]) -> float:

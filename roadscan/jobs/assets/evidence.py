@@ -211,16 +211,19 @@ class _Search:
 
     def _write_pieces(self, kind: AssetKind, found: Evidence, key: str) -> OutputRecord:
         unit = evidence_unit(kind.name, self._work.square)
-        return self._write_rows(EVIDENCE, unit, key, conformed(found.pieces, kind))
+        return self._write_rows(EVIDENCE, unit, key, conformed(found.pieces, kind), found.counts)
 
-    def _write_rows(self, product: str, unit: str, key: str, rows: pa.Table) -> OutputRecord:
-        """Keep rows as the table of that name; without any there is no file."""
+    def _write_rows(
+        self, product: str, unit: str, key: str, rows: pa.Table, counts: Mapping[str, int] | None = None
+    ) -> OutputRecord:
+        """Keep rows as the table of that name; without any there is no file. The record keeps `counts`, too."""
+        told = _told(rows.num_rows, **(counts or {}))
         if not rows.num_rows:
-            return OutputRecord(product, unit, key, "", 0, "", _told(0))
+            return OutputRecord(product, unit, key, "", 0, "", told)
         path = self._folder / f"{product}.parquet"
         pq.write_table(rows, path, compression="zstd", write_page_checksum=True, version="2.6")
         target = f"tables/{product}/{unit}.parquet"
-        return publish_file(self._task.store, path, target, product, unit, key, _told(rows.num_rows))
+        return publish_file(self._task.store, path, target, product, unit, key, told)
 
     def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
         grid, square = self._task.load.grid, self._work.square

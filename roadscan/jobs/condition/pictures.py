@@ -1,4 +1,4 @@
-"""Pictures of condition: a strip chart of each lane and kilometre, and its cross-section with the deepest rut."""
+"""Pictures of condition: a strip chart of each lane and kilometre, and its cross-sections at two ruts."""
 
 from __future__ import annotations
 
@@ -19,12 +19,18 @@ from roadscan.condition.of_sections.whole_sections import WholeSections
 from roadscan.jobs.condition.values import VALUES, Group, GroupTask, load_lane
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.kernels.condition.ruts import wire_places
-from roadscan.products.pictures.condition import Crossing, Strip, draw_crossing, draw_strips
+from roadscan.products.pictures.condition import Crossing, Strip, draw_crossings, draw_strips
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, file_digest
 
 PICTURES: Final = "condition_pictures"
+STRIP: Final = "strip"
+CROSS_SECTION: Final = "cross_section"
+_SURE: Final = 2.0
+"""Where few readings lie, σ is several times that of the lane; elsewhere it varies by a third."""
+RUT_M: Final = 5.0
+"""A rut goes on for longer than this; a pothole is shorter than half of it, so that a median over it passes it by."""
 _DEPTHS: Final = ("rut_depth_left_mm", "rut_depth_right_mm")
 
 
@@ -34,7 +40,7 @@ class PictureTask:
 
     task: GroupTask
     kind: str
-    """strip or cross_section."""
+    """`STRIP` or `CROSS_SECTION`."""
     values: tuple[OutputRecord, ...]
     key: str
 
@@ -57,8 +63,8 @@ def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[Pictur
         shape = [group.sections_m, [(r.unit, r.digest) for r in values], drawn]
         crossed = [(r.unit, r.digest) for r in group.cross_sections]
         if values:
-            found.append(PictureTask(task, "strip", values, key_of(code, "strip", shape)))
-            found.append(PictureTask(task, "cross_section", values, key_of(code, "crossing", shape, crossed)))
+            found.append(PictureTask(task, STRIP, values, key_of(code, "strip", shape)))
+            found.append(PictureTask(task, CROSS_SECTION, values, key_of(code, "crossing", shape, crossed)))
     return found
 
 
@@ -74,7 +80,7 @@ def draw_picture(one: PictureTask) -> OutputRecord:
     target = f"products/{PICTURES}/{one.unit}"
     with store.scratch() as folder:
         path = folder / one.unit
-        drawn = _strip(path, group, values) if one.kind == "strip" else _crossing(path, one.task, values)
+        drawn = _strip(path, group, values) if one.kind == STRIP else _crossing(path, one.task, values)
         if not drawn:
             return OutputRecord(PICTURES, one.unit, one.key, "", 0, "")
         size, digest = path.stat().st_size, file_digest(path)
@@ -108,26 +114,70 @@ def _of_quantity(rows: pa.Table, name: str) -> Strip:
 
 
 def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
-    """The cross-section with the deepest rut; False where none is known."""
+    """The cross-sections at the typical and at the deepest rut; False where none is known."""
     lane: LaneData = load_lane(task)
     whole = WholeSections.of(lane)
     if not whole.rows.size:
         return False
-    depths = {name: _by_station(values, name, lane.cross_sections.station_m[whole.rows]) for name in _DEPTHS}
-    deepest = np.nan_to_num(np.maximum(*depths.values()))
-    k = int(np.argmax(deepest))
-    station = float(lane.cross_sections.station_m[whole.rows[k]])
-    x, height = lane.cross_sections.offset_m, whole.height_m[k]
-    wire = np.zeros(x.size, np.int64)
-    count = wire_places(x, height, wire)
-    told = {"left rut": float(depths[_DEPTHS[0]][k]), "right rut": float(depths[_DEPTHS[1]][k])}
-    draw_crossing(path, f"{_title(task.group)}, station {station:,.1f} m", Crossing(x, height, wire[:count], told))
-    return True
+    station = lane.cross_sections.station_m[whole.rows]
+    depths, sigmas = (
+        np.stack([_by_station(values, name, station, of) for name in _DEPTHS]) for of in ("value", "sigma")
+    )
+    chosen = chosen_ruts(station, depths, sigmas)
+    x, crossings = lane.cross_sections.offset_m, []
+    for word, (k, smooth) in chosen.items():
+        height = whole.height_m[k]
+        wire = np.zeros(x.size, np.int64)
+        count = wire_places(x, height, wire)
+        told = {
+            f"{side} rut": (float(depths[n, k]), float(sigmas[n, k]), float(smooth[n]))
+            for n, side in enumerate(("left", "right"))
+        }
+        title = f"{word} rut, station {station[k]:,.1f} m"
+        crossings.append(Crossing(title, x, height, wire[:count], told))
+    if crossings:
+        draw_crossings(path, _title(task.group), crossings)
+    return bool(crossings)
 
 
-def _by_station(values: pa.Table, name: str, station_m: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+def chosen_ruts(
+    station_m: npt.NDArray[np.float64], depths_mm: npt.NDArray[np.float64], sigmas_mm: npt.NDArray[np.float64]
+) -> dict[str, tuple[int, npt.NDArray[np.float64]]]:
+    """Numbers of the cross-sections to be shown, with both depths (2,) as medians over `RUT_M`; none without a depth.
+
+    `typical` is where the deeper rut is as deep as in the median, `deepest` where it is deepest. Both are the
+    cross-section there whose own depths are nearest to the medians: one through a pothole is not. Where σ is more
+    than `_SURE` times that of the lane, as where a drive ends and few readings lie, noise makes depths: none is chosen
+    there.
+
+    Parameters
+    ----------
+    station_m : (n,) ascending.
+    depths_mm, sigmas_mm : (2, n) left and right, NaN where not measured.
+    """
+    sure = ~(sigmas_mm > _SURE * np.nanmedian(sigmas_mm)) if np.isfinite(sigmas_mm).any() else np.isfinite(depths_mm)
+    depths_mm = np.where(sure, depths_mm, np.nan)
+    smooth = np.full_like(depths_mm, np.nan)
+    around = [np.flatnonzero(np.abs(station_m - at) <= RUT_M / 2) for at in station_m]
+    for k, near in enumerate(around):
+        known = np.isfinite(depths_mm[:, near])
+        if 2 * known.sum(axis=1).min() > near.size and station_m[near[-1]] - station_m[near[0]] > RUT_M / 2:
+            smooth[:, k] = np.nanmedian(depths_mm[:, near], axis=1)
+    deeper = smooth.max(axis=0)
+    there = np.flatnonzero(np.isfinite(deeper))
+    if not there.size:
+        return {}
+    of_median = there[np.argmin(np.abs(deeper[there] - np.median(deeper[there])))]
+    found = {}
+    for word, k in (("typical", of_median), ("deepest", there[np.argmax(deeper[there])])):
+        away = np.abs(depths_mm[:, around[k]] - smooth[:, k, None]).max(axis=0)
+        found[word] = (int(around[k][np.nanargmin(away)]), smooth[:, k])
+    return found
+
+
+def _by_station(values: pa.Table, name: str, station_m: npt.NDArray[Any], column: str) -> npt.NDArray[np.float64]:
     own = values.filter(pc.equal(values["quantity"], name)).sort_by("station_from_m")
-    at, value = own["station_from_m"].to_numpy(), own["value"].to_numpy()
+    at, value = own["station_from_m"].to_numpy(), own[column].to_numpy()
     if not at.size:
         return np.full(station_m.size, np.nan)
     place = np.minimum(np.searchsorted(at, station_m - 1e-6), at.size - 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SECTIONS: Final = "condition_sections"
+_TABLE: Final = f"{SECTIONS}.parquet"
 _ROW: Final = ["road", "lane", "station_from_m", "station_to_m"]
 _SIGMAS: Final = {
     "sigma_mri_m_per_km": ("mri_m_per_km",),
@@ -81,6 +83,9 @@ def due_files(files: SectionFiles, manifest: Manifest) -> list[str]:
 def write_sections(files: SectionFiles) -> list[OutputRecord]:
     """Write all files of the section table."""
     table, shapes = section_table(files)
+    detail = json.dumps(
+        {"sections": table.num_rows, "not_measured": _not_measured(_of_sections(files))}, sort_keys=True
+    )
     records: list[OutputRecord] = []
     with files.store.scratch() as folder:
         for name, write in _WRITERS.items():
@@ -88,7 +93,7 @@ def write_sections(files: SectionFiles) -> list[OutputRecord]:
             write(path, table, shapes, files.context)
             size, digest, target = path.stat().st_size, file_digest(path), f"products/{SECTIONS}/{name}"
             files.store.publish(path, target)
-            records.append(OutputRecord(SECTIONS, name, files.key, target, size, digest))
+            records.append(OutputRecord(SECTIONS, name, files.key, target, size, digest, detail))
     return records
 
 
@@ -135,6 +140,28 @@ def _of_sections(files: SectionFiles) -> pa.Table:
     return pa.concat_tables([schema.empty_table(), *held])
 
 
+def _not_measured(values: pa.Table) -> dict[str, list[str]]:
+    """Quantities that no section has a value of, by the reason that is given in most of them."""
+    known = set(values.filter(pc.is_valid(values["value"]))["quantity"].to_pylist())
+    reasons: dict[str, list[str]] = {}
+    for quantity, reason in zip(values["quantity"].to_pylist(), values["reason"].to_pylist(), strict=True):
+        if quantity not in known and reason:
+            reasons.setdefault(quantity, []).append(reason)
+    found: dict[str, list[str]] = {}
+    for quantity, said in sorted(reasons.items()):
+        found.setdefault(max(sorted(set(said)), key=said.count), []).append(quantity)
+    return found
+
+
+def known_sections(manifest: Manifest) -> tuple[int, dict[str, list[str]]] | None:
+    """Number of sections in the section table, and the quantities that none has, by reason; None without a table."""
+    record = manifest.get(SECTIONS, _TABLE)
+    if record is None or not record.detail:
+        return None
+    told = record.figures()
+    return int(told["sections"]), dict(told["not_measured"])
+
+
 def _reasons(own: pd.DataFrame) -> str | None:
     """What is said of a section's values, each thing once."""
     said: dict[str, list[str]] = {}
@@ -173,7 +200,7 @@ def _write_csv(path: Path, table: pa.Table, shapes: npt.NDArray[Any], context: P
 
 
 _WRITERS: Final[dict[str, Callable[[Path, pa.Table, npt.NDArray[Any], ProductContext], None]]] = {
-    f"{SECTIONS}.parquet": _write_parquet,
+    _TABLE: _write_parquet,
     f"{SECTIONS}.csv": _write_csv,
     f"{SECTIONS}.gpkg": write_layer,
 }

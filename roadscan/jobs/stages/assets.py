@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
+from roadscan.assets.kinds.lane_line import LaneLine
+from roadscan.assets.paint.contrast import ROUGHEST_M
 from roadscan.jobs.assets.drives import drives_key, load_drives
 from roadscan.jobs.assets.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
 from roadscan.jobs.assets.gains import current_gains, find_samples, sample_tasks, write_gains
@@ -22,7 +25,22 @@ from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.tiles import run_tasks
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding, Witness
 from roadscan.tables.asset_schema import ASSET_FOLDER
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
+
+_MOST_ROUGH: Final = 0.5
+"""Verges and kerbs are rough; half of the ground is so only where the readings are."""
+
+ROUGH_READINGS: Final = Witness(
+    "rough_readings",
+    "lidar",
+    "Readings or poses scatter by more than the road's own roughness, so that nothing painted is found.",
+    f"the scatter of the returns on the ground about their mean height, against {1e3 * ROUGHEST_M:.0f} mm",
+    "paint is not sought where it is larger; where that is more than half of the ground, it is named",
+    ("findings",),
+)
 
 
 class Assets(Stage):
@@ -119,6 +137,20 @@ class Assets(Stage):
             if not all(manifest.is_current(SECTIONS, unit, one.key) for unit in one.units):
                 manifest.add(write_sections(one, plan.grid, session.store, context))
         manifest.settle()
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Where most of the ground is too rough to seek paint on it."""
+        records_of = manifest.of(EVIDENCE)
+        found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
+        dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
+        if survey.config.assets is None or rough <= _MOST_ROUGH * dense:
+            return ()
+        said = (
+            f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
+            f"scatter by more than {1e3 * ROUGHEST_M:.0f} mm about their mean height, so lane lines and markings are "
+            "missing there. The sensor's noise, poses of passes that disagree, or rough ground do that."
+        )
+        return (ROUGH_READINGS.finds("assets", said),)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Kinds, their settings and sensors are such that there are."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Final
 
-from roadscan.jobs.condition.lines import check_layer, write_lines
+from roadscan.condition.index import condition_indices
+from roadscan.condition.roads import LEAST_M
+from roadscan.jobs.condition.lines import LINES, check_layer, write_lines
 from roadscan.jobs.condition.pictures import draw_picture
 from roadscan.jobs.condition.ravelling import patches_of_group
 from roadscan.jobs.condition.road_edges import check_edge_polygons, edges_of_pieces
 from roadscan.jobs.condition.roughness_regions import regions_of_pieces
-from roadscan.jobs.condition.sections import write_sections
+from roadscan.jobs.condition.sections import known_sections, write_sections
 from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.surface_cells import check_surface_cells
 from roadscan.jobs.condition.tasks import P, PieceTask, S, run_units
@@ -23,9 +26,23 @@ from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding, Witness
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
 
 _PICTURES = 20
 """Pictures that a task draws."""
+_NAMED = 4
+"""Quantities that a finding names."""
+
+NOT_MEASURED: Final = Witness(
+    "condition_not_measured",
+    "cells",
+    "The drive is too short, the cells too coarse or too sparse for a figure of the road's condition.",
+    "the least length, the least share measured and the coarsest cells of each index, section by section",
+    "the figure stays empty in every section, and the limit is named",
+    ("findings",),
+)
 
 
 class Condition(Stage):
@@ -120,6 +137,22 @@ class Condition(Stage):
             + len(work.due_pieces)
         )
 
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Figures of condition that no section has, by the limit that they missed."""
+        if survey.config.condition is None or not manifest.of(LINES):
+            return ()
+        told = known_sections(manifest)
+        if told is None or not told[0]:
+            said = f"No section of a lane was made: no drive of {LEAST_M:g} m or more lies on tiles that hold cells."
+            return (NOT_MEASURED.finds("condition", said),)
+        of_cracks = {q.name for one in condition_indices().values() if one.needs_cracks for q in one.quantities}
+        found = []
+        for reason, quantities in told[1].items():
+            named = [name for name in quantities if name not in of_cracks]  # the product `cracks` is the user's choice
+            if named:
+                found.append(NOT_MEASURED.finds("condition", f"{_some(named)}: no section has a value; {reason}."))
+        return found
+
     def folders(self) -> Sequence[str]:
         """Tables of lines, lanes and what was surveyed of them, of edges, values, patches, regions and sections."""
         return (
@@ -130,3 +163,8 @@ class Condition(Stage):
             "products/condition_tiles", "products/condition_pictures", "tables/roughness_sections",
             "products/roughness_regions", "products/roughness_pictures",
         )  # fmt: skip
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more:,} more" if more > 0 else "")

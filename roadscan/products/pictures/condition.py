@@ -75,31 +75,51 @@ def _without_unit(quantity: str) -> str:
 class Crossing:
     """A cross-section to be drawn."""
 
+    title: str
+    """Which one it is, and where."""
     offset_m: Float64
     """(m,) from the lane's middle, positive to the right in the direction of travel."""
     height_m: Float64
     """(m,) finite."""
     wire: npt.NDArray[np.int64]
     """Places on which the wire rests."""
-    told: Mapping[str, float]
-    """Figures that stand in the title, by name."""
+    told: Mapping[str, tuple[float, float, float]]
+    """Depths (mm) that stand in the title, by name: of this cross-section with its σ, and the median of those around
+    it."""
 
 
-def draw_crossing(path: Path, title: str, crossing: Crossing) -> None:
-    """Write a picture of a cross-section, its tilt taken out, with the wire over it."""
-    x, wire = crossing.offset_m, crossing.wire
+def draw_crossings(path: Path, title: str, crossings: Sequence[Crossing]) -> None:
+    """Write a picture of cross-sections below each other, their tilt taken out, with the wire over each."""
+    figure = empty_figure(9.0, 0.4 + 3.0 * len(crossings), _DOTS_PER_INCH)
+    places = figure.subplots(len(crossings), 1, sharex=True, squeeze=False)[:, 0]
+    levels = [_level(crossing) for crossing in crossings]
+    low, high = min(float(level.min()) for level in levels), max(float(level.max()) for level in levels)
+    for axes, crossing, level in zip(places, crossings, levels, strict=True):
+        _draw_crossing(axes, crossing, level)
+        axes.set_ylim(low - 2.0, high + 2.0)  # one scale, so that depths can be compared
+    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
+    places[-1].set_xlabel("offset from the lane's middle, right in the direction of travel (m)", fontsize=8)
+    figure.savefig(path, metadata={"Software": None})
+
+
+def _level(crossing: Crossing) -> Float64:
+    """Heights (m,) above the straight line through them (mm)."""
+    x = crossing.offset_m
     tilt = np.polynomial.polynomial.polyval(x, np.polynomial.polynomial.polyfit(x, crossing.height_m, 1))
-    level = 1e3 * (crossing.height_m - tilt)
-    figure = empty_figure(9.0, 3.4, _DOTS_PER_INCH)
-    axes = figure.subplots()
+    return np.asarray(1e3 * (crossing.height_m - tilt), dtype=np.float64)
+
+
+def _draw_crossing(axes: Axes, crossing: Crossing, level: Float64) -> None:
+    x, wire = crossing.offset_m, crossing.wire
     axes.plot(x, level, color="#333333", linewidth=1.4, label="road")
     axes.plot(x[wire], level[wire], color=_COLOURS[1], linewidth=1.2, marker="o", markersize=2.5, label="wire")
     axes.fill_between(x, level, np.interp(x, x[wire], level[wire]), color=_COLOURS[1], alpha=0.15, linewidth=0)
-    told = ", ".join(f"{name} {value:.1f} mm" for name, value in crossing.told.items())
-    axes.set_title(f"{title}: {told}", fontsize=9, loc="left")
-    axes.set_xlabel("offset from the lane's middle, right in the direction of travel (m)", fontsize=8)
+    told = ", ".join(
+        f"{name} {own:.1f} ± {sigma:.1f} mm (over 5 m {near:.1f} mm)"
+        for name, (own, sigma, near) in crossing.told.items()
+    )
+    axes.set_title(f"{crossing.title}: {told}", fontsize=9, loc="left")
     axes.set_ylabel("height without its tilt (mm)", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(color="#e6e6e6", linewidth=0.6)
     axes.legend(fontsize=7, frameon=False)
-    figure.savefig(path, metadata={"Software": None})

@@ -197,7 +197,7 @@ class _StampTable:
     @property
     def kinds(self) -> dict[str, Kind]:
         """Columns to read, and their kinds."""
-        return {self.file_column: "text"} | self.stamps.kinds
+        return {**self.stamps.kinds, self.file_column: "text"}
 
 
 def _table(path: Path, options: ImagesOptions) -> tuple[TextLayout, dict[str, Found]]:

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import io
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
+from PIL import Image
+
+from roadscan.adjust.quality import ASPRS_CHECK_POINTS, NSSDA_CHECK_POINTS
 from roadscan.jobs.adjust.outcome import FOLDER, PICTURES, known_findings, known_lines
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
+from roadscan.model.counted import counted
+from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.tables.store import Store
 
 _MOST_TARGETS: Final = 24
 _TARGET_MM: Final = 25.0
 
+_FEWEST_RMSE: Final = 3
+"""With fewer, an RMSE has no σ of its own that is worth stating."""
+_ODD_SIGMAS: Final = 3.0
+"""A residual of more σ than this is named."""
 _NAMES: Final = {"check": "check points", "left_out": "each GCP left out"}
 
 Rows = Sequence[dict[str, Any]]
@@ -40,12 +50,14 @@ class Adjustment(Section):
         yield from _pictures(store, [f"{FOLDER}/seams.png"], seams)
         yield from _accuracy(_rows(session, "absolute_accuracy"))
         yield from _by_distance(_rows(session, "accuracy_by_distance"))
+        yield from _ties(_rows(session, "tie_residuals"))
         yield from _seams(_rows(session, "relative_accuracy"))
         yield from _control(_rows(session, "control_residuals"))
         targets = sorted(r.path for r in manifest.of(PICTURES).values() if "/targets/" in r.path)
         if targets:
-            yield Paragraph("Targets as the passes saw them; the file's name says point, run and GPS second:")
-        yield from _pictures(store, targets[:_MOST_TARGETS], "", _TARGET_MM)
+            yield Paragraph("Targets as the passes saw them: point, run and status, and when:")
+        for path in targets[:_MOST_TARGETS]:
+            yield from _pictures(store, [path], _of_target(store, path), _TARGET_MM)
 
 
 def _rows(session: Session, table: str) -> Rows:
@@ -56,22 +68,44 @@ def _rows(session: Session, table: str) -> Rows:
 def _pictures(store: Store, paths: Sequence[str], caption: str, width_mm: float = 170.0) -> Iterator[Picture]:
     for path in paths:
         if store.exists(path):
-            yield Picture(store.read_bytes(path), caption or path.rsplit("/", 1)[-1].removesuffix(".png"), width_mm)
+            yield Picture(store.read_bytes(path), caption, width_mm)
 
 
-def _accuracy(rows: Rows) -> Iterator[Table]:
-    if rows:
-        yield Table(
-            ("points", "component", "poses", "count", "mean", "mean absolute", "RMSE", "95 % (NSSDA)", "largest"),
-            [
-                (
-                    _NAMES[r["points"]], r["component"], r["poses"], f"{r['count']:,}",
-                    *(_mm(r[name]) for name in ("mean_m", "mean_absolute_m", "rmse_m", "nssda_95_m", "largest_m")),
-                )
-                for r in rows
-            ],
-            "Absolute accuracy in mm: surface minus survey", "absolute_accuracy",
-        )  # fmt: skip
+def _of_target(store: Store, path: str) -> str:
+    """Point, run and status, which stand in the picture's own title, and the time, whose GPS second ends its name."""
+    title = Image.open(io.BytesIO(store.read_bytes(path))).info.get("Title", "")
+    gps_s = int(path.removesuffix(".png").rsplit("-", 1)[-1])
+    return f"{title}, {iso_from_gps_ns(gps_s * NS_PER_S)[:19].replace('T', ' ')}"
+
+
+def _accuracy(rows: Rows) -> Iterator[Table | Paragraph]:
+    if not rows:
+        return
+    is_statement = any(r["count"] >= NSSDA_CHECK_POINTS for r in rows)
+    yield Table(
+        ("points", "component", "poses", "count", "mean", "mean absolute", "RMSE",
+         *(["95 % (NSSDA)"] if is_statement else []), "largest"),
+        [
+            (
+                _NAMES[r["points"]], r["component"], r["poses"], f"{r['count']:,}", _mm(r["mean_m"]),
+                _mm(r["mean_absolute_m"]), _rmse(r["rmse_m"], r["count"]),
+                *([_mm(r["nssda_95_m"]) if r["count"] >= NSSDA_CHECK_POINTS else "–"] if is_statement else []),
+                _mm(r["largest_m"]),
+            )
+            for r in sorted(rows, key=lambda r: (r["points"], r["component"], r["poses"] != "recorded"))
+        ],
+        "Absolute accuracy in mm: surface minus survey; an RMSE with the 1 σ that it has itself", "absolute_accuracy",
+    )  # fmt: skip
+    most = max((r["count"] for r in rows if r["points"] == "check"), default=0)
+    if most < ASPRS_CHECK_POINTS:
+        lacks = f"NSSDA takes {NSSDA_CHECK_POINTS} at least, ASPRS (2023) {ASPRS_CHECK_POINTS}"
+        said = "there are no check points" if not most else f"{counted(most, 'check point')} of a component at most"
+        yield Paragraph(f"This is no statement of accuracy after a standard: {said}; {lacks}.")
+
+
+def _rmse(value_m: float, count: int) -> str:
+    """RMSE in mm with its own σ: that of n normal errors is RMSE / √(2n)."""
+    return _mm(value_m) + (f" ± {1e3 * value_m / (2 * count) ** 0.5:.2f}" if count >= _FEWEST_RMSE else "")
 
 
 def _by_distance(rows: Rows) -> Iterator[Table]:
@@ -83,7 +117,7 @@ def _by_distance(rows: Rows) -> Iterator[Table]:
                     _NAMES[r["points"]],
                     f"from {r['from_m']:,.0f} m" + ("" if r["to_m"] is None else f" to {r['to_m']:,.0f} m"),
                     f"{r['mean_distance_m']:,.0f} m", f"{r['count']:,}",
-                    *(_mm(r[name]) for name in ("mean_m", "mean_absolute_m", "rmse_m")),
+                    _mm(r["mean_m"]), _mm(r["mean_absolute_m"]), _rmse(r["rmse_m"], r["count"]),
                 )
                 for r in rows
             ],
@@ -91,21 +125,41 @@ def _by_distance(rows: Rows) -> Iterator[Table]:
         )  # fmt: skip
 
 
+def _ties(rows: Rows) -> Iterator[Table | Paragraph]:
+    """Agreement of the passes over all ties that count, with the σ that these have."""
+    kinds: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        if row["accepted"]:
+            kinds[row["kind"].replace("_", " ")].append(row)
+    if not kinds:
+        return
+    figures = {
+        kind: [_rms([row[name] for row in own]) for name in ("before_m", "after_m", "sigma_m")]
+        for kind, own in sorted(kinds.items())
+    }
+    yield Table(
+        ("ties", "count", "RMS before", "RMS after", "σ of the ties"),
+        [(kind, f"{len(kinds[kind]):,}", *(_mm(value) for value in own)) for kind, own in figures.items()],
+        "Pass against pass, in mm", "tie_residuals",
+    )  # fmt: skip
+    for kind, (_, after, sigma) in figures.items():
+        if after > _ODD_SIGMAS * sigma > 0.0:
+            yield Paragraph(
+                f"After the adjustment the passes still differ by {_mm(after)} mm in the {kind}s, {after / sigma:.0f} "
+                f"times their σ of {_mm(sigma)} mm: this σ is that of finding the same surface or picture twice, and "
+                "the poses, the clocks or the mountings err by more.",
+                is_warning=True,
+            )
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float((sum(value**2 for value in values) / len(values)) ** 0.5)
+
+
 def _seams(rows: Rows) -> Iterator[Table]:
-    """Agreement of the passes over all sections, then by section of 100 m."""
+    """Agreement of the passes by section of 100 m."""
     if not rows:
         return
-    sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0, 0.0])
-    for row in rows:
-        sums[row["kind"]][0] += row["count"]
-        sums[row["kind"]][1] += row["count"] * row["rms_before_m"] ** 2
-        sums[row["kind"]][2] += row["count"] * row["rms_after_m"] ** 2
-    whole = [
-        (kind.replace("_", " "), f"{n:,.0f}", _mm((before / n) ** 0.5), _mm((after / n) ** 0.5))
-        for kind, (n, before, after) in sorted(sums.items())
-        if n
-    ]
-    yield Table(("ties", "count", "RMS before", "RMS after"), whole, "Pass against pass, in mm")
     yield Table(
         ("run", "ties", "from station (m)", "count", "RMS before", "RMS after"),
         [
@@ -115,24 +169,45 @@ def _seams(rows: Rows) -> Iterator[Table]:
             )
             for r in rows
         ],
-        "The same by 100 m, in mm", "relative_accuracy",
+        "Pass against pass by 100 m, in mm", "relative_accuracy",
     )  # fmt: skip
 
 
-def _control(rows: Rows) -> Iterator[Table]:
+def _control(rows: Rows) -> Iterator[Table | Paragraph]:
     if rows:
         yield Table(
-            ("point", "role", "run", "status", "height before", "height after", "σ", "weight", "why it does not count"),
+            ("point", "role", "run", "status", "height before", "height after", "σ", "after / σ", "weight", "remark"),
             [
                 (
                     r["name"], r["role"], r["run"], r["status"], _mm(r["height_before_m"]), _mm(r["height_after_m"]),
-                    _mm(r["sigma_height_m"]), "–" if r["weight_height"] is None else f"{r['weight_height']:.2f}",
-                    r["why_not"],
+                    _mm(r["sigma_height_m"]), _ratio(r),
+                    "–" if r["weight_height"] is None else f"{r['weight_height']:.2f}", r["why_not"],
                 )
                 for r in rows
             ],
-            "Control and check points: surveyed height minus measured, in mm", "control_residuals",
+            "Control and check points: surveyed height minus measured, in mm; σ is that of the point's survey and "
+            "of its measurement by the pass",
+            "control_residuals",
         )  # fmt: skip
+        odd = [r for r in rows if abs(_sigmas(r) or 0.0) > _ODD_SIGMAS]
+        if odd:
+            named = ", ".join(f"{r['name']} in {r['run']} ({_ratio(r)} σ)" for r in odd)
+            yield Paragraph(
+                f"A height after the adjustment contradicts its σ at {named}: the point, or the σ that is stated for "
+                "it or for the poses, is wrong.",
+                is_warning=True,
+            )
+
+
+def _sigmas(row: dict[str, Any]) -> float | None:
+    """How many of its σ a height is off after the adjustment."""
+    after, sigma = row["height_after_m"], row["sigma_height_m"]
+    return None if after is None or not sigma else float(after / sigma)
+
+
+def _ratio(row: dict[str, Any]) -> str:
+    sigmas = _sigmas(row)
+    return "–" if sigmas is None else f"{sigmas:.1f}"
 
 
 def _mm(value_m: float | None) -> str:

@@ -22,6 +22,7 @@ from roadscan.jobs.condition.roughness_regions import REGION_PICTURES
 from roadscan.jobs.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.jobs.report.section import Material, Section
 from roadscan.jobs.session import Session
+from roadscan.products.base import products
 from roadscan.tables.manifest import OutputRecord
 from roadscan.tables.store import Store
 
@@ -51,8 +52,7 @@ class Made(Section):
             return
         root = session.store.root.rstrip("/") + "/"
         rows = [
-            (name, f"{one.files:,}", f"{one.bytes / 1e6:,.1f} MB", one.folder.removeprefix(root))
-            for name, one in files.items()
+            (name, f"{one.files:,}", _size(one.bytes), one.folder.removeprefix(root)) for name, one in files.items()
         ]
         yield Table(("product", "files", "size", "folder"), rows, numbers=False)
         for record in _shown(session):
@@ -62,16 +62,31 @@ class Made(Section):
                 yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
                 continue
             if small is not None:
-                yield Picture(small, f"{record.product}: {record.path}")
+                yield Picture(small, f"{_title(record.product)}: {record.path}")
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB" if count >= 1_000_000 else f"{count / 1e3:,.1f} kB"
+
+
+def _title(product: str) -> str:
+    """What a product is, in words; its name where a package that is not installed made it."""
+    kind = products().get(product)
+    return product if kind is None else kind.title
 
 
 def _shown(session: Session) -> Iterator[OutputRecord]:
     """The first rasters and pictures of each product over many tiles, by path."""
     counts: Counter[str] = Counter()
+    stems: set[str] = set()
     for record in sorted(session.manifest.all(), key=lambda r: r.path):
         is_picture = record.path.startswith("products/") and record.path.endswith(_SUFFIXES)
         if not is_picture or record.product in _SHOWN_ELSEWHERE:
             continue
+        stem = record.path.rsplit(".", 1)[0]
+        if stem in stems:
+            continue  # the same picture in another format
+        stems.add(stem)
         counts[record.product] += 1
         if counts[record.product] <= _MOST_OF_A_PRODUCT:
             yield record

@@ -47,7 +47,8 @@ def _figures(found: SurveySummary) -> Iterator[tuple[str, str]]:
     for name, spread in (
         ("σ of the poses, horizontal", tiles.sigma_horizontal_m),
         ("σ of the poses, vertical", tiles.sigma_down_m),
-        ("σ of the heights in a cell", tiles.sigma_cells_m),
+        ("scatter of the heights in a cell", tiles.sigma_cells_m),
     ):
         if spread is not None:
-            yield name, f"{1e3 * spread.median:.2f} mm (median of the tiles)"
+            said = f"{1e3 * spread.median:.2f} mm (median of the tiles)"
+            yield name, said if spread.median else "not known: most cells hold one reading"

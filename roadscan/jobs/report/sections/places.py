@@ -61,10 +61,23 @@ def _worst(site: Site, layer: SiteLayer) -> Iterator[Picture]:
     for number in numbers[:_OF_A_LAYER]:
         row = layer.rows[number]
         named = str(row[layer.key]) if layer.key else str(number)
-        caption = f"{layer.title} {named}: {style.title} {_value(row, style):.4g}"
         shape = layer.shapes_m[number]
+        caption = f"{layer.title}{_where(row, layer, shape.bounds)}: {_figure(_value(row, style), style.title)}"
         picture = thumbnail(site, _around(shape.bounds), _PLACE_PX, shape)
         yield Picture(picture, caption, _WIDTH_MM, f"#row={layer.name}/{quote(named, safe='')}")
+
+
+def _where(row: Any, layer: SiteLayer, bounds: Box) -> str:
+    """Key of a row, and the middle of its shape on the map."""
+    west, south, east, north = bounds
+    named = f" {row[layer.key]}" if layer.key else ""
+    return f"{named} at easting {(west + east) / 2:,.0f} m, northing {(south + north) / 2:,.0f} m"
+
+
+def _figure(value: float, title: str) -> str:
+    """A value with its unit, which stands in brackets at the end of the title of its style."""
+    name, bracket, unit = title.partition(" (")
+    return f"{name} {value:.4g}" + (f" {unit.removesuffix(')')}" if bracket else "")
 
 
 def _value(row: Any, style: Style) -> float:

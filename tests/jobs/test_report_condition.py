@@ -1,0 +1,118 @@
+"""The report of a small survey as a road engineer reads it: what is shown, where, with which σ; what is not made."""
+
+from __future__ import annotations
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from roadscan.jobs.condition.pictures import chosen_ruts
+from roadscan.simulate import Scene, simulate
+from tests.answers import roadscan
+
+NOT_MEASURED = "mpd_mean_mm: no section has a value; cells have 50 mm; a mean profile depth takes 10 mm or less."
+
+
+@pytest.fixture(scope="module")
+def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """30 m of the demo's road in cells of 50 mm, both lanes driven once, with control points; run once."""
+    scene = Scene.load("demo").changed(
+        length_m=30.0, profilers={"spacing_m": 0.1, "readings": 200}, lidar={"range_max_m": 4.0}
+    )
+    file = simulate(scene, tmp_path_factory.mktemp("report") / "survey").survey_file
+    with file.open("a") as stream:
+        stream.write('\n[condition]\nsection_m = 10.0\n[tiles]\ncell_m = 0.05\n[products]\nmake = ["hillshade"]\n')
+    done = roadscan("run", file, "--workers", "0")
+    assert done.exit_code == 0, done.output
+    return file
+
+
+def page_of(survey_file: Path) -> str:
+    """The page's text, with its table cells apart; pictures left out."""
+    (path,) = survey_file.parent.glob("store/*/report/report.html")
+    page = re.sub(r'"data:image[^"]*"', '""', path.read_text(encoding="utf-8"))
+    return unescape(page)
+
+
+def test_captions_say_what_is_shown(survey_file: Path) -> None:
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", page_of(survey_file), re.DOTALL)
+    crossings = [one for one in captions if "typical and at its deepest rut" in one]
+    assert len(crossings) == 2
+    assert {one.split(",")[1].strip() for one in crossings} == {"lane 1", "lane 2"}
+    assert [one for one in captions if re.search(r"_\d{5}_", one)] == []
+    assert sum("shaded relief" in one for one in captions) == 1  # the same picture as TIFF and PNG is shown once
+
+
+def test_tables_of_condition_fit_the_page(survey_file: Path) -> None:
+    """Means stand with σ; remarks have numbers, and a column without a value is named below in place of dashes."""
+    page = page_of(survey_file)
+    (section,) = re.findall(r'<section id="condition">.*?</section>', page, re.DOTALL)
+    heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head in re.findall(r"<thead>.*?</thead>", section)]
+    assert [len(head) <= 9 for head in heads] == [True] * len(heads)
+    assert "rut left (mm)" in heads[0]
+    assert re.search(r"<td>\d+\.\d ± \d+\.\d</td>", section)
+    assert not any("MPD (mm)" in head for head in heads)
+    assert "In no section: MPD (mm). Cells have 50 mm; a mean profile depth takes 10 mm or less." in section
+    assert "crack_alligator_m" not in section
+
+
+@pytest.mark.witness("condition_not_measured")
+def test_what_condition_does_not_make_is_said(survey_file: Path) -> None:
+    told = json.loads(roadscan("run", survey_file, "--workers", "0", "--json").stdout)
+    texts = [one["text"] for one in told["findings"] if one["witness"] == "condition_not_measured"]
+    assert NOT_MEASURED in texts
+    assert [one for one in texts if "crack" in one] == []  # the survey does not ask for the product
+    assert NOT_MEASURED in roadscan("status", survey_file).output.replace("\n", " ").replace("  ", " ")
+
+
+def test_few_check_points_make_no_statement(survey_file: Path) -> None:
+    page = page_of(survey_file)
+    (path,) = survey_file.parent.glob("store/*/tables/absolute_accuracy/*.parquet")
+    counts = pq.read_table(path, columns=["count"])["count"].to_pylist()
+    assert max(counts) < 20
+    assert "95 % (NSSDA)" not in page
+    assert "95 % within" not in page
+    assert "NSSDA takes 20 at least, ASPRS (2023) 30" in page
+
+
+def ruts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """80 m: a left rut of 8 mm that is 14 mm deep from 50 to 60 m, a pothole of 45 mm at 20 m, few readings at 75 m."""
+    station = np.arange(0.0, 80.0, 0.5)
+    depths = np.full((2, station.size), 5.0)
+    depths[0] = np.where((station > 50) & (station < 60), 14.0, 8.0) + 0.01 * station
+    depths[0, np.abs(station - 20.0) < 0.8] = 45.0
+    sigmas = np.where(station > 75, 6.0, 1.0) * np.ones((2, 1))
+    depths[:, station > 75] = 30.0
+    return station, depths, sigmas
+
+
+def test_no_pothole_and_no_noise_is_shown_as_a_rut() -> None:
+    station, depths, sigmas = ruts()
+    chosen = chosen_ruts(station, depths, sigmas)
+    at = {word: float(station[k]) for word, (k, _) in chosen.items()}
+    assert 50 < at["deepest"] < 60
+    assert chosen["deepest"][1].tolist() == pytest.approx([14.55, 5.0], abs=0.1)
+    assert abs(depths[0, chosen["typical"][0]] - 8.4) < 0.2
+    assert chosen_ruts(station, np.full_like(depths, np.nan), sigmas) == {}
+
+
+@pytest.mark.witness("rough_readings")
+def test_paint_that_is_not_sought_is_said(tmp_path: Path) -> None:
+    """A lidar that errs by 200 mm hides the paint; that no lane line is found is no proof that there is none."""
+    scene = Scene.load("demo").changed(
+        length_m=8.0, passes=[{"lane": 2}], profilers={"on": False}, lidar={"range_max_m": 12.0},
+        noise={"lidar_range_m": 0.2},
+    )  # fmt: skip
+    file = simulate(scene, tmp_path / "survey").survey_file
+    with file.open("a") as stream:
+        stream.write('\n[assets]\nkinds = ["lane_line"]\n[tiles]\ncell_m = 0.2\n[products]\nmake = []\n')
+    done = roadscan("run", file, "--workers", "0", "--json")
+    assert done.exit_code == 0, done.output
+    (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "rough_readings")
+    assert re.match(r"Paint was not sought on \d+% of the ground", said)
+    assert "more than 30 mm" in said

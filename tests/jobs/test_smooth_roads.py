@@ -20,7 +20,6 @@ from roadscan.tables.store import Store
 from tests.condition.test_spacing_and_severe_places import e1926
 
 LENGTH_M = 230.0
-LIDAR = {"on": True, "range_max_m": 12.0}
 
 
 def sections(folder: Path, iri_m_per_km: float, seed: int, **scene: object) -> pd.DataFrame:
@@ -54,10 +53,10 @@ def sections(folder: Path, iri_m_per_km: float, seed: int, **scene: object) -> p
 
 
 def errors_within_the_bar(found: pd.DataFrame) -> None:
-    """MRI within 2 % (0.03 m/km up to 1.5), also as its σ says; a ride number with it."""
+    """MRI within 2 % or 0.03 m/km, and within its σ; a ride number with it."""
     error = (found["mri_m_per_km"] - found["true_m_per_km"]).abs()
     assert len(found) >= 2
-    assert (error <= np.maximum(0.02 * found["true_m_per_km"], 0.016)).all()
+    assert (error <= np.maximum(0.02 * found["true_m_per_km"], 0.03)).all()
     assert (error <= 3.0 * found["sigma_mri_m_per_km"]).all()
     assert (found["sigma_mri_m_per_km"] <= 0.03).all()
     assert found["ride_number"].notna().all()

@@ -123,7 +123,7 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert [at for at, _ in found] == pytest.approx([at for at, _ in right], abs=0.2)
         assert [height for _, height in found] == pytest.approx([height for _, height in right], abs=0.5)
         assert [at for at, _ in found[:2]] == pytest.approx([64.0, 76.0], abs=0.2)  # the line begins at station −10
-        assert [height for _, height in found[:2]] == pytest.approx([-STEP_MM, STEP_MM], abs=1.0)  # so may heights
+        assert [height for _, height in found[:2]] == pytest.approx([STEP_MM, -STEP_MM], abs=1.0)  # so may heights
 
 
 def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
@@ -334,7 +334,7 @@ def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) ->
         "cracks", "cracks.parquet", "k", "products/cracks/cracks.parquet", len(content), bytes_digest(content)
     )
     session.manifest.add([record])
-    assert {name for g in plan_condition(session).due_groups for name, _ in g.indices} == {"cracking"}
+    assert {name for g in plan_condition(session).due_groups for name, _ in g.indices} == {"cracking", "faulting"}
     stage_named("condition").run(session)
     table = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
     own = table[table["lane"] == "2"]

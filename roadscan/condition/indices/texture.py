@@ -20,6 +20,8 @@ from roadscan.condition.lane_data import LaneData
 
 _HALF_PATH_M: Final = 0.25
 """Half of the width of a wheel path (m)."""
+_SIGMA_RMS: Final = 0.03
+"""The same of a root mean square: what a rut that bends within a cell adds to it, or takes."""
 _SIGMA_MODEL: Final = 0.1
 """Standard deviation (share) of a mean profile depth from cells: what the forms of textures differ by."""
 
@@ -44,7 +46,7 @@ class Texture(ConditionIndex):
             held = lane.texture.between(from_m, to_m)
             for name, values, model, instead in (
                 ("mpd_mean_mm", held.mpd_mm[:, paths], _SIGMA_MODEL, coarse),
-                ("texture_rms_mean_mm", held.texture_mm[:, paths], 0.0, ""),
+                ("texture_rms_mean_mm", held.texture_mm[:, paths], _SIGMA_RMS, ""),
             ):
                 value, sigma, share, reason = _mean(values, model, lane.config.least_share)
                 if lane.config.heights == "surface":

@@ -51,19 +51,45 @@ def plane(sums, b, slopes):
 
 
 @inner
+def neighbour_slopes(sums, blocks, slopes):
+    """Slopes of the blocks that hold too few cells for a plane, from the means of the blocks beside them.
+
+    Where there is none beside, that of the whole square, which stands in the last row. slopes : (blocks² + 1, 2).
+    """
+    last = blocks * blocks
+    for i in range(blocks):
+        for j in range(blocks):
+            b = i * blocks + j
+            if sums[b, N] >= FITTED:
+                continue
+            for axis in range(2):
+                before, behind = b, b
+                if axis == 0:
+                    before = b - blocks if i > 0 and sums[b - blocks, N] > 0.0 else b
+                    behind = b + blocks if i < blocks - 1 and sums[b + blocks, N] > 0.0 else b
+                else:
+                    before = b - 1 if j > 0 and sums[b - 1, N] > 0.0 else b
+                    behind = b + 1 if j < blocks - 1 and sums[b + 1, N] > 0.0 else b
+                slopes[b, axis] = slopes[last, axis]
+                if before != behind and sums[before, N] > 0.0 and sums[behind, N] > 0.0:
+                    way = sums[behind, X + axis] / sums[behind, N] - sums[before, X + axis] / sums[before, N]
+                    rise = sums[behind, H] / sums[behind, N] - sums[before, H] / sums[before, N]
+                    if way > 0.0:
+                        slopes[b, axis] = rise / way
+
+
+@inner
 def block_scatter(sums, b, slopes, cell_m):
     """Variance of the heights of block b about its plane (m²): of its cells, and of the readings within them.
 
-    NaN where neither tells it. slopes : (blocks, 2) of the plane; (2,) of the whole square in its last row.
+    NaN where neither tells it. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
     """
     n = sums[b, N]
     if n < 1.0:
         return np.nan, np.nan
     between, within = np.nan, np.nan
-    last = slopes.shape[0] - 1
-    along, across = slopes[last, 0], slopes[last, 1]
+    along, across = slopes[b, 0], slopes[b, 1]
     if n >= FITTED:
-        along, across = slopes[b, 0], slopes[b, 1]
         hh = sums[b, HH] - sums[b, H] * sums[b, H] / n
         explained = along * (sums[b, XH] - sums[b, X] * sums[b, H] / n)
         explained += across * (sums[b, YH] - sums[b, Y] * sums[b, H] / n)
@@ -230,6 +256,7 @@ def texture_of_squares(table, places, edge_m, out):
         fill_blocks(found, count, base, half, blocks, sums)
         for b in range(blocks * blocks + 1):
             plane(sums, b, slopes)
+        neighbour_slopes(sums, blocks, slopes)
         known = 0
         for b in range(blocks * blocks):
             between, within = block_scatter(sums, b, slopes, cell)

@@ -51,6 +51,11 @@ class SectionConfig(Strict):
     """Width of lanes whose width nothing states (m)."""
     largest_gap_m: float = Field(default=0.5, ge=0.0, le=5.0)
     """Widest gap of a profile that is bridged by a straight line (m); a section with a wider one has no roughness."""
+    joint_spacing_m: float | None = Field(default=None, gt=1.0, le=100.0)
+    """Distance from joint to joint of concrete slabs along the reference line (m). With it the faulting of all joints
+    is measured, also of level ones; without it that of joints with a crack or a step."""
+    joint_station_m: float | None = None
+    """Station of one of these joints (m); left out, where cracks and steps show them."""
     least_share: float = Field(default=0.9, ge=0.0, le=1.0)
     """Share of a cross-section's heights, or of a section's cross-sections, that have to be measured."""
 

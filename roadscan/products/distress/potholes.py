@@ -16,7 +16,9 @@ from roadscan.products.distress.pothole_pieces import read_pieces
 from roadscan.products.geo_table import check_geo_table, write_geo_table
 from roadscan.surfaces.distress.potholes import Pothole, PotholePiece, join_potholes
 
-_FIGURES: Final = ("area_m2", "depth_mean_m", "depth_max_m", "volume_m3", "length_m", "breadth_m")
+_FIGURES: Final = (
+    "area_m2", "rim_area_m2", "sigma_rim_area_m2", "depth_mean_m", "depth_max_m", "volume_m3", "length_m", "breadth_m",
+)  # fmt: skip
 
 COLUMNS: Final = pa.schema(
     [pa.field("pothole", pa.int32(), nullable=False)]

@@ -72,3 +72,8 @@ def read(name: str, path: Path, options: dict[str, Any] | None = None, **stated:
         rows.append(item)
         batches.append(batch)
     return Readings(header.attributes, pa.Table.from_batches(batches, schema.arrow(header.list_size)), rows, rejects)
+
+
+def read_ellipsoidal(name: str, path: Path, options: dict[str, Any] | None = None, **stated: Any) -> Readings:
+    """As `read`, of a log whose heights are stated as ellipsoidal where nothing else is stated."""
+    return read(name, path, options, **({"height": "ellipsoidal"} | stated))

@@ -326,7 +326,7 @@ def pospac(folder: Path) -> Log:
         *[zero] * 3,
     ]
     path = columns_csv(folder / "a.csv", {"GPSTime": T0 + t} | dict(zip(names, values, strict=True)))
-    stated = {"clock": GPS, "crs": "EPSG:25832"}
+    stated = {"clock": GPS, "crs": "EPSG:25832", "height": "ellipsoidal"}
     return Log("pospac", "", path, {"axes": "flu"}, stated, other=with_pandas(path), against="pandas.read_csv")
 
 
@@ -385,7 +385,7 @@ def control_csv(folder: Path) -> Log:
         "height_m": np.full(n, 300.0),
     }  # fmt: skip
     path = columns_csv(folder / "a.csv", columns)
-    stated = {"crs": "EPSG:25832", "map": MapFrame(crs="EPSG:25832")}
+    stated = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": MapFrame(crs="EPSG:25832")}
     return Log("control_csv", "", path, {}, stated, other=with_pandas(path), against="pandas.read_csv")
 
 
@@ -396,7 +396,7 @@ def control_vector(folder: Path) -> Log:
     frame = geopandas.GeoDataFrame({"name": np.char.add("P", k.astype(str)), "role": "gcp"}, geometry=points, crs=25832)
     path = folder / "a.gpkg"
     _quietly(frame.to_file, path)
-    stated = {"crs": "EPSG:25832", "map": MapFrame(crs="EPSG:25832")}
+    stated = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": MapFrame(crs="EPSG:25832")}
     other = lambda: len(geopandas.read_file(path))  # noqa: E731
     return Log("control_vector", "GeoPackage", path, {}, stated, other=other, against="geopandas.read_file")
 

@@ -41,6 +41,7 @@ id = "monday"
 [[runs.logs]]
 path = "poses.csv"
 crs = "EPSG:25832"
+height = "ellipsoidal"
 clock = { system = "gps" }
 options = { heading = "grid" }
 
@@ -184,7 +185,7 @@ def _section(text: str) -> tuple[str, str]:
 
 
 def _poses_crs(line: str) -> tuple[str, str]:
-    return 'crs = "EPSG:25832"\nclock', f"{line}clock"
+    return 'crs = "EPSG:25832"\nheight', f"{line}height"
 
 
 def _scans_of(first_s: float) -> Callable[[Path], object]:
@@ -241,6 +242,11 @@ MISTAKES: Final = (
         "The map's CRS does not keep lengths",
         "Take the projected CRS of the region; Web Mercator is for looking at maps.",
         _map('crs = "EPSG:3857", max_datum_error_m = 5.0'),
+    ),
+    Mistake(
+        "The kind of a log's heights is not stated",
+        "State `height`, of the log or in `[defaults]`; or a CRS of three axes, such as `EPSG:4979`.",
+        ('height = "ellipsoidal"\n', ""),
     ),
     Mistake("A log of positions states no CRS", "State it.", _poses_crs("")),
     Mistake(

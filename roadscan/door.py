@@ -424,7 +424,7 @@ def read_log(
     format: str | None = None,  # noqa: A002  the survey file's own word
     clock: Clock | Mapping[str, Any] | str | None = None,
     crs: str | None = None,
-    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal",
+    height: Literal["ellipsoidal", "orthometric"] | None = None,
     geoid: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> LogTables:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -43,6 +43,10 @@ def inspect_files(
         str | None, typer.Option(help="Time system, such as gps_week_seconds,week=2405 or unix_utc,unit=us.")
     ] = None,
     crs: Annotated[str | None, typer.Option(help='CRS of positions, such as EPSG:4979 or "local".')] = None,
+    height: Annotated[
+        Literal["ellipsoidal", "orthometric"] | None,
+        typer.Option(help="Kind of heights, where neither the file nor its CRS says it."),
+    ] = None,
     option: Annotated[
         list[str] | None, typer.Option("--option", help="Setting of the format, key=value; may be repeated.")
     ] = None,
@@ -62,6 +66,7 @@ def inspect_files(
     stated = Stated(
         clock=None if clock is None else parse_clock(clock),
         crs=crs,
+        height=height,
         options=dict(parse_option(one) for one in option or ()),
     )
     found = []

@@ -152,7 +152,7 @@ def _map(found: FoundFolder) -> Iterator[str]:
         yield _question('crs = "????"')
         yield '# The map of the products: a projected CRS ("EPSG:25832"), or, for poses that are not tied to the Earth,'
         yield '# local = { name = "local" } in place of crs.'
-    yield '# height = "orthometric"  # and geoid = "…", grids = "…"; ellipsoidal unless it is stated'
+    yield '# height = "orthometric"  # and geoid = "…", grids = "…"; of the products; else ellipsoidal'
 
 
 def _utm_line(log: FoundLog, frame: str, *, is_known: bool) -> Iterator[str]:
@@ -212,8 +212,6 @@ def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
         if need.reason != before:
             yield from (line for words in (said, _hint(need, log, run)) if words for line in _remark(words))
         before = need.reason
-        if need.key == "crs":
-            yield '# height = "orthometric"  # and geoid = "…", if its heights are not ellipsoidal'
 
 
 def _alternatives(need: Need) -> Iterator[str]:

@@ -71,7 +71,7 @@ class Stated:
 
     clock: Clock | None = None
     crs: str | None = None
-    height: HeightKind = "ellipsoidal"
+    height: HeightKind | None = None
     geoid: Geoid | None = None
     options: dict[str, Any] = field(default_factory=dict)
     sensor: Sensor | None = None
@@ -313,9 +313,11 @@ class _Search:
             yield from (dataclasses.replace(trial, crs=crs) for crs in _CRS_CHOICES if crs != trial.crs)
 
     def _heights(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
-        wanted = any(one.proposed == "orthometric" for one in error.asks_for("height"))
-        if wanted and trial.height == self._stated.height == "ellipsoidal":
-            yield dataclasses.replace(trial, height="orthometric")
+        if self._stated.height is not None:
+            return
+        for one in error.asks_for("height"):
+            proposed = (one.proposed,) if one.proposed is not None else one.choices
+            yield from (dataclasses.replace(trial, height=kind) for kind in proposed if kind != trial.height)
 
     def _sensors(self, trial: Stated, error: RoadscanError) -> Iterator[Stated]:
         kind = sensor_kind(self._format)
@@ -352,7 +354,9 @@ class _Search:
         if trial.sensor != self._stated.sensor:
             yield Need("sensor", 'sensor = "????"', _reason(asked.get("sensor", fallback)))
         if trial.height != self._stated.height:
-            yield Need("height", f'height = "{trial.height}"', _reason(asked.get("height", fallback)))
+            error = asked.get("height", fallback)
+            said = any(one.proposed == trial.height for one in error.asks_for("height"))
+            yield Need("height", f'height = "{trial.height if said else "????"}"', _reason(error))
         answered: set[str] = set()
         for name, error in reasons.items():
             of_crs = of_file if isinstance(error, CrsError) else None

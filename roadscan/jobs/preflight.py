@@ -177,7 +177,7 @@ def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
     """Every geoid grid is there, whoever names it."""
     config = asked.survey.config
     named = [config.map.geoid if config.map.height == "orthometric" else None]
-    named += [log.config.geoid if log.config.height == "orthometric" else None for log in asked.logs]
+    named += [log.config.geoid if log.config.height != "ellipsoidal" else None for log in asked.logs]
     for geoid in (asked.survey.geoid(grid) for grid in dict.fromkeys(named)):
         if geoid is not None:
             yield from _faults(geoid.check)

@@ -15,7 +15,7 @@ import os
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -64,6 +64,37 @@ def crs_from_text(text: str, key: str = "CRS") -> pyproj.CRS:
             expected="an authority code such as EPSG:25832, or WKT",
             change="check the code (epsg.org lists them)",
         ) from error
+
+
+class StatedHeights(NamedTuple):
+    """What a CRS says of its heights."""
+
+    kind: HeightKind | None = None
+    """None where it says nothing."""
+    name: str = ""
+    """Name of the CRS that says it."""
+    unit_m: float | None = None
+    """Length of the unit of heights (m)."""
+
+
+NO_HEIGHTS: Final = StatedHeights()
+
+
+def heights_of(crs: pyproj.CRS) -> StatedHeights:
+    """Kind and unit of heights that a CRS states: a vertical one, one with a vertical part, or one of three axes."""
+    if crs.is_bound and crs.source_crs is not None:
+        return heights_of(crs.source_crs)
+    vertical = crs if crs.is_vertical else next((part for part in crs.sub_crs_list if part.is_vertical), None)
+    if vertical is not None:
+        unit_m = float(vertical.axis_info[-1].unit_conversion_factor)
+        datum = vertical.datum.name if vertical.datum is not None else ""
+        name = vertical.name or datum
+        if "ellips" in f"{name} {datum}".lower():
+            return StatedHeights("ellipsoidal", name, unit_m)
+        return StatedHeights(None if datum.lower() in {"", "unknown"} and not name else "orthometric", name, unit_m)
+    if not crs.is_compound and len(crs.axis_info) == 3 and not crs.is_geocentric:
+        return StatedHeights("ellipsoidal", crs.name, float(crs.axis_info[2].unit_conversion_factor))
+    return NO_HEIGHTS
 
 
 @functools.lru_cache(maxsize=64)
@@ -259,17 +290,8 @@ class MapFrame:
     """A change of datum less accurate than this is refused."""
 
     def __post_init__(self) -> None:
-        if self.height == "orthometric" and self.geoid is None and self.crs is not None:
-            raise CrsError(
-                "orthometric heights were asked for, and no geoid is named",
-                expected="map.geoid, the file name of a grid",
-                change='add geoid = "us_noaa_g2018u0.tif" (your region\'s grid), or height = "ellipsoidal"',
-            )
-        if self.vertical_crs is not None and not crs_from_text(self.vertical_crs, "map.vertical_crs").is_vertical:
-            raise CrsError(
-                f"map.vertical_crs '{self.vertical_crs}' ({crs_from_text(self.vertical_crs).name}) is not vertical",
-                expected='a CRS of heights, such as "EPSG:7837"',
-            )
+        if self.vertical_crs is not None:
+            self._check_vertical_crs(self.vertical_crs)
         if self.crs is not None:
             horizontal = crs_from_text(self.crs, "map.crs")
             if horizontal.is_compound:
@@ -285,6 +307,33 @@ class MapFrame:
                     change='state the projected CRS of your region, such as "EPSG:25832"',
                 )
 
+    def _check_vertical_crs(self, vertical_crs: str) -> None:
+        vertical = crs_from_text(vertical_crs, "map.vertical_crs")
+        if not vertical.is_vertical:
+            raise CrsError(
+                f"map.vertical_crs '{vertical_crs}' ({vertical.name}) is not vertical",
+                expected='a CRS of heights, such as "EPSG:7837"',
+            )
+        said = heights_of(vertical).kind
+        if self.crs is not None and said not in (None, self.height):
+            raise CrsError(
+                f"map.vertical_crs '{vertical_crs}' ({vertical.name}) is of {said} heights, map.height "
+                f"is {self.height}",
+                expected="one kind of height: the products would name a datum that their heights do not have",
+                change=f'set map.height = "{said}" (with map.geoid, where poses are brought there), '
+                "or leave map.vertical_crs out",
+            )
+
+    def _need_geoid(self) -> Geoid | None:
+        """The geoid of orthometric heights, without which no ellipsoidal height comes into the map."""
+        if self.height == "orthometric" and self.geoid is None:
+            raise CrsError(
+                "orthometric heights were asked for, and no geoid is named",
+                expected="map.geoid, the file name of a grid",
+                change='add geoid = "us_noaa_g2018u0.tif" (your region\'s grid), or height = "ellipsoidal"',
+            )
+        return self.geoid
+
     @property
     def is_local(self) -> bool:
         """True for a local engineering frame."""
@@ -297,11 +346,24 @@ class MapFrame:
 
     @property
     def vertical_unit_m(self) -> float:
-        """Length of the CRS's height unit in metres (1 unless a vertical CRS says otherwise)."""
-        return 1.0 if self.vertical_crs is None else _unit_m(self.vertical_crs, -1)
+        """Length of the unit of heights (m): that of the vertical CRS where one is named, else the horizontal one.
+
+        Programs take heights without a vertical CRS to be in the horizontal unit.
+        """
+        return self.horizontal_unit_m if self.vertical_crs is None else _unit_m(self.vertical_crs, -1)
+
+    @property
+    def vertical_unit(self) -> str:
+        """Name of the unit of heights."""
+        if self.vertical_crs is not None:
+            return str(crs_from_text(self.vertical_crs).axis_info[-1].unit_name)
+        return "metre" if self.crs is None else str(crs_from_text(self.crs).axis_info[0].unit_name)
 
     def wkt(self, version: Literal["WKT1_GDAL", "WKT2_2019"] = "WKT2_2019") -> str:
-        """WKT of the horizontal CRS, compound where a vertical CRS is named."""
+        """WKT of the horizontal CRS, compound where a vertical CRS is named.
+
+        WKT 1 always states the kind and unit of heights: clouds of points need them.
+        """
         if self.crs is None:
             name = self.local_name or "local"
             if version == "WKT1_GDAL":
@@ -314,7 +376,29 @@ class MapFrame:
         if self.vertical_crs is not None:
             vertical = crs_from_text(self.vertical_crs)
             crs = CompoundCRS(name=f"{crs.name} + {vertical.name}", components=[crs, vertical])
-        return str(crs.to_wkt(version))
+        if version == "WKT2_2019":
+            return str(crs.to_wkt(version))
+        # Without its axes PROJ writes Krovak's southing and westing as easting and northing.
+        axes = {axis.direction for axis in crs_from_text(self.crs).axis_info}
+        text = str(crs.to_wkt(version, output_axis_rule=None if axes <= {"east", "north"} else True))
+        if self.vertical_crs is not None:
+            return text
+        return f'COMPD_CS["{crs.name} + {self._vertical_name}",{text},{self._vertical_wkt1()}]'
+
+    @property
+    def _vertical_name(self) -> str:
+        if self.height == "ellipsoidal":
+            return f"Ellipsoid ({self.vertical_unit})"
+        return "height above the geoid" + (f" {Path(self.geoid.grid).name}" if self.geoid else "")
+
+    def _vertical_wkt1(self) -> str:
+        """Kind and unit of heights without a named vertical CRS, ellipsoidal ones as PROJ writes them for LAS 1.4."""
+        unit = f'UNIT["{self.vertical_unit}",{self.vertical_unit_m!r}]'
+        if self.height == "ellipsoidal":
+            datum, axis = 'VERT_DATUM["Ellipsoid",2002]', "Ellipsoidal height"
+        else:
+            datum, axis = f'VERT_DATUM["{self._vertical_name}",2005]', "Gravity-related height"
+        return f'VERT_CS["{self._vertical_name}",{datum},{unit},AXIS["{axis}",UP]]'
 
     def map_from_world(self, world: str, xyz_world_m: Float64) -> Float64:
         """Easting, northing, height (n, 3) in metres of world positions (n, 3) in metres."""
@@ -334,7 +418,7 @@ class MapFrame:
         elif self.crs is None:
             self._to_anchor_world(world)
         else:
-            _projection(self.crs, world, self.geoid, self.max_datum_error_m)
+            _projection(self.crs, world, self._need_geoid(), self.max_datum_error_m)
 
     def beyond_area_deg(self, lon_lat_deg: Float64) -> float:
         """How far (degrees) a place, longitude and latitude (2,), lies outside the area that the map's CRS is made for;
@@ -373,7 +457,7 @@ class MapFrame:
             anchor = self._anchor_for(world)
             rotation, origin = anchor.ecef_from_local()
             return self._forward(anchor.world, xyz @ rotation.T + origin)
-        return _projection(self.crs, world, self.geoid, self.max_datum_error_m).forward(xyz)
+        return _projection(self.crs, world, self._need_geoid(), self.max_datum_error_m).forward(xyz)
 
     def _inverse(self, world: str, enh: Float64) -> Float64:
         if self.crs is None:
@@ -385,7 +469,7 @@ class MapFrame:
             anchor = self._anchor_for(world)
             rotation, origin = anchor.ecef_from_local()
             return (self._inverse(anchor.world, enh) - origin) @ rotation
-        return _projection(self.crs, world, self.geoid, self.max_datum_error_m).inverse(enh)
+        return _projection(self.crs, world, self._need_geoid(), self.max_datum_error_m).inverse(enh)
 
     def _anchor_for(self, world: str) -> Anchor:
         if self.anchor is None:

@@ -177,8 +177,8 @@ class LogDefaults(Strict):
     crs: str | None = None
     """CRS of positions of a log that states none, and whose file names none."""
     height: Literal["ellipsoidal", "orthometric"] | None = None
-    """Kind of heights of a log that does not state `height`. A log whose file says that its heights are of another
-    kind is refused until it states its own."""
+    """Kind of heights of a log that states none, and of which neither file, CRS nor format says it. A log whose file
+    says that its heights are of another kind is refused until it states its own."""
     geoid: str | None = None
     """Geoid grid of logs with orthometric heights that name none."""
     clock: ClockDefaults | None = None
@@ -198,24 +198,25 @@ class LogConfig(Strict):
     """Time system; required unless the format states its own."""
     crs: str | None = None
     """CRS of positions in the log (for example "EPSG:4979", or "local"), where it holds any."""
-    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
-    """Kind of heights in the log, where it holds any."""
+    height: Literal["ellipsoidal", "orthometric"] | None = None
+    """Kind of heights in the log; required where it holds any and neither its file, nor its CRS (such as "EPSG:4979"),
+    nor its format says it."""
     geoid: str | None = None
     """Geoid grid that brings the log's orthometric heights to the ellipsoid."""
     options: dict[str, Any] = {}
     """Settings of the format (`roadscan formats NAME`)."""
 
     def completed(self, defaults: LogDefaults) -> LogConfig:
-        """The log with the kind of heights, geoid, week and date of the defaults where it states none.
+        """The log with the geoid, week and date of the defaults where it states none.
 
-        Default CRS and time system are not put in: only the log's reader knows whether its file says its own.
+        Default CRS, kind of heights and time system are not put in: only the log's reader knows whether its file says
+        its own.
         """
-        height = self.height if defaults.height is None or "height" in self.model_fields_set else defaults.height
-        geoid = defaults.geoid if self.geoid is None and height == "orthometric" else self.geoid
+        geoid = defaults.geoid if self.geoid is None and self.height != "ellipsoidal" else self.geoid
         clock = self.clock
         if clock is not None and defaults.clock is not None:
             clock = defaults.clock.dated(clock)
-        return self.model_copy(update={"height": height, "geoid": geoid, "clock": clock})
+        return self.model_copy(update={"geoid": geoid, "clock": clock})
 
 
 class RunConfig(Strict):

@@ -16,7 +16,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from roadscan.codecs.cog import BLOCK, About, Band, write_sparse_cog
-from roadscan.model.crs import MapFrame, crs_from_text
+from roadscan.model.crs import MapFrame
 from roadscan.model.ids import TileId
 from roadscan.points.cloud import QUANTA_PER_M
 from roadscan.products.base import ProductContext
@@ -96,7 +96,7 @@ class CellBox:
 @functools.lru_cache(maxsize=16)
 def height_unit(frame: MapFrame) -> str:
     """Name of the unit that heights are written in."""
-    return "metre" if frame.vertical_crs is None else str(crs_from_text(frame.vertical_crs).axis_info[-1].unit_name)
+    return frame.vertical_unit
 
 
 def cell_image(cells: TileCells, values: npt.NDArray[Any], dtype: str) -> npt.NDArray[Any]:

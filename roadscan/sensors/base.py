@@ -13,18 +13,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, TypeAlias
+from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.model.crs import LOCAL_WORLD, Geoid, MapFrame
-from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.model.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame
+from roadscan.model.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.model.gpstime import Clock
 from roadscan.model.rig import Sensor, SensorKind
 from roadscan.model.strict import Strict
-from roadscan.model.witness import Finding
+from roadscan.model.witness import Finding, Witness
 from roadscan.plugins import found_kinds
 from roadscan.sensors.columns import Quantity
 
@@ -37,6 +37,25 @@ ENTRY_POINT_GROUP: Final = "roadscan.formats"
 class NoOptions(Strict):
     """Settings of a format without settings."""
 
+
+_HEIGHT_ASKED: Final = Missing("height", choices=("ellipsoidal", "orthometric"))
+
+HEIGHT_NOT_STATED: Final = Witness(
+    name="height_not_stated",
+    input="heights",
+    fault="Nothing says whether a log's heights are ellipsoidal or orthometric: they differ by up to 106 m.",
+    asks="the log's header, its CRS or the definition of its format, then the survey file",
+    does="a log of which none of them says the kind is refused, with the line that states it",
+    told=("error",),
+)
+HEIGHT_CONTRADICTED: Final = Witness(
+    name="height_contradicted",
+    input="heights",
+    fault="The survey file states another kind or unit of heights than the log itself.",
+    asks="vertical CRS, GeoTIFF keys, axes of the CRS, header, or the definition of the format",
+    does="the log is refused; the message names both",
+    told=("error",),
+)
 
 _CARTESIAN: Final = 'crs = "local", or a geocentric one such as "EPSG:4978"'
 
@@ -51,6 +70,8 @@ class SourceDefaults:
     """Clock of seconds of the GPS week, where the survey file gives a week or date for all logs."""
     crs: str | None = None
     """CRS of positions that neither the log nor its entry in the survey file explains."""
+    height: HeightKind | None = None
+    """Kind of heights that neither the log nor its entry in the survey file explains."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +88,8 @@ class LogSource:
     """Sensor of the rig that wrote the log."""
     crs: str | None = None
     """CRS of the log's positions as stated ("local" for a local frame)."""
-    height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
-    """Kind of the log's heights."""
+    height: HeightKind | None = None
+    """Kind of the log's heights as stated; None where the survey file states none."""
     geoid: Geoid | None = None
     """Geoid that brings orthometric heights to the ellipsoid."""
     map: MapFrame | None = None
@@ -112,6 +133,49 @@ class LogSource:
                 missing=Missing("crs"),
             )
         return crs
+
+    @property
+    def any_height(self) -> HeightKind | None:
+        """The stated kind of heights, or the survey's default."""
+        return self.defaults.height if self.height is None else self.height
+
+    def need_height(self, known: HeightKind | None = None, by: str = "", way_out: str = "") -> HeightKind:
+        """Kind of the log's heights: what the log says, or what the survey file states; an error where neither does.
+
+        Parameters
+        ----------
+        known : kind that the log itself says, by its header, its CRS or the definition of its format.
+        by : what says it, in words.
+        way_out : what to state where the log is wrong.
+
+        Raises
+        ------
+        ConfigError
+            where nothing says the kind: it is never guessed.
+        CrsError
+            where log and survey file say different kinds.
+        """
+        said = self.any_height
+        if known is None:
+            if said is not None:
+                return said
+            raise ConfigError(
+                "the kind of the log's heights is not stated",
+                expected=f"{_HEIGHT_ASKED}, with geoid where heights change their kind on the way into the map",
+                file=self.path,
+                missing=_HEIGHT_ASKED,
+            )
+        if said is None or said == known:
+            return known
+        whose = "defaults.height" if self.height is None else "height"
+        also = " (and geoid, to change them into another kind)" if known == "orthometric" else ""
+        raise CrsError(
+            f"heights are {known} by {by}, {whose} in the survey file says {said}",
+            expected="one kind of height",
+            change=f'set height = "{known}" for this log{also}{f", or {way_out}" if way_out else ""}',
+            file=self.path,
+            missing=Missing("height", known),
+        )
 
     def need_file(self) -> None:
         """Refuse a log that is no file, or one that cannot be opened, for formats of single files."""

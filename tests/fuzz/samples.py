@@ -433,7 +433,7 @@ def roads_zip(folder: Path) -> Path:
 
 _POSES = {"clock": GPS, "crs": "local"}
 _IMU: dict[str, Any] = test_imu_csv.STATED
-_UTM32 = {"crs": "EPSG:25832", "map": MapFrame(crs="EPSG:25832")}
+_UTM32 = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": MapFrame(crs="EPSG:25832")}
 _DEGREES = {"crs": "EPSG:4979", "map": MapFrame(crs="EPSG:32632")}
 _CLOUD = {"clock": Clock(TimeSystem.GPS_ADJUSTED), "crs": "local"}
 _LAS_FIELDS = (24, 94, 96, 100, 104, 105, 107, 111, 115, 119, 131, 139, 155, 163, 179, 187, 227, 235, 243, 247, 255)
@@ -508,7 +508,7 @@ def _poses() -> Iterator[Sample]:
     yield Sample("pose_quaternions", "parquet", file("a.parquet", pose_parquet), axes, _POSES)
     yield Sample("trajectory_table", "parquet", file("a.parquet", level_parquet))
     yield Sample("trajectory_table", "feather", file("a.feather", level_feather))
-    ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832"}
+    ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832", "height": "ellipsoidal"}
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
     yield Sample(
@@ -597,7 +597,7 @@ def _lidar() -> Iterator[Sample]:
 
 
 def _clouds() -> Iterator[Sample]:
-    cloud = {"clock": test_las.ADJUSTED}
+    cloud = {"clock": test_las.ADJUSTED, "height": "ellipsoidal"}
     for point_format in (3, 7):
         yield Sample("las", f"las{point_format}", las("a.las", point_format), {}, cloud, fields=_LAS_FIELDS)
         yield Sample(

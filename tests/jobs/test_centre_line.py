@@ -48,7 +48,7 @@ def write_layer(path: Path, crs: str | None = "EPSG:32632", **columns: Any) -> N
 
 def survey_of(folder: Path, **filters: Any) -> Survey:
     logs = [
-        {"path": "points.las", "format": "las", "crs": "EPSG:32632"},
+        {"path": "points.las", "format": "las", "crs": "EPSG:32632", "height": "ellipsoidal"},
         {"path": "roads.shp", "crs": "EPSG:32632"},
     ]
     values = {

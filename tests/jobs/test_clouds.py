@@ -37,6 +37,7 @@ def run(folder: Path, logs: list[str], edge: int) -> Store:
         "store": f"store-{edge}",
         "map": {"crs": "EPSG:32632"},
         "tiles": {"block_tiles": edge, "cell_m": 0.5},
+        "defaults": {"height": "ellipsoidal"},
         "runs": [{"id": "r", "logs": [{"path": p, "format": "las", "crs": "EPSG:32632"} for p in logs]}],
     }
     survey = Survey.parse(values, folder=folder)

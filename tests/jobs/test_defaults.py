@@ -33,7 +33,7 @@ logs = [
 ]
 [[runs]]
 id = "other"
-logs = [{{ path = "utc.csv", crs = "EPSG:25832", options = {{ heading = "grid" }} }}]
+logs = [{{ path = "utc.csv", crs = "EPSG:25832", height = "ellipsoidal", options = {{ heading = "grid" }} }}]
 """
 OWN = {"crs": ', crs = "EPSG:4937"', "clock": f', clock = {{ system = "gps_week_seconds", week = {WEEK} }}'}
 DEFAULTS = f"""
@@ -110,15 +110,16 @@ def test_another_default_reads_the_log_again(tmp_path: Path) -> None:
         ('height = "orthometric"\ngeoid = "g.tif"', "", "orthometric", "g.tif"),
         ('height = "orthometric"\ngeoid = "g.tif"', ', height = "ellipsoidal"', "ellipsoidal", None),
         ('height = "orthometric"\ngeoid = "g.tif"', ', geoid = "own.tif"', "orthometric", "own.tif"),
-        ('geoid = "g.tif"', "", "ellipsoidal", None),
+        ('geoid = "g.tif"', "", None, "g.tif"),
         ('geoid = "g.tif"', ', height = "orthometric"', "orthometric", "g.tif"),
     ],
 )
-def test_heights_and_geoid(tmp_path: Path, defaults: str, own: str, height: str, geoid: str | None) -> None:
+def test_heights_and_geoid(tmp_path: Path, defaults: str, own: str, height: str | None, geoid: str | None) -> None:
     write_logs(tmp_path)
     (tmp_path / "SURVEY.toml").write_text(SURVEY.format(defaults=f"[defaults]\n{defaults}\n", crs=own, clock=""))
-    log = Survey.load(tmp_path / "SURVEY.toml").config.runs[0].logs[0]
-    assert (log.height, log.geoid) == (height, geoid)
+    planned, _ = plan_logs(Survey.load(tmp_path / "SURVEY.toml"), Store(str(tmp_path / "store"), "shared"))
+    source = next(p.source for p in planned if p.format.name == "sbet")
+    assert (source.any_height, source.geoid.grid if source.geoid else None) == (height, geoid)
 
 
 @pytest.mark.parametrize(

@@ -252,7 +252,7 @@ def test_a_log_whose_file_states_its_crs_fills_the_map_in(tmp_path: Path) -> Non
     import pyproj
 
     header = laspy.LasHeader(point_format=6, version="1.4")
-    header.add_crs(pyproj.CRS.from_epsg(25832))
+    header.add_crs(pyproj.CRS("EPSG:25832+7837"))
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = np.full(3, 500_000.0), np.full(3, 5.4e6), np.full(3, 100.0)

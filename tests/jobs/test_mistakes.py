@@ -176,7 +176,7 @@ def test_what_would_make_them_meet(tmp_path: Path, shift_s: int, words: str) -> 
 def test_logs_that_cannot_meet_are_told_before_they_are_read(tmp_path: Path) -> None:
     """As large logs are: by their first chunk, and by their end where that is found in a moment."""
     clock = 'crs = "EPSG:4937"\nclock = { system = "gps_week_seconds", week = %d }\nformat = "sbet"'
-    old = 'crs = "EPSG:25832"\nclock = { system = "gps" }\noptions = { heading = "grid" }'
+    old = 'crs = "EPSG:25832"\nheight = "ellipsoidal"\nclock = { system = "gps" }\noptions = { heading = "grid" }'
     changed(tmp_path, ('"poses.csv"', '"poses.sbet"'), (old, clock % 2416))
     at = FIRST_GPS_S % 604_800
     poses = np.zeros((70_000, 17))
@@ -209,6 +209,7 @@ id = "tuesday"
 [[runs.logs]]
 path = "poses.csv"
 crs = "EPSG:25832"
+height = "ellipsoidal"
 clock = { system = "gps" }
 options = { heading = "grid" }
 

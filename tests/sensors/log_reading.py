@@ -71,3 +71,8 @@ def read_log(name: str, path: Path, options: dict[str, Any] | None = None, **sta
         rows.append(item)
         batches.append(batch)
     return Log(header.attributes, pa.Table.from_batches(batches, schema.arrow()), rows, rejects, findings)
+
+
+def read_ellipsoidal(name: str, path: Path, options: dict[str, Any] | None = None, **stated: Any) -> Log:
+    """As `read_log`, of a log whose heights are stated as ellipsoidal where nothing else is stated."""
+    return read_log(name, path, options, **({"height": "ellipsoidal"} | stated))

@@ -80,3 +80,8 @@ def read(name: str, path: Path, options: dict[str, Any] | None = None, **stated:
     return Readings(
         header.attributes, pa.Table.from_batches(batches, schema.arrow(header.list_size)), rows, rejects, findings
     )
+
+
+def read_ellipsoidal(name: str, path: Path, options: dict[str, Any] | None = None, **stated: Any) -> Readings:
+    """As `read`, of a log whose heights are stated as ellipsoidal where nothing else is stated."""
+    return read(name, path, options, **({"height": "ellipsoidal"} | stated))

@@ -12,7 +12,7 @@ import pytest
 from roadscan.model.crs import Anchor, Geoid, MapFrame
 from roadscan.model.errors import ConfigError, CrsError, FormatError
 from roadscan.sensors.base import format_named, format_of
-from tests.sensors.log_reading import read_log
+from tests.sensors.log_reading import read_ellipsoidal as read_log
 
 UTM32 = MapFrame(crs="EPSG:25832")
 LOCAL = MapFrame(crs=None, local_name="site")

@@ -15,7 +15,8 @@ import shapely
 from roadscan.model.crs import MapFrame
 from roadscan.model.errors import ConfigError, CrsError, FormatError
 from roadscan.sensors.base import format_named, format_of
-from tests.sensors.log_reading import Log, read_log
+from tests.sensors.log_reading import Log
+from tests.sensors.log_reading import read_ellipsoidal as read_log
 
 UTM32 = MapFrame(crs="EPSG:25832")
 ENH = np.array([[571600.125, 5539000.5, 312.75], [571610.5, 5539001.25, 313.5], [571620.0, 5539002.0, 314.0]])

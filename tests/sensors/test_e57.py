@@ -32,7 +32,7 @@ from tests.sensors.e57_files import (
     small_e57,
     start,
 )
-from tests.sensors.readings import read
+from tests.sensors.readings import read_ellipsoidal as read
 
 pye57 = pytest.importorskip("pye57")
 

@@ -17,7 +17,7 @@ from roadscan.model.crs import Geoid
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import SourceDefaults, format_named, format_of
-from tests.sensors.readings import read
+from tests.sensors.readings import read_ellipsoidal as read
 
 ADJUSTED = Clock(TimeSystem.GPS_ADJUSTED)
 UTM = "EPSG:25832"
@@ -274,6 +274,8 @@ def test_heights_by_the_files_vertical_crs(tmp_path: Path) -> None:
     path = cloud(tmp_path / "a.las", crs="EPSG:2263+6360")  # NAVD88 height, US survey feet
     with pytest.raises(CrsError, match=r'heights are orthometric.*height = "orthometric"'):
         read("las", path)
+    log = read("las", path, height=None)
+    assert log.attributes["height"] == "orthometric"
     log = read("las", path, height="orthometric")
     assert log.attributes["vertical_unit_m"] == pytest.approx(1200 / 3937)
     assert (log.attributes["crs"], log.attributes["height"]) == ("EPSG:2263", "orthometric")

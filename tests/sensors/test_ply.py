@@ -14,7 +14,7 @@ import pytest
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_of
-from tests.sensors.readings import read
+from tests.sensors.readings import read_ellipsoidal as read
 
 plyfile = pytest.importorskip("plyfile")
 

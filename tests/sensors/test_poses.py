@@ -99,7 +99,7 @@ def test_grid_and_true_headings(crs: str, easting: float, northing: float, headi
         return np.array([lon, lat]), np.array(geographic.transform(lon, lat, direction="INVERSE")) * unit_m
 
     for north in ("grid", "true"):
-        placement = level_placement(source(crs), north)
+        placement = level_placement(source(crs, height="ellipsoidal"), north)
         xyz, quaternion = placement.place(position, attitude)
         ahead = xyz[:, 0] + 5.0 * rotation(quaternion).apply([1.0, 0.0, 0.0])[0]
         degrees, grid = to_grid(placement.world, xyz[:, 0])
@@ -143,7 +143,7 @@ def test_orthometric_heights_are_raised_by_the_named_geoid(tmp_path: Path, crs: 
     attitude = ned_from_rph(np.zeros(1), np.zeros(1), np.zeros(1))
     column = np.array(position)[:, None]
     north = "true"
-    ellipsoidal, _ = level_placement(source(crs), north).place(column, attitude)
+    ellipsoidal, _ = level_placement(source(crs, height="ellipsoidal"), north).place(column, attitude)
     raised, _ = level_placement(source(crs, height="orthometric", geoid=Geoid.found(str(grid))), north).place(
         column, attitude
     )
@@ -156,6 +156,8 @@ def test_orthometric_heights_are_raised_by_the_named_geoid(tmp_path: Path, crs: 
     [
         ({"crs": None}, None, ConfigError, "CRS of the log's positions is not stated"),
         ({"crs": "EPSG:25832"}, None, ConfigError, "north that the log's heading is counted from"),
+        ({"crs": "EPSG:25832"}, "grid", ConfigError, "kind of the log's heights is not stated"),
+        ({"crs": "EPSG:4326"}, None, ConfigError, "kind of the log's heights is not stated"),
         ({"crs": "local"}, "true", ConfigError, "no true north"),
         ({"crs": "EPSG:4979"}, "grid", ConfigError, "has no grid"),
         ({"crs": "EPSG:4978"}, None, CrsError, "no geographic CRS"),

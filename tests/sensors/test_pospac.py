@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import format_of
-from tests.sensors.log_reading import Log, read_log
+from tests.sensors.log_reading import Log
+from tests.sensors.log_reading import read_ellipsoidal as read_log
 
 MICROSECONDS = Clock(TimeSystem.UNIX_UTC, unit="us")
 NANOSECONDS = Clock(TimeSystem.UNIX_UTC, unit="ns")

@@ -131,7 +131,9 @@ def _source_defaults(survey: Survey, config: LogConfig | ControlConfig) -> Sourc
         clock = None
     elif clock is not None and (clock.week is not None or clock.date is not None):
         week = Clock(TimeSystem.GPS_WEEK, week=clock.week, date=clock.date)
-    return SourceDefaults(None if clock is None else clock.clock(), week, stated.crs if config.crs is None else None)
+    crs = stated.crs if config.crs is None else None
+    height = stated.height if config.height is None else None
+    return SourceDefaults(None if clock is None else clock.clock(), week, crs, height)
 
 
 def _plan_log(

@@ -195,7 +195,6 @@ def _report(material: Material) -> Any:
 def _crs(frame: MapFrame) -> dict[str, Any]:
     crs = None if frame.crs is None else crs_from_text(frame.crs)
     authority = None if crs is None else crs.to_authority()
-    vertical = "metre" if frame.vertical_crs is None else crs_from_text(frame.vertical_crs).axis_info[-1].unit_name
     return {
         "name": (frame.local_name or "local") if crs is None else crs.name,
         "authority": None if authority is None else ":".join(authority), "is_local": frame.is_local,
@@ -203,8 +202,8 @@ def _crs(frame: MapFrame) -> dict[str, Any]:
         "horizontal_unit": {
             "name": "metre" if crs is None else crs.axis_info[0].unit_name, "m": frame.horizontal_unit_m,
         },
-        "vertical_unit": {"name": vertical, "m": frame.vertical_unit_m}, "height": frame.height,
-        "geoid": None if frame.geoid is None else str(getattr(frame.geoid, "name", frame.geoid)),
+        "vertical_unit": {"name": frame.vertical_unit, "m": frame.vertical_unit_m}, "height": frame.height,
+        "geoid": None if frame.geoid is None else frame.geoid.grid,
     }  # fmt: skip
 
 

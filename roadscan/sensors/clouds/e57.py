@@ -34,6 +34,7 @@ from roadscan.sensors.clouds.reference_scan import (
     cloud_items,
     no_epoch,
     reference_crs,
+    reference_height,
     stated_epoch_gps_ns,
 )
 from roadscan.sensors.records import Sieve, options_of
@@ -90,11 +91,14 @@ class E57Scans(LogFormat):
         source.need_file()
         with source.path.open("rb") as stream:
             file, plans = _open(source, stream)
+            crs = reference_crs(source)
+            ignored = options_of(source, E57Options).ignore_file_crs
+            height = reference_height(source, crs, None if ignored else _written_crs(file.crs))
             return LogHeader(
                 {
-                    "crs": reference_crs(source),
-                    "height": source.height,
-                    "geoid": source.geoid.grid if source.geoid else None,
+                    "crs": crs,
+                    "height": height,
+                    "geoid": source.geoid.grid if source.geoid and height == "orthometric" else None,
                     "file_crs": file.crs,
                     "scans": [
                         {
@@ -181,15 +185,20 @@ def _open(source: LogSource, stream: Any) -> tuple[E57, list[_Plan]]:
     return file, [_Plan.of(scan, number, source, options) for number, scan in enumerate(file.scans, 1)]
 
 
+def _written_crs(written: str) -> pyproj.CRS | None:
+    """The CRS that the file names; None where it names none that PROJ knows."""
+    try:
+        return pyproj.CRS.from_user_input(written) if written else None
+    except ProjCrsError:
+        return None
+
+
 def _check_crs(stated: str, written: str, path: Path) -> None:
     """Refuse a file whose own CRS is another than the stated one; text that PROJ does not know says nothing."""
-    try:
-        own = pyproj.CRS.from_user_input(written).to_2d() if written else None
-    except ProjCrsError:
-        return
+    own = _written_crs(written)
     if own is None or not (own.is_projected or own.is_compound or own.is_geographic):
         return
-    horizontal = own.sub_crs_list[0] if own.is_compound else own
+    horizontal = (own.sub_crs_list[0] if own.is_compound else own).to_2d()
     if stated != LOCAL_WORLD and horizontal.equals(crs_from_text(stated), ignore_axis_order=True):
         return
     raise CrsError(

@@ -106,8 +106,8 @@ class Las(LogFormat):
         return LogHeader(
             {
                 "crs": units.crs,
-                "height": source.height,
-                "geoid": source.geoid.grid if source.geoid else None,
+                "height": units.height,
+                "geoid": source.geoid.grid if source.geoid and units.height == "orthometric" else None,
                 "horizontal_unit_m": units.horizontal_unit_m,
                 "vertical_unit_m": units.vertical_unit_m,
                 "time_system": str(times.stamps.clock.system),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, Self, TypeAlias
 
 import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
-from roadscan.model.crs import crs_from_text
+from roadscan.codecs.geo_keys import DIRECTORY, DOUBLES, TEXTS, crs_of_keys, short_keys
+from roadscan.model.crs import NO_HEIGHTS, HeightKind, StatedHeights, crs_from_text, heights_of
 from roadscan.model.errors import ConfigError, CrsError, Missing
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.clouds.las_file import UNREADABLE, Cloud, brief
@@ -19,12 +22,20 @@ UNIT_M: Final[dict[LengthUnit, float]] = {"metre": 1.0, "foot": 0.3048, "us_surv
 """Length of the units that `options.vertical_unit` names."""
 
 _EPSG_UNIT_M: Final = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
-_EPSG_CODES: Final = range(1024, 32_767)
+_PROJECTION: Final = "LASF_Projection"
+_KEY_RECORDS: Final = (DIRECTORY, DOUBLES, TEXTS)
+_WITHOUT_UNIT: Final = range(5_001, 5_300)
+"""Values of GeoTIFF key 4096 that name a vertical datum, as GeoTIFF 1.0 lists them, and no unit of heights."""
 _LINEAR_UNIT_KEY: Final = 3076
 _VERTICAL_CRS_KEY: Final = 4096
 _VERTICAL_UNIT_KEY: Final = 4099
 _SAME_UNIT: Final = 1e-9
 
+_VERTICAL_WKT: Final = re.compile(r"\b(?:VERT_?CS|VERTCRS|VERTICALCRS)\s*[\[(]")
+_UNIT_WKT: Final = re.compile(r'\b(?:LENGTH)?UNIT\s*[\[(]\s*"([^"]*)"')
+_UNIT_WORDS: Final = (("survey", 1200 / 3937), ("metre", 1.0), ("meter", 1.0), ("foot", 0.3048), ("feet", 0.3048))
+"""Words in names of units, and their lengths (m); the first that fits counts."""
+_VERTICAL_UNIT: Final = Missing("options.vertical_unit", choices=("metre", "foot", "us_survey_foot"))
 _IGNORED: Final = Missing("options.ignore_file_crs", True)
 
 
@@ -34,6 +45,8 @@ class CloudUnits:
 
     crs: str
     """Horizontal CRS, or "local"."""
+    height: HeightKind
+    """Kind of the heights."""
     horizontal_unit_m: float
     """Length of the unit of x and y (m)."""
     vertical_unit_m: float
@@ -53,47 +66,21 @@ class CloudUnits:
             source = replace(source, crs=source.defaults.crs)
         if source.crs == "local":
             if written.crs is not None:
+                _check_projected(source, _horizontal(written.crs))
                 raise _two_crs(source, written.crs)
-            return cls("local", 1.0, UNIT_M[vertical_unit or "metre"])
+            height = source.any_height or "ellipsoidal"  # z of the frame, which has no kind
+            return cls("local", height, 1.0, UNIT_M[vertical_unit or "metre"])
         crs = _agreed(source, written.crs)
         horizontal = _horizontal(crs)
-        if not horizontal.is_projected:
-            raise CrsError(
-                f"the points' CRS is '{horizontal.name}', not a projected one",
-                expected="easting and northing",
-                change="export the cloud in a projected CRS, or state the right one with options.ignore_file_crs",
-                file=source.path,
-                missing=_IGNORED,
-            )
+        _check_projected(source, horizontal)
         unit_m = float(horizontal.axis_info[0].unit_conversion_factor)
         _check_linear_unit(source, written, unit_m)
-        heights = _Heights.of(crs)
-        if heights.kind is None:
-            heights = written.heights
-        _check_heights(source, heights)
+        heights, units = _agreed_heights(source, crs, written)
+        height = source.need_height(
+            heights.kind, f"their CRS ({heights.name})", "options.ignore_file_crs = true if the file is wrong"
+        )
         name = source.crs if source.crs is not None and not crs.is_compound else _name(horizontal)
-        return cls(name, unit_m, _vertical_unit_m(source, heights, vertical_unit, unit_m))
-
-
-@dataclass(frozen=True)
-class _Heights:
-    """What a CRS says of its heights."""
-
-    kind: Literal["ellipsoidal", "orthometric"] | None = None
-    name: str = ""
-    unit_m: float | None = None
-
-    @classmethod
-    def of(cls, crs: pyproj.CRS | None) -> Self:
-        if crs is None:
-            return cls()
-        vertical = crs if crs.is_vertical else next((part for part in crs.sub_crs_list if part.is_vertical), None)
-        if vertical is not None:
-            unit_m = float(vertical.axis_info[-1].unit_conversion_factor)
-            return cls("ellipsoidal" if "ellips" in vertical.name.lower() else "orthometric", vertical.name, unit_m)
-        if not crs.is_compound and len(crs.axis_info) == 3:
-            return cls("ellipsoidal", crs.name, float(crs.axis_info[2].unit_conversion_factor))
-        return cls()
+        return cls(name, height, unit_m, _vertical_unit_m(source, units, vertical_unit, unit_m))
 
 
 @dataclass(frozen=True)
@@ -101,18 +88,28 @@ class _Written:
     """What the file itself says."""
 
     crs: pyproj.CRS | None = None
-    heights: _Heights = _Heights()
+    heights: StatedHeights = NO_HEIGHTS
     linear_unit_m: float | None = None
+    """Unit of x and y by a GeoTIFF key."""
+    units_m: tuple[tuple[str, float], ...] = ()
+    """Units of z that the file states, each with what states it; one, where the file contradicts itself not."""
 
     @classmethod
     def of(cls, source: LogSource, cloud: Cloud) -> Self:
-        keys = _geo_keys(cloud)
+        records = {
+            r.record_id: r.record_data_bytes()
+            for r in cloud.reader.header.vlrs
+            if r.user_id == _PROJECTION and r.record_id in _KEY_RECORDS
+        }
+        wkt = cloud.wkt
         try:
-            crs = pyproj.CRS.from_wkt(cloud.head.wkt) if cloud.head.wkt else cloud.reader.header.parse_crs()
-            vertical = keys.get(_VERTICAL_CRS_KEY, 0)
-            heights = _Heights.of(crs)
-            if heights.kind is None and vertical in _EPSG_CODES:
-                heights = _Heights.of(pyproj.CRS.from_epsg(vertical))
+            if wkt:
+                crs = pyproj.CRS.from_wkt(wkt)
+                heights = heights_of(crs)
+                if heights.kind is None and (nested := _nested_vertical(wkt)):
+                    heights = heights_of(pyproj.CRS.from_wkt(nested))
+                return cls(crs, heights, None, tuple(_units_named(heights)) + tuple(_unit_words(wkt, heights)))
+            keyed = crs_of_keys(records)
         except (ProjCrsError, *UNREADABLE) as error:
             raise CrsError(
                 f"the file's CRS cannot be understood: {brief(error)}",
@@ -121,19 +118,72 @@ class _Written:
                 file=source.path,
                 missing=_IGNORED,
             ) from error
-        if heights.unit_m is None:
-            heights = _Heights(heights.kind, heights.name, _EPSG_UNIT_M.get(keys.get(_VERTICAL_UNIT_KEY, 0)))
-        return cls(crs, heights, _EPSG_UNIT_M.get(keys.get(_LINEAR_UNIT_KEY, 0)))
+        if keyed.false_origin_units is not None and source.crs is None:
+            raise _two_origins(source, *keyed.false_origin_units)
+        keys = short_keys(records.get(DIRECTORY, b""))
+        heights = NO_HEIGHTS if keyed.crs is None else heights_of(keyed.crs)
+        by_key = _EPSG_UNIT_M.get(keys.get(_VERTICAL_UNIT_KEY, 0))
+        if keys.get(_VERTICAL_CRS_KEY, 0) in _WITHOUT_UNIT:
+            heights = heights._replace(unit_m=by_key)
+        units = list(_units_named(heights))
+        if by_key is not None:
+            units.append((f"GeoTIFF key {_VERTICAL_UNIT_KEY}", by_key))
+        return cls(keyed.crs, heights, _EPSG_UNIT_M.get(keys.get(_LINEAR_UNIT_KEY, 0)), tuple(units))
 
 
-def _geo_keys(cloud: Cloud) -> dict[int, int]:
-    """Values of the GeoTIFF keys that hold one short number, by key."""
-    keys: dict[int, int] = {}
-    for record in cloud.reader.header.vlrs:
-        for key in getattr(record, "geo_keys", []):
-            if key.tiff_tag_location == 0:
-                keys[int(key.id)] = int(key.value_offset)
-    return keys
+def _units_named(heights: StatedHeights) -> Iterator[tuple[str, float]]:
+    if heights.unit_m is not None:
+        yield f"the vertical CRS ({heights.name or 'without a name'})", heights.unit_m
+
+
+def _nested_vertical(wkt: str) -> str:
+    """WKT of a vertical CRS that stands inside a horizontal one, where PROJ leaves it out; "" where there is none."""
+    found = _VERTICAL_WKT.search(wkt)
+    if found is None:
+        return ""
+    depth, quoted = 0, False
+    for at in range(found.start(), len(wkt)):
+        quoted ^= wkt[at] == '"'
+        depth += 0 if quoted else (wkt[at] in "[(") - (wkt[at] in "])")
+        if depth == 0 and not quoted and wkt[at] in "])":
+            return wkt[found.start() : at + 1]
+    return ""
+
+
+def _unit_words(wkt: str, heights: StatedHeights) -> Iterator[tuple[str, float]]:
+    """The unit of z by its name, where its factor says another."""
+    vertical = _nested_vertical(wkt)
+    named = _UNIT_WKT.search(vertical)
+    if named is None or heights.unit_m is None:
+        return
+    unit_m = next((m for words, m in _UNIT_WORDS if words in named[1].lower().replace("_", " ")), None)
+    if unit_m is not None and abs(unit_m - heights.unit_m) > _SAME_UNIT:
+        yield f"the name of its unit ({named[1]})", unit_m
+
+
+def _two_origins(source: LogSource, own_unit: pyproj.CRS, metres: pyproj.CRS) -> CrsError:
+    return CrsError(
+        f"the GeoTIFF keys define '{own_unit.name}' with a false origin that may be in its unit of "
+        f"{own_unit.axis_info[0].unit_conversion_factor:.9g} m or, as older programs wrote it, in metres; neither is a "
+        "CRS that PROJ knows",
+        expected="one CRS",
+        change='state crs = "EPSG:…" or its WKT, and options.ignore_file_crs = true',
+        file=source.path,
+        missing=_IGNORED,
+    )
+
+
+def _check_projected(source: LogSource, horizontal: pyproj.CRS) -> None:
+    if not horizontal.is_projected:
+        raise CrsError(
+            f"the points' CRS is '{horizontal.name}', not a projected one"
+            + (": x and y are longitude and latitude in degrees" if horizontal.is_geographic else ""),
+            expected="easting and northing",
+            change="export the cloud in a projected CRS; or, if the file names the wrong one, state the right crs "
+            "and options.ignore_file_crs = true",
+            file=source.path,
+            missing=_IGNORED,
+        )
 
 
 def _agreed(source: LogSource, written: pyproj.CRS | None) -> pyproj.CRS:
@@ -196,33 +246,56 @@ def _check_linear_unit(source: LogSource, written: _Written, unit_m: float) -> N
         )
 
 
-def _check_heights(source: LogSource, heights: _Heights) -> None:
-    if heights.kind is not None and heights.kind != source.height:
-        also = " (and geoid, to change them into another kind)" if heights.kind == "orthometric" else ""
+def _agreed_heights(
+    source: LogSource, crs: pyproj.CRS, written: _Written
+) -> tuple[StatedHeights, tuple[tuple[str, float], ...]]:
+    """Heights by the agreed CRS, or by the file where that says nothing; and the units of z, each with what states it.
+
+    Raises
+    ------
+    CrsError
+        where the stated CRS and the file say different kinds.
+    """
+    stated = heights_of(crs)
+    if stated.kind is None or crs is written.crs:
+        return written.heights, written.units_m
+    if written.heights.kind not in (None, stated.kind):
         raise CrsError(
-            f"heights are {heights.kind} by their CRS ({heights.name}), the survey file says {source.height}",
+            f"heights are {written.heights.kind} by the file's CRS ({written.heights.name}), and {stated.kind} by the "
+            f"stated one ({stated.name})",
             expected="one kind of height",
-            change=f'set height = "{heights.kind}" for this log{also}',
+            change="correct crs, or set options.ignore_file_crs = true if the file is wrong",
             file=source.path,
-            missing=Missing("height", heights.kind),
+            missing=_IGNORED,
         )
+    return stated, (*_units_named(stated), *written.units_m)
 
 
 def _vertical_unit_m(
-    source: LogSource, heights: _Heights, vertical_unit: LengthUnit | None, horizontal_unit_m: float
+    source: LogSource, units: Sequence[tuple[str, float]], vertical_unit: LengthUnit | None, horizontal_unit_m: float
 ) -> float:
+    """Length of the unit of z (m)."""
+    lengths = {round(unit_m / _SAME_UNIT): unit_m for _, unit_m in units}
     stated = UNIT_M[vertical_unit] if vertical_unit else None
-    if stated is not None and heights.unit_m is not None and abs(heights.unit_m - stated) > _SAME_UNIT:
+    if stated is None and len(lengths) > 1:
+        raise CrsError(
+            "the file states two units of z: " + ", ".join(f"{by} {unit_m:.9g} m" for by, unit_m in units),
+            expected="one vertical unit",
+            change="state the right one",
+            file=source.path,
+            missing=_VERTICAL_UNIT,
+        )
+    if stated is not None and lengths and all(abs(unit_m - stated) > _SAME_UNIT for unit_m in lengths.values()):
         raise ConfigError(
-            f"options.vertical_unit is '{vertical_unit}', the file says a unit of {heights.unit_m:.9g} m",
+            f"options.vertical_unit is '{vertical_unit}', the file says a unit of {units[0][1]:.9g} m",
             expected="one vertical unit",
             file=source.path,
         )
-    known = heights.unit_m if heights.unit_m is not None else stated
+    known = stated if stated is not None else next(iter(lengths.values()), None)
     if known is None and horizontal_unit_m != 1.0:
         raise CrsError(
             f"eastings are in a unit of {horizontal_unit_m:.9g} m, and nothing says the unit of z",
             file=source.path,
-            missing=Missing("options.vertical_unit", choices=("metre", "foot", "us_survey_foot")),
+            missing=_VERTICAL_UNIT,
         )
     return 1.0 if known is None else known

@@ -16,6 +16,7 @@ from typing import BinaryIO, Final, Self, TypeAlias
 import laspy
 import numpy as np
 import numpy.typing as npt
+from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from roadscan.codecs.laz import Laz, LazChunks, LazError
 from roadscan.model.errors import FormatError
@@ -193,6 +194,14 @@ class Cloud:
                 yield cls(path, head, reader, laz, chunks, count)
             else:
                 yield cls(path, head, reader, None, None, min(head.claimed, head.room))
+
+    @property
+    def wkt(self) -> str:
+        """WKT of the points' CRS; "" where the file has none."""
+        if self.head.wkt:
+            return self.head.wkt
+        texts = (getattr(r, "string", "") for r in self.reader.header.vlrs if isinstance(r, WktCoordinateSystemVlr))
+        return next((text.split("\0")[0] for text in texts if text), "")
 
     @property
     def names(self) -> frozenset[str]:

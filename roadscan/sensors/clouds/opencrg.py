@@ -23,6 +23,7 @@ from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.clouds.opencrg_file import CrgBlock, CrgFile, CurvedRegularGrid, is_crg
+from roadscan.sensors.clouds.reference_scan import reference_height
 from roadscan.sensors.records import options_of
 
 Float64 = npt.NDArray[np.float64]
@@ -59,12 +60,13 @@ class OpenCrg(LogFormat):
         """CRS, heights and the size of the grid's columns."""
         _epoch(source)
         crs = _crs(source)
+        height = reference_height(source, crs)
         head = CrgFile.open(source.path).header
         return LogHeader(
             {
                 "crs": crs,
-                "height": source.height,
-                "geoid": source.geoid.grid if source.geoid else None,
+                "height": height,
+                "geoid": source.geoid.grid if source.geoid and height == "orthometric" else None,
                 "encoding": head.encoding,
                 "columns": int(head.columns.size),
                 "comments": list(head.comments),

@@ -33,6 +33,7 @@ from roadscan.sensors.clouds.reference_scan import (
     cloud_items,
     no_epoch,
     reference_crs,
+    reference_height,
     stated_epoch_gps_ns,
     whole_numbers,
 )
@@ -99,11 +100,13 @@ class Ply(LogFormat):
         """CRS, kind of heights, and which properties are taken."""
         source.need_file()
         plan = _Plan.of(source)
+        crs = reference_crs(source)
+        height = reference_height(source, crs)
         return LogHeader(
             {
-                "crs": reference_crs(source),
-                "height": source.height,
-                "geoid": source.geoid.grid if source.geoid else None,
+                "crs": crs,
+                "height": height,
+                "geoid": source.geoid.grid if source.geoid and height == "orthometric" else None,
                 "unit_m": plan.unit_m,
                 "points": plan.vertex.count,
                 "taken": plan.taken,

@@ -15,13 +15,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyproj
 
-from roadscan.model.crs import LOCAL_WORLD, crs_from_text
+from roadscan.model.crs import LOCAL_WORLD, NO_HEIGHTS, HeightKind, crs_from_text, heights_of
 from roadscan.model.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.model.gpstime import LATEST_GPS_NS, gps_ns_from_utc
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogSource, Rows
 from roadscan.sensors.records import Sieve, few_rejects
+from roadscan.sensors.trajectories.poses import height_in
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -75,6 +77,28 @@ def reference_crs(source: LogSource) -> str:
             file=source.path,
         )
     return stated
+
+
+def reference_height(source: LogSource, crs: str, written: pyproj.CRS | None = None) -> HeightKind:
+    """Kind of the points' heights; in a local frame, whose z has none, ellipsoidal where nothing is stated.
+
+    Parameters
+    ----------
+    written : CRS that the file itself names, if any.
+
+    Raises
+    ------
+    ConfigError, CrsError
+        see :meth:`LogSource.need_height`.
+    """
+    if crs == LOCAL_WORLD:
+        return source.any_height or "ellipsoidal"
+    said = NO_HEIGHTS if written is None else heights_of(written)
+    if said.kind is None:
+        return height_in(source, crs)
+    return source.need_height(
+        said.kind, f"the file's CRS ({said.name})", "options.ignore_file_crs = true if the file is wrong"
+    )
 
 
 def stated_epoch_gps_ns(options: ReferenceOptions, file: Path) -> int | None:

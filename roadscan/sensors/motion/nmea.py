@@ -171,7 +171,7 @@ def _plan(source: LogSource) -> _Plan:
             file=source.path,
             missing=Missing("clock", {"system": "unix_utc"}),
         )
-    if options.altitude == "ellipsoidal" and source.height != "ellipsoidal":
+    if options.altitude == "ellipsoidal" and source.any_height == "orthometric":
         raise ConfigError(
             'options.altitude = "ellipsoidal", and height = "orthometric"',
             expected="one kind of heights",
@@ -451,7 +451,7 @@ class _Solutions:
             return altitude
         height = altitude + merged.value("undulation_m")
         unknown = located & np.isnan(height)
-        geoid = self._source.geoid if self._source.height == "orthometric" else None
+        geoid = self._source.geoid if self._source.any_height == "orthometric" else None
         if geoid is not None:
             rows = self._covered(geoid, unknown, merged, located, sieve)
             height[rows] = altitude[rows] + geoid.undulation_m(*_degrees(merged, rows))

@@ -29,7 +29,14 @@ from roadscan.sensors.motion.gnss import (
 from roadscan.sensors.records import EpochReader, Sieve, options_of
 from roadscan.sensors.stamps import parse_calendar
 from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, first_fields, head_of, text_blocks
-from roadscan.sensors.trajectories.poses import SIGMA_MAX_M, GeodeticPlacement, LevelPlacement, Placement
+from roadscan.sensors.trajectories.poses import (
+    SIGMA_MAX_M,
+    GeodeticPlacement,
+    LevelPlacement,
+    Placement,
+    check_geographic,
+    height_in,
+)
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -347,10 +354,11 @@ def _geodetic_placement(source: LogSource, header: _Header) -> GeodeticPlacement
             file=source.path,
             missing=Missing("crs", "EPSG:4979"),
         )
+    check_geographic(crs, source.path)
     geodetic = crs_from_text(crs).geodetic_crs
     if header.datum == "Tokyo" and (geodetic is None or "tokyo" not in str(geodetic.datum).lower()):
         raise CrsError(f"the header says the datum Tokyo, the crs is '{crs}'", expected='"EPSG:4301"', file=source.path)
-    if header.height == "geodetic" and (source.height != "orthometric" or source.geoid is None):
+    if header.height == "geodetic" and (source.any_height != "orthometric" or source.geoid is None):
         raise CrsError(
             "the header says geodetic heights, which RTKLIB counts from its geoid model",
             expected='height = "orthometric" and geoid, the grid of that model',
@@ -358,13 +366,13 @@ def _geodetic_placement(source: LogSource, header: _Header) -> GeodeticPlacement
             file=source.path,
             missing=[[Missing("height", "orthometric"), Missing("geoid")]],
         )
-    if header.height == "ellipsoidal" and source.height != "ellipsoidal":
-        raise CrsError(
-            "the header says ellipsoidal heights, the survey file says orthometric",
-            file=source.path,
-            missing=Missing("height", "ellipsoidal"),
-        )
-    return GeodeticPlacement(crs, source.height, source.geoid, source.path)
+    if header.height == "geodetic":
+        return GeodeticPlacement(crs, "orthometric", source.geoid, source.path)
+    if header.height == "ellipsoidal":
+        height = source.need_height("ellipsoidal", "the log's header")
+    else:
+        height = height_in(source, crs)
+    return GeodeticPlacement(crs, height, source.geoid, source.path)
 
 
 def _base(source: LogSource, header: _Header) -> Float64:

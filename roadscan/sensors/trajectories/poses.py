@@ -31,6 +31,7 @@ from roadscan.model.crs import (
     crs_from_text,
     geodetic_from_world,
     grid_convergence_rad,
+    heights_of,
     world_frame_of,
 )
 from roadscan.model.errors import ConfigError, CrsError, Missing, RoadscanError
@@ -142,18 +143,7 @@ class GeodeticPlacement(Placement):
     """Longitude, latitude (rad), height (m); attitude north-east-down from body, true north."""
 
     def __init__(self, crs: str, height: HeightKind, geoid: Geoid | None, file: Path) -> None:
-        geographic = crs_from_text(crs)
-        if geographic.is_compound or not geographic.is_geographic:
-            raise CrsError(
-                f"the log's positions are latitude and longitude, its crs '{crs}' ({geographic.name}) is no "
-                "geographic CRS",
-                expected='a geographic CRS, such as "EPSG:4979"; heights are stated apart',
-                file=file,
-            )
-        if geographic.prime_meridian is not None and geographic.prime_meridian.longitude != 0.0:
-            raise CrsError(
-                f"'{crs}' counts longitude from {geographic.prime_meridian.name}", expected="Greenwich", file=file
-            )
+        geographic = check_geographic(crs, file)
         self.world = world_frame_of(crs)
         self._geoid = _need_geoid(height, geoid, file)
         self._axis_m, self._e2 = _ellipsoid(geographic)
@@ -204,22 +194,8 @@ class GridPlacement(Placement):
     The attitude's north is grid north or true north, as stated.
     """
 
-    def __init__(self, crs: str, height: HeightKind, geoid: Geoid | None, north: North | None, file: Path) -> None:
-        projected = crs_from_text(crs)
-        geographic = projected.geodetic_crs
-        if projected.is_compound or not projected.is_projected or geographic is None:
-            raise CrsError(
-                f"the log's positions are easting and northing, its crs '{crs}' ({projected.name}) is not projected",
-                expected='a projected CRS, such as "EPSG:25832"; heights are stated apart',
-                file=file,
-            )
-        if north is None:
-            raise ConfigError(
-                "the north that the log's heading is counted from is not stated",
-                change="they differ by the meridian convergence, up to some degrees",
-                file=file,
-                missing=Missing("options.heading", choices=("true", "grid")),
-            )
+    def __init__(self, crs: str, height: HeightKind, geoid: Geoid | None, north: North, file: Path) -> None:
+        geographic = _geodetic_of_grid(crs, file)
         self.world = world_frame_of(crs)
         self._crs = crs
         self._north = north
@@ -303,7 +279,15 @@ def level_placement(source: LogSource, north: North | None) -> Placement:
             )
         return LevelPlacement()
     if crs_from_text(crs).is_projected:
-        return GridPlacement(crs, source.height, source.geoid, north, source.path)
+        _geodetic_of_grid(crs, source.path)
+        if north is None:
+            raise ConfigError(
+                "the north that the log's heading is counted from is not stated",
+                change="they differ by the meridian convergence, up to some degrees",
+                file=source.path,
+                missing=Missing("options.heading", choices=("true", "grid")),
+            )
+        return GridPlacement(crs, height_in(source, crs), source.geoid, north, source.path)
     if north == "grid":
         raise ConfigError(
             f"options.heading = \"grid\", and the crs '{crs}' has no grid",
@@ -311,7 +295,50 @@ def level_placement(source: LogSource, north: North | None) -> Placement:
             file=source.path,
             missing=Missing("options.heading", "true"),
         )
-    return GeodeticPlacement(crs, source.height, source.geoid, source.path)
+    check_geographic(crs, source.path)
+    return GeodeticPlacement(crs, height_in(source, crs), source.geoid, source.path)
+
+
+def check_geographic(crs: str, file: Path) -> pyproj.CRS:
+    """The geographic CRS of positions; an error where it is none, or does not count longitude from Greenwich."""
+    found = crs_from_text(crs)
+    if found.is_compound or not found.is_geographic:
+        raise CrsError(
+            f"the log's positions are latitude and longitude, its crs '{crs}' ({found.name}) is no geographic CRS",
+            expected='a geographic CRS, such as "EPSG:4979"; heights are stated apart',
+            file=file,
+        )
+    if found.prime_meridian is not None and found.prime_meridian.longitude != 0.0:
+        raise CrsError(f"'{crs}' counts longitude from {found.prime_meridian.name}", expected="Greenwich", file=file)
+    return found
+
+
+def _geodetic_of_grid(crs: str, file: Path) -> pyproj.CRS:
+    """Geodetic CRS of the projected one that positions are in; an error where it is none."""
+    projected = crs_from_text(crs)
+    geographic = projected.geodetic_crs
+    if projected.is_compound or not projected.is_projected or geographic is None:
+        raise CrsError(
+            f"the log's positions are easting and northing, its crs '{crs}' ({projected.name}) is not projected",
+            expected='a projected CRS, such as "EPSG:25832"; heights are stated apart',
+            file=file,
+        )
+    return geographic
+
+
+def height_in(source: LogSource, crs: str) -> HeightKind:
+    """Kind of heights of positions in a geographic or projected CRS, where the log's own entry states none.
+
+    Three axes say it, two do not.
+
+    Raises
+    ------
+    ConfigError, CrsError
+        see :meth:`LogSource.need_height`.
+    """
+    if source.height is not None:
+        return source.height
+    return source.need_height(heights_of(crs_from_text(crs)).kind, f"the three axes of their CRS, {crs[:80]}")
 
 
 def _check_cartesian(position: Float64, sieve: Sieve) -> None:

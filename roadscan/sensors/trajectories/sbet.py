@@ -228,7 +228,9 @@ def _placement(source: LogSource) -> GeodeticPlacement:
             file=source.path,
             missing=Missing("crs", "EPSG:4979"),
         )
-    return GeodeticPlacement(crs, source.height, source.geoid, source.path)
+    # The format's heights are ellipsoidal; an export of others has to be stated.
+    height = source.height or source.need_height("ellipsoidal", "the definition of SBET")
+    return GeodeticPlacement(crs, height, source.geoid, source.path)
 
 
 def _chunks(path: Path, first: int = 0) -> Iterator[tuple[int, Float64 | Reject]]:

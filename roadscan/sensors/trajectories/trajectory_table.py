@@ -177,15 +177,10 @@ def _agreed(source: LogSource, own: TrajectoryFrame) -> LogSource:
             change="leave crs out of the survey file, or correct the one that is wrong",
             file=source.path,
         )
-    if own.height is not None and own.height != source.height:
-        geoid = " and geoid, the grid that they count from," if own.height == "orthometric" else ""
-        raise CrsError(
-            f"the file says {own.height} heights, the survey file {source.height} ones",
-            expected="one kind of height",
-            change=f'state height = "{own.height}"{geoid} for this log',
-            file=source.path,
-        )
-    return dataclasses.replace(source, crs=own.crs if source.crs is None else source.crs)
+    height = source.height
+    if own.height is not None:
+        height = source.need_height(own.height, f"the file's metadata '{FRAME_KEY}'")
+    return dataclasses.replace(source, crs=own.crs if source.crs is None else source.crs, height=height)
 
 
 def _is_same(one: str, other: str) -> bool:

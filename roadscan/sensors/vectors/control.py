@@ -27,7 +27,7 @@ from roadscan.model.crs import (
 from roadscan.model.errors import ConfigError, CrsError, Missing
 from roadscan.sensors.base import Item, LogSource, Rows
 from roadscan.sensors.records import Sieve, drop_failing
-from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
+from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, height_in
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -67,12 +67,13 @@ class ControlFrame:
         crs = source.need_crs("EPSG:25832")
         if source.map is None:
             raise ConfigError("control points need the survey's map", expected="a map frame", file=source.path)
+        height = source.any_height or "ellipsoidal" if crs == LOCAL_WORLD else height_in(source, crs)
         geoid = source.geoid
-        if source.height == "orthometric" and geoid is None and source.map.height == "orthometric":
+        if height == "orthometric" and geoid is None and source.map.height == "orthometric":
             geoid = source.map.geoid  # both heights stand on the survey's own geoid
         if crs == LOCAL_WORLD:
-            return cls(crs, "local", 1.0, source.height, None, source.map, source.path)
-        if source.height == "orthometric" and geoid is None:
+            return cls(crs, "local", 1.0, height, None, source.map, source.path)
+        if height == "orthometric" and geoid is None:
             raise CrsError(
                 "the control points' heights are orthometric, the map's are ellipsoidal, and no geoid is named",
                 expected="geoid, the file name of a grid",
@@ -90,8 +91,8 @@ class ControlFrame:
         scale = float(stated.axis_info[0].unit_conversion_factor)  # to metres or radians
         if kind == "geographic":
             scale = float(np.degrees(scale))
-        own_geoid = geoid if source.height == "orthometric" else None
-        return cls(crs, kind, scale, source.height, own_geoid, source.map, source.path)
+        own_geoid = geoid if height == "orthometric" else None
+        return cls(crs, kind, scale, height, own_geoid, source.map, source.path)
 
     def check(self, coordinates: Float64, sieve: Sieve) -> None:
         """Drop points whose coordinates (3, n) are missing or absurd."""

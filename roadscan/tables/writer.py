@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -51,11 +52,15 @@ class LogWriter:
         self.findings: list[Finding] = []
         """What is doubtful of the log; kept in its record."""
 
-    def add(self, table: str, batch: pa.RecordBatch) -> list[tuple[npt.NDArray[np.int64], str]]:
-        """Take rows of a table; returns the rows refused, with their reasons."""
+    def add(
+        self, table: str, batch: pa.RecordBatch, refused: Sequence[tuple[npt.NDArray[np.int64], str]] = ()
+    ) -> list[tuple[npt.NDArray[np.int64], str]]:
+        """Take rows of a table; returns the rows refused, with their reasons: those `refused` already, and others."""
         schema = table_schema(table)
         rows = schema.conform(batch, self._list_size)
-        faults = schema.faults(rows)
+        known = np.concatenate([bad for bad, _ in refused]) if refused else None
+        faults = [(bad if known is None else np.setdiff1d(bad, known), reason) for bad, reason in schema.faults(rows)]
+        faults = [*refused, *((bad, reason) for bad, reason in faults if bad.size)]
         if faults:
             good = np.ones(rows.num_rows, dtype=bool)
             for bad, _ in faults:

@@ -11,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
+from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, grid_folder, plan_logs
 from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.crs import add_grid_folder
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
+from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
 from roadscan.sensors.base import Item, LogHeader, Reject
@@ -149,8 +151,11 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
         add_grid_folder(task.grids)
     header = task.log.format.header(task.log.source)
     writer = LogWriter(folder, header.list_size)
+    clock = task.log.source.clock
+    order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
     for item in _items(task.log, header):
-        _take(writer, item)
+        _take(writer, item, order)
+    writer.findings += order.findings()
     writer.finish()
     _check_unchanged(task.log)
     return writer, header
@@ -259,14 +264,14 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item) -> None:
+def _take(writer: LogWriter, item: Item, order: EpochOrder) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    for rows, reason in writer.add(item.table, item.batch):
+    for rows, reason in writer.add(item.table, item.batch, order.refused(item)):
         for first, count in _consecutive(rows):
             offset = -1 if item.first_offset < 0 or not item.record_bytes else (
                 item.first_offset + first * item.record_bytes

@@ -1,0 +1,132 @@
+"""Time that goes back within a log, through `roadscan ingest`: left out or named, and never sorted in silently."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from roadscan.cli import app
+from roadscan.model.survey import Survey
+from roadscan.tables.logs import LogRecord, read_log_records
+from roadscan.tables.store import Store
+
+START_S = 1_461_920_418.0
+RATE_HZ = 100
+IMU = "time_s,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s,acc_x_g,acc_y_g,acc_z_g\n"
+SURVEY = """
+id = "s"
+store = "store"
+[map]
+crs = "EPSG:32632"
+[rig.sensors.imu]
+kind = "imu"
+axes = "frd"
+[[runs]]
+id = "r"
+[[runs.logs]]
+path = "i.csv"
+sensor = "imu"
+clock = {clock}
+"""
+GPS, FREE = '{ system = "gps", unit = "s" }', '{ system = "free", unit = "s", offset_s = 1.0 }'
+
+
+def line(stamp_s: float, number: int) -> str:
+    return f"{stamp_s:.4f},0.{number % 997:04d},0,0,0,0,1\n"
+
+
+def even(first: int, count: int, off_s: float = 0.0) -> list[str]:
+    """Lines of readings `first` and on, of a clock that is off."""
+    return [line(START_S + k / RATE_HZ + off_s, k) for k in range(first, first + count)]
+
+
+def ingested(folder: Path, lines: list[str], clock: str = GPS) -> LogRecord:
+    (folder / "i.csv").write_text(IMU + "".join(lines))
+    (folder / "SURVEY.toml").write_text(SURVEY.replace("{clock}", clock))
+    done = CliRunner().invoke(app, ["ingest", str(folder / "SURVEY.toml")])
+    assert done.exit_code == 0, f"{done.output}{done.exception}"
+    survey = Survey.load(folder / "SURVEY.toml")
+    (record,) = read_log_records(Store(survey.store_url, survey.config.id))
+    return record
+
+
+def said(record: LogRecord) -> dict[str, str]:
+    return {one.witness: one.text for one in record.findings}
+
+
+@pytest.mark.witness("time_goes_back")
+@pytest.mark.parametrize("clock", [GPS, FREE])
+def test_a_clock_that_starts_anew_is_not_sorted_into_what_came_before(tmp_path: Path, clock: str) -> None:
+    """After 20 s the stamps start again 15 s back: 15 s of them would lie among the first."""
+    record = ingested(tmp_path, even(0, 2_000) + even(2_000, 2_500, -15.0), clock)
+    assert record.rows == 3_000
+    assert record.rejected == 1_500
+    assert "by 14.990 s" in said(record)["time_goes_back"]
+    done = CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")])
+    assert "time goes back once" in " ".join(done.output.split())
+
+
+def test_a_leap_second_inside_a_log_loses_a_second_and_is_named(tmp_path: Path) -> None:
+    record = ingested(tmp_path, even(0, 2_000) + even(2_000, 2_000, -1.0))
+    assert (record.rows, record.rejected) == (3_900, 100)
+    assert "by 0.990 s" in said(record)["time_goes_back"]
+
+
+def test_the_count_of_a_free_clock_never_goes_back(tmp_path: Path) -> None:
+    """Before the first stamp: another log of a GPS clock, a restart of a count."""
+    lines = even(0, 1_000) + even(1_000, 500, -500.0)
+    (tmp_path / "gps").mkdir()
+    record = ingested(tmp_path / "gps", lines)
+    assert (record.rows, record.rejected) == (1_500, 0)
+    assert "500 at times of which it holds no other row are used" in said(record)["time_goes_back"]
+    (tmp_path / "free").mkdir()
+    record = ingested(tmp_path / "free", lines, FREE)
+    assert (record.rows, record.rejected) == (1_000, 500)
+
+
+def test_a_log_appended_to_itself_counts_once(tmp_path: Path) -> None:
+    record = ingested(tmp_path, even(0, 30_000) + even(0, 30_000))
+    assert (record.rows, record.rejected) == (30_000, 30_000)
+
+
+@pytest.mark.witness("rows_twice")
+def test_rows_that_stand_twice_count_once(tmp_path: Path) -> None:
+    record = ingested(tmp_path, [one for one in even(0, 500) for _ in range(2)])
+    assert (record.rows, record.reject_reasons) == (500, {"the row stands twice, one after the other": 500})
+
+
+def test_late_rows_that_fill_a_gap_are_used_and_named(tmp_path: Path) -> None:
+    lines = even(0, 1_000)
+    lines[100], lines[101] = lines[101], lines[100]
+    lines.insert(560, lines.pop(500))
+    record = ingested(tmp_path, lines)
+    assert (record.rows, record.rejected) == (1_000, 0)
+    assert "time goes back 2 times" in said(record)["time_goes_back"]
+
+
+@pytest.mark.parametrize("count", [3, 300])
+def test_stamps_that_leap_and_come_back_are_left_out(tmp_path: Path, count: int) -> None:
+    """Both neighbours exclude them, though later stamps reach their time."""
+    lines = even(0, 1_000) + even(1_000, count, 20.0) + even(1_000 + count, 4_000)
+    record = ingested(tmp_path, lines)
+    assert (record.rows, record.rejected) == (5_000, count)
+    assert set(record.reject_reasons) == {"the stamps leap out of the log's order and come back"}
+
+
+@pytest.mark.witness("time_jumps")
+def test_a_jump_forward_of_an_imu_is_named(tmp_path: Path) -> None:
+    record = ingested(tmp_path, even(0, 2_000) + even(2_000, 2_000, 5.0))
+    assert (record.rows, record.rejected) == (4_000, 0)
+    assert "by 5.010 s" in said(record)["time_jumps"]
+
+
+def test_sound_logs_are_not_doubted(tmp_path: Path) -> None:
+    """Jitter, lost rows and a rate that changes."""
+    rng = np.random.default_rng(5)
+    stamps = START_S + np.cumsum(np.concatenate([rng.uniform(0.008, 0.012, 3_000), rng.uniform(0.018, 0.022, 1_000)]))
+    lines = [line(s, k) for k, s in enumerate(stamps.tolist()) if k % 50]
+    record = ingested(tmp_path, lines)
+    assert (record.rejected, record.findings) == (0, ())

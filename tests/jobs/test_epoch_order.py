@@ -12,6 +12,8 @@ from roadscan.cli import app
 from roadscan.model.survey import Survey
 from roadscan.tables.logs import LogRecord, read_log_records
 from roadscan.tables.store import Store
+from tests.sensors.test_velodyne_clock import heard, piece
+from tests.sensors.test_velodyne_pcap import capture
 
 START_S = 1_461_920_418.0
 RATE_HZ = 100
@@ -130,3 +132,32 @@ def test_sound_logs_are_not_doubted(tmp_path: Path) -> None:
     lines = [line(s, k) for k, s in enumerate(stamps.tolist()) if k % 50]
     record = ingested(tmp_path, lines)
     assert (record.rejected, record.findings) == (0, ())
+
+
+@pytest.mark.witness("same_content")
+def test_a_log_that_is_listed_twice_under_two_names_counts_once_and_is_named(tmp_path: Path) -> None:
+    text = IMU + "".join(even(0, 500))
+    for name in ("i.csv", "copy.csv"):
+        (tmp_path / name).write_text(text)
+    stated = SURVEY.replace("{clock}", GPS)
+    (tmp_path / "SURVEY.toml").write_text(stated + stated[stated.index("[[runs.logs]]") :].replace("i.csv", "copy.csv"))
+    assert CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")]).exit_code == 0
+    said = " ".join(CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output.split())
+    assert "the same bytes as" in said
+    assert "counts once" in said
+    (tmp_path / "copy.csv").write_text(text.replace("0,0,0,0,1", "0,0,0,0,2"))  # another log
+    CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
+    assert "the same bytes as" not in CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output
+
+
+def test_one_capture_in_two_runs_is_named(tmp_path: Path) -> None:
+    """A drive that is listed twice would be two passes that agree."""
+    capture(tmp_path / "l.pcap", heard(600.0, 600.1) + piece(600.2, 600.2))
+    (tmp_path / "again.pcap").write_bytes((tmp_path / "l.pcap").read_bytes())
+    text = 'id = "s"\nstore = "store"\n[map]\ncrs = "EPSG:32632"\n[rig.sensors.roof]\nkind = "lidar"\naxes = "flu"\n'
+    for run, name in (("one", "l"), ("two", "again")):
+        text += f'[[runs]]\nid = "{run}"\n[[runs.logs]]\npath = "{name}.pcap"\nsensor = "roof"\n'
+    (tmp_path / "SURVEY.toml").write_text(text)
+    CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
+    said = " ".join(CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output.split())
+    assert "its readings count a second time as two/roof" in said

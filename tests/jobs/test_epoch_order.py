@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -161,3 +162,91 @@ def test_one_capture_in_two_runs_is_named(tmp_path: Path) -> None:
     CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
     said = " ".join(CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output.split())
     assert "its readings count a second time as two/roof" in said
+
+
+def test_parts_of_a_capture_in_another_order_are_used_and_named(tmp_path: Path) -> None:
+    packets = heard(602.0, 602.1) + piece(602.2, 602.2, 700) + heard(600.0, 600.1) + piece(600.2, 600.2, 700)
+    capture(tmp_path / "l.pcap", packets)
+    text = 'id = "s"\nstore = "store"\n[map]\ncrs = "EPSG:32632"\n[rig.sensors.roof]\nkind = "lidar"\naxes = "flu"\n'
+    (tmp_path / "SURVEY.toml").write_text(
+        f'{text}[[runs]]\nid = "r"\n[[runs.logs]]\npath = "l.pcap"\nsensor = "roof"\n'
+    )
+    CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
+    survey = Survey.load(tmp_path / "SURVEY.toml")
+    (record,) = read_log_records(Store(survey.store_url, survey.config.id))
+    assert (record.rows, record.rejected) == (1_400 * 384, 0)
+    assert "parts were joined in another order" in said(record)["time_goes_back"]
+
+
+NMEA_LINES = [
+    "GPGGA,{t},4800.0000,N,00900.0000,E,4,12,0.8,300.0,M,47.0,M,1.0,0001",
+    "GPRMC,{t},A,4800.0000,N,00900.0000,E,0.0,0.0,040526,,,A",
+]
+
+
+def nmea(first: int, count: int) -> str:
+    """Sentences of `count` seconds from 09:00 on."""
+    out = ""
+    for k in range(first, first + count):
+        for body in NMEA_LINES:
+            text = body.format(t=f"{90000 + k // 60 * 100 + k % 60:06d}.00")
+            check = 0
+            for character in text.encode():
+                check ^= character
+            out += f"${text}*{check:02X}\r\n"
+    return out
+
+
+def sbet(first: int, count: int) -> bytes:
+    """Records of `count` seconds of the week, ten a second."""
+    records = np.zeros((10 * count, 17))
+    records[:, 0] = 1_000.0 + first + np.arange(10 * count) / 10
+    records[:, 1:4] = np.radians(48.0), np.radians(9.0), 300.0
+    return records.astype("<f8").tobytes()
+
+
+def poses(first: int, count: int) -> str:
+    return "".join(f"{START_S + k},48.0,9.0,300,0,0,10\n" for k in range(first, first + count))
+
+
+POSES = "time_s,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg\n"
+
+
+@pytest.mark.witness("nmea_time_goes_back")
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize(
+    ("name", "content", "stated"),
+    [
+        ("a.nmea", lambda a, b: (nmea(*a) + nmea(*b)).encode(), 'format = "nmea"\ncrs = "EPSG:4979"\nsensor = "gnss"\n'
+         'height = "ellipsoidal"\n'),
+        ("a.sbet", lambda a, b: sbet(*a) + sbet(*b), 'format = "sbet"\ncrs = "EPSG:4979"\n'
+         'clock = { system = "gps_week_seconds", date = 2026-05-04 }\n'),
+        ("a.csv", lambda a, b: (POSES + poses(*a) + POSES + poses(*b)).encode(), 'crs = "EPSG:4979"\n'
+         f"clock = {GPS}\n"),
+        ("e.csv", lambda a, b: ("time_s,ticks\n" + "".join(
+            f"{START_S + k},{100 * n}\n" for n, k in enumerate([*range(sum(a)), *range(b[0], sum(b))]))).encode(),
+         f'sensor = "wheel"\noptions = {{ record = "total" }}\nclock = {GPS}\n'),
+    ],
+)  # fmt: skip
+def test_siblings_whose_clock_goes_back(
+    tmp_path: Path, name: str, content: Callable[[tuple[int, int], tuple[int, int]], bytes], stated: str, restart: bool
+) -> None:
+    """A log appended to itself, and one whose clock is set back by 20 s: what goes back is left out and counted."""
+    (tmp_path / name).write_bytes(content((0, 100), (80, 50) if restart else (0, 100)))
+    text = 'id = "s"\nstore = "store"\n[map]\ncrs = "EPSG:32632"\n[rig.sensors.wheel]\nkind = "encoder"\n'
+    text += '[rig.sensors.gnss]\nkind = "gnss"\n[[runs]]\nid = "r"\n[[runs.logs]]\n'
+    (tmp_path / "SURVEY.toml").write_text(f'{text}path = "{name}"\n{stated}')
+    done = CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
+    assert done.exit_code == 0, f"{done.output}{done.exception}"
+    survey = Survey.load(tmp_path / "SURVEY.toml")
+    (record,) = read_log_records(Store(survey.store_url, survey.config.id))
+    rate = 10 if name == "a.sbet" else 1
+    assert record.rows == rate * (130 if restart else 100)
+    if name == "a.nmea":
+        back = "a second GGA sentence of one epoch: the first stands"
+        assert record.reject_reasons[back] == (20 if restart else 100)
+        assert "nmea_time_goes_back" in said(record)
+        return
+    back = "the stamp goes back to a time that the log holds already"
+    assert record.reject_reasons[back] == rate * (20 if restart else 100)
+    assert "time_goes_back" in said(record)

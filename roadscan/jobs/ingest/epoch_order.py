@@ -246,16 +246,48 @@ def _equal(a: pa.Array, b: pa.Array) -> Bool:
 
 
 @dataclass
+class _Returns:
+    """Chunks of returns; within one they stand in no order of time."""
+
+    _top_ns: int | None = None
+    _back: int = 0
+    _farthest_ns: int = 0
+
+    def take(self, batch: pa.RecordBatch) -> None:
+        """Compare a chunk with those before it."""
+        ends = pc.min_max(batch.column("epoch_gps_ns")).as_py() if "epoch_gps_ns" in batch.schema.names else {}
+        last_ns = ends.get("max")
+        if last_ns is None:
+            return
+        if self._top_ns is not None and last_ns < self._top_ns - _JUMP_NS:
+            self._back += 1
+            self._farthest_ns = max(self._farthest_ns, self._top_ns - last_ns)
+        self._top_ns = max(last_ns, self._top_ns or last_ns)
+
+    def findings(self) -> Iterator[Finding]:
+        """Whether whole chunks lie before others that precede them in the file."""
+        if self._back:
+            yield TIME_GOES_BACK.finds(
+                "",
+                f"its returns lie up to {self._farthest_ns / NS_PER_S:.3f} s before others that precede them in the "
+                f"file ({self._back:,} chunks): parts were joined in another order, or a clock was set; all are used",
+            )
+
+
+@dataclass
 class EpochOrder:
     """Follows the epochs of one log, table by table, in the order of its files."""
 
     free: bool
     """The log's clock counts from an unknown instant."""
     _series: dict[tuple[str, str, str], _Series] = field(default_factory=dict)
+    _returns: _Returns = field(default_factory=_Returns)
 
     def refused(self, rows: Rows) -> list[tuple[Int64, str]]:
         """Rows of a chunk (by index) that are left out, with their reasons."""
         batch = rows.batch
+        if rows.table == "returns" and batch.num_rows:
+            self._returns.take(batch)
         if rows.table not in _ORDERED or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
             return []
         column = batch.column("epoch_gps_ns")
@@ -268,6 +300,7 @@ class EpochOrder:
 
     def findings(self) -> Iterator[Finding]:
         """What is doubtful of the log's time, once it is read."""
+        yield from self._returns.findings()
         for (table, file, wheel), series in self._series.items():
             where = "".join([f" of {file}" if file else "", f" of wheel {wheel}" if wheel else ""])
             if series.back:

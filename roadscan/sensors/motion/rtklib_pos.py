@@ -85,11 +85,13 @@ class RtklibPos(LogFormat):
     (or of the orbits, without a base): state its datum as crs. Heights are ellipsoidal or geodetic as
     the header says; geodetic ones need height = "orthometric" and the geoid that RTKLIB used. A
     header without that line leaves it to `height`. With crs = "local", baselines are taken as x, y, z.
+    Records behind a second header that says otherwise than the first are rejected.
     """
 
     name = "rtklib_pos"
     title = "RTKLIB solution (.pos): GNSS positions, with σ, velocity and ambiguity ratio where written"
     yields = ("gnss",)
+    version = 2
     suffixes: ClassVar[tuple[str, ...]] = (".pos",)
     time = "the header says GPST, UTC or JST; a clock need not be stated, save for its measured offset"
     options = RtklibPosOptions

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeAlias
 
@@ -243,11 +243,6 @@ class Rows:
         numbers, offsets = self.numbers[rows], self.offsets[rows]
         runs = np.split(np.arange(rows.size), np.flatnonzero(np.diff(numbers) != 1) + 1)
         return [(int(numbers[run[0]]), int(offsets[run[0]]), run.size) for run in runs if run.size]
-
-    def without(self, rows: npt.NDArray[np.int64]) -> Rows:
-        """The same without some rows (m,)."""
-        kept = np.delete(np.arange(self.batch.num_rows), rows)
-        return replace(self, batch=self.batch.take(pa.array(kept)), records=self.numbers[kept])
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import bz2
 import codecs
 import csv
 import gzip
+import itertools
 import lzma
 import math
 import re
@@ -30,6 +31,7 @@ from roadscan.model.errors import ConfigError, FormatError, Missing
 from roadscan.model.strict import Strict
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import Reject
+from roadscan.sensors.later_headers import AGAIN, Headers, NameLines
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -46,6 +48,8 @@ Kind: TypeAlias = Literal["number", "integer", "text"]
 """Type of a column: float64, int64 or text. An empty number is NaN, an empty whole number is a fault."""
 
 _ARROW_TYPES: Final[dict[Kind, pa.DataType]] = {"number": pa.float64(), "integer": pa.int64(), "text": pa.string()}
+_LETTERS: Final = frozenset(b"abcdfghijklmopqrstuvwxyzABCDFGHIJKLMOPQRSTUVWXYZ_")
+"""Letters of names that stand in no number (1e5, nan)."""
 _DELIMITERS: Final = (",", ";", "\t", "|")
 _UTF8: Final = "utf-8"
 _UTF16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
@@ -394,13 +398,20 @@ def number_stamp_kind(path: Path, layout: TextLayout, name: str, unit: str) -> K
     return kind
 
 
-def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> Iterator[TextBlock | Reject]:
+def text_blocks(
+    path: Path, layout: TextLayout, kinds: Mapping[str, Kind], headers: Headers | None = None
+) -> Iterator[TextBlock | Reject]:
     """Read the columns `kinds` in blocks of whole lines; lines at fault become rejects.
 
     A compressed stream that breaks off costs what lies behind the break. Memory is bounded by
-    a block of some 1 MB of text.
+    a block of some 1 MB of text. Behind a header that differs from the first no line is read.
+
+    Parameters
+    ----------
+    headers : what knows the headers of the format; lines of column names by default.
     """
     record = 0
+    reader = _Lines(layout, kinds, headers or _name_lines(path, layout, kinds))
     for offset, data in line_blocks(path, layout.data_offset, coding=layout.coding):
         if isinstance(data, Reject):
             yield Reject(data.reason, record, offset)
@@ -411,7 +422,88 @@ def text_blocks(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> It
             continue
         records = record + np.arange(starts.size, dtype=np.int64)
         record += starts.size
-        yield from parse_lines(data, starts, ends, layout, kinds, records, offset + starts)
+        yield from reader.items(data, starts, ends, records, offset + starts)
+
+
+@dataclass
+class _Lines:
+    """Reads lines of a file block by block, and heeds headers that stand among them."""
+
+    layout: TextLayout
+    kinds: Mapping[str, Kind]
+    headers: Headers
+    _foreign: bool = False
+    """The last header differs from the first."""
+
+    def items(
+        self, data: bytes, starts: Int64, ends: Int64, records: Int64, offsets: Int64
+    ) -> Iterator[TextBlock | Reject]:
+        """Rows and rejects of the lines of a block that count (see :func:`parse_lines`)."""
+        marks = self._comments(data, starts, ends)
+        whole = None if marks or self._foreign else _parsed(data, starts, ends, self.layout, self.kinds)
+        if whole is not None:
+            yield TextBlock(whole, records, offsets)
+            return
+        marks |= self._rows(data, starts, ends)
+        bounds = sorted({0, starts.size, *(k for k, _ in marks), *(k + 1 for k, is_row in marks if is_row)})
+        for a, b in itertools.pairwise(bounds):
+            own = slice(a, b)
+            if (a, True) in marks:
+                self._foreign = not marks[a, True]
+                reason = self.headers.other if self._foreign else AGAIN
+                yield Reject(reason, int(records[a]), int(offsets[a]))
+                continue
+            if (a, False) in marks:
+                self._foreign = not marks[a, False]
+            if self._foreign:
+                yield Reject(self.headers.other, int(records[a]), int(offsets[a]), b - a)
+            else:
+                yield from parse_lines(
+                    data, starts[own], ends[own], self.layout, self.kinds, records[own], offsets[own]
+                )
+        if (starts.size, False) in marks:
+            self._foreign = not marks[starts.size, False]
+
+    def _comments(self, data: bytes, starts: Int64, ends: Int64) -> dict[tuple[int, bool], bool]:
+        """Headers among the comments: the line before which each stands, and whether it says what the first says."""
+        comment = self.layout.comment.encode()
+        found: dict[tuple[int, bool], bool] = {}
+        if not comment or comment not in data:
+            return found
+        letters = np.frombuffer(data, dtype=np.uint8)
+        begins = np.concatenate([[0], np.flatnonzero(letters == ord("\n")) + 1])
+        begins = begins[begins < letters.size]
+        for begin in begins[letters[begins] == comment[0]].tolist():
+            end = data.find(b"\n", begin)
+            said = self.headers.comment(data[begin : end if end >= 0 else None].decode("utf-8", errors="replace"))
+            if said is not None:
+                found[int(np.searchsorted(starts, begin)), False] = said
+        return found
+
+    def _rows(self, data: bytes, starts: Int64, ends: Int64) -> dict[tuple[int, bool], bool]:
+        """Headers among the lines that count."""
+        found: dict[tuple[int, bool], bool] = {}
+        for k, (a, b) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+            line = data[a:b]
+            if line.isascii() and not any(c in _LETTERS for c in line):
+                continue
+            try:
+                said = self.headers.row(_fields(line.decode("utf-8").strip(), self.layout.delimiter))
+            except UnicodeDecodeError:
+                continue
+            if said is not None:
+                found[k, True] = said
+        return found
+
+
+def _name_lines(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> NameLines:
+    """Lines of column names of a file; the last line above its records is its own, where names are stated."""
+    numbers = tuple(k for k, name in enumerate(layout.names) if kinds.get(name, "text") != "text")
+    head = layout.coding.decoded(head_of(path, 2 * layout.data_offset)) if layout.data_offset else b""
+    above = head[: layout.data_offset]
+    last = next((line for line in reversed(above.splitlines()) if line.strip()), b"")
+    own = _fields(last.decode("utf-8", errors="replace").strip(), layout.delimiter)
+    return NameLines(layout.names, numbers, tuple(own) if len(own) > 1 else ())
 
 
 def parse_lines(
@@ -431,12 +523,19 @@ def parse_lines(
     layout : `data_offset` and `comment` are not looked at.
     records, offsets : (n,) record number and byte offset of each line, as blocks and rejects state them.
     """
-    whole = int((ends - starts).sum()) == len(data)
-    table = _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
+    table = _parsed(data, starts, ends, layout, kinds)
     if table is not None:
         yield TextBlock(table, records, offsets)
     else:
         yield from _parse_singly(data, starts, ends, layout, kinds, records, offsets)
+
+
+def _parsed(
+    data: bytes, starts: Int64, ends: Int64, layout: TextLayout, kinds: Mapping[str, Kind]
+) -> dict[str, pa.Array] | None:
+    """Columns of lines without faults; None where a line is at fault."""
+    whole = int((ends - starts).sum()) == len(data)
+    return _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
 
 
 def line_blocks(

@@ -39,6 +39,18 @@ class _Bin:
     """Written parts with their first and last epoch."""
 
 
+def _once(
+    faults: Sequence[tuple[npt.NDArray[np.int64], str]]
+) -> list[tuple[npt.NDArray[np.int64], str]]:  # fmt: skip
+    """The same with each row under its first reason alone."""
+    found: list[tuple[npt.NDArray[np.int64], str]] = []
+    for rows, reason in faults:
+        rest = np.setdiff1d(rows, np.concatenate([bad for bad, _ in found])) if found else rows
+        if rest.size:
+            found.append((rest, reason))
+    return found
+
+
 class LogWriter:
     """Writes the rows of one log; nothing is visible before :meth:`publish`."""
 
@@ -52,11 +64,13 @@ class LogWriter:
         self.findings: list[Finding] = []
         """What is doubtful of the log; kept in its record."""
 
-    def add(self, table: str, batch: pa.RecordBatch) -> list[tuple[npt.NDArray[np.int64], str]]:
-        """Take rows of a table; returns the rows refused, with their reasons."""
+    def add(
+        self, table: str, batch: pa.RecordBatch, refused: Sequence[tuple[npt.NDArray[np.int64], str]] = ()
+    ) -> list[tuple[npt.NDArray[np.int64], str]]:
+        """Take rows of a table; returns the rows refused, with their reasons: those `refused` already, and others."""
         schema = table_schema(table)
         rows = schema.conform(batch, self._list_size)
-        faults = schema.faults(rows)
+        faults = _once([*refused, *schema.faults(rows)])
         if faults:
             good = np.ones(rows.num_rows, dtype=bool)
             for bad, _ in faults:

@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
 from roadscan.jobs.engine.compute import Compute, Done, Inline
+from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -19,6 +17,7 @@ from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
+from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
 from roadscan.sensors.base import Item, LogHeader, Reject, Rows
@@ -148,11 +147,13 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     """The rows of a log, finished in a scratch folder, and what its header says."""
     header = task.log.format.header(task.log.source)
     writer, poses, repeats = LogWriter(folder, header.list_size), PoseRecords(), RepeatedProfiles()
+    clock = task.log.source.clock
+    order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
-        _take(writer, item, header, poses)
-    writer.findings += [found] if (found := repeats.finding()) else []
+        _take(writer, item, header, poses, order)
+    writer.findings += [*order.findings(), *([found] if (found := repeats.finding()) else [])]
     writer.finish()
     if writer.rows["trajectory"]:
         check_poses(writer, str(header.attributes["world_frame"]), poses)
@@ -263,7 +264,7 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords) -> None:
+def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords, order: EpochOrder) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
@@ -271,17 +272,9 @@ def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords) 
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
     astray = place_faults(item.table, item.batch, header) if item.table in PLACED else []
-    _reject(writer, item, astray)
-    if astray:
-        item = item.without(np.concatenate([rows for rows, _ in astray]))
-    refused = writer.add(item.table, item.batch)
+    refused = writer.add(item.table, item.batch, [*astray, *order.refused(item)])
     poses.take(item, [rows for rows, _ in refused])
-    _reject(writer, item, refused)
-
-
-def _reject(writer: LogWriter, item: Rows, faults: Sequence[tuple[npt.NDArray[np.int64], str]]) -> None:
-    """List the records of rows that were refused."""
-    for rows, reason in faults:
+    for rows, reason in refused:
         for record, offset, count in item.places(rows):
             writer.reject(item.file, record, offset, count, reason)
 

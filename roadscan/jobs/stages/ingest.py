@@ -14,6 +14,7 @@ from roadscan.jobs.ingest.overlap import (
     empty_logs,
     reject_findings,
 )
+from roadscan.jobs.ingest.same_content import same_content_findings
 from roadscan.jobs.products import wanted_products
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
@@ -67,6 +68,7 @@ class Ingest(Stage):
         """What readers and checks of rows doubt, and logs of which much was rejected or stands under one stamp."""
         share = survey.config.checks.lost_share
         own = [one for record in records for one in record.findings]
+        own += same_content_findings(survey, records)
         return [*own, *reject_findings(records, share), *one_stamp_findings(records, share)]
 
 

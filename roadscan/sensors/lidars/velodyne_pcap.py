@@ -9,6 +9,11 @@ return mode both returns are kept, and one that is written twice is kept once.
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
 See :mod:`roadscan.sensors.lidars.velodyne_hours`.
+
+**A clock that steps.** Where the stamps step against the capture's own clock, the capture is divided, and each part is
+held against GPRMC and the PPS byte (2: locked): parts that cannot be put on GPS time are rejected, packet by packet,
+and named. A capture without position packets has only its own clock to compare with. Packets that stand twice count
+once. See `docs/clocks.md`, "Clocks that step".
 """
 
 from __future__ import annotations
@@ -103,6 +108,7 @@ class VelodynePcap(LogFormat):
     name: ClassVar[str] = "velodyne_pcap"
     title: ClassVar[str] = "Velodyne HDL-32E or VLP-16 packets in a PCAP capture, a stamp per return"
     yields: ClassVar[tuple[str, ...]] = ("returns",)
+    version: ClassVar[int] = 2
     suffixes: ClassVar[tuple[str, ...]] = (
         ".pcap",
         ".pcapng",

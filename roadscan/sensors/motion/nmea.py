@@ -15,6 +15,7 @@ from roadscan.model.crs import LOCAL_WORLD, Geoid
 from roadscan.model.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.model.strict import Strict
+from roadscan.model.witness import Finding, Witness
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.lidars.pcap import MAGICS, PCAPNG
 from roadscan.sensors.motion.gnss import NO_POSITION, GnssReader, RawSolutions
@@ -45,6 +46,15 @@ HELD_MAX: Final = 20_000
 SNIFF_BYTES: Final = 1 << 14
 MIXED_SENTENCES: Final = 3
 """So many known sentences with right checksums at the start make a log with binary messages one of NMEA."""
+
+SENTENCES_GO_BACK: Final = Witness(
+    "nmea_time_goes_back",
+    input="nmea",
+    fault="The times of sentences go back: logs were appended to one another, or the receiver set its clock.",
+    asks="the time of each sentence against the one before it, over 2 s",
+    does="of sentences of one kind and epoch the first counts; other epochs are used, and the log is named",
+    told=("rejects", "findings"),
+)
 
 _EPOCH_DAY: Final = dt.date(1970, 1, 1)
 _UNKNOWN: Final = np.iinfo(np.int64).min
@@ -124,6 +134,7 @@ class Nmea(LogFormat):
             heights += int((sentences.kinds == KINDS.index("GGA")).sum())
             yield from solutions.items(epochs, *calendar.timed(sentences))
         yield from solutions.items(epochs, *calendar.finish(), last=True)
+        yield from calendar.findings()
         if fixes and not heights:
             raise FormatError(
                 f"{fixes} RMC sentences state a position, and no GGA sentence its height",
@@ -267,6 +278,9 @@ class _Calendar:
         self._first_day = plan.first_day
         self._last_epoch = _UNKNOWN
         self._waiting = Sentences.joined([])
+        self._last_ns: int | None = None
+        self._back: list[tuple[int, int]] = []
+        """By how much time goes back (ns), and the line at which it does."""
 
     def timed(self, sentences: Sentences) -> tuple[Sentences, Int64, list[Reject]]:
         """Sentences with their GPS epochs (n,), and those without one as rejects."""
@@ -305,7 +319,25 @@ class _Calendar:
         real = leap_seconds_at_unix(second + 1) > leap_seconds_at_unix(second)
         sieve.drop(leap & ~real, "time is 23:59:60 on a day without a leap second")
         epochs = self._epochs.epochs(unix_ns, sieve, timed.lines) + np.where(leap, NS_PER_S, 0)
+        good = np.flatnonzero(sieve.good)
+        if good.size:
+            own = epochs[good]
+            steps = np.diff(own, prepend=own[0] if self._last_ns is None else self._last_ns)
+            far = np.flatnonzero(steps < -LATE_NS)
+            self._back += [(-int(steps[k]), int(timed.lines[good[k]])) for k in far]
+            self._last_ns = int(own[-1])
         return np.where(sieve.good, epochs, _UNKNOWN)
+
+    def findings(self) -> Iterator[Finding]:
+        """Whether the times of the log go back."""
+        if self._back:
+            farthest_ns, line = max(self._back)
+            yield SENTENCES_GO_BACK.finds(
+                "",
+                f"the times of its sentences go back {len(self._back):,} times, by {farthest_ns / NS_PER_S:.1f} s at "
+                f"the most (line {line + 1:,}): logs were appended to one another, or the receiver's clock was set; of "
+                "sentences of one epoch the first counts, and all other epochs are used",
+            )
 
     def _days(self, timed: Sentences, passed: Int64, sieve: Sieve) -> Int64:
         """Date (n,) of the log's first time as each sentence has it: its epoch's own, or the last before it."""

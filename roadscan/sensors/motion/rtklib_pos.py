@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Final, Literal, TypeAlias
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pyarrow.compute as pc
 
 from roadscan.model.crs import LOCAL_WORLD, crs_from_text, world_from_geodetic
-from roadscan.model.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError
+from roadscan.model.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, Clock, TimeSystem
 from roadscan.model.strict import Strict
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
@@ -92,11 +92,13 @@ class RtklibPos(LogFormat):
     (or of the orbits, without a base): state its datum as crs. Heights are ellipsoidal or geodetic as
     the header says; geodetic ones need height = "orthometric" and the geoid that RTKLIB used. A
     header without that line leaves it to `height`. With crs = "local", baselines are taken as x, y, z.
+    Records behind a second header that says otherwise than the first are rejected.
     """
 
     name = "rtklib_pos"
     title = "RTKLIB solution (.pos): GNSS positions, with σ, velocity and ambiguity ratio where written"
     yields = ("gnss",)
+    version = 2
     suffixes: ClassVar[tuple[str, ...]] = (".pos",)
     time = "the header says GPST, UTC or JST; a clock need not be stated, save for its measured offset"
     options = RtklibPosOptions
@@ -117,7 +119,7 @@ class RtklibPos(LogFormat):
         plan = _plan(source)
         epochs = EpochReader(plan.clock, source.path)
         reader = GnssReader(source, plan.placement)
-        for block in text_blocks(source.path, plan.layout, plan.kinds):
+        for block in text_blocks(source.path, plan.layout, plan.kinds, _LaterHeaders(plan.header)):
             if isinstance(block, Reject):
                 yield block
                 continue
@@ -156,6 +158,50 @@ class _Header:
     """Words of the base station's position, as many as there are."""
 
 
+@dataclass
+class _LaterHeaders:
+    """Headers of solutions that were appended to the first; the lines of each are judged one after another."""
+
+    first: _Header
+    other: str = (
+        "a second header stands before it, which differs from the first in time system, columns, datum, kind of height "
+        "or base station"
+    )
+    _same: dict[str, bool] = field(default_factory=dict)
+    """Whether the last header agrees, by what its lines are of."""
+
+    def row(self, fields: Sequence[str]) -> bool | None:
+        """Rows are never headers: those are comments."""
+        return None
+
+    def comment(self, line: str) -> bool | None:
+        """Whether rows behind this line are of the first header; None for a line that says nothing of that."""
+        said = _said_of_position(line)
+        if any(name in line for name in _FIRST_COLUMNS):
+            self._same["columns"] = self._has_columns(line)
+        elif said:
+            self._same["position"] = said == (self.first.datum, self.first.height)
+        elif re.match(r"%\s*ref pos\s*:", line):
+            base = _base_words(line.encode(), self.first.separator)
+            self._same["base"] = base == self.first.base or self.first.solution != "e/n/u-baseline"
+        else:
+            return None
+        return all(self._same.values())
+
+    def _has_columns(self, line: str) -> bool:
+        try:
+            later = _columns_of(line, None)
+        except RoadscanError:
+            return False
+        return replace(later, datum=self.first.datum, height=self.first.height, base=self.first.base) == self.first
+
+
+def _said_of_position(text: str) -> tuple[str, str] | None:
+    """Datum and kind of height that a header line states."""
+    said = re.search(r"lat/lon/height=(\w+)/(\w+)", text)
+    return (said[1], said[2]) if said else None
+
+
 def _header(path: Path) -> _Header:
     head = head_of(path)
     line = _column_line(head)
@@ -166,6 +212,14 @@ def _header(path: Path) -> _Header:
             change="let RTKLIB write its header (out-outhead = on)",
             file=path,
         )
+    header = _columns_of(line, path)
+    own = "\n".join(_own_header_lines(head, line))
+    datum, height = _said_of_position(own) or ("", "")
+    return replace(header, datum=datum, height=height, base=_base_words(own.encode(), header.separator))
+
+
+def _columns_of(line: str, path: Path | None) -> _Header:
+    """What the line of column names says."""
     first = next(name for name in _FIRST_COLUMNS if name in line)
     behind = line[line.index(first) + len(first) :][:1]
     separator = behind if behind and behind in _SEPARATORS else " "
@@ -177,16 +231,15 @@ def _header(path: Path) -> _Header:
     columns = tuple(re.sub(r"\(.*\)$", "", word) for word in words[1:])
     if len(set(columns)) < len(columns):
         raise FormatError("two columns of the header have one name", expected="each column once", file=path)
-    said = re.search(r"lat/lon/height=(\w+)/(\w+)", head.decode("utf-8", errors="replace"))
     return _Header(
         time=words[0],
         solution=_FIRST_COLUMNS[first],
         columns=columns,
         sexagesimal="d'" in first,
         separator=separator,
-        datum=said[1] if said else "",
-        height=said[2] if said else "",
-        base=_base_words(head, separator),
+        datum="",
+        height="",
+        base=(),
     )
 
 
@@ -194,6 +247,17 @@ def _header_lines(head: bytes) -> Iterator[str]:
     for raw in head.splitlines():
         if raw.startswith(b"%"):
             yield raw.decode("utf-8", errors="replace")
+
+
+def _own_header_lines(head: bytes, columns: str) -> Iterator[str]:
+    """Header lines above the first record: those of files appended behind it say nothing of it."""
+    is_behind = False
+    for line in head.decode("utf-8", errors="replace").splitlines():
+        is_behind |= line == columns
+        if line.startswith("%"):
+            yield line
+        elif is_behind and line.strip():
+            return
 
 
 def _column_line(head: bytes) -> str | None:

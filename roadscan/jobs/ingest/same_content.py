@@ -1,0 +1,92 @@
+"""Logs that hold the same bytes under two names: a copy, or one drive that would count as two."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from roadscan.model.survey import LogConfig, Survey
+from roadscan.model.witness import Finding, Witness
+from roadscan.tables.logs import LogRecord
+
+SAME_CONTENT: Final = Witness(
+    "same_content",
+    input="any log",
+    fault="The same log is listed under two names: a copy, or one drive listed as two.",
+    asks="the content of the logs of the survey file, byte by byte",
+    does="a copy in the same run and with the same settings counts once; readings that count in two runs or for two "
+    "sensors are used, and named",
+    told=("findings",),
+)
+
+_READINGS: Final = ("scans", "returns", "cloud", "images")
+"""Tables of which no two runs share a log. One trajectory may cover several runs."""
+_COMPARED_BYTES: Final = 1 << 20
+"""Bytes of either end that are compared, where sizes are the same."""
+
+
+def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
+    """Copies among the survey file's logs, and readings that count twice."""
+    listed = {(run.id, str(log.path)): log for run in survey.config.runs for log in run.logs}
+    return [*_copies(survey, listed, records), *_twice(listed, records)]
+
+
+def _copies(
+    survey: Survey, listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]
+) -> Iterator[Finding]:
+    """Logs without a record of their own, whose bytes and settings are those of another."""
+    known = {(r.run, r.path) for r in records}
+    for (run, path), config in listed.items():
+        file = survey.resolve(config.path)
+        if (run, path) in known or not file.is_file():
+            continue
+        for record in records:
+            other = listed.get((record.run, record.path))
+            same = other is not None and record.run == run and _settings(other) == _settings(config)
+            if same and _is_copy(file, survey.resolve(Path(record.path))):
+                yield SAME_CONTENT.finds(
+                    path, f"it holds the same bytes as {record.path} of the same run {run}, and counts once"
+                )
+                break
+
+
+def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """Readings of the same bytes in two runs, or of two sensors by the same settings."""
+    groups: dict[str, list[LogRecord]] = defaultdict(list)
+    for record in records:
+        if any(table in record.tables for table in _READINGS):
+            groups[record.content].append(record)
+    for group in groups.values():
+        for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
+            one, other = listed.get((first.run, first.path)), listed.get((later.run, later.path))
+            if one is None or other is None or one.options != other.options:
+                continue
+            yield SAME_CONTENT.finds(
+                later.path,
+                f"its bytes are those of {first.path} ({first.run}/{first.sensor}): its readings count a second time "
+                f"as {later.run}/{later.sensor}; they are used",
+            )
+
+
+def _settings(config: LogConfig) -> dict[str, object]:
+    return config.model_dump(exclude={"path"})
+
+
+def _is_copy(file: Path, other: Path) -> bool:
+    """Whether two files are of one size and have the same ends."""
+    try:
+        size = file.stat().st_size
+        if size != other.stat().st_size:
+            return False
+        return all(_part(file, at) == _part(other, at) for at in (0, max(0, size - _COMPARED_BYTES)))
+    except OSError:
+        return False
+
+
+def _part(file: Path, start: int) -> bytes:
+    with file.open("rb") as stream:
+        stream.seek(start)
+        return stream.read(_COMPARED_BYTES)

@@ -31,6 +31,8 @@ _APART: Final = 9.21
 a hundred times as likely (2 ln 100)."""
 _MANY: Final = 8
 """Heights and places from which on the stated σ of all surveys can be told from single wrong points."""
+_FEW: Final = 0.25
+"""Share of the heights and places that may be wrong one by one."""
 _UNDERSTATED: Final = 9.0
 """A median of the squared residuals that is so many times the usual one shows that the stated σ is too small: with
 eight right points two surveys in 10,000 have it."""
@@ -157,12 +159,23 @@ def judged(errors: SurveyErrors, rules: AdjustmentSettings) -> ControlVerdict:
 
     Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
     fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
-    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`.
+    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`. Where many points are found
+    wrong, the stated σ of the survey is asked as well.
     """
-    false_alarm, datum = rules.false_alarm, rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
-    asked = rules.estimate_variance_components is not False
-    factor = _survey_factor(replace(errors, covariance_m2=errors.covariance_m2 + datum)) if asked else 1.0
-    errors = replace(errors, covariance_m2=errors.covariance_m2 + datum + factor * np.diag(errors.survey_m2))
+    datum = rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
+    errors = replace(errors, covariance_m2=errors.covariance_m2 + datum)
+    found, parts = _with_factor(errors, rules, 1.0), len(errors.parts())
+    many = parts >= _MANY and len(found.left_out) > _FEW * parts
+    if not many or rules.estimate_variance_components is False:
+        return found
+    factor = _survey_factor(errors)
+    return _with_factor(errors, rules, factor) if factor > 1.0 else found
+
+
+def _with_factor(errors: SurveyErrors, rules: ControlRules, factor: float) -> ControlVerdict:
+    """The verdict with a factor of the surveys' stated variances."""
+    errors = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
+    false_alarm = rules.false_alarm
     fixed = _snooped(errors, false_alarm, free=False)
     at_once = common_offset(errors, _kept(errors, fixed))
     free = _snooped(errors, false_alarm, free=True)
@@ -187,8 +200,6 @@ def _survey_factor(errors: SurveyErrors) -> float:
     the survey that is wrong.
     """
     parts = errors.parts()
-    if len(parts) < _MANY:
-        return 1.0
 
     def spread(factor: float) -> float:
         whole = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))

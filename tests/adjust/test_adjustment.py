@@ -431,3 +431,45 @@ def test_nothing_to_correct_is_refused() -> None:
 def test_what_no_run_explains_is_refused(change: dict[str, np.ndarray], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         adjust(replace(scattered(), **change), priors(), ALL_COUNT)
+
+
+def test_a_survey_of_control_whose_sigma_is_ten_times_too_small_is_not_taken_for_many_wrong_points() -> None:
+    road = Road(1500.0, 8, 10.0, 75.0, lane_m=3.5, survey_height_sigma_m=0.02, survey_place_sigma_m=0.03)
+    observations, stations, truth = drawn(road, 31)
+    stated = replace(observations, survey_sigma_m=observations.survey_sigma_m / 10.0)
+    found = adjust(stated, road.priors(), AdjustmentSettings(knot_spacing_s=0.5))
+    # A median of 42 squares errs by a third (1 σ), and so the σ by a sixth.
+    assert np.sqrt(found.variance_factors["control_survey"]) == pytest.approx(10.0, rel=0.4)
+    assert len(found.verdict.wrong) <= 1
+    off = heights_off(found, road, stations, truth)
+    assert np.sqrt(np.mean(off**2)) < 2.0 * np.mean([s[:, 2].mean() for s in found.sigma])
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_one_wrong_height_is_named_and_no_right_one_beyond_the_stated_chance(runs: int) -> None:
+    """Five points of 600 m, one of them wrong, in 14 draws, and 60 draws of right control."""
+    road = Road(600.0, runs, 10.0, 150.0, lane_m=3.5 if runs > 1 else 0.0, speed_m_s=25.0)
+    settings = AdjustmentSettings(knot_spacing_s=0.5)
+
+    def of_seed(seed: int, wrong_m: float) -> Adjustment:
+        rng = np.random.default_rng(seed)
+        truth = drawn_errors(road, np.concatenate([road.ties_m, road.control_m]), rng)
+        parts = ([ties(road, truth, rng)] if runs > 1 else []) + [control(road, truth, rng)]
+        observations = Observations.joined(parts)
+        wrong = (observations.place == 2) & (observations.kind == KINDS.index("control_height"))
+        observations.observed_m[wrong & (observations.run[:, 1] == FIXED)] += wrong_m
+        return adjust(observations, road.priors(), settings)
+
+    named = {0.02: 0, 0.05: 0, 0.1: 0, 1.0: 0}
+    right = 0
+    for wrong_m in named:
+        for seed in range(14):
+            found = of_seed(seed, wrong_m).verdict.left_out
+            named[wrong_m] += (2, "height") in found
+            right += bool(found - {(2, "height")})
+    assert [named[w] for w in (0.05, 0.1, 1.0)] == [14, 14, 14]
+    # Of one drive, which knows the height between neighbours to 4 mm, 20 mm are five σ.
+    assert named[0.02] >= 12
+    right += sum(bool(of_seed(100 + seed, 0.0).verdict.left_out) for seed in range(60))
+    # 116 draws, of which one in a hundred may name a right point: more than five have a chance of 0.1 %.
+    assert right <= 5

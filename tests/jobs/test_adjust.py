@@ -421,6 +421,37 @@ def test_a_control_point_whose_place_is_wrong_is_named_and_bends_nothing(adjuste
     assert weights == [{"name": "G003"}]
 
 
+@pytest.mark.witness("control_target")
+def test_a_target_that_lies_elsewhere_is_measured_where_it_lies(adjusted: Simulated, tmp_path: Path) -> None:
+    """One stated 0.3 m from its paint, then all of them: no height moves, though the road falls by some mm there."""
+    before = rows(adjusted.store(), "FROM control_residuals ORDER BY point, run")
+    found: dict[str, Session] = {}
+    wide = {"adjust__targets": CIRCLES["adjust__targets"] | {"search_m": 0.5}}
+    for name, shifted in (("one", ["G003"]), ("all", [f"{'GCGCGG'[k]}00{k + 1}" for k in range(6)])):
+
+        def shift(points: dict[str, dict[str, str]], shifted: list[str] = shifted) -> None:
+            for point in shifted:
+                points[point]["easting_m"] = f"{float(points[point]['easting_m']) + 0.3:.4f}"
+
+        copy = with_control(adjusted, tmp_path / name, shift)
+        found[name] = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust"), **wide)
+        after = rows(copy.store(), "FROM control_residuals ORDER BY point, run")
+        assert {row["status"] for row in after if row["name"] in shifted} == {"moved"}
+        pairs = list(zip(after, before, strict=True))
+        assert max(abs(a["height_before_m"] - b["height_before_m"]) for a, b in pairs) < 0.0005
+        assert max(abs(a["height_after_m"] - b["height_after_m"]) for a, b in pairs) < 0.001
+        notes = [line for line in found[name].reporter.lines if line.startswith("note: control: ")]  # type: ignore[attr-defined]
+        assert [line for line in notes if f"{3 * len(shifted)} targets lie elsewhere than surveyed" in line]
+    one, every = (found[name].reporter.lines for name in ("one", "all"))  # type: ignore[attr-defined]
+    assert [line for line in one if line.startswith("note: G003: its surveyed place lies 30")]
+    assert not [line for line in (*one, *every) if "the stated σ of" in line]
+    # All of them: poses of 20 mm cannot err so; heights hold, and so does the shape in the plane.
+    assert [
+        line for line in every if "the places of the control lie" in line and "mm east from where the poses" in line
+    ]
+    assert not [line for line in every if "its surveyed place lies" in line]
+
+
 def test_targets_picked_by_hand_stand_in_for_those_that_would_be_found(adjusted: Simulated, tmp_path: Path) -> None:
     """A tester picks the true places as the recorded poses show them: the check points come as near as by finding."""
     found = rows(adjusted.store(), "FROM control_residuals ORDER BY point, run")

@@ -1,9 +1,9 @@
 """The adjustment: from observations to corrections of every run's poses, with their covariance.
 
 Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
-process as prior (:mod:`roadscan.adjust.process`); ties and control are observations; what solves them is one sparse
-least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing changes
-(:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
+process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
+solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
+changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
 share its error, and a wrong one is told by all of them.
 """
 
@@ -117,7 +117,11 @@ class Adjustment:
         variance += np.einsum("ni,nij,nj->n", right, own[before + 1], right)
         variance += 2.0 * np.einsum("ni,nij,nj->n", left, self.covariance_with_next[run_index][before], right)
         factors = np.array([self.variance_factors[c] for c in COMPONENTS]) * self.active[run_index]
-        lines = line_variance(share[:, None], step[:, None] / 1e9, prior.taus_s) * (prior.sigmas**2 * factors)
+        parts = prior.parts_at(knots)
+        count = parts.shape[1] // len(COMPONENTS)
+        ends, taus = (parts[before], parts[before + 1]), np.tile(prior.taus_s, count)
+        lines = line_variance(share[:, None], step[:, None] / 1e9, taus, ends)
+        lines = lines.reshape(-1, count, len(COMPONENTS)).sum(axis=1) * factors
         return np.asarray(np.sqrt(variance + (partials**2 * lines).sum(axis=1)))
 
 
@@ -154,7 +158,7 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n), {k: float(v) for k, v in factors.items()},
-        estimate.rounds, estimate.settled, tuple(priors), unknowns.sigmas > 0.0,
+        estimate.rounds, estimate.settled, tuple(priors), unknowns.active,
     )  # fmt: skip
 
 
@@ -208,20 +212,23 @@ def _of_knots(
     values, covariance, with_next = [], [], []
     for run, sigma in enumerate(unknowns.sigmas):
         numbers = unknowns.of_run(run)
-        there = numbers >= 0
-        values.append(np.where(there, estimate.solution[numbers], 0.0) * sigma)
-        covariance.append(_blocks(estimate, numbers, numbers, sigma))
-        with_next.append(_blocks(estimate, numbers[:-1], numbers[1:], sigma))
+        parts = np.where(numbers >= 0, estimate.solution[numbers], 0.0) * sigma
+        values.append(parts.reshape(len(parts), -1, len(COMPONENTS)).sum(axis=1))
+        covariance.append(_blocks(estimate, (numbers, sigma), (numbers, sigma)))
+        with_next.append(_blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:])))
     return tuple(values), tuple(covariance), tuple(with_next)
 
 
-def _blocks(estimate: Estimate, first: Int64, second: Int64, sigma: Float64) -> Float64:
-    """Covariances (k, 6, 6) of two tables (k, 6) of unknowns."""
-    i, j = np.broadcast_arrays(first[:, :, None], second[:, None, :])
+def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
+    """Covariances (k, 6, 6) of what two tables of unknowns add up to, each with what it is scaled by."""
+    i, j = np.broadcast_arrays(first[0][:, :, None], second[0][:, None, :])
     there = (i >= 0) & (j >= 0)
     blocks = np.zeros(i.shape)
     blocks[there] = estimate.inverse.at(i[there], j[there])
-    return blocks * sigma[:, None] * sigma
+    blocks *= first[1][:, :, None] * second[1][:, None, :]
+    rows, columns, size = first[0].shape[1], second[0].shape[1], len(COMPONENTS)
+    folded = blocks.reshape(-1, rows // size, size, columns // size, size)
+    return np.asarray(folded.sum(axis=(1, 3)))
 
 
 def _of_observations(

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, ControlErrors
+from roadscan.adjust.process import mean_over_time
 from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -164,18 +164,9 @@ def mean_corrections(adjustment: Adjustment) -> MeanCorrections:
     """The mean correction of each run, held against its prior.
 
     Control that is wrong as a whole contradicts nothing but the prior, so no single point is rejected for it.
-
-    Notes
-    -----
-    The mean over a time T of a process with σ, τ has the variance 2 σ² τ/T (1 − τ/T (1 − e^(−T/τ))).
     """
-    mean = np.array([v.mean(axis=0) for v in adjustment.values])
-    sigma = np.zeros(mean.shape)
-    for run, prior in enumerate(adjustment.priors):
-        span = max((prior.last_gps_ns - prior.first_gps_ns) / NS_PER_S, 1e-9) / prior.taus_s
-        # (T/τ − (1 − e^(−T/τ))) / (T/τ)², 1/2 for a short run.
-        share = np.where(span > 1e-4, (span + np.expm1(-span)) / span**2, 0.5)
-        sigma[run] = prior.sigmas * np.sqrt(2.0 * share)
+    runs = zip(adjustment.priors, adjustment.epochs_gps_ns, adjustment.values, strict=True)
+    mean, sigma = (np.array(both) for both in zip(*(mean_over_time(*one) for one in runs), strict=True))
     return MeanCorrections(mean, mean / np.where(adjustment.active, sigma, np.nan))
 
 

@@ -1,6 +1,7 @@
 """The unknowns of an adjustment, and its observations as rows of them.
 
-Unknowns are in units of their prior σ: corrections of each run's components at its knots, then the errors of the
+Unknowns are in units of their prior σ: the parts of the corrections of each run's components at its knots
+(:mod:`roadscan.adjust.process`), then the errors of the
 surveyed coordinates of control points (north, east, down), which all runs that saw a point share.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS, FIXED, Observations
-from roadscan.adjust.process import RunPrior, knots_of, line_variance, precision_of
+from roadscan.adjust.process import RunPrior, knots_of, line_variance, precision_of, stretches
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
@@ -74,8 +75,8 @@ class Unknowns:
     priors: tuple[RunPrior, ...]
     knots: tuple[Int64, ...]
     """Epochs of each run's knots."""
-    sigmas: Float64
-    """(runs, 6) stationary σ, 0 where a component is not estimated."""
+    sigmas: tuple[Float64, ...]
+    """(k, 6), or (k, 12) where a run has outages: σ of the parts of each run's processes at its knots; 0: not there."""
     control: ControlPoints
 
     @classmethod
@@ -83,13 +84,20 @@ class Unknowns:
         cls, priors: Sequence[RunPrior], control: ControlPoints, spacing_s: float, components: npt.NDArray[np.bool_]
     ) -> Unknowns:
         """Knots at most `spacing_s` apart; only some components are estimated."""
-        sigmas = np.array([p.sigmas for p in priors]).reshape(-1, _SIZE) * components
-        return cls(tuple(priors), tuple(knots_of(p, spacing_s) for p in priors), sigmas, control)
+        knots = tuple(knots_of(p, spacing_s) for p in priors)
+        parts = [p.parts_at(own) for p, own in zip(priors, knots, strict=True)]
+        sigmas = tuple(own * np.tile(components, own.shape[1] // _SIZE) for own in parts)
+        return cls(tuple(priors), knots, sigmas, control)
+
+    @cached_property
+    def active(self) -> npt.NDArray[np.bool_]:
+        """(runs, 6) components that are estimated."""
+        return np.array([(own[:, :_SIZE] > 0.0).all(axis=0) for own in self.sigmas], bool).reshape(-1, _SIZE)
 
     @cached_property
     def first(self) -> Int64:
         """(runs + 1,) the first unknown of each run; the last is that of the control points."""
-        sizes = [k.size * int((s > 0.0).sum()) for k, s in zip(self.knots, self.sigmas, strict=True)]
+        sizes = [int((own > 0.0).sum()) for own in self.sigmas]
         return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
     @property
@@ -106,11 +114,10 @@ class Unknowns:
         return numbers
 
     def of_run(self, run: int) -> Int64:
-        """(k, 6) unknown of each knot and component of a run, −1: none."""
-        active = self.sigmas[run] > 0.0
-        numbers = np.full((self.knots[run].size, _SIZE), -1, np.int64)
-        count = self.knots[run].size * int(active.sum())
-        numbers[:, active] = self.first[run] + np.arange(count).reshape(self.knots[run].size, int(active.sum()))
+        """Unknown of each knot and part of a run, as `sigmas`; −1: none."""
+        there = self.sigmas[run] > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first[run] + np.arange(int(there.sum()))
         return numbers
 
     def intervals(self, run: int, epochs_gps_ns: Int64) -> tuple[Int64, Float64, Float64]:
@@ -133,20 +140,23 @@ class Unknowns:
         ----------
         point : (n,) control point of each observation, −1: none.
         """
-        n = observations.size
-        unknown = np.full((n, 4 * _SIZE + 3), -1, np.int64)
-        derivative, variance = np.zeros((n, 4 * _SIZE + 3)), np.zeros((n, _SIZE))
+        n, width = observations.size, max((own.shape[1] for own in self.sigmas), default=_SIZE)
+        unknown = np.full((n, 4 * width + 3), -1, np.int64)
+        derivative, variance = np.zeros((n, 4 * width + 3)), np.zeros((n, _SIZE))
         for run in range(len(self.priors)):
-            numbers, sigma, taus = self.of_run(run), self.sigmas[run], self.priors[run].taus_s
+            numbers, sigma = self.of_run(run), self.sigmas[run]
+            parts, own = sigma.shape[1] // _SIZE, sigma.shape[1]
+            taus = np.tile(self.priors[run].taus_s, parts)
             for end in (0, 1):
                 here = np.flatnonzero(observations.run[:, end] == run)
                 before, share, step_s = self.intervals(run, observations.epoch_gps_ns[here, end])
-                scaled = observations.partials[here, end] * sigma
+                partial = np.tile(observations.partials[here, end], parts)
                 after = np.minimum(before + 1, len(numbers) - 1)
                 for side, (knot, weight) in enumerate(((before, 1.0 - share), (after, share))):
-                    at = slice((2 * end + side) * _SIZE, (2 * end + side + 1) * _SIZE)
-                    unknown[here, at], derivative[here, at] = numbers[knot], scaled * weight[:, None]
-                variance[here] += scaled**2 * line_variance(share[:, None], step_s[:, None], taus)
+                    at = slice((2 * end + side) * width, (2 * end + side) * width + own)
+                    unknown[here, at], derivative[here, at] = numbers[knot], partial * sigma[knot] * weight[:, None]
+                lines = line_variance(share[:, None], step_s[:, None], taus, (sigma[before], sigma[after]))
+                variance[here] += (partial**2 * lines).reshape(-1, parts, _SIZE).sum(axis=1)
         seen = point >= 0
         unknown[seen, -3:] = self.of_control[point[seen]]
         derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
@@ -159,13 +169,14 @@ class Unknowns:
         """
         parts: list[tuple[Int64, Int64, Float64, Int64]] = []
         for run, prior in enumerate(self.priors):
-            numbers = self.of_run(run)
-            for component in np.flatnonzero(self.sigmas[run] > 0.0):
-                diagonal, beside = precision_of(self.knots[run], prior.processes[component].tau_s)
-                own = numbers[:, component]
-                row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
-                value = np.concatenate([diagonal, beside])
-                parts.append((row, column, value, np.full(row.size, component, np.int64)))
+            for part, numbers in enumerate(self.of_run(run).T):
+                component = part % _SIZE
+                for one in stretches(numbers >= 0):
+                    diagonal, beside = precision_of(self.knots[run][one], prior.processes[component].tau_s)
+                    own = numbers[one]
+                    row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
+                    value = np.concatenate([diagonal, beside])
+                    parts.append((row, column, value, np.full(row.size, component, np.int64)))
         if not parts:
             empty = np.zeros(0, np.int64)
             return empty, empty, np.zeros(0), empty

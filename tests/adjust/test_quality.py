@@ -85,7 +85,7 @@ def test_the_mean_of_a_process_has_the_spread_that_it_is_held_against() -> None:
         times = np.linspace(0.0, seconds, 101)
         root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 60.0) + 1e-12 * np.eye(101))
         runs = [RunPrior(str(i), 0, seconds * 10**9, (process,) * 6) for i in range(200)]
-        nothing = adjust(Observations.none(), runs, AdjustmentSettings(knot_spacing_s=1e6))
+        nothing = adjust(Observations.none(), runs, AdjustmentSettings(knot_spacing_s=seconds / 100))
         drawn = replace(nothing, values=tuple(0.015 * root @ rng.standard_normal((101, 6)) for _ in runs))
         assert np.std(mean_corrections(drawn).normalised) == pytest.approx(1.0, rel=0.08)
 

@@ -12,6 +12,7 @@ import numpy as np
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
 from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.process import RunPrior
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.control_work import (
     SIGHTINGS,
@@ -104,7 +105,7 @@ def adjust_survey(session: Session) -> None:
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
     runs = runs_of(plan)
     priors = priors_of(plan, sources, runs)
-    work = plan_work(plan, sources, [max(p.sigmas[:2]) for p in priors])
+    work = plan_work(plan, sources, priors)
     failed = _collect(session, work)
     ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs)
     sightings, pictures = load_sightings(session.store, manifest, work.control)
@@ -136,14 +137,14 @@ def adjust_survey(session: Session) -> None:
     _keep(session, key, held, (lines, notes), failed)
 
 
-def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float]) -> Work:
+def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
     """Where passes overlap and where they come by control points: tasks for both."""
     tracks = tracks_of(plan, sources)
     config = plan.survey.config.adjust
     places = _places(tracks, config.places)
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan))
-    control = control_tasks(plan, sources, tracks, points, sigma_pose_m)
+    control = control_tasks(plan, sources, tracks, points, priors)
     return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points))
 
 

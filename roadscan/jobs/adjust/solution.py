@@ -16,19 +16,20 @@ from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
+from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
-from roadscan.jobs.navigate.pose_sigma import median_pose_sigma
+from roadscan.jobs.navigate.pose_sigma import stated_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan
-from roadscan.jobs.readings import load_recorded
+from roadscan.jobs.readings import TrajectorySource, load_recorded
 from roadscan.model.settings.adjust import PosePriors
 from roadscan.model.settings.adjustment import AdjustmentSettings
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _NONE: Final = (GaussMarkov(0.0, 1.0),) * 6
@@ -93,14 +94,21 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
             found.append(RunPrior(run, 0, 0, _NONE))
             continue
         spans = [span_of(s, files) for s, files in own]
-        stated = median_pose_sigma(plan.store, plan.records, trajectory)
-        found.append(RunPrior(run, min(a for a, _ in spans), max(b for _, b in spans), _processes(config, stated)))
+        stated = _stated(plan, trajectory) if config.source == "sigma" else None
+        first, last = min(a for a, _ in spans), max(b for _, b in spans)
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated))
     return tuple(found)
 
 
+def _stated(plan: SurveyPlan, trajectory: TrajectorySource) -> StatedSigma | None:
+    epochs, sigma = stated_pose_sigma(plan.store, plan.records, trajectory)
+    return StatedSigma(epochs, sigma) if epochs.size else None
+
+
 def _processes(
-    config: PosePriors, stated: Float64
+    config: PosePriors, stated: StatedSigma | None
 ) -> tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]:
+    """Those of the settings, with the median of the σ that the logs state of a component."""
     assumed = np.array(
         [
             config.sigma_horizontal_m,
@@ -111,9 +119,9 @@ def _processes(
             config.sigma_heading_deg,
         ]
     )
-    known = np.isfinite(stated) & (stated > 0.0) & (config.source == "sigma")
-    sigma = np.where(known, stated, assumed)
-    sigma[3:] = np.radians(sigma[3:])
+    assumed[3:] = np.radians(assumed[3:])
+    usual = np.full(assumed.size, np.nan) if stated is None else np.median(stated.sigma, axis=0)
+    sigma = np.where(np.isfinite(usual), usual, assumed)
     times = (config.position_time_s,) * 3 + (config.attitude_time_s,) * 3
     n, e, d, r, p, h = (GaussMarkov(float(s), t) for s, t in zip(sigma, times, strict=True))
     return n, e, d, r, p, h
@@ -198,7 +206,9 @@ def _far_notes(far: Mapping[str, float], evidence: Evidence) -> list[str]:
     ]
     surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
     # The poses are as they were recorded.
-    sigma = max((float(prior.sigmas[2]) for prior in evidence.priors), default=0.0)
+    sigma = max(
+        (float(evidence.priors[one.run].sigma_at(_epoch(one))[0, 2]) for one in evidence.sightings), default=0.0
+    )
     points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
     return notes + _swapped_notes(points)
 
@@ -234,8 +244,12 @@ def _rigid_fit(evidence: Evidence, entering: Bool) -> RigidFit:
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
     seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
-    sigma = np.array([evidence.priors[one.run].sigmas[:3] for one in seen]).reshape(-1, 3)
+    sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
     return rigid_fit(seen, sigma)
+
+
+def _epoch(one: Sighting) -> Int64:
+    return np.array([one.epoch_gps_ns], np.int64)
 
 
 def _rigid_corrections(plan: SurveyPlan, evidence: Evidence, fit: RigidFit) -> dict[str, Corrections]:

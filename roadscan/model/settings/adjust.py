@@ -21,8 +21,8 @@ class PosePriors(Strict):
     """What is known of the errors of the recorded poses: of each component a first-order Gauss–Markov process."""
 
     source: Literal["sigma", "stated"] = "sigma"
-    """`sigma`: the 1 σ that a run's logs state (SMRMSG, σ columns, a computed trajectory), the median over the run;
-    where they state none, and with `stated`, those below."""
+    """`sigma`: the 1 σ that a run's logs state of each pose (SMRMSG, σ columns, a computed trajectory); where they
+    state none, and with `stated`, those below."""
     sigma_horizontal_m: float = Field(default=0.02, ge=0.0, le=100.0)
     """1 σ of north and of east (m); 0: they are not corrected."""
     sigma_down_m: float = Field(default=0.03, ge=0.0, le=100.0)

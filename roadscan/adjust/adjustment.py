@@ -3,8 +3,8 @@
 Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
 process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
 solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
-changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
-share its error, and a wrong one is told by all of them.
+changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
+point share its error, and a wrong one is told by all of them.
 """
 
 from __future__ import annotations

@@ -135,10 +135,10 @@ def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
     if prior.stated is None:
         return even
     more = _more_knots(prior, even)
-    parts = [
-        even,
-        *(even[:-1][more > k] + (np.diff(even) * k // (more + 1))[more > k] for k in range(1, _MOST_MORE + 1)),
-    ]
+    parts = [even]
+    for k in range(1, int(more.max(initial=0)) + 1):
+        own = more >= k
+        parts.append(even[:-1][own] + np.diff(even)[own] * k // (more[own] + 1))
     return np.unique(np.concatenate(parts))
 
 

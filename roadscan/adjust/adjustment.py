@@ -4,7 +4,9 @@ Corrections are piecewise linear between knots in time. Each component of each r
 process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
 solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
 changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
-point share its error, and a wrong one is told by all of them.
+point share its error. Surveys are first left aside, and judged by what poses and ties say of them
+(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
+share, are unknowns beside the poses.
 """
 
 from __future__ import annotations
@@ -15,9 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.control_test import COMPONENTS as SURVEYED
+from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
-from roadscan.adjust.process import RunPrior, line_variance
+from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
@@ -52,6 +56,19 @@ class ControlErrors:
 
 
 @dataclass(frozen=True)
+class MountingErrors:
+    """What the adjustment says of the mountings of s sensors."""
+
+    sensors: tuple[str, ...]
+    prior_sigma: Float64
+    """(s, 6) as it came in, `MOUNTED`; 0: not estimated."""
+    error: Float64
+    """(s, 6) what has to be added to the mounting (m, rad); 0 where not estimated."""
+    sigma: Float64
+    """(s, 6) 1 σ of the mounting then; that of the prior where nothing tells of it."""
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """Corrections of each run, and what they say of the observations."""
 
@@ -75,20 +92,29 @@ class Adjustment:
     normalised_residual: Float64
     """(n,) against the prediction of all others, over its σ; NaN where not used."""
     control: ControlErrors
+    mountings: MountingErrors
     variance_factors: Mapping[str, float]
     """Of the stated variances, by kind of observation and by component of the processes; 1 where not estimated."""
     rounds: int
     settled: bool
     """False where weights still changed in the last round."""
+    verdict: ControlVerdict
+    """What the surveys of the control points are worth."""
+    applied: AppliedOffset
+    """Offset that the surveys were taken to have in common."""
     priors: tuple[RunPrior, ...]
     """As they came in."""
     active: Bool
     """(runs, 6) components that were estimated."""
+    response: tuple[Float64, ...]
+    """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north,
+    east, down."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
-        """(k, 6) 1 σ of each run's knots."""
-        return tuple(np.sqrt(np.einsum("kii->ki", c)) for c in self.covariance)
+        """(k, 6) 1 σ of each run's knots, with that of an offset of the control."""
+        shared = [np.einsum("kia,ab,kib->ki", r, self.applied.covariance_m2, r) for r in self.response]
+        return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
 
     def corrections(self, run: str) -> Corrections:
         """A run's corrections as navigation takes them."""
@@ -125,13 +151,19 @@ class Adjustment:
         return np.asarray(np.sqrt(variance + (partials**2 * lines).sum(axis=1)))
 
 
-def adjust(observations: Observations, priors: Sequence[RunPrior], settings: AdjustmentSettings) -> Adjustment:
+def adjust(
+    observations: Observations,
+    priors: Sequence[RunPrior],
+    settings: AdjustmentSettings,
+    mountings: Sequence[MountingPrior] = (),
+) -> Adjustment:
     """Corrections of all runs.
 
     Parameters
     ----------
     observations : in any order; the result does not depend on it.
     priors : of each run that `Observations.run` counts.
+    mountings : of each sensor that `Observations.sensor` counts; estimated where all runs are adjusted jointly.
 
     Raises
     ------
@@ -144,9 +176,14 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
     chosen = ordered.chosen(which)
     components = HEIGHT_ALONE if settings.mode == "vertical" else np.ones(len(COMPONENTS), bool)
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
-    unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components)
+    shared = mountings if settings.mode == "joint" else ()
+    unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
     unknowns.check(observations)
-    estimate = Rounds(_problem(unknowns, chosen), settings).run()
+    rounds = Rounds(_problem(unknowns, chosen), settings)
+    alone = rounds.without_surveys()
+    verdict = judged(_survey_errors(unknowns, alone, rounds), settings)
+    applied = applied_offset(verdict, settings, settings.reject_beyond)
+    estimate, response = _with_control(unknowns, alone, rounds, verdict, applied)
     values, covariance, with_next = _of_knots(unknowns, estimate)
     told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
     back = np.empty(order.size, np.int64)
@@ -157,15 +194,16 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
-        _of_control(unknowns, estimate, n), {k: float(v) for k, v in factors.items()},
-        estimate.rounds, estimate.settled, tuple(priors), unknowns.active,
+        _of_control(unknowns, estimate, n), _of_mountings(unknowns, estimate),
+        {k: float(v) for k, v in factors.items()},
+        estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
     )  # fmt: skip
 
 
 def _canonical(observations: Observations) -> Int64:
     """Order that depends on the observations alone, not on how they arrived."""
     o = observations
-    keys = [o.kind, o.place, *o.run.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
+    keys = [o.kind, o.place, *o.run.T, *o.sensor.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
     keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
     return np.lexsort(keys[::-1])
 
@@ -205,18 +243,56 @@ def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
     )
 
 
+def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
+    """Control point, axis and σ (m,) of each surveyed coordinate, in the order of their unknowns."""
+    point, axis = np.nonzero(unknowns.of_control >= 0)
+    return point.astype(np.int64), axis.astype(np.int64), unknowns.control.sigma_m[point, axis]
+
+
+def _survey_errors(unknowns: Unknowns, alone: Estimate, rounds: Rounds) -> SurveyErrors:
+    """What poses and ties say of the surveys."""
+    point, axis, sigma = _surveyed(unknowns)
+    if not point.size:
+        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)))
+    away = alone.solution[unknowns.of_control[point, axis]] * sigma
+    unit = rounds.survey_covariance() + np.eye(sigma.size)
+    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma)
+
+
+def _with_control(
+    unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
+) -> tuple[Estimate, tuple[Float64, ...]]:
+    """The solution with surveys that are right, and by how much each knot follows an offset of all of them."""
+    point, axis, sigma = _surveyed(unknowns)
+    left_out = verdict.left_out
+    component = {a: name for name, axes in SURVEYED.items() for a in axes}
+    names = [component[a] for a in axis.tolist()]
+    counts = [n not in applied.refused and (p, n) not in left_out for p, n in zip(point.tolist(), names, strict=True)]
+    weight = np.array(counts, np.float64)
+    if not weight.any():
+        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
+    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, alone.rounds)
+    moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
+    return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+
+
+def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
+    """Corrections (k, 6) of each run's knots."""
+    numbers = [unknowns.of_run(run) for run in range(len(unknowns.priors))]
+    parts = [np.where(n >= 0, solution[n], 0.0) * s for n, s in zip(numbers, unknowns.sigmas, strict=True)]
+    return [own.reshape(len(own), -1, len(COMPONENTS)).sum(axis=1) for own in parts]
+
+
 def _of_knots(
     unknowns: Unknowns, estimate: Estimate
 ) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
     """Values, covariances, and those with the next knot, of each run."""
-    values, covariance, with_next = [], [], []
+    covariance, with_next = [], []
     for run, sigma in enumerate(unknowns.sigmas):
         numbers = unknowns.of_run(run)
-        parts = np.where(numbers >= 0, estimate.solution[numbers], 0.0) * sigma
-        values.append(parts.reshape(len(parts), -1, len(COMPONENTS)).sum(axis=1))
         covariance.append(_blocks(estimate, (numbers, sigma), (numbers, sigma)))
         with_next.append(_blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:])))
-    return tuple(values), tuple(covariance), tuple(with_next)
+    return tuple(_of_solution(unknowns, estimate.solution)), tuple(covariance), tuple(with_next)
 
 
 def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
@@ -242,6 +318,15 @@ def _of_observations(
     residual[used], weight[used] = estimate.residual[:n], estimate.weight[:n]
     redundancy[used], normalised[used] = estimate.without.redundancy[:n], estimate.without.statistic[:n]
     return residual, weight, redundancy, normalised
+
+
+def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
+    prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
+    there = numbers >= 0
+    error, sigma = np.zeros(prior.shape), np.zeros(prior.shape)
+    error[there] = estimate.solution[numbers[there]] * prior[there]
+    sigma[there] = np.sqrt(estimate.inverse.at(numbers[there], numbers[there])) * prior[there]
+    return MountingErrors(tuple(one.sensor for one in unknowns.mountings), prior, error, sigma)
 
 
 def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors:

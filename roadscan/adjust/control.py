@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import FIXED, KINDS, Observations, partials
+from roadscan.adjust.observations import FIXED, KINDS, Observations, mount_partials, partials
 from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.targets.find import find_target
@@ -18,13 +18,15 @@ from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]
-"""`height`: no target is looked for, the height alone was measured; `unseen`: not even that."""
+"""`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see
+the road where the target is looked for."""
 
 _NEAR_M: Final = 3.0
 _LONGEST_NS: Final = 20 * NS_PER_S
@@ -74,7 +76,8 @@ class Sighting:
     covariance_m2: Float64
     """(2, 2) of easting and northing, without that of the poses."""
     height_m: float
-    """Of the road at the target, or at the surveyed place where none was found."""
+    """Of the road at the target; at the surveyed place where none is looked for or none was found; NaN where there are
+    several, and with them several heights."""
     sigma_height_m: float
     slope_east: float
     slope_north: float
@@ -90,8 +93,10 @@ class Sighting:
 
     @property
     def is_placed(self) -> bool:
-        """Whether the place was measured, and not the height alone."""
-        return self.status in ("found", "picked")
+        """Whether the place was measured, and not the height alone: a target that lies elsewhere than surveyed counts
+        where it lies, and the adjustment judges its survey.
+        """
+        return self.status in ("found", "moved", "picked")
 
     @property
     def observed(self) -> int:
@@ -163,12 +168,15 @@ def sight(
         )
         find = find_target(readings, expected, settings)
         status, why_not = find.status, find.why_not
-        if find.found:
+        if status in ("found", "moved"):
             place, covariance = np.array([find.easting_m, find.northing_m]), find.covariance_m2
     at = place if np.isfinite(place).all() else np.array([point.easting_m, point.northing_m])
     height = height_at(readings, float(at[0]), float(at[1]), settings)
-    if not np.isfinite(height.height_m) and status == "height":
+    if not np.isfinite(height.height_m) and status in ("height", "missed"):
         status, why_not = "unseen", height.why_not
+    if status == "doubled":
+        nowhere = float("nan")
+        height = replace(height, height_m=nowhere, sigma_m=nowhere, slope_east=nowhere, slope_north=nowhere)
     return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
 
 
@@ -205,29 +213,60 @@ def _unseen(point: ControlPoint, head: PassReadings) -> Sighting:
     )  # fmt: skip
 
 
-def moved_m(one: Sighting, corrections: Corrections | None) -> Float64:
+def moved_m(
+    one: Sighting, corrections: Corrections | None, mounting: tuple[MountingChange, Float64] | None = None
+) -> Float64:
     """How corrections move what a sighting saw: easting, northing, height (3,) (m); of a point that was not placed the
     height at its surveyed place, on a road that slopes.
+
+    mounting : change of that of the sensor that saw it, and its lever arm (3,).
     """
-    if corrections is None or not np.isfinite(one.arm_body_m).all():
+    if (corrections is None and mounting is None) or not np.isfinite(one.arm_body_m).all():
         return np.zeros(3)
-    shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
-    level = shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    level = np.zeros((1, 3))
+    if corrections is not None:
+        shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
+        level = level + shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    if mounting is not None:
+        change, lever = mounting
+        level = level + change.moves_level(one.level_from_body[None], one.arm_body_m[None], lever)
     easting, northing, height = map_from_level(level, one.convergence_rad)[0]
     if not one.is_placed and np.isfinite(one.slope_east):
         height -= one.slope_east * easting + one.slope_north * northing
     return np.array([easting, northing, height])
 
 
-def observations_of(sightings: Sequence[Sighting]) -> Observations:
+@dataclass(frozen=True)
+class SeenBy:
+    """The sensor that saw a point."""
+
+    number: int
+    """Among those whose mounting is estimated; −1: it is not."""
+    lever_body_m: Float64
+    """(3,) its lever arm."""
+
+
+def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | None = None) -> Observations:
     """Height of each sighting, and two components of those that were placed, in order of the sightings.
 
     The height is that along the normal of the road at a point without a target, whose place on the road is known by the
     poses alone. The components of a place are along the axes of its covariance, so that they are independent.
+
+    seen_by : of each sighting; mountings are not asked for where it is left out.
     """
     parts = [part for number, one in enumerate(sightings) for part in _of_one(number, one)]
     groups = np.array([int(part.group[0]) for part in parts], np.int64)
-    return replace(Observations.joined(parts), group=groups)
+    joined = replace(Observations.joined(parts), group=groups)
+    if seen_by is None or not joined.size:
+        return joined
+    each = [own for one, own in zip(sightings, seen_by, strict=True) for _ in range(one.observed)]
+    seen = [one for one in sightings for _ in range(one.observed)]
+    turned = np.array([one.level_from_body for one in seen])
+    in_body = np.einsum("nji,nj->ni", turned, joined.partials[:, 0, :3])
+    by_mounting = np.zeros((joined.size, 2, 6))
+    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], np.array([s.lever_body_m for s in each]))
+    sensor = np.array([[s.number, -1] for s in each], np.int32)
+    return replace(joined, sensor=sensor, mount_partials=by_mounting)
 
 
 def _of_one(number: int, one: Sighting) -> list[Observations]:

@@ -24,21 +24,35 @@ class WrongPoint:
 
     name: str
     height_m: float
-    """Surveyed minus what all others say; NaN where the height was not rejected."""
+    """Surveyed minus what all others say; NaN where the height is right."""
     horizontal_m: float
-    """Distance of the surveyed place from where all others say; NaN where the place was not rejected."""
+    """Distance of the surveyed place from where all others say; NaN where the place is right."""
     sigma_m: float
     """1 σ of the height's difference."""
     surveyed_height_m: float
+    sigmas: float = float("nan")
+    """Length of the normalised residual; NaN where it is not known."""
+    limit: float = float("nan")
+    """That from which on a point is wrong."""
+    alternatives: tuple[str, ...] = ()
+    """Points that may be the wrong ones in its stead."""
 
     def told(self) -> str:
         """In words."""
-        parts = []
+        parts, what = [], []
         if np.isfinite(self.height_m):
-            parts.append(f"{self.height_m * 1e3:+.1f} mm in height")
+            parts.append(f"its surveyed height lies {self.height_m * 1e3:+.1f} mm")
+            what.append("height")
         if np.isfinite(self.horizontal_m):
-            parts.append(f"{self.horizontal_m * 1e3:.1f} mm in place")
-        return f"{self.name} ({', '.join(parts)})"
+            parts.append(f"its surveyed place lies {self.horizontal_m * 1e3:.1f} mm")
+            what.append("place")
+        text = f"{' and '.join(parts)} from what all other evidence says"
+        if np.isfinite(self.sigmas):
+            text += f" ({self.sigmas:.1f} σ, where {self.limit:.1f} σ are the limit)"
+        if self.alternatives:
+            names = listed(self.alternatives)
+            return f"{text}; it or {names} is wrong, and nothing tells which of them: none of their {what[0]}s counts"
+        return f"{text}; its {' and its '.join(what)} does not count"
 
 
 def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:

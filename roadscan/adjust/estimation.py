@@ -1,7 +1,13 @@
-"""The rounds of an adjustment: solve, judge each observation by the others, weigh anew."""
+"""The rounds of an adjustment: solve, judge each observation by the others, weigh anew.
+
+The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control_test`): here
+they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
+another, and no weight that both get round by round tells which of them is wrong.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,6 +37,11 @@ _ENOUGH: Final = 30.0
 _FACTORS: Final = (1e-3, 1e3)
 _STEP: Final = 4.0
 """A factor changes by no more in a round."""
+_UNDERSTATED: Final = 3.0
+"""Variances that are so many times those stated are estimated, whether that was asked for or not: with σ that are 1.7
+times too small, right observations are rejected and published σ are wrong."""
+_MEDIAN: Final = 0.6745
+"""Median of the absolute of a standard normal number."""
 
 
 @dataclass(frozen=True)
@@ -75,25 +86,63 @@ class Rounds:
 
     def __init__(self, problem: Problem, settings: AdjustmentSettings) -> None:
         self.problem, self.settings = problem, settings
+        self._estimating = bool(settings.estimate_variance_components)
+        self._surveyed = problem.kind == SURVEY
+        self._survey_weight = np.zeros(int(self._surveyed.sum()))
+        self._observed = problem.observed.copy()
         self._row, self._column, self._value, self._component = problem.unknowns.prior_entries()
         prior, wanted = (self._row, self._column, self._value), problem.unknowns.wanted_pairs()
         self._equations = NormalEquations(problem.rows, prior, wanted, problem.unknowns.size)
-        self._weight = np.ones(problem.observed.size)
+        self._weight = np.where(self._surveyed, 0.0, 1.0)
         self._kinds, self._processes = np.ones(len(KINDS) + 1), np.ones(len(COMPONENTS))
 
-    def run(self) -> Estimate:
-        """All rounds."""
+    def without_surveys(self) -> Estimate:
+        """All rounds, with the surveys of control points left aside."""
         done = 0
         while done < min(_HUBER_ROUNDS, self.settings.max_rounds - 1):
             done += 1
             residual = self._solved()[1]
             if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
                 break
-        while True:
-            done += 1
-            estimate = self._judged(done)
-            if estimate.settled or done >= self.settings.max_rounds:
-                return estimate
+        estimate = self._rounds(done)
+        if self.settings.estimate_variance_components is None and self._is_understated(estimate):
+            self._estimating = True
+            estimate = self._rounds(estimate.rounds)
+        return estimate
+
+    def with_surveys(self, weight: Float64, observed: Float64, done: int) -> Estimate:
+        """Rounds from there on, with surveys that count by a weight of 1 or 0 each.
+
+        Parameters
+        ----------
+        observed : error that each survey states of itself, in its σ: 0, or an offset that all of them have.
+        done : rounds so far.
+        """
+        self._survey_weight = weight
+        self._observed[self._surveyed] = observed
+        self._weight[self._surveyed] = weight
+        return self._rounds(done)
+
+    def _rounds(self, done: int) -> Estimate:
+        """Rounds of IGG III after those that are done."""
+        for number in range(self.settings.max_rounds):
+            estimate = self._judged(done + number + 1, calm=number >= _CALM)
+            if estimate.settled:
+                break
+        return estimate
+
+    def survey_covariance(self) -> Float64:
+        """Covariance (m, m) of the errors of all surveyed coordinates, in their σ, by the last solution."""
+        unknowns = self.problem.unknowns
+        numbers = unknowns.of_control[unknowns.of_control >= 0]
+        return np.array([self._equations.solve(row)[numbers] for row in _unit_rows(numbers, unknowns.size)])
+
+    def response(self, shift: Float64) -> Float64:
+        """By how much the last solution (u,) moves where surveys state `shift` more of an error, in their σ."""
+        whole = np.zeros(self._observed.size)
+        whole[self._surveyed] = shift
+        scaled = self._counted() / self._own()
+        return self._equations.solve(self.problem.rows.transposed_times(scaled * whole, self.problem.unknowns.size))
 
     def _own(self) -> Float64:
         """Variance of each row beside that of the corrections at the knots."""
@@ -107,12 +156,12 @@ class Rounds:
     def _solved(self) -> tuple[Float64, Float64]:
         """Solution and residuals with the weights of now."""
         rows, scaled = self.problem.rows, self._counted() / self._own()
-        self._equations.factor(scaled, self._value / self._processes[self._component])
-        right = rows.transposed_times(scaled * self.problem.observed, self.problem.unknowns.size)
+        self._equations.factor(scaled, self._value / np.append(self._processes, 1.0)[self._component])
+        right = rows.transposed_times(scaled * self._observed, self.problem.unknowns.size)
         solution = self._equations.solve(right)
-        return solution, self.problem.observed - rows.times(solution)
+        return solution, self._observed - rows.times(solution)
 
-    def _judged(self, rounds: int) -> Estimate:
+    def _judged(self, rounds: int, *, calm: bool) -> Estimate:
         """One round of IGG III; it is settled when what comes out of it is what went in."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
@@ -121,15 +170,40 @@ class Rounds:
         without = left_out(residual, inverse.variances(self.problem.rows), own, self._counted())
         near, far = self.settings.full_weight_within, self.settings.reject_beyond
         wanted = self.problem.groups.igg_iii(without.statistic, near, far)
-        moved = self._moved_to(wanted if rounds < _CALM else 0.5 * (weight + wanted))
-        if self.settings.estimate_variance_components:
+        moved = self._moved_to(0.5 * (weight + wanted) if calm else wanted)
+        if self._estimating:
             moved = max(moved, self._new_factors(solution, inverse, residual, without, own, weight))
         return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
 
     def _moved_to(self, weight: Float64) -> float:
+        """Weights of the next round; one that has all but gone is 0, so that 0 says that a row does not count."""
+        weight = np.where(weight < _SETTLED, 0.0, weight)
+        weight[self._surveyed] = self._survey_weight
         moved = float(np.abs(weight - self._weight).max(initial=0.0))
         self._weight = weight
         return moved
+
+    def _is_understated(self, estimate: Estimate) -> bool:
+        """Whether the stated σ of a kind of observation, or of a component of the poses, is much too small.
+
+        Of observations the median tells, because those that contradict a σ that is too small were rejected.
+        """
+        statistic = np.abs(estimate.without.statistic)
+        wide = False
+        for kind in range(len(KINDS)):
+            here = statistic[self.problem.kind == kind]
+            if here.size >= _ENOUGH and (ratio := (float(np.median(here)) / _MEDIAN) ** 2) > _UNDERSTATED:
+                self._kinds[kind] = ratio
+                wide = True
+        if wide:
+            return True
+        kinds, processes = self._kinds.copy(), self._processes.copy()
+        own = self._own()
+        self._new_factors(
+            estimate.solution, estimate.inverse, estimate.residual, estimate.without, own, estimate.weight
+        )
+        found, self._kinds, self._processes = self._processes, kinds, processes
+        return bool((found > _UNDERSTATED).any())
 
     def _new_factors(
         self,
@@ -162,6 +236,13 @@ class Rounds:
             self._processes[component] = _stepped(factor, ratio, told)
         after = np.concatenate([self._kinds, self._processes])
         return float(np.abs(np.log(after / before)).max())
+
+
+def _unit_rows(numbers: Int64, size: int) -> Iterator[Float64]:
+    for number in numbers.tolist():
+        row = np.zeros(size)
+        row[number] = 1.0
+        yield row
 
 
 def _stepped(factor: float, ratio: float, redundancy: float, share: float = 1.0) -> float:

@@ -16,9 +16,9 @@ import scipy
 
 from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.control import Sighting
+from roadscan.adjust.control_test import quantile
 from roadscan.adjust.patches import level_from_map
 from roadscan.model.errors import ConfigError
-from roadscan.navigation.calibration.robust import length_limit
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -27,8 +27,6 @@ Bool = npt.NDArray[np.bool_]
 
 _THIN: Final = 1e-3
 """Points whose second extent is below this share of their first lie on a line."""
-_SIGMAS: Final = 3.5
-"""A point farther from where the others put it does not count."""
 _DOWN: Final = 2
 
 
@@ -216,13 +214,14 @@ class _Seen:
         return (away * weight).sum(axis=0) / weight.sum(axis=0), sigma
 
 
-def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64) -> RigidFit:
+def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64, false_alarm: float = 0.01) -> RigidFit:
     """The movement of a survey onto its targets.
 
     Parameters
     ----------
     sightings : of ground control, placed and with a height.
     sigma_pose_m : (n, 3) 1 σ of the pose of each, north, east, down.
+    false_alarm : chance that one of all points is left out although all are right.
 
     Raises
     ------
@@ -244,7 +243,7 @@ def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64) -> RigidFit:
     points = np.unique(seen.point)
     while True:
         left = [seen.left_out(int(point), counting) for point in points]
-        worst = np.array([_contradiction(*one) for one in left])
+        worst = np.array([_contradiction(*one, false_alarm, 2 * points.size) for one in left])
         worst[~np.isin(points, seen.point[counting])] = 0.0
         if not worst.size or worst.max() <= 1.0:
             break
@@ -260,9 +259,10 @@ def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64) -> RigidFit:
     return RigidFit(found, origin, turned, control)
 
 
-def _contradiction(away_m: Float64, sigma_m: Float64) -> float:
+def _contradiction(away_m: Float64, sigma_m: Float64, false_alarm: float, tests: int) -> float:
     """How far a point lies from where the others put it, in limits of its height or of its place; 0: not known."""
     if not np.isfinite(away_m).all():
         return 0.0
     sigmas = np.abs(away_m / sigma_m)
-    return float(max(sigmas[_DOWN] / _SIGMAS, np.hypot(*sigmas[:_DOWN]) / length_limit(_SIGMAS, 2)))
+    limits = [quantile(false_alarm, tests, numbers) for numbers in (1, 2)]
+    return float(max(sigmas[_DOWN] / limits[0], np.hypot(*sigmas[:_DOWN]) / limits[1]))

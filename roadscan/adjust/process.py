@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.model.errors import ConfigError
@@ -120,6 +119,15 @@ class RunPrior:
         return np.array([p.tau_s for p in self.processes])
 
 
+@dataclass(frozen=True)
+class MountingPrior:
+    """What is known of the mounting of a sensor, which all runs share, before the adjustment."""
+
+    sensor: str
+    sigma: Float64
+    """(6,) 1 σ of its errors (m, rad), in the order of `MOUNTED`; 0: not estimated."""
+
+
 def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
     """Epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
 
@@ -170,26 +178,6 @@ def stretches(there: npt.NDArray[np.bool_]) -> list[slice]:
     """Runs of neighbours that are True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-def mean_over_time(prior: RunPrior, knots_gps_ns: Int64, values: Float64) -> tuple[Float64, Float64]:
-    """Mean over a run's time of values (k, 6) at its knots, linear between them, and its 1 σ (6,).
-
-    That σ is the one of the run's processes alone.
-    """
-    parts = prior.parts_at(knots_gps_ns)
-    if knots_gps_ns.size == 1:
-        return values[0], np.sqrt((parts[0] ** 2).reshape(-1, len(COMPONENTS)).sum(axis=0))
-    step = np.diff(knots_gps_ns) / NS_PER_S
-    share = 0.5 * (np.append(step, 0.0) + np.append(0.0, step)) / step.sum()
-    variance = np.zeros(len(COMPONENTS))
-    for column, own in enumerate((share[:, None] * parts).T):
-        component = column % len(COMPONENTS)
-        for one in stretches(own > 0.0):
-            diagonal, beside = precision_of(knots_gps_ns[one], prior.processes[component].tau_s)
-            bands = np.stack([diagonal, np.append(beside, 0.0)])
-            variance[component] += own[one] @ scipy.linalg.solveh_banded(bands, own[one], lower=True)
-    return share @ values, np.sqrt(variance)
 
 
 def line_variance(

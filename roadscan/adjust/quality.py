@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, ControlErrors
-from roadscan.adjust.process import mean_over_time
+from roadscan.adjust.adjustment import ControlErrors
 from roadscan.model.errors import ConfigError
 
 Float64 = npt.NDArray[np.float64]
@@ -63,13 +62,17 @@ class HorizontalAccuracy:
     """RMSE_H of ASPRS (2023): with the σ of the check points' own survey."""
 
 
-def vertical_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> VerticalAccuracy:
+def vertical_accuracy(
+    error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0, point: Int64 | None = None
+) -> VerticalAccuracy:
     """Accuracy of heights.
 
     Parameters
     ----------
     error_m : (n,) surface minus survey; NaN where there is none.
     survey_sigma_m : 1 σ of the check points' own heights, one value or (n,).
+    point : (n,) number of the point of each error, where passes saw a point several times: it counts once, with the
+        mean of its errors, of their sizes and of their squares.
 
     Raises
     ------
@@ -83,21 +86,26 @@ def vertical_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> 
     """
     there = np.asarray(np.isfinite(error_m), dtype=bool)
     error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
-    rmse = _rms(error)
-    deviation = float(error.std(ddof=1)) if error.size > 1 else float("nan")
+    count, share = _shares(error.shape[0], None if point is None else point[there])
+    rmse, mean = _rms(error, share), float(share @ error)
+    spread = max(rmse**2 - mean**2, 0.0)
+    deviation = float(np.sqrt(spread * count / (count - 1))) if count > 1 else float("nan")
     return VerticalAccuracy(
-        error.size, float(error.mean()), float(np.abs(error).mean()), deviation, rmse,
-        float(np.abs(error).max()), NSSDA_VERTICAL * rmse, float(np.hypot(rmse, _rms(survey))),
+        count, mean, float(share @ np.abs(error)), deviation, rmse,
+        float(np.abs(error).max()), NSSDA_VERTICAL * rmse, float(np.hypot(rmse, _rms(survey, share))),
     )  # fmt: skip
 
 
-def horizontal_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -> HorizontalAccuracy:
+def horizontal_accuracy(
+    error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0, point: Int64 | None = None
+) -> HorizontalAccuracy:
     """Accuracy of places in the plane.
 
     Parameters
     ----------
     error_m : (n, 2) north and east, surface minus survey; NaN where there is none.
     survey_sigma_m : 1 σ of each coordinate of the check points' own survey, one value, (n, 1) or (n, 2).
+    point : as of :func:`vertical_accuracy`.
 
     Raises
     ------
@@ -111,10 +119,12 @@ def horizontal_accuracy(error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0) -
     """
     there = np.asarray(np.isfinite(error_m).all(axis=1), dtype=bool)
     error, survey = _there(error_m, there), np.broadcast_to(survey_sigma_m, error_m.shape)[there]
-    north, east = _rms(error[:, 0]), _rms(error[:, 1])
-    rmse_r, of_survey = float(np.hypot(north, east)), float(np.hypot(_rms(survey[:, 0]), _rms(survey[:, 1])))
+    count, share = _shares(len(error), None if point is None else point[there])
+    north, east = _rms(error[:, 0], share), _rms(error[:, 1], share)
+    of_survey = float(np.hypot(_rms(survey[:, 0], share), _rms(survey[:, 1], share)))
+    rmse_r = float(np.hypot(north, east))
     return HorizontalAccuracy(
-        len(error), float(error[:, 0].mean()), float(error[:, 1].mean()), float(np.hypot(*error.T).mean()),
+        count, float(share @ error[:, 0]), float(share @ error[:, 1]), float(share @ np.hypot(*error.T)),
         north, east, rmse_r, NSSDA_HORIZONTAL * rmse_r, float(np.hypot(rmse_r, of_survey)),
     )  # fmt: skip
 
@@ -137,7 +147,7 @@ class LeaveOneOut:
 def leave_one_out(control: ControlErrors) -> LeaveOneOut:
     """Accuracy by leaving out one control coordinate at a time, from the one adjustment that there is.
 
-    Surveys that the adjustment rejected are left out of the figures, not of `normalised`.
+    Surveys that were found wrong are left out of the figures, not of `normalised`.
     """
     kept = np.where(control.weight > 0.0, control.left_out_m, np.nan)
     # Down is the height's negative; errors are surface minus survey.
@@ -147,27 +157,6 @@ def leave_one_out(control: ControlErrors) -> LeaveOneOut:
         horizontal_accuracy(level) if np.isfinite(level).all(axis=1).any() else None,
         control.left_out_m / np.where(control.left_out_sigma_m > 0.0, control.left_out_sigma_m, np.nan),
     )
-
-
-@dataclass(frozen=True)
-class MeanCorrections:
-    """By how much each run was moved as a whole."""
-
-    mean: Float64
-    """(runs, 6) mean of the corrections over the run's time (m, rad), `COMPONENTS`."""
-    normalised: Float64
-    """(runs, 6) over the σ that the run's process has for it; NaN where a component is not corrected. Several σ, alike
-    in all runs, are no error of navigation: control and trajectories are of two datums or frames."""
-
-
-def mean_corrections(adjustment: Adjustment) -> MeanCorrections:
-    """The mean correction of each run, held against its prior.
-
-    Control that is wrong as a whole contradicts nothing but the prior, so no single point is rejected for it.
-    """
-    runs = zip(adjustment.priors, adjustment.epochs_gps_ns, adjustment.values, strict=True)
-    mean, sigma = (np.array(both) for both in zip(*(mean_over_time(*one) for one in runs), strict=True))
-    return MeanCorrections(mean, mean / np.where(adjustment.active, sigma, np.nan))
 
 
 @dataclass(frozen=True)
@@ -213,13 +202,14 @@ class DistanceClass:
     accuracy: VerticalAccuracy
 
 
-def accuracy_by_distance(distance_m: Float64, error_m: Float64) -> list[DistanceClass]:
+def accuracy_by_distance(distance_m: Float64, error_m: Float64, point: Int64 | None = None) -> list[DistanceClass]:
     """How the error of heights grows with the distance to ground control, by class that holds a point.
 
     Parameters
     ----------
     distance_m : (n,) along the road to the nearest ground control that counts; NaN where there is none.
     error_m : (n,) surface minus survey; NaN where there is none.
+    point : as of :func:`vertical_accuracy`.
     """
     known = np.isfinite(distance_m) & np.isfinite(error_m)
     number = np.searchsorted(np.array(DISTANCES_M), distance_m, side="right") - 1
@@ -227,7 +217,8 @@ def accuracy_by_distance(distance_m: Float64, error_m: Float64) -> list[Distance
     for k in np.unique(number[known]).tolist():
         own = known & (number == k)
         mean = float(distance_m[own].mean())
-        found.append(DistanceClass(DISTANCES_M[k], DISTANCES_M[k + 1], mean, vertical_accuracy(error_m[own])))
+        accuracy = vertical_accuracy(error_m[own], point=None if point is None else point[own])
+        found.append(DistanceClass(DISTANCES_M[k], DISTANCES_M[k + 1], mean, accuracy))
     return found
 
 
@@ -247,5 +238,13 @@ def _there(error_m: Float64, there: npt.NDArray[np.bool_]) -> Float64:
     return error_m[there]
 
 
-def _rms(values: Float64) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _shares(size: int, point: Int64 | None) -> tuple[int, Float64]:
+    """Number of points, and the share (n,) of each error in their mean: all points count alike."""
+    if point is None:
+        return size, np.full(size, 1.0 / size)
+    _, own, seen = np.unique(point, return_inverse=True, return_counts=True)
+    return seen.size, 1.0 / (seen.size * seen[own.ravel()])
+
+
+def _rms(values: Float64, share: Float64) -> float:
+    return float(np.sqrt(share @ values**2))

@@ -1,8 +1,8 @@
 """The unknowns of an adjustment, and its observations as rows of them.
 
 Unknowns are in units of their prior σ: the parts of the corrections of each run's components at its knots
-(:mod:`roadscan.adjust.process`), then the errors of the
-surveyed coordinates of control points (north, east, down), which all runs that saw a point share.
+(:mod:`roadscan.adjust.process`), then the errors of the surveyed coordinates of control points (north, east, down),
+which all runs that saw a point share, then those of the mountings of sensors, which all runs share.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS, FIXED, Observations
-from roadscan.adjust.process import RunPrior, knots_of, line_variance, precision_of, stretches
+from roadscan.adjust.process import MountingPrior, RunPrior, knots_of, line_variance, precision_of, stretches
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
@@ -78,16 +78,22 @@ class Unknowns:
     sigmas: tuple[Float64, ...]
     """(k, 6), or (k, 12) where a run has outages: σ of the parts of each run's processes at its knots; 0: not there."""
     control: ControlPoints
+    mountings: tuple[MountingPrior, ...] = ()
 
     @classmethod
     def of(
-        cls, priors: Sequence[RunPrior], control: ControlPoints, spacing_s: float, components: npt.NDArray[np.bool_]
+        cls,
+        priors: Sequence[RunPrior],
+        control: ControlPoints,
+        spacing_s: float,
+        components: npt.NDArray[np.bool_],
+        mountings: Sequence[MountingPrior] = (),
     ) -> Unknowns:
         """Knots at most `spacing_s` apart; only some components are estimated."""
         knots = tuple(knots_of(p, spacing_s) for p in priors)
         parts = [p.parts_at(own) for p, own in zip(priors, knots, strict=True)]
         sigmas = tuple(own * np.tile(components, own.shape[1] // _SIZE) for own in parts)
-        return cls(tuple(priors), knots, sigmas, control)
+        return cls(tuple(priors), knots, sigmas, control, tuple(mountings))
 
     @cached_property
     def active(self) -> npt.NDArray[np.bool_]:
@@ -103,7 +109,25 @@ class Unknowns:
     @property
     def size(self) -> int:
         """Number of unknowns."""
+        return self.first_mounting + int((self.mount_sigma > 0.0).sum())
+
+    @property
+    def first_mounting(self) -> int:
+        """The first unknown of a mounting."""
         return int(self.first[-1]) + int((self.control.sigma_m > 0.0).sum())
+
+    @cached_property
+    def mount_sigma(self) -> Float64:
+        """(s, 6) prior σ of the mountings."""
+        return np.array([one.sigma for one in self.mountings]).reshape(-1, _SIZE)
+
+    @cached_property
+    def of_mountings(self) -> Int64:
+        """(s, 6) unknown of each component of the mountings, −1: none."""
+        there = self.mount_sigma > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first_mounting + np.arange(int(there.sum()))
+        return numbers
 
     @cached_property
     def of_control(self) -> Int64:
@@ -142,7 +166,7 @@ class Unknowns:
         """
         n, width = observations.size, max((own.shape[1] for own in self.sigmas), default=_SIZE)
         unknown = np.full((n, 4 * width + 3), -1, np.int64)
-        derivative, variance = np.zeros((n, 4 * width + 3)), np.zeros((n, _SIZE))
+        derivative, variance = np.zeros(unknown.shape), np.zeros((n, _SIZE))
         for run in range(len(self.priors)):
             numbers, sigma = self.of_run(run), self.sigmas[run]
             parts, own = sigma.shape[1] // _SIZE, sigma.shape[1]
@@ -160,12 +184,25 @@ class Unknowns:
         seen = point >= 0
         unknown[seen, -3:] = self.of_control[point[seen]]
         derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
-        return Rows.of(unknown, derivative), variance
+        mounted, by_mounting = self._of_mounted(observations)
+        return Rows.of(np.hstack([unknown, mounted]), np.hstack([derivative, by_mounting])), variance
+
+    def _of_mounted(self, observations: Observations) -> tuple[Int64, Float64]:
+        """Unknowns and derivatives (n, 12), of the mountings of both ends; (n, 0) where none is estimated."""
+        n = observations.size
+        if not self.mountings:
+            return np.zeros((n, 0), np.int64), np.zeros((n, 0))
+        here = observations.sensor >= 0
+        unknown, derivative = np.full((n, 2, _SIZE), -1, np.int64), np.zeros((n, 2, _SIZE))
+        unknown[here] = self.of_mountings[observations.sensor[here]]
+        derivative[here] = observations.mount_partials[here] * self.mount_sigma[observations.sensor[here]]
+        return unknown.reshape(n, -1), derivative.reshape(n, -1)
 
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
-        """Upper entries of the prior's inverse covariance: row, column, value, component (control: `len(COMPONENTS)`).
+        """Upper entries of the prior's inverse covariance: row, column, value, component.
 
-        Those of control points are not among them: their survey is an observation, which may be wrong.
+        Mountings have the component `len(COMPONENTS)`. Those of control points are not among them: their survey is an
+        observation, which may be wrong.
         """
         parts: list[tuple[Int64, Int64, Float64, Int64]] = []
         for run, prior in enumerate(self.priors):
@@ -177,6 +214,9 @@ class Unknowns:
                     row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
                     value = np.concatenate([diagonal, beside])
                     parts.append((row, column, value, np.full(row.size, component, np.int64)))
+        mounted = self.of_mountings[self.of_mountings >= 0]
+        if mounted.size:
+            parts.append((mounted, mounted, np.ones(mounted.size), np.full(mounted.size, _SIZE, np.int64)))
         if not parts:
             empty = np.zeros(0, np.int64)
             return empty, empty, np.zeros(0), empty
@@ -185,7 +225,7 @@ class Unknowns:
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
         """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point."""
-        parts = [_pairs(self.of_control, self.of_control)]
+        parts = [_pairs(self.of_control, self.of_control), _pairs(self.of_mountings, self.of_mountings)]
         for run in range(len(self.priors)):
             numbers = self.of_run(run)
             parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]

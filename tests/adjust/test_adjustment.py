@@ -13,12 +13,14 @@ from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
 from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
-from roadscan.adjust.quality import mean_corrections
 from roadscan.model.errors import ConfigError
 
 S = 10**9
 START = 10**18
-ALL_COUNT = AdjustmentSettings(knot_spacing_s=0.5, full_weight_within=1e6, reject_beyond=2e6)
+ALL_COUNT = AdjustmentSettings(
+    knot_spacing_s=0.5, full_weight_within=1e6, reject_beyond=2e6, estimate_variance_components=False, false_alarm=0.0,
+    datum_offset="follow", datum_false_alarm=0.0,
+)  # fmt: skip
 PROCESSES = (
     GaussMarkov(0.010, 100.0), GaussMarkov(0.012, 80.0), GaussMarkov(0.015, 120.0),
     GaussMarkov(1e-4, 60.0), GaussMarkov(1e-4, 60.0), GaussMarkov(2e-4, 30.0),
@@ -321,20 +323,37 @@ def test_a_wrong_control_point_is_named_and_not_absorbed() -> None:
     assert rms[1] < 1.5 * rms[0]
 
 
-def test_control_that_is_wrong_as_a_whole_is_told_by_the_means() -> None:
-    """60 mm between two height datums, which no single point contradicts; 0.5 m, which none of them gets through."""
-    observations, _, _ = drawn(ROAD, 21)
-    right = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
-    assert np.abs(right.normalised).max() < 4.0
+@pytest.mark.parametrize("offset_m", [0.06, -0.3, 0.5])
+def test_control_that_is_wrong_as_a_whole_does_not_move_the_road(offset_m: float) -> None:
+    """An offset between two height datums, which no single point contradicts: it is estimated, and σ holds it."""
+    observations, stations, truth = drawn(ROAD, 21)
+    right = adjust(observations, ROAD.priors(), AdjustmentSettings())
+    assert right.verdict.doubted == ()
     height = observations.kind == KINDS.index("control_height")
-    observations.observed_m[height] += 0.06
-    moved = mean_corrections(adjust(observations, ROAD.priors(), AdjustmentSettings()))
-    np.testing.assert_allclose(moved.mean[:, 2] - right.mean[:, 2], 0.06, atol=0.005)
-    assert (moved.normalised[:, 2] > 3.0).all()
-    observations.observed_m[height] += 0.44
+    observations.observed_m[height] += offset_m
     found = adjust(observations, ROAD.priors(), AdjustmentSettings())
-    assert (found.control.weight[:, 2] == 0.0).all()
-    assert np.abs(mean_corrections(found).mean[:, 2]).max() < 0.02
+    assert found.verdict.doubted == ("height",)
+    assert not found.verdict.wrong
+    sigma = found.verdict.offset.sigma_m("height")
+    assert found.verdict.offset.offset_m[2] == pytest.approx(offset_m, abs=3 * sigma)
+    # Three independent drives know their mean height to 15 mm over the root of three, about.
+    assert sigma == pytest.approx(0.015 / np.sqrt(3), rel=0.25)
+    off = heights_off(found, ROAD, stations, truth)
+    assert np.abs(off).max() < 3 * found.sigma[0][:, 2].mean()
+    assert found.sigma[0][:, 2].mean() == pytest.approx(sigma, rel=0.2)
+    # The shape is that of the control: the error is the same everywhere.
+    assert off.std() < 1.2 * heights_off(right, ROAD, stations, truth).std() + 1e-4
+    # Of the user who trusts it, it is followed, and σ holds the offset.
+    followed = adjust(observations, ROAD.priors(), AdjustmentSettings(datum_offset="follow"))
+    assert heights_off(followed, ROAD, stations, truth).mean() == pytest.approx(offset_m, abs=0.005)
+    assert np.abs(offset_m) < 1.5 * followed.sigma[0][:, 2].min()
+    refused = adjust(observations, ROAD.priors(), AdjustmentSettings(datum_offset="leave_out"))
+    assert (refused.control.weight[:, 2] == 0.0).all()
+    assert (refused.control.weight[:, :2] == 1.0).all()
+    # Who states the σ of the datum gets the weighted mean of both.
+    stated = adjust(observations, ROAD.priors(), AdjustmentSettings(sigma_datum_m=abs(offset_m)))
+    assert stated.verdict.doubted == ()
+    assert np.abs(heights_off(stated, ROAD, stations, truth)).max() < 3 * stated.sigma[0][:, 2].mean()
 
 
 def test_a_target_that_one_run_saw_wrongly_costs_that_one() -> None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from roadscan.adjust.adjustment import AdjustmentSettings, ControlErrors, adjust
-from roadscan.adjust.observations import Observations
-from roadscan.adjust.process import GaussMarkov, RunPrior
+from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.quality import (
     accuracy_by_distance,
     asprs_three_dimensional,
     horizontal_accuracy,
     leave_one_out,
-    mean_corrections,
     nearest_m,
     relative_accuracy,
     vertical_accuracy,
@@ -77,17 +72,15 @@ def test_leave_one_out_leaves_the_rejected_out_of_its_figures() -> None:
     assert np.isnan(found.normalised[:, :2]).all()
 
 
-def test_the_mean_of_a_process_has_the_spread_that_it_is_held_against() -> None:
-    """Drawn processes of three lengths as if they were corrections."""
-    rng = np.random.default_rng(9)
-    process = GaussMarkov(0.015, 60.0)
-    for seconds in (5, 60, 600):
-        times = np.linspace(0.0, seconds, 101)
-        root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 60.0) + 1e-12 * np.eye(101))
-        runs = [RunPrior(str(i), 0, seconds * 10**9, (process,) * 6) for i in range(200)]
-        nothing = adjust(Observations.none(), runs, AdjustmentSettings(knot_spacing_s=seconds / 100))
-        drawn = replace(nothing, values=tuple(0.015 * root @ rng.standard_normal((101, 6)) for _ in runs))
-        assert np.std(mean_corrections(drawn).normalised) == pytest.approx(1.0, rel=0.08)
+def test_a_point_that_several_passes_saw_counts_once() -> None:
+    error, point = np.array([0.03, -0.03, 0.01, 0.02]), np.array([7, 7, 7, 9])
+    found = vertical_accuracy(error, 0.01, point)
+    assert found.count == 2
+    assert found.mean == pytest.approx((0.01 / 3 + 0.02) / 2)
+    assert found.mean_absolute == pytest.approx((0.07 / 3 + 0.02) / 2)
+    assert found.rmse == pytest.approx(np.sqrt((0.0019 / 3 + 0.0004) / 2))
+    level = horizontal_accuracy(np.stack([error, 0 * error], axis=-1), 0.01, point)
+    assert (level.count, level.rmse_r) == (2, pytest.approx(found.rmse))
 
 
 def test_passes_agree_by_section() -> None:

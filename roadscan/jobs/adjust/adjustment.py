@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,10 +22,19 @@ from roadscan.jobs.adjust.control_work import (
     load_sightings,
     sight_control,
 )
+from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.mountings import (
+    calibrated_sigma,
+    held_values,
+    mounted_of,
+    mounting_findings,
+    mounting_lines,
+    publish_mountings,
+)
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
-from roadscan.jobs.adjust.publication import digest_of, foreign_runs, publish
+from roadscan.jobs.adjust.publication import digests_of, foreign_runs, publish
 from roadscan.jobs.adjust.seams import shown_seams
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
 from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
@@ -36,6 +45,7 @@ from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.session import Session
 from roadscan.model.settings.tie_settings import PlaceSettings
+from roadscan.model.witness import Finding
 from roadscan.navigation.movement import largest
 from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord
@@ -73,6 +83,8 @@ def solution_key(plan: SurveyPlan) -> str:
     ]
     return key_of(
         code_digest(f"{__name__}:adjust_survey"), config.model_dump(mode="json"), runs_of(plan), sources, beside,
+        [[name, s.lever_arm_sigma_m, s.boresight_sigma_deg] for name, s in sorted(plan.survey.rig.sensors.items())],
+        sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
         None if picked is None or not picked.is_file() else file_digest(picked), sorted(foreign_runs(plan.store)),
     )  # fmt: skip
 
@@ -86,7 +98,7 @@ def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
         return False
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
-    return whole and record.figures()["table"] == digest_of(plan.store)
+    return whole and record.figures()["table"] == digests_of(plan.store)
 
 
 def withdraw(session: Session) -> None:
@@ -94,6 +106,7 @@ def withdraw(session: Session) -> None:
     manifest, plan = session.manifest, session.plan
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, plan.survey.config.adjust)
+    publish_mountings(session.store, None, plan.survey.config.adjust)
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
@@ -107,34 +120,39 @@ def adjust_survey(session: Session) -> None:
     priors = priors_of(plan, sources, runs)
     work = plan_work(plan, sources, priors)
     failed = _collect(session, work)
-    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs)
+    mounted = mounted_of(plan, sources, foreign=bool(foreign))
+    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs, mounted)
     sightings, pictures = load_sightings(session.store, manifest, work.control)
-    evidence = Evidence(runs, priors, ties, tuple(sightings))
-    notes = [
-        f"the poses of run '{run}' were corrected by another program: they are not adjusted" for run in sorted(foreign)
+    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted)
+    doubts = [
+        CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
+        for run in sorted(foreign)
     ]
     if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
+        publish_mountings(session.store, None, plan.survey.config.adjust)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
-        _keep(session, key, {}, (lines, notes + _of_points(work, sightings)), failed)
+        _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed)
         return
     solution = solve(plan, evidence)
     held = publish(session.store, solution.corrections, plan.survey.config.adjust)
-    points = control_rows(evidence, solution, held)
+    changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
+    added = held_values(mounted, changes)
+    points = control_rows(evidence, solution, held, added)
     tables = {
-        "tie_residuals": tie_rows(evidence, solution, held),
+        "tie_residuals": tie_rows(evidence, solution, held, added),
         "control_residuals": points,
-        "relative_accuracy": relative_rows(evidence, work.tracks, held),
+        "relative_accuracy": relative_rows(evidence, work.tracks, held, added),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
         "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
-    seams, not_drawn = shown_seams(work.ties, evidence, solution, held, session.compute)
+    seams, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
-    lines = _lines(work, evidence, solution, held, tables)
-    notes += [*solution.notes, *_of_points(work, sightings), *not_drawn]
-    _keep(session, key, held, (lines, notes), failed)
+    lines = [*_lines(work, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    doubts += [*solution.findings, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
+    _keep(session, key, held, (lines, doubts), failed)
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
@@ -179,10 +197,13 @@ def _collect(session: Session, work: Work) -> bool:
     return bool(found)
 
 
-def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[str]], failed: bool) -> None:
+def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], failed: bool) -> None:
     """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
-    lines, notes = said
-    detail = {"runs": sorted(held), "table": digest_of(session.store), "lines": lines, "notes": notes}
+    lines, doubts = said
+    detail = {
+        "runs": sorted(held), "table": digests_of(session.store), "lines": lines,
+        "findings": [asdict(one) for one in doubts],
+    }  # fmt: skip
     own = key if not failed else key_of(key, "failed")
     session.manifest.add([OutputRecord(ADJUSTMENT, SOLUTION, own, "", 0, "", json.dumps(detail))])
     for line in lines:
@@ -196,28 +217,21 @@ def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
     return f"{seen} of {len(work.points)} control points seen"
 
 
-def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[str]:
-    """Notes of points that were not found as they should be."""
-    notes: list[str] = []
+def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
+    """Findings on points that no pass saw, and on targets that are not as they should be."""
+    found: list[Finding] = []
     if work.points and not work.control:
-        notes.append(
+        text = (
             f"not one of the {len(work.points)} control points lies where a pass drove: check crs of their [[control]]"
         )
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(work.points)))
     elif beside := _beside(work, sightings):
-        notes.append(
+        text = (
             f"{len(beside)} of {len(work.points)} control points lie where no pass saw the road: {listed(beside)}; "
             "they are of another stretch, or in another CRS"
         )
-    for status, words in (
-        ("missed", "targets were not found"),
-        ("doubled", "targets are there more than once"),
-        ("moved", "targets lie elsewhere than surveyed"),
-    ):
-        own = [one for one in sightings if one.status == status]
-        if own:
-            told = [f"{one.point.name} in {one.sensor}: {one.why_not}" for one in own]
-            notes.append(f"{len(own)} {words}: {listed(told)}")
-    return notes
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(beside)))
+    return found + target_findings(sightings)
 
 
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
@@ -256,12 +270,12 @@ def _lines(
         if was and now:
             lines.append(
                 f"check points, {component}: RMSE {was['rmse_m'] * 1e3:.2f} mm before, {now['rmse_m'] * 1e3:.2f} mm "
-                f"after, 95 % within {now['nssda_95_m'] * 1e3:.2f} mm (NSSDA, {now['count']} sightings)"
+                f"after, 95 % within {now['nssda_95_m'] * 1e3:.2f} mm (NSSDA, {now['count']} points)"
             )
     left = by.get(("left_out", "height", "adjusted"))
     if left:
         lines.append(f"each GCP against all other evidence, height: RMSE {left['rmse_m'] * 1e3:.2f} mm")
-    return lines
+    return [*lines, *solution.lines]
 
 
 def _rms(values: Sequence[float]) -> float:

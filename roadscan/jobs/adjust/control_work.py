@@ -17,6 +17,7 @@ from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.jobs.adjust.tracks import runs_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
@@ -147,7 +148,7 @@ def control_tasks(
     priors : of each run, in the order of the survey file.
     """
     config = plan.survey.config.adjust
-    runs = tuple(run.id for run in plan.survey.config.runs)
+    runs = runs_of(plan)
     settings = TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
     code, picked = code_digest(f"{__name__}:sight_control"), picked_places(plan, points)
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]

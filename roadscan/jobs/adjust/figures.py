@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from roadscan.adjust.control import Sighting, moved_m
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
+    DistanceClass,
     HorizontalAccuracy,
     VerticalAccuracy,
     accuracy_by_distance,
@@ -21,18 +22,21 @@ from roadscan.adjust.quality import (
     vertical_accuracy,
 )
 from roadscan.jobs.adjust.solution import Evidence, Solution
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Rows = list[dict[str, Any]]
 Held = Mapping[str, Corrections]
+_AT_THEIR_PLACE: Final = ("found", "picked")
+"""A check point whose target lies elsewhere than surveyed says nothing of the poses' error in the plane."""
 
 
-def tie_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
-    """Of the table `tie_residuals`."""
+def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
+    """Of the table `tie_residuals`; mounted : (s, 6) what is added to the mountings."""
     ties = evidence.ties
-    after = left_after(ties.observations, held, evidence.runs)
+    after = left_after(ties.observations, held, evidence.runs, mounted)
     names = ("place", "kind", "first_run", "second_run", "easting_m", "northing_m", "accepted", "sigma_m")
     columns = {name: np.asarray(ties.columns[name]).tolist() for name in names}
     columns |= {"before_m": ties.observations.observed_m.tolist(), "after_m": after.tolist()}
@@ -40,12 +44,12 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
     return _rows(columns)
 
 
-def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held) -> Rows:
+def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
     """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run."""
     ties = evidence.ties
     own = ties.accepted
     observations = ties.observations.chosen(own)
-    after = left_after(observations, held, evidence.runs)
+    after = left_after(observations, held, evidence.runs, mounted)
     kinds = np.asarray(ties.columns["kind"])[own]
     rows: Rows = []
     for number in np.unique(observations.run[:, 0]).tolist():
@@ -77,12 +81,13 @@ def _station_m(track: Track, epochs_gps_ns: Int64) -> Float64:
 def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Sequence[Track]) -> Rows:
     """Of the table `accuracy_by_distance`, from rows of `control_residuals`.
 
-    Where all runs are adjusted together, a control point that is left out counts once, in the first run that saw it.
+    A check point counts once, with the mean of what the passes say of it. Where all runs are adjusted together, a
+    control point that is left out counts once, in the first run that saw it.
     """
     seen = [row for row in rows if row["height_before_m"] is not None]
     tracked = {track.run: track for track in reversed(tracks)}
-    found: dict[str, list[tuple[float, float]]] = {"check": [], "left_out": []}
-    counted: set[tuple[int, int]] = set()
+    found: dict[str, list[tuple[float, float, float]]] = {"check": [], "left_out": []}
+    counted: dict[tuple[int, int], int] = {}
     for number, run in enumerate(evidence.runs):
         own = [row for row in seen if row["run"] == run]
         if not own or number not in tracked:
@@ -93,32 +98,41 @@ def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Se
         away = nearest_m(station, points, station[control], points[control]).tolist()
         for row, distance_m in zip(own, away, strict=True):
             if row["role"] == "check":
-                found["check"].append((distance_m, -row["height_after_m"]))
+                found["check"].append((distance_m, -row["height_after_m"], row["point"]))
                 continue
             key = (row["point"], -1 if (row["point"], -1) in solution.points else number)
             left = row.get("left_out_height_m")
             if left is not None and (row.get("weight_height") or 0.0) > 0.0 and key not in counted:
-                counted.add(key)
-                found["left_out"].append((distance_m, -left))
+                counted[key] = len(counted)
+                found["left_out"].append((distance_m, -left, counted[key]))
     return [
         {
             "points": points, "from_m": one.from_m, "to_m": one.to_m if np.isfinite(one.to_m) else None,
             "count": one.accuracy.count, "mean_distance_m": one.mean_distance_m, "mean_m": one.accuracy.mean,
             "mean_absolute_m": one.accuracy.mean_absolute, "rmse_m": one.accuracy.rmse,
         }
-        for points, pairs in found.items()
-        for one in accuracy_by_distance(*np.array(pairs).reshape(-1, 2).T)
+        for points, rows_of in found.items()
+        for one in _by_distance(np.array(rows_of).reshape(-1, 3))
     ]  # fmt: skip
 
 
-def control_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
-    """Of the table `control_residuals`."""
-    return [_control_row(one, evidence, solution, held) for one in evidence.sightings]
+def _by_distance(rows: Float64) -> list[DistanceClass]:
+    """Classes of rows (n, 3): distance, error, number of the point."""
+    return accuracy_by_distance(rows[:, 0], rows[:, 1], rows[:, 2].astype(np.int64))
 
 
-def _control_row(one: Sighting, evidence: Evidence, solution: Solution, held: Held) -> dict[str, Any]:
+def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
+    """Of the table `control_residuals`; mounted : (s, 6) what is added to the mountings."""
+    return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
+
+
+def _control_row(
+    one: Sighting, evidence: Evidence, solution: Solution, held: Held, mounted: Float64
+) -> dict[str, Any]:  # fmt: skip
     point, run = one.point, evidence.runs[one.run]
-    moved = moved_m(one, held.get(run))
+    seen_by = evidence.seen_by(one)
+    mounting = None if seen_by.number < 0 else (MountingChange.of(mounted[seen_by.number]), seen_by.lever_body_m)
+    moved = moved_m(one, held.get(run), mounting)
     height = point.height_m - one.height_m
     east, north = point.easting_m - one.easting_m, point.northing_m - one.northing_m
     own = solution.point(point.number, one.run) if point.role == "gcp" else None
@@ -139,11 +153,15 @@ def _control_row(one: Sighting, evidence: Evidence, solution: Solution, held: He
             "left_out_height_m": own.left_out_height_m,
             "left_out_sigma_m": float(own.left_out_sigma_m[2]),
         }
-    refused = own is not None and own.weight_height == 0.0
+    refused = (
+        []
+        if own is None
+        else [w for w, x in (("height", own.weight_height), ("place", own.weight_horizontal)) if x == 0.0]
+    )
     named: dict[str, Any] = {
         "point": point.number, "name": point.name, "role": point.role, "run": run, "epoch_gps_ns": one.epoch_gps_ns,
         "easting_m": point.easting_m, "northing_m": point.northing_m, "status": one.status,
-        "why_not": one.why_not or ("its height contradicts all other evidence" if refused else ""),
+        "why_not": one.why_not or (f"all else contradicts its {' and its '.join(refused)}" if refused else ""),
     }  # fmt: skip
     return named | {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
 
@@ -153,18 +171,22 @@ def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
     found: Rows = []
     checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True) if row["role"] == "check"]
     for poses, word in (("recorded", "before"), ("adjusted", "after")):
-        upright = [(row[f"height_{word}_m"], one.point.sigma_height_m) for row, one in checks]
-        known = np.array([[-value, sigma] for value, sigma in upright if value is not None]).reshape(-1, 2)
-        if len(known):
-            found.append(_accuracy("check", "height", poses, vertical_accuracy(known[:, 0], known[:, 1])))
-        level = [
-            [-row[f"northing_{word}_m"], -row[f"easting_{word}_m"], one.point.sigma_horizontal_m]
+        upright = [
+            (-row[f"height_{word}_m"], one.point.sigma_height_m, row["point"])
             for row, one in checks
-            if row[f"northing_{word}_m"] is not None
+            if row[f"height_{word}_m"] is not None
+        ]
+        if upright:
+            errors, sigmas, points = np.array(upright).T
+            found.append(_accuracy("check", "height", poses, vertical_accuracy(errors, sigmas, points)))
+        level = [
+            (-row[f"northing_{word}_m"], -row[f"easting_{word}_m"], one.point.sigma_horizontal_m, row["point"])
+            for row, one in checks
+            if row["status"] in _AT_THEIR_PLACE
         ]
         if level:
-            errors = np.array(level)
-            accuracy = horizontal_accuracy(errors[:, :2], errors[:, 2:])
+            places = np.array(level)
+            accuracy = horizontal_accuracy(places[:, :2], places[:, 2:3], places[:, 3])
             found.append(_accuracy("check", "horizontal", poses, accuracy))
     left = solution.left_out
     if left is not None and left.vertical is not None:

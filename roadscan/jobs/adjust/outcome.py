@@ -14,7 +14,7 @@ from roadscan.codecs.grey_picture import write_png
 from roadscan.jobs.adjust.figures import Rows
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.navigate.recorded_pictures import keep_file
-from roadscan.model.witness import Finding, Witness
+from roadscan.model.witness import Finding
 from roadscan.products.pictures.adjustment import AdjustmentPicture, draw_adjustment
 from roadscan.products.pictures.seams import ShownSeam, draw_seams
 from roadscan.tables.manifest import Manifest, OutputRecord
@@ -42,20 +42,10 @@ def known_lines(manifest: Manifest) -> list[str]:
     return [] if record is None else list(record.figures()["lines"])
 
 
-CONTROL: Final = Witness(
-    "control",
-    input="control points",
-    fault="The survey of a point, its datum or its target is wrong.",
-    asks="all other points and passes, by the prediction of the adjustment without it",
-    does="a point that contradicts all other evidence does not count",
-    told=("findings",),
-)
-
-
 def known_findings(manifest: Manifest) -> list[Finding]:
     """What it found wrong."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
-    return [] if record is None else [CONTROL.finds("adjust", note) for note in record.figures()["notes"]]
+    return [] if record is None else [Finding.of(one) for one in record.figures()["findings"]]
 
 
 def keep_tables(store: Store, manifest: Manifest, key: str, tables: Mapping[str, Rows]) -> None:

@@ -4,34 +4,54 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, ControlErrors, adjust
-from roadscan.adjust.control import Sighting, observations_of
-from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height, listed, swapped
+from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.control import SeenBy, Sighting, observations_of
+from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
+from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
+from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.jobs.adjust.doubts import (
+    CONTROL,
+    CONTROL_DATUM,
+    HELMERT_TURN,
+    exchanged,
+    far_points,
+    not_held,
+    offset_findings,
+    offset_line,
+    power_line,
+    solver_findings,
+    solver_line,
+    wrong_points,
+)
+from roadscan.jobs.adjust.mountings import Mounted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
 from roadscan.jobs.navigate.pose_sigma import stated_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import TrajectorySource, load_recorded
-from roadscan.model.settings.adjust import PosePriors
-from roadscan.model.settings.adjustment import AdjustmentSettings
+from roadscan.model.settings.adjust import AdjustConfig, PosePriors
+from roadscan.model.settings.adjustment import AdjustmentSettings, ControlRules
+from roadscan.model.witness import Finding
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
+_WIDENED: Final = 3
+"""Adjustments, at most, until no mounting is off by more than its σ allows."""
 _NONE: Final = (GaussMarkov(0.0, 1.0),) * 6
 
 
@@ -45,6 +65,14 @@ class Evidence:
     """Of each of them; without σ where a run is not adjusted."""
     ties: KnownTies
     sightings: tuple[Sighting, ...]
+    mounted: Mounted
+
+    def seen_by(self, one: Sighting) -> SeenBy:
+        """The sensor that saw a point."""
+        if one.status == "unseen":
+            return SeenBy(-1, np.zeros(3))
+        lever = self.mounted.lever_m(self.runs[one.run], one.sensor, np.array([one.epoch_gps_ns], np.int64))
+        return SeenBy(self.mounted.number(one.sensor), lever[0])
 
 
 @dataclass(frozen=True)
@@ -73,11 +101,13 @@ class Solution:
     """By number of the point and run, −1 for all runs."""
     control: Observations
     """Of all sightings, check points too."""
-    notes: tuple[str, ...]
-    """What is wrong with the control."""
-    variance_factors: Mapping[str, float]
-    rounds: int
+    findings: tuple[Finding, ...]
+    """What is wrong with control, runs and stated σ."""
+    lines: tuple[str, ...]
+    """What the solution says of itself."""
     left_out: LeaveOneOut | None = None
+    mountings: MountingErrors | None = None
+    """What is wrong with the mountings of the sensors; None where they are not estimated."""
 
     def point(self, number: int, run: int) -> PointFigures | None:
         """Figures of a point as a run saw it."""
@@ -136,38 +166,88 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         where a Helmert transformation has too few points.
     """
     config = plan.survey.config.adjust
-    control = observations_of(evidence.sightings)
-    role = np.array([one.point.role == "gcp" for one in _by_observation(evidence.sightings)], bool)
+    control = observations_of(evidence.sightings, [evidence.seen_by(one) for one in evidence.sightings])
+    sightings = _by_observation(evidence.sightings)
+    role = np.array([one.point.role == "gcp" for one in sightings], bool)
     datum = datum_fault(evidence.sightings, config.control.largest_m)
     far = {} if datum else far_in_height(evidence.sightings, config.control.largest_m)
-    names = np.array([one.point.name for one in _by_observation(evidence.sightings)], dtype=object)
+    names = np.array([one.point.name for one in sightings], dtype=object)
     entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
-    notes = [datum] if datum else []
-    notes += _far_notes(far, evidence)
+    found = [CONTROL_DATUM.finds(CONTROL, datum, left_out=len(set(names.tolist())))] if datum else []
+    found += _far_findings(far, evidence)
     if config.mode == "helmert":
-        fit = _rigid_fit(evidence, entering)
-        points = _points(fit.control, 0)
-        notes += _wrong_notes(evidence.sightings, points)
-        return Solution(
-            _rigid_corrections(plan, evidence, fit), np.zeros(evidence.ties.observations.size), points, control,
-            tuple(notes), {}, 0, leave_one_out(fit.control),
-        )  # fmt: skip
-    accepted = evidence.ties.accepted
-    first_point = int(evidence.ties.observations.place.max(initial=-1)) + 1
-    points_apart = replace(control, place=control.place + first_point).chosen(entering)
-    joined = Observations.joined([evidence.ties.observations.chosen(accepted), points_apart])
-    settings = AdjustmentSettings(mode=config.mode, **config.solver.model_dump())
-    found = adjust(joined, evidence.priors, settings)
-    weight = np.zeros(accepted.size)
-    weight[accepted] = found.weight[: int(accepted.sum())]
-    points = _points(found.control, first_point)
-    notes += _wrong_notes(evidence.sightings, points)
-    reached = {int(run) for run in np.unique(joined.run) if run != FIXED and _moves(evidence.priors[int(run)])}
-    corrections = {evidence.runs[k]: _with_sigma(found, k) for k in sorted(reached)}
+        return _rigid_solution(plan, evidence, control, entering, found)
+    entering_ties = _entering(evidence)
+    adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    weight = np.zeros(entering_ties.size)
+    weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
+    points = _points(adjusted.control, first)
+    found += wrong_points(_wrong(evidence.sightings, adjusted, first))
+    counting = len(_counting_points(adjusted.control))
+    found += offset_findings(adjusted.verdict, adjusted.applied, counting)
+    joined = evidence.ties.observations.chosen(weight > 0.0)
+    found += _not_held(evidence, joined.run, control.chosen(entering), points)
+    found += solver_findings(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled)
+    reached = {
+        int(run) for run in np.unique([*joined.run.ravel(), *control.chosen(entering).run.ravel()]) if run != FIXED
+    }
+    moved = sorted(run for run in reached if _moves(evidence.priors[run]))
+    corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
+    lines = [
+        solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
+        offset_line(adjusted.verdict), power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
+    ]  # fmt: skip
     return Solution(
-        corrections, weight, points, control, tuple(notes), found.variance_factors, found.rounds,
-        leave_one_out(found.control) if found.control.place.size else None,
+        corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
+        leave_one_out(adjusted.control) if adjusted.control.place.size else None,
+        adjusted.mountings if adjusted.mountings.sensors else None,
     )  # fmt: skip
+
+
+def _entering(evidence: Evidence) -> Bool:
+    """Ties (t,) that enter: those that passed their tests, and for mountings those between heads of one pass."""
+    ties = evidence.ties
+    return ties.accepted | ties.of_heads if evidence.mounted.priors else ties.accepted
+
+
+def _adjusted(
+    config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
+) -> tuple[Adjustment, int]:
+    """The adjustment of ties and control, and the place that stands for point 0.
+
+    A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
+    as what was found, and the adjustment is made once more.
+    """
+    ties = evidence.ties.observations
+    first = int(ties.place.max(initial=-1)) + 1
+    joined = Observations.joined([ties.chosen(_entering(evidence)), replace(control, place=control.place + first)])
+    rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
+    settings = AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
+    priors = evidence.mounted.priors
+    for _ in range(_WIDENED):
+        found = adjust(joined, evidence.priors, settings, priors)
+        off = disproved(found.mountings)
+        if not off.any():
+            break
+        sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
+        priors = tuple(MountingPrior(one.sensor, own) for one, own in zip(priors, sigma, strict=True))
+    stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, 6)
+    return replace(found, mountings=replace(found.mountings, prior_sigma=stated)), first
+
+
+def _counting_points(control: ControlErrors) -> set[int]:
+    """Points of which a survey counts."""
+    return set(control.place[(control.weight > 0.0).any(axis=1)].tolist())
+
+
+def _not_held(
+    evidence: Evidence, links: Int32, control: Observations, points: Mapping[tuple[int, int], PointFigures]
+) -> list[Finding]:
+    """Runs that nothing holds, by ties that count and by points that do."""
+    right = {number for (number, _), own in points.items() if own.weight_height != 0.0 or own.weight_horizontal != 0.0}
+    held = {int(run) for run, point in zip(control.run.max(axis=1), control.place, strict=True) if int(point) in right}
+    moving = [number for number, prior in enumerate(evidence.priors) if _moves(prior)]
+    return not_held(evidence.runs, moving, np.asarray(links, np.int64), held)
 
 
 def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
@@ -196,75 +276,107 @@ def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFi
     return points
 
 
-def _far_notes(far: Mapping[str, float], evidence: Evidence) -> list[str]:
-    if not far:
-        return []
-    words = [f"{name} ({away:+.3f} m)" for name, away in sorted(far.items())]
-    notes = [
-        f"{len(far)} control points lie far above or below the road that was measured, and are not used: "
-        f"{listed(words)}; they are in another height datum or CRS, or under a bridge"
-    ]
+def _far_findings(far: Mapping[str, float], evidence: Evidence) -> list[Finding]:
     surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
     # The poses are as they were recorded.
     sigma = max(
         (float(evidence.priors[one.run].sigma_at(_epoch(one))[0, 2]) for one in evidence.sightings), default=0.0
     )
     points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
-    return notes + _swapped_notes(points)
+    return far_points(far) + exchanged(points)
 
 
-def _swapped_notes(points: Sequence[WrongPoint]) -> list[str]:
-    return [f"the heights of {one} and {other} look exchanged" for one, other in swapped(points)]
+def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> list[WrongPoint]:
+    """Points whose height or place is wrong, by name."""
+    by_number, control = {one.point.number: one.point for one in sightings}, adjusted.control
+    found: list[WrongPoint] = []
+    for one in adjusted.verdict.wrong:
+        point = by_number[int(control.place[one.point]) - first]
+        others = tuple(sorted(by_number[int(control.place[k]) - first].name for k in one.alternatives))
+        away = control.left_out_m[one.point]
+        height = -float(away[2]) if one.component == HEIGHT else float("nan")
+        place = float(np.hypot(*away[:2])) if one.component == PLACE else float("nan")
+        sigma = float(control.left_out_sigma_m[one.point, 2])
+        found.append(WrongPoint(point.name, height, place, sigma, point.height_m, one.sigmas, one.limit, others))
+    return sorted(found, key=lambda one: one.name)
 
 
-def _wrong_notes(
-    sightings: Sequence[Sighting], points: Mapping[tuple[int, int], PointFigures]
-) -> list[str]:  # fmt: skip
+def _rigid_solution(
+    plan: SurveyPlan, evidence: Evidence, control: Observations, entering: Bool, found: list[Finding]
+) -> Solution:
+    """The survey as a whole, shifted and turned onto its control."""
+    config = plan.survey.config.adjust
+    fit = _rigid_fit(evidence, entering, config.control.false_alarm)
+    points = _points(fit.control, 0)
+    found += wrong_points(_left_out_of(evidence.sightings, points))
+    # What poses and ties say of the control as a whole; a rigid movement follows the control whatever they say.
+    following = config.model_copy(update={"control": config.control.model_copy(update={"datum_offset": "follow"})})
+    adjusted, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
+    found += offset_findings(adjusted.verdict, adjusted.applied, len(points))
+    corrections, sides_m = _rigid_corrections(plan, evidence, fit)
+    prior = max((float(p.sigmas[2]) for p in evidence.priors), default=0.0)
+    if sides_m > prior:
+        found.append(
+            HELMERT_TURN.finds(
+                "adjust", f"control lies along a line, which leaves the turn about it open: σ of heights "
+                f"{config.moved_arm_m:g} m to the side of the vehicle is {1e3 * sides_m:.1f} mm by the transformation "
+                f"alone, more than the {1e3 * prior:.1f} mm of the poses",
+            )
+        )  # fmt: skip
+    return Solution(
+        corrections, np.zeros(evidence.ties.observations.size), points, control, tuple(found),
+        tuple(line for line in (offset_line(adjusted.verdict),) if line), leave_one_out(fit.control),
+    )  # fmt: skip
+
+
+def _left_out_of(sightings: Sequence[Sighting], points: Mapping[tuple[int, int], PointFigures]) -> list[WrongPoint]:
+    """Points that a rigid movement leaves out as a whole, by name."""
     by_number = {one.point.number: one.point for one in sightings}
-    wrong: dict[str, WrongPoint] = {}
-    for (number, _), figures in points.items():
-        point = by_number[number]
-        height = figures.left_out_height_m if figures.weight_height == 0.0 else float("nan")
-        away = float(np.hypot(*figures.left_out_horizontal_m)) if figures.weight_horizontal == 0.0 else float("nan")
-        if np.isfinite(height) or np.isfinite(away):
-            sigma = float(figures.left_out_sigma_m[2])
-            wrong[point.name] = WrongPoint(point.name, height, away, sigma, point.height_m)
-    if not wrong:
-        return []
-    ordered = sorted(wrong.values(), key=lambda one: one.name)
-    notes = [
-        f"{len(ordered)} control points contradict all other evidence and do not count: "
-        f"{listed([one.told() for one in ordered])}; their survey, or what stands for them, is wrong"
-    ]
-    return notes + _swapped_notes(ordered)
+    wrong: list[WrongPoint] = []
+    for (number, _), own in points.items():
+        if own.weight_height == 0.0:
+            point, away = by_number[number], float(np.hypot(*own.left_out_horizontal_m))
+            wrong.append(
+                WrongPoint(point.name, own.left_out_height_m, away, float(own.left_out_sigma_m[2]), point.height_m)
+            )
+    return sorted(wrong, key=lambda one: one.name)
 
 
-def _rigid_fit(evidence: Evidence, entering: Bool) -> RigidFit:
+def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidFit:
     """The one rigid movement of the survey onto its targets."""
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
     seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
     sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
-    return rigid_fit(seen, sigma)
+    return rigid_fit(seen, sigma, false_alarm)
 
 
 def _epoch(one: Sighting) -> Int64:
     return np.array([one.epoch_gps_ns], np.int64)
 
 
-def _rigid_corrections(plan: SurveyPlan, evidence: Evidence, fit: RigidFit) -> dict[str, Corrections]:
-    """A rigid movement as corrections of each run."""
+def _rigid_corrections(
+    plan: SurveyPlan, evidence: Evidence, fit: RigidFit
+) -> tuple[dict[str, Corrections], float]:  # fmt: skip
+    """A rigid movement as corrections of each run, and the largest σ of a height to the side of the vehicles."""
     corrections: dict[str, Corrections] = {}
+    config, largest = plan.survey.config.adjust, 0.0
     for prior in evidence.priors:
         source = next((s for s, _ in plan.sources if s.run == prior.run and s.trajectory is not None), None)
         if source is None or source.trajectory is None or not _moves(prior):
             continue
-        knots = knots_of(prior, plan.survey.config.adjust.solver.knot_spacing_s)
+        knots = knots_of(prior, config.solver.knot_spacing_s)
         recorded = load_recorded(
             plan.store, source.trajectory, [(int(knots[0]), int(knots[-1]))], plan.ground.max_gap_s
         )
         poses = level_poses(recorded, plan.ground.map, knots)
         if poses.epoch_gps_ns.size:
             places = level_from_map(poses.body_m - fit.origin_m, fit.convergence_rad)
-            corrections[prior.run] = fit.helmert.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
-    return corrections
+            own = fit.helmert.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
+            sides = config.moved_arm_m * poses.level_from_body[:, :, 1]
+            sigma = np.max([fit.helmert.sigma_of(places + way * sides) for way in (-1.0, 0.0, 1.0)], axis=0)
+            largest = max(largest, float(sigma[:, 2].max()))
+            recorded_sigma = prior.sigma_at(poses.epoch_gps_ns)
+            whole = np.concatenate([np.hypot(sigma, recorded_sigma[:, :3]), recorded_sigma[:, 3:]], 1)
+            corrections[prior.run] = replace(own, sigma=whole)
+    return corrections, largest

@@ -29,7 +29,7 @@ _LIDAR_REACH_M: Final = 12.0
 
 
 def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
-    """Readings that recorded poses place, by run as the survey file lists them.
+    """Readings that recorded poses place, by run and sensor.
 
     Of a run with profiles, which are dense, these alone: returns of a lidar are for rigs that have nothing else.
     """
@@ -41,8 +41,8 @@ def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
 
 
 def runs_of(plan: SurveyPlan) -> tuple[str, ...]:
-    """Runs of the survey file; an adjustment counts them so."""
-    return tuple(run.id for run in plan.survey.config.runs)
+    """Runs by name, whatever their order in the survey file; an adjustment counts them so."""
+    return tuple(sorted(run.id for run in plan.survey.config.runs))
 
 
 def span_of(source: ReadingSource, files: Sequence[DataFile]) -> tuple[int, int]:

@@ -21,8 +21,9 @@ class SolverSettings(Strict):
     """A residual of so many σ or more does not count."""
     max_rounds: int = Field(default=60, ge=1)
     """Rounds of re-weighting, at most."""
-    estimate_variance_components: bool = False
-    """Estimate a factor of the stated variances of each kind of observation and of each component's process."""
+    estimate_variance_components: bool | None = None
+    """Estimate a factor of the stated variances of each kind of observation and of each component's process. Left out:
+    where a stated σ turns out to be 1.7 times too small or more; `false`: never."""
 
     @model_validator(mode="after")
     def _limits_are_in_order(self) -> Self:
@@ -31,7 +32,32 @@ class SolverSettings(Strict):
         return self
 
 
-class AdjustmentSettings(SolverSettings):
+DatumOffset = Literal["judge", "follow", "estimate", "leave_out"]
+"""What becomes of control that is off as a whole."""
+
+
+class ControlRules(Strict):
+    """How the surveys of control points are judged."""
+
+    false_alarm: float = Field(default=0.01, ge=0.0, le=0.2)
+    """Chance that a point of right control is found wrong, of all points together. A point whose leave-one-out residual
+    exceeds the quantile of the normal distribution that follows (3.3 σ for ten heights) is named, and its height or
+    place does not count. 0: no point is found wrong."""
+    datum_false_alarm: float = Field(default=0.05, ge=0.0, le=0.2)
+    """Chance that right control is doubted as a whole: 2.2 σ of its common offset in height. A doubt costs no more than
+    a wider σ. 0: it is never doubted."""
+    datum_offset: DatumOffset = "judge"
+    """What is done where all points are off together, in height or in place, by more than σ and correlation time of the
+    poses explain. `judge`: up to `adjust.solver.reject_beyond` σ the control is followed and the σ that is published
+    holds the offset; beyond it, the offset is estimated. `follow`: the control is followed, and σ holds the offset.
+    `estimate`: the offset is always estimated: poses say where the survey lies, and control says its shape.
+    `leave_out`: control that is off does not count."""
+    sigma_datum_m: float = Field(default=0.0, ge=0.0, le=10.0)
+    """1 σ of an offset that all points have in common, on each axis (m): of the datum that the control was surveyed in
+    against that of the poses."""
+
+
+class AdjustmentSettings(SolverSettings, ControlRules):
     """What is adjusted, and how."""
 
     mode: Literal["joint", "each_pass", "vertical"] = "joint"

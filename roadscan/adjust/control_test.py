@@ -1,0 +1,291 @@
+"""Is the control right? Each surveyed coordinate against what poses, ties and the other control say of it.
+
+The adjustment first leaves the surveys aside. What it then says of each point, with the covariance of all of them, is
+all that is needed: a point that is wrong is found by its normalised leave-one-out residual (data snooping, Baarda
+1968), an offset that all points share by its least-squares estimate over its σ. Both are held against quantiles of the
+normal distribution that right control passes with a stated chance, all tests together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtri
+
+from roadscan.model.settings.adjustment import ControlRules
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+HEIGHT, PLACE = "height", "place"
+COMPONENTS: Final = {HEIGHT: (2,), PLACE: (0, 1)}
+"""Axes (north, east, down) of what may be wrong by itself: the height of a point, or its place."""
+_POWER: Final = 0.8416
+"""Standard normal quantile of 80 %: an offset so many σ above the limit is found so often."""
+_APART: Final = 9.21
+"""Two points of which one is wrong are told apart where one explains this much more of the squared residuals:
+a hundred times as likely (2 ln 100)."""
+_KNOWN: Final = 1e-9
+"""Share of its variance that a residual has to keep to say anything of its observation."""
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """What poses and ties alone say of m surveyed coordinates."""
+
+    point: Int64
+    """(m,) row of the control point."""
+    axis: Int64
+    """(m,) 0 north, 1 east, 2 down."""
+    away_m: Float64
+    """(m,) surveyed minus what poses and ties say."""
+    covariance_m2: Float64
+    """(m, m) of that, with the variance of the survey."""
+
+    def parts(self) -> list[tuple[int, str, Int64]]:
+        """Point, component, and rows of each height and each place."""
+        found = []
+        for point in np.unique(self.point).tolist():
+            for name, axes in COMPONENTS.items():
+                rows = np.flatnonzero((self.point == point) & np.isin(self.axis, axes))
+                if rows.size:
+                    found.append((point, name, rows))
+        return found
+
+
+@dataclass(frozen=True)
+class WrongSurvey:
+    """A point whose height or place is contradicted by all else."""
+
+    point: int
+    component: str
+    """`height` or `place`."""
+    sigmas: float
+    """Length of its normalised leave-one-out residual."""
+    limit: float
+    """Length from which on a point is wrong."""
+    alternatives: tuple[int, ...] = ()
+    """Points that may be the wrong ones in its stead: what is known does not tell which of them is."""
+
+
+@dataclass(frozen=True)
+class CommonOffset:
+    """An offset of all surveyed coordinates from poses and ties: surveyed minus those."""
+
+    offset_m: Float64
+    """(3,) north, east, down; 0 where it is not observed."""
+    covariance_m2: Float64
+    """(3, 3)"""
+    observed: Bool
+    """(3,) axes that a point was observed along."""
+
+    def sigmas(self, component: str) -> float:
+        """The offset over its σ, as a standard normal number would be as rare; 0: not observed."""
+        axes = [a for a in COMPONENTS[component] if self.observed[a]]
+        if not axes:
+            return 0.0
+        own = self.offset_m[axes]
+        return float(np.sqrt(own @ np.linalg.solve(self.covariance_m2[np.ix_(axes, axes)], own)))
+
+    def sigma_m(self, component: str) -> float:
+        """1 σ of the component, the larger one of a place; NaN: not observed."""
+        axes = [a for a in COMPONENTS[component] if self.observed[a]]
+        return float(np.sqrt(np.diag(self.covariance_m2)[axes].max())) if axes else float("nan")
+
+
+@dataclass(frozen=True)
+class ControlVerdict:
+    """What the control's surveys are worth."""
+
+    wrong: tuple[WrongSurvey, ...]
+    offset: CommonOffset
+    """Of the points that are not wrong."""
+    doubted: tuple[str, ...]
+    """Components whose common offset the poses exclude with the stated chance of error."""
+    detectable_m: dict[str, float]
+    """By component: a common offset of this size is found four times of five."""
+    limit_point: float
+    """Normalised leave-one-out residual of a height from which on a point is wrong."""
+
+    @property
+    def left_out(self) -> set[tuple[int, str]]:
+        """Row of the point and component of all that does not count."""
+        return {(p, one.component) for one in self.wrong for p in (one.point, *one.alternatives)}
+
+
+@dataclass(frozen=True)
+class AppliedOffset:
+    """The offset that surveys are taken to have in common."""
+
+    offset_m: Float64
+    """(3,) north, east, down: subtracted from all surveys."""
+    covariance_m2: Float64
+    """(3, 3) that it adds to what follows from the control."""
+    estimated: tuple[str, ...]
+    """Components in which the poses, and not the control, say where the survey lies."""
+    refused: tuple[str, ...]
+    """Components of which no survey counts."""
+
+
+def quantile(chance: float, tests: int, numbers: int = 1) -> float:
+    """Length of `numbers` standard normal numbers that the largest of `tests` exceeds with a chance; inf for 0."""
+    if chance <= 0.0:
+        return float("inf")
+    return float(np.sqrt(chdtri(numbers, -np.expm1(np.log1p(-chance) / max(tests, 1)))))
+
+
+def judged(errors: SurveyErrors, rules: ControlRules) -> ControlVerdict:
+    """Which points are wrong, and whether all of them are off together.
+
+    Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
+    fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
+    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`.
+    """
+    false_alarm, datum = rules.false_alarm, rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
+    errors = replace(errors, covariance_m2=errors.covariance_m2 + datum)
+    fixed = _snooped(errors, false_alarm, free=False)
+    at_once = common_offset(errors, _kept(errors, fixed))
+    free = _snooped(errors, false_alarm, free=True)
+    freely = common_offset(errors, _kept(errors, free))
+    limits = {name: quantile(rules.datum_false_alarm, len(COMPONENTS), len(axes)) for name, axes in COMPONENTS.items()}
+    doubted = {name: [one.sigmas(name) > limits[name] for one in (at_once, freely)] for name in COMPONENTS}
+    offsets = sum(late for _, late in doubted.values())
+    simpler = offsets > 0 and (len(free) + offsets < len(fixed) or any(early for early, _ in doubted.values()))
+    wrong, offset = (free, freely) if simpler else (fixed, at_once)
+    tests = max(len(errors.parts()), 1)
+    return ControlVerdict(
+        tuple(wrong), offset, tuple(name for name in COMPONENTS if offset.sigmas(name) > limits[name]),
+        {name: (limits[name] + _POWER) * offset.sigma_m(name) for name in COMPONENTS},
+        quantile(false_alarm, tests),
+    )  # fmt: skip
+
+
+def common_offset(errors: SurveyErrors, kept: Bool) -> CommonOffset:
+    """The offset that surveys have in common, from some of the coordinates."""
+    axes = np.unique(errors.axis[kept])
+    offset, covariance, observed = np.zeros(3), np.zeros((3, 3)), np.zeros(3, bool)
+    if axes.size:
+        shared = (errors.axis[kept][:, None] == axes).astype(np.float64)
+        weighed = np.linalg.solve(errors.covariance_m2[np.ix_(kept, kept)], shared)
+        own = np.linalg.inv(shared.T @ weighed)
+        offset[axes] = own @ weighed.T @ errors.away_m[kept]
+        covariance[np.ix_(axes, axes)], observed[axes] = own, True
+    return CommonOffset(offset, covariance, observed)
+
+
+def _kept(errors: SurveyErrors, wrong: list[WrongSurvey]) -> Bool:
+    kept = np.ones(errors.point.size, bool)
+    for one in wrong:
+        own = np.isin(errors.point, (one.point, *one.alternatives))
+        kept[own & np.isin(errors.axis, COMPONENTS[one.component])] = False
+    return kept
+
+
+def _snooped(errors: SurveyErrors, false_alarm: float, *, free: bool) -> list[WrongSurvey]:
+    """Wrong points, the worst first: each is left out before the others are judged.
+
+    free : all points may have an offset in common.
+    """
+    parts, wrong = errors.parts(), list[WrongSurvey]()
+    if not parts:
+        return wrong
+    while True:
+        kept = _kept(errors, wrong)
+        squares = _explained(errors, parts, kept, free=free)
+        excess = np.array(
+            [_excess(s, r.size, false_alarm, len(parts)) for s, (_, _, r) in zip(squares, parts, strict=True)]
+        )
+        if excess.max() <= 1.0:
+            break
+        worst = int(excess.argmax())
+        alike = [k for k in np.flatnonzero(excess > 1.0) if k != worst and parts[k][1] == parts[worst][1]]
+        others = tuple(parts[k][0] for k in alike if squares[worst] - squares[k] < _APART)
+        point, component, rows = parts[worst]
+        limit = quantile(false_alarm, len(parts), rows.size)
+        wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), limit, others))
+    return _without_the_right(errors, parts, wrong, false_alarm, free=free)
+
+
+def _excess(square: float, numbers: int, false_alarm: float, tests: int) -> float:
+    return float(np.sqrt(square) / quantile(false_alarm, tests, numbers))
+
+
+def _explained(errors: SurveyErrors, parts: list[tuple[int, str, Int64]], kept: Bool, *, free: bool) -> Float64:
+    """By how much the weighted squared residuals fall where a part is left out: the square of its normalised
+    leave-one-out residual; 0 of those that are left out, or that the others say nothing of.
+    """
+    squares = np.zeros(len(parts))
+    if not kept.any():
+        return squares
+    weight = np.zeros_like(errors.covariance_m2)
+    weight[np.ix_(kept, kept)] = np.linalg.inv(errors.covariance_m2[np.ix_(kept, kept)])
+    if free:
+        axes = np.unique(errors.axis[kept])
+        shared = ((errors.axis[:, None] == axes) & kept[:, None]).astype(np.float64)
+        weighed = weight @ shared
+        weight_after = weight - weighed @ np.linalg.solve(shared.T @ weighed, weighed.T)
+    else:
+        weight_after = weight
+    score = weight_after @ errors.away_m
+    for k, (_, _, rows) in enumerate(parts):
+        own = weight_after[np.ix_(rows, rows)]
+        if kept[rows].all() and (np.diag(own) > _KNOWN * np.diag(weight)[rows]).all():
+            squares[k] = max(float(score[rows] @ np.linalg.solve(own, score[rows])), 0.0)
+    return squares
+
+
+def _without_the_right(
+    errors: SurveyErrors,
+    parts: list[tuple[int, str, Int64]],
+    wrong: list[WrongSurvey],
+    false_alarm: float,
+    *,
+    free: bool,
+) -> list[WrongSurvey]:
+    """Points that fit once the worse ones are left out count again: a wrong neighbour had spoiled what they are held
+    against. Each gets its normalised residual against all that counts.
+    """
+    found = list(wrong)
+    for one in sorted(wrong, key=lambda w: w.sigmas):
+        rest = [w for w in found if w is not one]
+        number = next(k for k, (p, c, _) in enumerate(parts) if (p, c) == (one.point, one.component))
+        kept = _kept(errors, rest)
+        kept[parts[number][2]] = True
+        squares = _explained(errors, parts, kept, free=free)
+        fits = _excess(squares[number], parts[number][2].size, false_alarm, len(parts)) <= 1.0
+        if fits and len(rest) < len(found) and not one.alternatives:
+            found = rest
+        else:
+            found[found.index(one)] = replace(one, sigmas=float(np.sqrt(squares[number])))
+    return found
+
+
+def applied_offset(verdict: ControlVerdict, rules: ControlRules, contradicted_from: float) -> AppliedOffset:
+    """What is made of an offset of the control as a whole.
+
+    contradicted_from : σ from which on poses contradict control, and do not merely cast doubt on it.
+    """
+    found, prior = verdict.offset, rules.sigma_datum_m**2
+    offset, covariance = np.zeros(3), np.zeros((3, 3))
+    estimated, refused = list[str](), list[str]()
+    for name, every in COMPONENTS.items():
+        axes = [a for a in every if found.observed[a]]
+        if not axes:
+            continue
+        block, away = np.ix_(axes, axes), found.offset_m[axes]
+        stated = found.covariance_m2[block]
+        off, doubted = found.sigmas(name) > contradicted_from, name in verdict.doubted
+        if rules.datum_offset == "leave_out" and doubted:
+            refused.append(name)
+        elif rules.datum_offset == "estimate" or (rules.datum_offset == "judge" and off and doubted):
+            estimated.append(name)
+            offset[axes], covariance[block] = away, stated - prior * np.eye(len(axes))
+        else:
+            gain = prior * np.linalg.inv(stated)
+            offset[axes], covariance[block] = gain @ away, prior * (np.eye(len(axes)) - gain)
+            covariance[axes, axes] += np.where(doubted, (away - offset[axes]) ** 2, 0.0)
+    return AppliedOffset(offset, covariance, tuple(estimated), tuple(refused))

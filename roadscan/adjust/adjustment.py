@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,9 @@ from roadscan.navigation.trajectory import Corrections
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
+
+SURVEY_FACTOR: Final = "control_survey"
+"""Name of the factor of the surveys' stated variances."""
 
 __all__ = ["Adjustment", "AdjustmentSettings", "ControlErrors", "adjust"]
 
@@ -94,7 +98,8 @@ class Adjustment:
     control: ControlErrors
     mountings: MountingErrors
     variance_factors: Mapping[str, float]
-    """Of the stated variances, by kind of observation and by component of the processes; 1 where not estimated."""
+    """Of the stated variances, by kind of observation, by component of the processes, and of the surveys of control; 1
+    where not estimated."""
     rounds: int
     settled: bool
     """False where weights still changed in the last round."""
@@ -190,11 +195,11 @@ def adjust(
     back[order] = np.arange(order.size)
     factors = dict(
         zip((*KINDS, *COMPONENTS), [*estimate.kind_factors[:SURVEY], *estimate.process_factors], strict=True)
-    )
+    ) | {SURVEY_FACTOR: verdict.survey_factor}
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
-        _of_control(unknowns, estimate, n), _of_mountings(unknowns, estimate),
+        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
     )  # fmt: skip
@@ -253,10 +258,10 @@ def _survey_errors(unknowns: Unknowns, alone: Estimate, rounds: Rounds) -> Surve
     """What poses and ties say of the surveys."""
     point, axis, sigma = _surveyed(unknowns)
     if not point.size:
-        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)))
+        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)), sigma)
     away = alone.solution[unknowns.of_control[point, axis]] * sigma
-    unit = rounds.survey_covariance() + np.eye(sigma.size)
-    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma)
+    unit = rounds.survey_covariance()
+    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma, sigma**2)
 
 
 def _with_control(
@@ -271,7 +276,7 @@ def _with_control(
     weight = np.array(counts, np.float64)
     if not weight.any():
         return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
-    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, alone.rounds)
+    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, verdict.survey_factor, alone.rounds)
     moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
     return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
 
@@ -329,7 +334,7 @@ def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
     return MountingErrors(tuple(one.sensor for one in unknowns.mountings), prior, error, sigma)
 
 
-def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors:
+def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:
     """The rows after the first n are those of surveys."""
     control, numbers = unknowns.control, unknowns.of_control
     there = numbers >= 0
@@ -343,5 +348,5 @@ def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors
     error = table(estimate.solution[numbers[there]]) * sigma
     # The survey says that its error is nought; what the others say of it is the prediction.
     left_out = table(-without.residual[n:]) * sigma
-    left_out_sigma = table(np.sqrt(1.0 + without.variance[n:])) * sigma
+    left_out_sigma = table(np.sqrt(factor + without.variance[n:])) * sigma
     return ControlErrors(control.place, control.run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)

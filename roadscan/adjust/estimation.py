@@ -218,7 +218,7 @@ class Rounds:
         twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
         moved = twice * solution[self._row] * solution[self._column]
         shrunk = twice * inverse.at(self._row, self._column)
-        unknowns = np.bincount(self._component[self._row == self._column], minlength=len(COMPONENTS))
+        unknowns = np.bincount(self._component[self._row == self._column], minlength=len(COMPONENTS))[: len(COMPONENTS)]
         squares, lost = (
             np.array([v[self._component == c].sum() for c in range(len(COMPONENTS))]) / self._processes
             for v in (moved, shrunk)

@@ -22,6 +22,7 @@ from roadscan.model.settings.adjustment import AdjustmentSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
 SURVEY: Final = len(KINDS)
 """Kind of the rows that say that a control point lies where it was surveyed."""
@@ -120,13 +121,18 @@ class Rounds:
         if self._wide_kinds(freed).any():
             self._processes /= _FREE
             self._kinds = np.maximum(self._kinds, self._wide_kinds(estimate))
-        else:
-            ratio, told = self._process_ratios(freed.solution, freed.inverse)
-            factor = np.where(told < _SOME, 0.0, ratio * _FREE)
-            self._fixed = factor < max(_UNDERSTATED, _ALSO * float(factor.max()))
-            self._enough, self._processes[self._fixed] = _SOME, 1.0
-        self._estimating = True
-        return self._rounds(freed.rounds)
+            self._estimating = True
+            return self._rounds(freed.rounds)
+        self._keep_stated(self._process_ratios(freed.solution, freed.inverse)[1] < _SOME)
+        self._enough, self._estimating = _SOME, True
+        estimate = self._rounds(freed.rounds)
+        self._keep_stated(self._processes < max(_UNDERSTATED, _ALSO * float(self._processes.max())))
+        return self._rounds(estimate.rounds)
+
+    def _keep_stated(self, components: Bool) -> None:
+        """σ of some components of the poses stays as it was stated."""
+        self._fixed = self._fixed | components
+        self._processes[self._fixed] = 1.0
 
     def with_surveys(self, weight: Float64, observed: Float64, factor: float, done: int) -> Estimate:
         """Rounds from there on, with surveys that count by a weight of 1 or 0 each.

@@ -181,7 +181,7 @@ class Rounds:
     def _solved(self) -> tuple[Float64, Float64]:
         """Solution and residuals with the weights of now."""
         rows, scaled = self.problem.rows, self._counted() / self._own()
-        self._equations.factor(scaled, self._value / self._processes[self._component])
+        self._equations.factor(scaled, self._value / np.append(self._processes, 1.0)[self._component])
         right = rows.transposed_times(scaled * self._observed, self.problem.unknowns.size)
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
@@ -224,7 +224,7 @@ class Rounds:
         twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
         moved = twice * solution[self._row] * solution[self._column]
         shrunk = twice * inverse.at(self._row, self._column)
-        unknowns = np.bincount(self._component[self._row == self._column], minlength=len(COMPONENTS))
+        unknowns = np.bincount(self._component[self._row == self._column], minlength=len(COMPONENTS))[: len(COMPONENTS)]
         squares, lost = (
             np.array([v[self._component == c].sum() for c in range(len(COMPONENTS))]) / self._processes
             for v in (moved, shrunk)

@@ -1,17 +1,19 @@
 """The adjustment: from observations to corrections of every run's poses, with their covariance.
 
 Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
-process as prior (:mod:`roadscan.adjust.process`); ties and control are observations; what solves them is one sparse
-least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing changes
-(:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the point
-share its error. Surveys are first left aside, and judged by what poses and ties say of them
-(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly.
+process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
+solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
+changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
+point share its error. Surveys are first left aside, and judged by what poses and ties say of them
+(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
+share, are unknowns beside the poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +22,7 @@ from roadscan.adjust.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
-from roadscan.adjust.process import RunPrior, line_variance
+from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
@@ -30,6 +32,9 @@ from roadscan.navigation.trajectory import Corrections
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
+
+SURVEY_FACTOR: Final = "control_survey"
+"""Name of the factor of the surveys' stated variances."""
 
 __all__ = ["Adjustment", "AdjustmentSettings", "ControlErrors", "adjust"]
 
@@ -52,6 +57,19 @@ class ControlErrors:
     """(c, 3) surveyed minus what all others say of the point: leave-one-out, coordinate by coordinate."""
     left_out_sigma_m: Float64
     """(c, 3) 1 σ of it, that of the survey included."""
+
+
+@dataclass(frozen=True)
+class MountingErrors:
+    """What the adjustment says of the mountings of s sensors."""
+
+    sensors: tuple[str, ...]
+    prior_sigma: Float64
+    """(s, 6) as it came in, `MOUNTED`; 0: not estimated."""
+    error: Float64
+    """(s, 6) what has to be added to the mounting (m, rad); 0 where not estimated."""
+    sigma: Float64
+    """(s, 6) 1 σ of the mounting then; that of the prior where nothing tells of it."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +96,10 @@ class Adjustment:
     normalised_residual: Float64
     """(n,) against the prediction of all others, over its σ; NaN where not used."""
     control: ControlErrors
+    mountings: MountingErrors
     variance_factors: Mapping[str, float]
-    """Of the stated variances, by kind of observation and by component of the processes; 1 where not estimated."""
+    """Of the stated variances, by kind of observation, by component of the processes, and of the surveys of control; 1
+    where not estimated."""
     rounds: int
     settled: bool
     """False where weights still changed in the last round."""
@@ -128,17 +148,27 @@ class Adjustment:
         variance += np.einsum("ni,nij,nj->n", right, own[before + 1], right)
         variance += 2.0 * np.einsum("ni,nij,nj->n", left, self.covariance_with_next[run_index][before], right)
         factors = np.array([self.variance_factors[c] for c in COMPONENTS]) * self.active[run_index]
-        lines = line_variance(share[:, None], step[:, None] / 1e9, prior.taus_s) * (prior.sigmas**2 * factors)
+        parts = prior.parts_at(knots)
+        count = parts.shape[1] // len(COMPONENTS)
+        ends, taus = (parts[before], parts[before + 1]), np.tile(prior.taus_s, count)
+        lines = line_variance(share[:, None], step[:, None] / 1e9, taus, ends)
+        lines = lines.reshape(-1, count, len(COMPONENTS)).sum(axis=1) * factors
         return np.asarray(np.sqrt(variance + (partials**2 * lines).sum(axis=1)))
 
 
-def adjust(observations: Observations, priors: Sequence[RunPrior], settings: AdjustmentSettings) -> Adjustment:
+def adjust(
+    observations: Observations,
+    priors: Sequence[RunPrior],
+    settings: AdjustmentSettings,
+    mountings: Sequence[MountingPrior] = (),
+) -> Adjustment:
     """Corrections of all runs.
 
     Parameters
     ----------
     observations : in any order; the result does not depend on it.
     priors : of each run that `Observations.run` counts.
+    mountings : of each sensor that `Observations.sensor` counts; estimated where all runs are adjusted jointly.
 
     Raises
     ------
@@ -151,7 +181,8 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
     chosen = ordered.chosen(which)
     components = HEIGHT_ALONE if settings.mode == "vertical" else np.ones(len(COMPONENTS), bool)
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
-    unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components)
+    shared = mountings if settings.mode == "joint" else ()
+    unknowns = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
     unknowns.check(observations)
     rounds = Rounds(_problem(unknowns, chosen), settings)
     alone = rounds.without_surveys()
@@ -164,19 +195,20 @@ def adjust(observations: Observations, priors: Sequence[RunPrior], settings: Adj
     back[order] = np.arange(order.size)
     factors = dict(
         zip((*KINDS, *COMPONENTS), [*estimate.kind_factors[:SURVEY], *estimate.process_factors], strict=True)
-    )
+    ) | {SURVEY_FACTOR: verdict.survey_factor}
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
-        _of_control(unknowns, estimate, n), {k: float(v) for k, v in factors.items()},
-        estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.sigmas > 0.0, response,
+        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate),
+        {k: float(v) for k, v in factors.items()},
+        estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
     )  # fmt: skip
 
 
 def _canonical(observations: Observations) -> Int64:
     """Order that depends on the observations alone, not on how they arrived."""
     o = observations
-    keys = [o.kind, o.place, *o.run.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
+    keys = [o.kind, o.place, *o.run.T, *o.sensor.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
     keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
     return np.lexsort(keys[::-1])
 
@@ -226,10 +258,10 @@ def _survey_errors(unknowns: Unknowns, alone: Estimate, rounds: Rounds) -> Surve
     """What poses and ties say of the surveys."""
     point, axis, sigma = _surveyed(unknowns)
     if not point.size:
-        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)))
+        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)), sigma)
     away = alone.solution[unknowns.of_control[point, axis]] * sigma
-    unit = rounds.survey_covariance() + np.eye(sigma.size)
-    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma)
+    unit = rounds.survey_covariance()
+    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma, sigma**2)
 
 
 def _with_control(
@@ -244,7 +276,7 @@ def _with_control(
     weight = np.array(counts, np.float64)
     if not weight.any():
         return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
-    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, alone.rounds)
+    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, verdict.survey_factor, alone.rounds)
     moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
     return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
 
@@ -252,7 +284,8 @@ def _with_control(
 def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
     """Corrections (k, 6) of each run's knots."""
     numbers = [unknowns.of_run(run) for run in range(len(unknowns.priors))]
-    return [np.where(n >= 0, solution[n], 0.0) * s for n, s in zip(numbers, unknowns.sigmas, strict=True)]
+    parts = [np.where(n >= 0, solution[n], 0.0) * s for n, s in zip(numbers, unknowns.sigmas, strict=True)]
+    return [own.reshape(len(own), -1, len(COMPONENTS)).sum(axis=1) for own in parts]
 
 
 def _of_knots(
@@ -262,18 +295,21 @@ def _of_knots(
     covariance, with_next = [], []
     for run, sigma in enumerate(unknowns.sigmas):
         numbers = unknowns.of_run(run)
-        covariance.append(_blocks(estimate, numbers, numbers, sigma))
-        with_next.append(_blocks(estimate, numbers[:-1], numbers[1:], sigma))
+        covariance.append(_blocks(estimate, (numbers, sigma), (numbers, sigma)))
+        with_next.append(_blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:])))
     return tuple(_of_solution(unknowns, estimate.solution)), tuple(covariance), tuple(with_next)
 
 
-def _blocks(estimate: Estimate, first: Int64, second: Int64, sigma: Float64) -> Float64:
-    """Covariances (k, 6, 6) of two tables (k, 6) of unknowns."""
-    i, j = np.broadcast_arrays(first[:, :, None], second[:, None, :])
+def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
+    """Covariances (k, 6, 6) of what two tables of unknowns add up to, each with what it is scaled by."""
+    i, j = np.broadcast_arrays(first[0][:, :, None], second[0][:, None, :])
     there = (i >= 0) & (j >= 0)
     blocks = np.zeros(i.shape)
     blocks[there] = estimate.inverse.at(i[there], j[there])
-    return blocks * sigma[:, None] * sigma
+    blocks *= first[1][:, :, None] * second[1][:, None, :]
+    rows, columns, size = first[0].shape[1], second[0].shape[1], len(COMPONENTS)
+    folded = blocks.reshape(-1, rows // size, size, columns // size, size)
+    return np.asarray(folded.sum(axis=(1, 3)))
 
 
 def _of_observations(
@@ -289,7 +325,16 @@ def _of_observations(
     return residual, weight, redundancy, normalised
 
 
-def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors:
+def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
+    prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
+    there = numbers >= 0
+    error, sigma = np.zeros(prior.shape), np.zeros(prior.shape)
+    error[there] = estimate.solution[numbers[there]] * prior[there]
+    sigma[there] = np.sqrt(estimate.inverse.at(numbers[there], numbers[there])) * prior[there]
+    return MountingErrors(tuple(one.sensor for one in unknowns.mountings), prior, error, sigma)
+
+
+def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:
     """The rows after the first n are those of surveys."""
     control, numbers = unknowns.control, unknowns.of_control
     there = numbers >= 0
@@ -303,5 +348,5 @@ def _of_control(unknowns: Unknowns, estimate: Estimate, n: int) -> ControlErrors
     error = table(estimate.solution[numbers[there]]) * sigma
     # The survey says that its error is nought; what the others say of it is the prediction.
     left_out = table(-without.residual[n:]) * sigma
-    left_out_sigma = table(np.sqrt(1.0 + without.variance[n:])) * sigma
+    left_out_sigma = table(np.sqrt(factor + without.variance[n:])) * sigma
     return ControlErrors(control.place, control.run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)

@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import FIXED, KINDS, Observations, partials
+from roadscan.adjust.observations import FIXED, KINDS, Observations, mount_partials, partials
 from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.targets.find import find_target
@@ -18,6 +18,7 @@ from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -212,29 +213,60 @@ def _unseen(point: ControlPoint, head: PassReadings) -> Sighting:
     )  # fmt: skip
 
 
-def moved_m(one: Sighting, corrections: Corrections | None) -> Float64:
+def moved_m(
+    one: Sighting, corrections: Corrections | None, mounting: tuple[MountingChange, Float64] | None = None
+) -> Float64:
     """How corrections move what a sighting saw: easting, northing, height (3,) (m); of a point that was not placed the
     height at its surveyed place, on a road that slopes.
+
+    mounting : change of that of the sensor that saw it, and its lever arm (3,).
     """
-    if corrections is None or not np.isfinite(one.arm_body_m).all():
+    if (corrections is None and mounting is None) or not np.isfinite(one.arm_body_m).all():
         return np.zeros(3)
-    shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
-    level = shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    level = np.zeros((1, 3))
+    if corrections is not None:
+        shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
+        level = level + shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
+    if mounting is not None:
+        change, lever = mounting
+        level = level + change.moves_level(one.level_from_body[None], one.arm_body_m[None], lever)
     easting, northing, height = map_from_level(level, one.convergence_rad)[0]
     if not one.is_placed and np.isfinite(one.slope_east):
         height -= one.slope_east * easting + one.slope_north * northing
     return np.array([easting, northing, height])
 
 
-def observations_of(sightings: Sequence[Sighting]) -> Observations:
+@dataclass(frozen=True)
+class SeenBy:
+    """The sensor that saw a point."""
+
+    number: int
+    """Among those whose mounting is estimated; −1: it is not."""
+    lever_body_m: Float64
+    """(3,) its lever arm."""
+
+
+def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | None = None) -> Observations:
     """Height of each sighting, and two components of those that were placed, in order of the sightings.
 
     The height is that along the normal of the road at a point without a target, whose place on the road is known by the
     poses alone. The components of a place are along the axes of its covariance, so that they are independent.
+
+    seen_by : of each sighting; mountings are not asked for where it is left out.
     """
     parts = [part for number, one in enumerate(sightings) for part in _of_one(number, one)]
     groups = np.array([int(part.group[0]) for part in parts], np.int64)
-    return replace(Observations.joined(parts), group=groups)
+    joined = replace(Observations.joined(parts), group=groups)
+    if seen_by is None or not joined.size:
+        return joined
+    each = [own for one, own in zip(sightings, seen_by, strict=True) for _ in range(one.observed)]
+    seen = [one for one in sightings for _ in range(one.observed)]
+    turned = np.array([one.level_from_body for one in seen])
+    in_body = np.einsum("nji,nj->ni", turned, joined.partials[:, 0, :3])
+    by_mounting = np.zeros((joined.size, 2, 6))
+    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], np.array([s.lever_body_m for s in each]))
+    sensor = np.array([[s.number, -1] for s in each], np.int32)
+    return replace(joined, sensor=sensor, mount_partials=by_mounting)
 
 
 def _of_one(number: int, one: Sighting) -> list[Observations]:

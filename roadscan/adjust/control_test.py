@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from roadscan.model.settings.adjustment import ControlRules
+from roadscan.model.settings.adjustment import AdjustmentSettings, ControlRules
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -29,6 +29,18 @@ _POWER: Final = 0.8416
 _APART: Final = 9.21
 """Two points of which one is wrong are told apart where one explains this much more of the squared residuals:
 a hundred times as likely (2 ln 100)."""
+_MANY: Final = 8
+"""Heights and places from which on the stated σ of all surveys can be told from single wrong points."""
+_FEW: Final = 0.25
+"""Share of the heights and places that may be wrong one by one."""
+_UNDERSTATED: Final = 9.0
+"""A median of the squared residuals that is so many times the usual one shows that the stated σ is too small: with
+eight right points two surveys in 10,000 have it."""
+_LARGEST_FACTOR: Final = 1e6
+_BISECTIONS: Final = 12
+_LEAST_CONTRADICTED_M: Final = 0.03
+"""Poses of a vehicle, whatever σ they state, do not know the mean height of a drive so well that they would contradict
+control that is off by less."""
 _KNOWN: Final = 1e-9
 """Share of its variance that a residual has to keep to say anything of its observation."""
 
@@ -44,7 +56,9 @@ class SurveyErrors:
     away_m: Float64
     """(m,) surveyed minus what poses and ties say."""
     covariance_m2: Float64
-    """(m, m) of that, with the variance of the survey."""
+    """(m, m) of what poses and ties say, without that of the survey."""
+    survey_m2: Float64
+    """(m,) stated variance of the survey."""
 
     def parts(self) -> list[tuple[int, str, Int64]]:
         """Point, component, and rows of each height and each place."""
@@ -110,6 +124,8 @@ class ControlVerdict:
     """By component: a common offset of this size is found four times of five."""
     limit_point: float
     """Normalised leave-one-out residual of a height from which on a point is wrong."""
+    survey_factor: float
+    """Of the stated variances of all surveys."""
 
     @property
     def left_out(self) -> set[tuple[int, str]]:
@@ -138,15 +154,28 @@ def quantile(chance: float, tests: int, numbers: int = 1) -> float:
     return float(np.sqrt(chdtri(numbers, -np.expm1(np.log1p(-chance) / max(tests, 1)))))
 
 
-def judged(errors: SurveyErrors, rules: ControlRules) -> ControlVerdict:
+def judged(errors: SurveyErrors, rules: AdjustmentSettings) -> ControlVerdict:
     """Which points are wrong, and whether all of them are off together.
 
     Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
     fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
-    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`.
+    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`. Where many points are found
+    wrong, the stated σ of the survey is asked as well.
     """
-    false_alarm, datum = rules.false_alarm, rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
+    datum = rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
     errors = replace(errors, covariance_m2=errors.covariance_m2 + datum)
+    found, parts = _with_factor(errors, rules, 1.0), len(errors.parts())
+    many = parts >= _MANY and len(found.left_out) > _FEW * parts
+    if not many or rules.estimate_variance_components is False:
+        return found
+    factor = _survey_factor(errors)
+    return _with_factor(errors, rules, factor) if factor > 1.0 else found
+
+
+def _with_factor(errors: SurveyErrors, rules: ControlRules, factor: float) -> ControlVerdict:
+    """The verdict with a factor of the surveys' stated variances."""
+    errors = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
+    false_alarm = rules.false_alarm
     fixed = _snooped(errors, false_alarm, free=False)
     at_once = common_offset(errors, _kept(errors, fixed))
     free = _snooped(errors, false_alarm, free=True)
@@ -160,8 +189,31 @@ def judged(errors: SurveyErrors, rules: ControlRules) -> ControlVerdict:
     return ControlVerdict(
         tuple(wrong), offset, tuple(name for name in COMPONENTS if offset.sigmas(name) > limits[name]),
         {name: (limits[name] + _POWER) * offset.sigma_m(name) for name in COMPONENTS},
-        quantile(false_alarm, tests),
+        quantile(false_alarm, tests), factor,
     )  # fmt: skip
+
+
+def _survey_factor(errors: SurveyErrors) -> float:
+    """Factor of the stated variances of all surveys: 1, or more where most points contradict one another.
+
+    Wrong points are few. Where the median of all normalised leave-one-out residuals is far too large, it is the σ of
+    the survey that is wrong.
+    """
+    parts = errors.parts()
+
+    def spread(factor: float) -> float:
+        whole = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
+        squares = _explained(whole, parts, np.ones(errors.point.size, bool), free=True)
+        usual = np.array([chdtri(rows.size, 0.5) for _, _, rows in parts])
+        return float(np.median(squares / usual))
+
+    if spread(1.0) <= _UNDERSTATED:
+        return 1.0
+    low, high = 0.0, np.log(_LARGEST_FACTOR)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if spread(float(np.exp(middle))) > 1.0 else (low, middle)
+    return float(np.exp(high))
 
 
 def common_offset(errors: SurveyErrors, kept: Bool) -> CommonOffset:
@@ -278,7 +330,8 @@ def applied_offset(verdict: ControlVerdict, rules: ControlRules, contradicted_fr
             continue
         block, away = np.ix_(axes, axes), found.offset_m[axes]
         stated = found.covariance_m2[block]
-        off, doubted = found.sigmas(name) > contradicted_from, name in verdict.doubted
+        off = found.sigmas(name) > contradicted_from and float(np.linalg.norm(away)) > _LEAST_CONTRADICTED_M
+        doubted = name in verdict.doubted
         if rules.datum_offset == "leave_out" and doubted:
             refused.append(name)
         elif rules.datum_offset == "estimate" or (rules.datum_offset == "judge" and off and doubted):

@@ -22,6 +22,7 @@ from roadscan.model.settings.adjustment import AdjustmentSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
 SURVEY: Final = len(KINDS)
 """Kind of the rows that say that a control point lies where it was surveyed."""
@@ -40,6 +41,12 @@ _STEP: Final = 4.0
 _UNDERSTATED: Final = 3.0
 """Variances that are so many times those stated are estimated, whether that was asked for or not: with σ that are 1.7
 times too small, right observations are rejected and published σ are wrong."""
+_FREE: Final = 100.0
+"""Variances of the poses are made so much larger to see whether they were too small."""
+_SOME: Final = 1.0
+"""Redundancy from which on the σ of poses that turned out too small is estimated, however roughly."""
+_ALSO: Final = 0.1
+"""A component whose factor is below this share of the largest one keeps its stated σ: it follows the other's errors."""
 _MEDIAN: Final = 0.6745
 """Median of the absolute of a standard normal number."""
 
@@ -95,6 +102,7 @@ class Rounds:
         self._equations = NormalEquations(problem.rows, prior, wanted, problem.unknowns.size)
         self._weight = np.where(self._surveyed, 0.0, 1.0)
         self._kinds, self._processes = np.ones(len(KINDS) + 1), np.ones(len(COMPONENTS))
+        self._enough, self._fixed = _ENOUGH, np.zeros(len(COMPONENTS), bool)
 
     def without_surveys(self) -> Estimate:
         """All rounds, with the surveys of control points left aside."""
@@ -105,20 +113,37 @@ class Rounds:
             if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
                 break
         estimate = self._rounds(done)
-        if self.settings.estimate_variance_components is None and self._is_understated(estimate):
+        if self.settings.estimate_variance_components is not None or not self._is_understated(estimate):
+            return estimate
+        # Ties that contradict poses of too small a σ look wrong themselves: poses are asked first.
+        self._processes *= _FREE
+        freed = self._rounds(estimate.rounds)
+        if self._wide_kinds(freed).any():
+            self._processes /= _FREE
+            self._kinds = np.maximum(self._kinds, self._wide_kinds(estimate))
             self._estimating = True
-            estimate = self._rounds(estimate.rounds)
-        return estimate
+            return self._rounds(freed.rounds)
+        self._keep_stated(self._process_ratios(freed.solution, freed.inverse)[1] < _SOME)
+        self._enough, self._estimating = _SOME, True
+        estimate = self._rounds(freed.rounds)
+        self._keep_stated(self._processes < max(_UNDERSTATED, _ALSO * float(self._processes.max())))
+        return self._rounds(estimate.rounds)
 
-    def with_surveys(self, weight: Float64, observed: Float64, done: int) -> Estimate:
+    def _keep_stated(self, components: Bool) -> None:
+        """σ of some components of the poses stays as it was stated."""
+        self._fixed = self._fixed | components
+        self._processes[self._fixed] = 1.0
+
+    def with_surveys(self, weight: Float64, observed: Float64, factor: float, done: int) -> Estimate:
         """Rounds from there on, with surveys that count by a weight of 1 or 0 each.
 
         Parameters
         ----------
         observed : error that each survey states of itself, in its σ: 0, or an offset that all of them have.
+        factor : of the surveys' stated variances.
         done : rounds so far.
         """
-        self._survey_weight = weight
+        self._survey_weight, self._kinds[SURVEY] = weight, factor
         self._observed[self._surveyed] = observed
         self._weight[self._surveyed] = weight
         return self._rounds(done)
@@ -156,7 +181,7 @@ class Rounds:
     def _solved(self) -> tuple[Float64, Float64]:
         """Solution and residuals with the weights of now."""
         rows, scaled = self.problem.rows, self._counted() / self._own()
-        self._equations.factor(scaled, self._value / self._processes[self._component])
+        self._equations.factor(scaled, self._value / np.append(self._processes, 1.0)[self._component])
         right = rows.transposed_times(scaled * self._observed, self.problem.unknowns.size)
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
@@ -184,26 +209,41 @@ class Rounds:
         return moved
 
     def _is_understated(self, estimate: Estimate) -> bool:
-        """Whether the stated σ of a kind of observation, or of a component of the poses, is much too small.
-
-        Of observations the median tells, because those that contradict a σ that is too small were rejected.
-        """
-        statistic = np.abs(estimate.without.statistic)
-        wide = False
-        for kind in range(len(KINDS)):
-            here = statistic[self.problem.kind == kind]
-            if here.size >= _ENOUGH and (ratio := (float(np.median(here)) / _MEDIAN) ** 2) > _UNDERSTATED:
-                self._kinds[kind] = ratio
-                wide = True
-        if wide:
+        """Whether the stated σ of a kind of observation, or of a component of the poses, is much too small."""
+        if self._wide_kinds(estimate).any():
             return True
-        kinds, processes = self._kinds.copy(), self._processes.copy()
-        own = self._own()
+        kinds, processes, own = self._kinds.copy(), self._processes.copy(), self._own()
         self._new_factors(
             estimate.solution, estimate.inverse, estimate.residual, estimate.without, own, estimate.weight
         )
         found, self._kinds, self._processes = self._processes, kinds, processes
         return bool((found > _UNDERSTATED).any())
+
+    def _process_ratios(self, solution: Float64, inverse: SelectedInverse) -> tuple[Float64, Float64]:
+        """Squares over redundancy (6,) of each component's process with the factor of now, and the redundancy."""
+        twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
+        moved = twice * solution[self._row] * solution[self._column]
+        shrunk = twice * inverse.at(self._row, self._column)
+        unknowns = np.bincount(self._component[self._row == self._column], minlength=len(COMPONENTS))[: len(COMPONENTS)]
+        squares, lost = (
+            np.array([v[self._component == c].sum() for c in range(len(COMPONENTS))]) / self._processes
+            for v in (moved, shrunk)
+        )
+        told = unknowns - lost
+        return squares / np.maximum(told, 1e-300), told
+
+    def _wide_kinds(self, estimate: Estimate) -> Float64:
+        """Factors of the stated variances of kinds of observations that are much too small; 0 of the others.
+
+        The median tells, because observations that contradict a σ that is too small were rejected.
+        """
+        statistic, found = np.abs(estimate.without.statistic), np.zeros(len(KINDS) + 1)
+        for kind in range(len(KINDS)):
+            here = statistic[self.problem.kind == kind]
+            if here.size >= _ENOUGH:
+                ratio = (float(np.median(here)) / _MEDIAN) ** 2
+                found[kind] = ratio if ratio > _UNDERSTATED else 0.0
+        return found
 
     def _new_factors(
         self,
@@ -224,16 +264,10 @@ class Rounds:
             told, own_part = redundancy[here].sum(), (share * redundancy)[here].sum()
             ratio = (share * squares)[here].sum() / max(own_part, 1e-300)
             self._kinds[kind] = _stepped(self._kinds[kind], ratio, told, own_part / max(told, 1e-300))
-        twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
-        moved = twice * solution[self._row] * solution[self._column]
-        shrunk = twice * inverse.at(self._row, self._column)
-        for component in range(len(COMPONENTS)):
-            here = self._component == component
-            factor = self._processes[component]
-            unknowns = float((here & (self._row == self._column)).sum())
-            told = unknowns - shrunk[here].sum() / factor
-            ratio = moved[here].sum() / factor / max(told, 1e-300)
-            self._processes[component] = _stepped(factor, ratio, told)
+        for component, (ratio, told) in enumerate(zip(*self._process_ratios(solution, inverse), strict=True)):
+            if not self._fixed[component]:
+                factor = self._processes[component]
+                self._processes[component] = _stepped(factor, float(ratio), float(told), enough=self._enough)
         after = np.concatenate([self._kinds, self._processes])
         return float(np.abs(np.log(after / before)).max())
 
@@ -245,7 +279,9 @@ def _unit_rows(numbers: Int64, size: int) -> Iterator[Float64]:
         yield row
 
 
-def _stepped(factor: float, ratio: float, redundancy: float, share: float = 1.0) -> float:
+def _stepped(
+    factor: float, ratio: float, redundancy: float, share: float = 1.0, enough: float = _ENOUGH
+) -> float:  # fmt: skip
     """The factor that makes squares as large as their redundancy; the same where that is too little to tell.
 
     Parameters
@@ -253,7 +289,7 @@ def _stepped(factor: float, ratio: float, redundancy: float, share: float = 1.0)
     ratio : squares over redundancy, with the factor of now.
     share : of the variance that the factor multiplies, in that of what is squared.
     """
-    if redundancy < _ENOUGH:
+    if redundancy < enough:
         return factor
     step = np.clip(1.0 + (ratio - 1.0) / share, 1.0 / _STEP, _STEP)
     return float(np.clip(factor * step, *_FACTORS))

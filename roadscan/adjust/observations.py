@@ -8,6 +8,9 @@ of the body (rad). A point of the body, `arm_body_m` from its origin, moves in l
 An observation with direction n (unit, local level) sees n · d of each of its ends, so its partial derivatives by the
 six corrections are n and arm × (Rᵀ n) (Skaloud & Lichti 2006, linearised). Its second end counts negatively: after the
 correction, the two ends agree along n.
+
+The mounting of the sensor that saw an end moves the point as well: by a change of the lever arm, and by a small turn
+about the axes of the body, at the sensor's origin. Those derivatives are Rᵀ n and (arm − lever arm) × (Rᵀ n).
 """
 
 from __future__ import annotations
@@ -30,6 +33,9 @@ height, or a component of the place, of a control point."""
 
 COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 """The unknowns of a pose, in the order of the partial derivatives."""
+
+MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
+"""The unknowns of a mounting: lever arm, then a turn that follows the boresight, both along the axes of the body."""
 
 FIXED: Final = -1
 """Run of an end that no correction moves: a control point."""
@@ -60,8 +66,15 @@ class Observations:
     """(n,) of control: 1 σ of the surveyed coordinate along the direction, apart from `sigma_m`, which is that of the
     measurement alone. All observations of a control point share the error of its survey. 0 for ties; zeros where none
     are given."""
+    sensor: Int32 = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    """(n, 2) number of the sensor that saw each end; −1 where its mounting is not asked for, as where none is given."""
+    mount_partials: Float64 = field(default_factory=lambda: np.zeros((0, 2, 6)))
+    """(n, 2, 6) derivatives by `MOUNTED` of that sensor, the sign of the end included."""
 
     def __post_init__(self) -> None:
+        if len(self.sensor) != self.kind.size or len(self.mount_partials) != self.kind.size:
+            object.__setattr__(self, "sensor", np.full((self.kind.size, 2), -1, np.int32))
+            object.__setattr__(self, "mount_partials", np.zeros((self.kind.size, 2, 6)))
         if self.survey_sigma_m.size != self.kind.size:
             if self.survey_sigma_m.size:
                 raise ValueError(f"{self.survey_sigma_m.size} σ of a survey for {self.kind.size} observations")
@@ -97,6 +110,18 @@ class Observations:
     def chosen(self, which: npt.NDArray[np.bool_] | Int64) -> Self:
         """Some of them."""
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+
+def mount_partials(in_body: Float64, arm_turns: Float64, lever_body_m: Float64) -> Float64:
+    """Derivatives (n, 6) of the movement along a direction by the mounting of a sensor.
+
+    Parameters
+    ----------
+    in_body : (n, 3) the direction in body axes.
+    arm_turns : (n, 3) derivatives by a turn of the pose: arm × direction.
+    lever_body_m : (n, 3) lever arm of the sensor.
+    """
+    return np.concatenate([in_body, arm_turns - np.cross(lever_body_m, in_body)], axis=-1)
 
 
 def partials(direction_level: Float64, level_from_body: Float64, arm_body_m: Float64) -> Float64:

@@ -1,13 +1,17 @@
 """Errors of a run's poses as stochastic processes, sampled at knots.
 
-A first-order Gauss–Markov process has the covariance σ² e^(−|Δt|/τ) (Gelb 1974, 3.8). At knots it is the sequence
-x(k+1) = φ x(k) + w, φ = e^(−h/τ), var w = σ² (1 − φ²), without any approximation. Between knots the adjustment puts a
-straight line; by how much the process leaves it has a variance in closed form (`line_variance`).
+An error is b(t) u(t) + e(t) v(t). Here u is a first-order Gauss–Markov process of unit variance, with the covariance
+e^(−|Δt|/τ) (Gelb 1974, 3.8), and b(t) is the σ that the logs state of each pose. In an outage, where σ is much larger
+than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, and each outage has its own, because
+what an outage adds says nothing of the error before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
+φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment puts a straight line; by how much
+the process leaves it has a variance in closed form (`line_variance`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,15 +23,48 @@ from roadscan.model.gpstime import NS_PER_S
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
+_OUTAGE: Final = float(np.sqrt(2.0))
+"""σ above the usual one by this factor is that of an outage: half of its variance or more is not of the usual kind."""
+_BUDGET: Final = 4.0
+"""So many times as many knots as evenly spaced ones are added to a run at most."""
+_MOST_MORE: Final = 15
+"""An interval of the even knots gets no more within it: they are 6 ms apart where the others are 0.1 s."""
+
 
 @dataclass(frozen=True)
 class GaussMarkov:
     """First-order Gauss–Markov process of one component."""
 
     sigma: float
-    """Stationary 1 σ (m or rad); 0: the component is not corrected."""
+    """Usual 1 σ (m or rad), and that of all times where a run's logs state none; 0: the component is not corrected."""
     tau_s: float
     """Correlation time (s)."""
+
+
+@dataclass(frozen=True)
+class StatedSigma:
+    """1 σ of a run's poses over time, as its logs state it."""
+
+    epochs_gps_ns: Int64
+    """(k,) ascending, one or more."""
+    sigma: Float64
+    """(k, 6) m and rad, in the order of `COMPONENTS`; columns of NaN where the logs state none of a component."""
+
+    def __post_init__(self) -> None:
+        known = np.isfinite(self.sigma)
+        if self.sigma.shape != (self.epochs_gps_ns.size, len(COMPONENTS)) or not self.epochs_gps_ns.size:
+            raise ConfigError(
+                f"σ of the shape {self.sigma.shape} at {self.epochs_gps_ns.size} epochs", expected="(k, 6)"
+            )
+        if (known.any(axis=0) & ~known.all(axis=0)).any() or (self.sigma[known] <= 0.0).any():
+            raise ConfigError(
+                "σ of poses that are not positive numbers throughout", expected="σ above 0, or none at all"
+            )
+
+    def at(self, epochs_gps_ns: Int64) -> Float64:
+        """Linear between the stated epochs, and the end values beyond them: (n, 6)."""
+        since, known = ((e - self.epochs_gps_ns[0]).astype(np.float64) for e in (epochs_gps_ns, self.epochs_gps_ns))
+        return np.stack([np.interp(since, known, column) for column in self.sigma.T], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -39,6 +76,8 @@ class RunPrior:
     last_gps_ns: int
     processes: tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]
     """In the order of `COMPONENTS`; independent of one another."""
+    stated: StatedSigma | None = None
+    """σ over time, in place of the usual one of the components that it states and that are corrected."""
 
     def __post_init__(self) -> None:
         if self.last_gps_ns < self.first_gps_ns:
@@ -56,8 +95,23 @@ class RunPrior:
 
     @property
     def sigmas(self) -> Float64:
-        """(6,) stationary 1 σ."""
+        """(6,) usual 1 σ."""
         return np.array([p.sigma for p in self.processes])
+
+    def sigma_at(self, epochs_gps_ns: Int64) -> Float64:
+        """1 σ (n, 6) of the poses' errors at epochs (n,)."""
+        usual = np.broadcast_to(self.sigmas, (epochs_gps_ns.size, len(COMPONENTS)))
+        if self.stated is None:
+            return usual.copy()
+        stated = self.stated.at(epochs_gps_ns)
+        return np.where(np.isfinite(stated) & (usual > 0.0), stated, usual)
+
+    def parts_at(self, epochs_gps_ns: Int64) -> Float64:
+        """The parts b and e of that σ at epochs (n,): (n, 6), or (n, 12) with e where there is an outage among them."""
+        sigma = self.sigma_at(epochs_gps_ns)
+        usual = np.minimum(sigma, _OUTAGE * self.sigmas)
+        extra = np.sqrt(np.maximum(sigma**2 - usual**2, 0.0))
+        return np.concatenate([usual, extra], axis=1) if extra.any() else usual
 
     @property
     def taus_s(self) -> Float64:
@@ -65,14 +119,46 @@ class RunPrior:
         return np.array([p.tau_s for p in self.processes])
 
 
+@dataclass(frozen=True)
+class MountingPrior:
+    """What is known of the mounting of a sensor, which all runs share, before the adjustment."""
+
+    sensor: str
+    sigma: Float64
+    """(6,) 1 σ of its errors (m, rad), in the order of `MOUNTED`; 0: not estimated."""
+
+
 def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
-    """Epochs (k,) of a run's knots: evenly spaced from its first epoch to its last, at most `spacing_s` apart."""
+    """Epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
+
+    They are evenly spaced but where σ is larger than usual: there they are closer, as the variance by which the process
+    leaves a line between knots, about σ² h / (3 τ), would grow with σ². How many there are has a bound.
+    """
     span = prior.last_gps_ns - prior.first_gps_ns
     intervals = max(1, -(-span // max(1, round(spacing_s * NS_PER_S))))
     if span == 0:
         return np.array([prior.first_gps_ns], np.int64)
     steps = np.arange(intervals + 1, dtype=np.int64)
-    return np.asarray(prior.first_gps_ns + (span // intervals) * steps + (span % intervals) * steps // intervals)
+    even = np.asarray(prior.first_gps_ns + (span // intervals) * steps + (span % intervals) * steps // intervals)
+    if prior.stated is None:
+        return even
+    more = _more_knots(prior, even)
+    parts = [even]
+    for k in range(1, int(more.max(initial=0)) + 1):
+        own = more >= k
+        parts.append(even[:-1][own] + np.diff(even)[own] * k // (more[own] + 1))
+    return np.unique(np.concatenate(parts))
+
+
+def _more_knots(prior: RunPrior, even: Int64) -> Int64:
+    """How many knots (k − 1,) each interval of the even ones gets within it."""
+    usual = np.where(prior.sigmas > 0.0, prior.sigmas, np.inf)
+    within = np.concatenate([even, (even[:-1] + even[1:]) // 2])
+    ratio = (prior.sigma_at(within) / usual).max(axis=1)
+    largest = np.maximum(np.maximum(ratio[: even.size - 1], ratio[1 : even.size]), ratio[even.size :])
+    wanted = np.clip(0.5 * largest**2 - 1.0, 0.0, _MOST_MORE)
+    fits = min(1.0, _BUDGET * largest.size / max(float(wanted.sum()), 1.0))
+    return np.asarray(np.floor(wanted * fits), np.int64)
 
 
 def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
@@ -88,20 +174,33 @@ def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
     return diagonal, -keep * gain
 
 
-def line_variance(share: Float64, step_s: Float64, tau_s: float | Float64) -> Float64:
-    """Variance by which a process of σ = 1 leaves the straight line between two knots.
+def stretches(there: npt.NDArray[np.bool_]) -> list[slice]:
+    """Runs of neighbours that are True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def line_variance(
+    share: Float64,
+    step_s: Float64,
+    tau_s: float | Float64,
+    sigma: tuple[float | Float64, float | Float64] = (1.0, 1.0),
+) -> Float64:
+    """Variance by which a process leaves the straight line between two knots.
 
     Parameters
     ----------
     share : where between the knots, 0 to 1.
     step_s : from knot to knot (s).
-    tau_s : correlation time (s). All three broadcast.
+    tau_s : correlation time (s).
+    sigma : of the process at the first and at the second knot, between which it is linear. All broadcast.
 
     Notes
     -----
-    Var[x(t) − (1 − λ) x(0) − λ x(h)] of the covariance e^(−|Δt|/τ); for h ≪ τ it is 2 λ (1 − λ) h / τ.
+    Var[x(t) − (1 − λ) x(0) − λ x(h)] of the covariance σ(t) σ(t') e^(−|Δt|/τ); for h ≪ τ and an even σ it is
+    2 σ² λ (1 − λ) h / τ.
     """
-    left, right = 1.0 - share, share
+    left, right = (1.0 - share) * sigma[0], share * sigma[1]
     # Written with e^x − 1: the terms of order one cancel.
-    whole, to_left, to_right = (np.expm1(-d / tau_s) for d in (step_s, share * step_s, left * step_s))
-    return np.maximum(2.0 * (left * right * whole - left * to_left - right * to_right), 0.0)
+    whole, to_left, to_right = (np.expm1(-d / tau_s) for d in (step_s, share * step_s, (1.0 - share) * step_s))
+    return np.maximum(2.0 * (left * right * whole - (left + right) * (left * to_left + right * to_right)), 0.0)

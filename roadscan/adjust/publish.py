@@ -44,10 +44,20 @@ def published(before: Corrections | None, solved: Corrections, moved_m: float, a
 
 
 def left_after(
-    observations: Observations, corrections: Mapping[str, Corrections], runs: Sequence[str]
-) -> Float64:  # fmt: skip
-    """What is left (n,) of each observation once the poses are corrected (m); runs are counted as in `runs`."""
+    observations: Observations,
+    corrections: Mapping[str, Corrections],
+    runs: Sequence[str],
+    mountings: Float64 | None = None,
+) -> Float64:
+    """What is left (n,) of each observation once poses and mountings are corrected (m).
+
+    runs are counted as in `runs`; mountings : (s, 6) what is added to those that `Observations.sensor` counts.
+    """
     left = observations.observed_m.copy()
+    for end in (0, 1) if mountings is not None and len(mountings) else ():
+        here = np.flatnonzero(observations.sensor[:, end] >= 0)
+        own = np.asarray(mountings)[observations.sensor[here, end]]
+        left[here] -= np.einsum("ni,ni->n", observations.mount_partials[here, end], own)
     for number, run in enumerate(runs):
         own = corrections.get(run)
         if own is None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
 from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -44,9 +45,10 @@ def seam_view(
     readings: tuple[PassReadings, PassReadings],
     corrections: tuple[Corrections | None, Corrections | None],
     settings: TieSettings,
+    mountings: tuple[tuple[MountingChange, Float64] | None, tuple[MountingChange, Float64] | None] = (None, None),
 ) -> SeamView | None:
     """Both passes at a place, without and with their corrections; None where they have no cell in common."""
-    states = [readings, tuple(moved(r, c) for r, c in zip(readings, corrections, strict=True))]
+    states = [readings, tuple(moved(*one) for one in zip(readings, corrections, mountings, strict=True))]
     patches = [[patch_of(place, r, settings.cell_m, settings.least_readings) for r in pair] for pair in states]
     known = [[p for p in pair if p is not None] for pair in patches]
     if any(len(pair) < 2 for pair in known):
@@ -59,15 +61,24 @@ def seam_view(
     return SeamView(settings.cell_m, difference, known[0][0].middle_m, sections)
 
 
-def moved(readings: PassReadings, corrections: Corrections | None) -> PassReadings:
-    """The readings of a traverse, placed with corrected poses; corrections are small, so turns are linear."""
-    if corrections is None or not readings.pose.size:
+def moved(
+    readings: PassReadings, corrections: Corrections | None, mounting: tuple[MountingChange, Float64] | None = None
+) -> PassReadings:
+    """The readings of a traverse, placed with corrected poses; corrections are small, so turns are linear.
+
+    mounting : change of that of the sensor, and its lever arm (3,).
+    """
+    if (corrections is None and mounting is None) or not readings.pose.size:
         return readings
-    shift, turn = corrections.at(readings.epoch_gps_ns)
     points = np.stack([readings.easting_m, readings.northing_m, readings.height_m], axis=-1)
     pose = readings.pose.astype(np.int64)
-    swung = np.cross(turn[pose], readings.arm_body_m(points, pose))
-    level = shift[pose] + np.einsum("nij,nj->ni", readings.level_from_body[pose], swung)
+    arm, level = readings.arm_body_m(points, pose), np.zeros(points.shape)
+    if corrections is not None:
+        shift, turn = corrections.at(readings.epoch_gps_ns)
+        swung = np.cross(turn[pose], arm)
+        level = level + shift[pose] + np.einsum("nij,nj->ni", readings.level_from_body[pose], swung)
+    if mounting is not None:
+        level = level + mounting[0].moves_level(readings.level_from_body[pose], arm, mounting[1])
     there = points + map_from_level(level, readings.convergence_rad)
     easting, northing, height = (np.ascontiguousarray(there[:, k]) for k in range(3))
     return replace(readings, easting_m=easting, northing_m=northing, height_m=height)

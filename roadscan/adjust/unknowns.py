@@ -1,7 +1,8 @@
 """The unknowns of an adjustment, and its observations as rows of them.
 
-Unknowns are in units of their prior σ: corrections of each run's components at its knots, then the errors of the
-surveyed coordinates of control points (north, east, down), which all runs that saw a point share.
+Unknowns are in units of their prior σ: the parts of the corrections of each run's components at its knots
+(:mod:`roadscan.adjust.process`), then the errors of the surveyed coordinates of control points (north, east, down),
+which all runs that saw a point share, then those of the mountings of sensors, which all runs share.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS, FIXED, Observations
-from roadscan.adjust.process import RunPrior, knots_of, line_variance, precision_of
+from roadscan.adjust.process import MountingPrior, RunPrior, knots_of, line_variance, precision_of, stretches
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
@@ -74,28 +75,59 @@ class Unknowns:
     priors: tuple[RunPrior, ...]
     knots: tuple[Int64, ...]
     """Epochs of each run's knots."""
-    sigmas: Float64
-    """(runs, 6) stationary σ, 0 where a component is not estimated."""
+    sigmas: tuple[Float64, ...]
+    """(k, 6), or (k, 12) where a run has outages: σ of the parts of each run's processes at its knots; 0: not there."""
     control: ControlPoints
+    mountings: tuple[MountingPrior, ...] = ()
 
     @classmethod
     def of(
-        cls, priors: Sequence[RunPrior], control: ControlPoints, spacing_s: float, components: npt.NDArray[np.bool_]
+        cls,
+        priors: Sequence[RunPrior],
+        control: ControlPoints,
+        spacing_s: float,
+        components: npt.NDArray[np.bool_],
+        mountings: Sequence[MountingPrior] = (),
     ) -> Unknowns:
         """Knots at most `spacing_s` apart; only some components are estimated."""
-        sigmas = np.array([p.sigmas for p in priors]).reshape(-1, _SIZE) * components
-        return cls(tuple(priors), tuple(knots_of(p, spacing_s) for p in priors), sigmas, control)
+        knots = tuple(knots_of(p, spacing_s) for p in priors)
+        parts = [p.parts_at(own) for p, own in zip(priors, knots, strict=True)]
+        sigmas = tuple(own * np.tile(components, own.shape[1] // _SIZE) for own in parts)
+        return cls(tuple(priors), knots, sigmas, control, tuple(mountings))
+
+    @cached_property
+    def active(self) -> npt.NDArray[np.bool_]:
+        """(runs, 6) components that are estimated."""
+        return np.array([(own[:, :_SIZE] > 0.0).all(axis=0) for own in self.sigmas], bool).reshape(-1, _SIZE)
 
     @cached_property
     def first(self) -> Int64:
         """(runs + 1,) the first unknown of each run; the last is that of the control points."""
-        sizes = [k.size * int((s > 0.0).sum()) for k, s in zip(self.knots, self.sigmas, strict=True)]
+        sizes = [int((own > 0.0).sum()) for own in self.sigmas]
         return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
+        return self.first_mounting + int((self.mount_sigma > 0.0).sum())
+
+    @property
+    def first_mounting(self) -> int:
+        """The first unknown of a mounting."""
         return int(self.first[-1]) + int((self.control.sigma_m > 0.0).sum())
+
+    @cached_property
+    def mount_sigma(self) -> Float64:
+        """(s, 6) prior σ of the mountings."""
+        return np.array([one.sigma for one in self.mountings]).reshape(-1, _SIZE)
+
+    @cached_property
+    def of_mountings(self) -> Int64:
+        """(s, 6) unknown of each component of the mountings, −1: none."""
+        there = self.mount_sigma > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first_mounting + np.arange(int(there.sum()))
+        return numbers
 
     @cached_property
     def of_control(self) -> Int64:
@@ -106,11 +138,10 @@ class Unknowns:
         return numbers
 
     def of_run(self, run: int) -> Int64:
-        """(k, 6) unknown of each knot and component of a run, −1: none."""
-        active = self.sigmas[run] > 0.0
-        numbers = np.full((self.knots[run].size, _SIZE), -1, np.int64)
-        count = self.knots[run].size * int(active.sum())
-        numbers[:, active] = self.first[run] + np.arange(count).reshape(self.knots[run].size, int(active.sum()))
+        """Unknown of each knot and part of a run, as `sigmas`; −1: none."""
+        there = self.sigmas[run] > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first[run] + np.arange(int(there.sum()))
         return numbers
 
     def intervals(self, run: int, epochs_gps_ns: Int64) -> tuple[Int64, Float64, Float64]:
@@ -133,39 +164,59 @@ class Unknowns:
         ----------
         point : (n,) control point of each observation, −1: none.
         """
-        n = observations.size
-        unknown = np.full((n, 4 * _SIZE + 3), -1, np.int64)
-        derivative, variance = np.zeros((n, 4 * _SIZE + 3)), np.zeros((n, _SIZE))
+        n, width = observations.size, max((own.shape[1] for own in self.sigmas), default=_SIZE)
+        unknown = np.full((n, 4 * width + 3), -1, np.int64)
+        derivative, variance = np.zeros(unknown.shape), np.zeros((n, _SIZE))
         for run in range(len(self.priors)):
-            numbers, sigma, taus = self.of_run(run), self.sigmas[run], self.priors[run].taus_s
+            numbers, sigma = self.of_run(run), self.sigmas[run]
+            parts, own = sigma.shape[1] // _SIZE, sigma.shape[1]
+            taus = np.tile(self.priors[run].taus_s, parts)
             for end in (0, 1):
                 here = np.flatnonzero(observations.run[:, end] == run)
                 before, share, step_s = self.intervals(run, observations.epoch_gps_ns[here, end])
-                scaled = observations.partials[here, end] * sigma
+                partial = np.tile(observations.partials[here, end], parts)
                 after = np.minimum(before + 1, len(numbers) - 1)
                 for side, (knot, weight) in enumerate(((before, 1.0 - share), (after, share))):
-                    at = slice((2 * end + side) * _SIZE, (2 * end + side + 1) * _SIZE)
-                    unknown[here, at], derivative[here, at] = numbers[knot], scaled * weight[:, None]
-                variance[here] += scaled**2 * line_variance(share[:, None], step_s[:, None], taus)
+                    at = slice((2 * end + side) * width, (2 * end + side) * width + own)
+                    unknown[here, at], derivative[here, at] = numbers[knot], partial * sigma[knot] * weight[:, None]
+                lines = line_variance(share[:, None], step_s[:, None], taus, (sigma[before], sigma[after]))
+                variance[here] += (partial**2 * lines).reshape(-1, parts, _SIZE).sum(axis=1)
         seen = point >= 0
         unknown[seen, -3:] = self.of_control[point[seen]]
         derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
-        return Rows.of(unknown, derivative), variance
+        mounted, by_mounting = self._of_mounted(observations)
+        return Rows.of(np.hstack([unknown, mounted]), np.hstack([derivative, by_mounting])), variance
+
+    def _of_mounted(self, observations: Observations) -> tuple[Int64, Float64]:
+        """Unknowns and derivatives (n, 12), of the mountings of both ends; (n, 0) where none is estimated."""
+        n = observations.size
+        if not self.mountings:
+            return np.zeros((n, 0), np.int64), np.zeros((n, 0))
+        here = observations.sensor >= 0
+        unknown, derivative = np.full((n, 2, _SIZE), -1, np.int64), np.zeros((n, 2, _SIZE))
+        unknown[here] = self.of_mountings[observations.sensor[here]]
+        derivative[here] = observations.mount_partials[here] * self.mount_sigma[observations.sensor[here]]
+        return unknown.reshape(n, -1), derivative.reshape(n, -1)
 
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
-        """Upper entries of the prior's inverse covariance: row, column, value, component (control: `len(COMPONENTS)`).
+        """Upper entries of the prior's inverse covariance: row, column, value, component.
 
-        Those of control points are not among them: their survey is an observation, which may be wrong.
+        Mountings have the component `len(COMPONENTS)`. Those of control points are not among them: their survey is an
+        observation, which may be wrong.
         """
         parts: list[tuple[Int64, Int64, Float64, Int64]] = []
         for run, prior in enumerate(self.priors):
-            numbers = self.of_run(run)
-            for component in np.flatnonzero(self.sigmas[run] > 0.0):
-                diagonal, beside = precision_of(self.knots[run], prior.processes[component].tau_s)
-                own = numbers[:, component]
-                row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
-                value = np.concatenate([diagonal, beside])
-                parts.append((row, column, value, np.full(row.size, component, np.int64)))
+            for part, numbers in enumerate(self.of_run(run).T):
+                component = part % _SIZE
+                for one in stretches(numbers >= 0):
+                    diagonal, beside = precision_of(self.knots[run][one], prior.processes[component].tau_s)
+                    own = numbers[one]
+                    row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
+                    value = np.concatenate([diagonal, beside])
+                    parts.append((row, column, value, np.full(row.size, component, np.int64)))
+        mounted = self.of_mountings[self.of_mountings >= 0]
+        if mounted.size:
+            parts.append((mounted, mounted, np.ones(mounted.size), np.full(mounted.size, _SIZE, np.int64)))
         if not parts:
             empty = np.zeros(0, np.int64)
             return empty, empty, np.zeros(0), empty
@@ -174,7 +225,7 @@ class Unknowns:
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
         """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point."""
-        parts = [_pairs(self.of_control, self.of_control)]
+        parts = [_pairs(self.of_control, self.of_control), _pairs(self.of_mountings, self.of_mountings)]
         for run in range(len(self.priors)):
             numbers = self.of_run(run)
             parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]

@@ -21,6 +21,7 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.rig import Mounting, Mountings
 from roadscan.model.settings.segmentation import RoadSegmentation
 from roadscan.navigation.clocks import ClockCorrection
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.movement import NO_CORRECTION, Allowance
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.points.charts import Charts, charts_along
@@ -53,6 +54,8 @@ CORRECTION_SIGMAS: Final = tuple(
     f"sigma_{name}" for name in ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 )
 """Columns of the table `corrections`."""
+MOUNTING_COLUMNS: Final = ("lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad")
+"""Columns of the table `mounting_corrections`."""
 _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz", *_SIGMA_COLUMNS]
 
 
@@ -89,6 +92,8 @@ class ReadingSource:
     belongs to the keys of tiles."""
     geoid: Geoid | None = None
     """Grid that a cloud's orthometric heights count from."""
+    mounting_change: MountingChange | None = None
+    """What an adjustment adds to the mountings. Not in `key`, as corrections of the poses are not."""
     allowance: Allowance = NO_CORRECTION
     """Corrections of the poses that footprints leave room for. Not in `key`: it belongs to the keys of footprints."""
 
@@ -98,6 +103,11 @@ class ReadingSource:
             return tuple(ingested)
         ends = self.clock.applied(np.array(ingested, dtype=np.int64).ravel()).reshape(-1, 2)
         return tuple((int(a), int(b)) for a, b in ends)
+
+    @property
+    def adjusted_mountings(self) -> Mountings:
+        """The mountings as an adjustment changed them: they go with corrected poses."""
+        return self.mountings if self.mounting_change is None else self.mounting_change.applied(self.mountings)
 
     @property
     def attribute(self) -> dict[str, Any]:
@@ -171,10 +181,10 @@ class Placer:
     """Places the readings of slices: loads the poses they need, once for each source."""
 
     def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice], *, recorded: bool = False) -> None:
-        """`recorded`: with the poses as they were recorded, whatever corrections there are."""
+        """`recorded`: with poses as they were recorded and mountings as stated, whatever corrections there are."""
         self._store = store
         self._ground = ground
-        self._load = load_recorded if recorded else load_trajectory
+        self._load, self._recorded = load_recorded if recorded else load_trajectory, recorded
         self._placements: dict[str, Placement] = {}
         spans: dict[str, list[tuple[int, int]]] = {}
         sources: dict[str, ReadingSource] = {}
@@ -258,15 +268,16 @@ class Placer:
         around = [(first - wide, last + wide) for first, last in spans]
         trajectory = self._load(self._store, source.trajectory, around, self._ground.max_gap_s)
         limits = source.range_min_m, source.range_max_m
+        mountings = source.mountings if self._recorded else source.adjusted_mountings
         return Placement(
             trajectory=trajectory,
             charts=_charts(self._ground.map, trajectory),
-            mountings=source.mountings,
+            mountings=mountings,
             range_min_m=source.range_min_m,
             range_max_m=source.range_max_m,
             heights=self._ground.heights,
             tile_quanta=self._ground.grid.size_quanta,
-            road=None if source.road is None else RoadFinder(source.road, trajectory, source.mountings, *limits),
+            road=None if source.road is None else RoadFinder(source.road, trajectory, mountings, *limits),
         )
 
 
@@ -340,6 +351,15 @@ def _sigma(rows: pa.Table) -> npt.NDArray[np.float64] | None:
     if any(name not in rows.column_names for name in CORRECTION_SIGMAS):
         return None
     return np.stack([pc.fill_null(rows.column(c), np.nan).to_numpy() for c in CORRECTION_SIGMAS], axis=-1)
+
+
+def load_mounting_changes(store: Store) -> dict[str, MountingChange]:
+    """What an adjustment adds to the mountings of sensors, by sensor."""
+    table = read_held(store, "mounting_corrections")
+    return {
+        row["sensor"]: MountingChange.of(np.array([row[name] for name in MOUNTING_COLUMNS]))
+        for row in ([] if table is None else table.to_pylist())
+    }
 
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:

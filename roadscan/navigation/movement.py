@@ -43,7 +43,7 @@ class Allowance(NamedTuple):
 NO_CORRECTION: Final = Allowance(0.0, 0.0)
 
 
-def allowance_for(corrections: Corrections | None) -> Allowance:
+def allowance_for(corrections: Corrections | None, mounting: tuple[float, float] = (0.0, 0.0)) -> Allowance:
     """The least allowance that covers corrections, in steps of four from 0.05 m and 0.5 mrad on.
 
     The first step is left room for where there are none yet: most corrections to come stay within it.
@@ -51,6 +51,7 @@ def allowance_for(corrections: Corrections | None) -> Allowance:
     Parameters
     ----------
     corrections : of one run; None where it has none.
+    mounting : shift (m) and turn (rad) that are added to the mounting of the sensor.
 
     Raises
     ------
@@ -58,7 +59,7 @@ def allowance_for(corrections: Corrections | None) -> Allowance:
         where corrections are beyond all reason (819 m, 8 rad).
     """
     shift, turn = largest(corrections)
-    return Allowance(_step(shift, _LEAST_SHIFT_M), _step(turn, _LEAST_TURN_RAD))
+    return Allowance(_step(shift + mounting[0], _LEAST_SHIFT_M), _step(turn + mounting[1], _LEAST_TURN_RAD))
 
 
 def largest(corrections: Corrections | None) -> tuple[float, float]:

@@ -25,6 +25,7 @@ WAY_OUT: Final = {
     "clock_residuals": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
     "mountings": "`roadscan calibrate` makes it anew of the survey file's evidence; if it is removed, the rig file's "
     "mountings hold",
+    "mounting_corrections": "put it back, or adjust again; if it is removed, mountings hold as they were stated",
     "corrections": "put it back, or compute it again; if it is removed, trajectories hold as they were recorded",
 }
 """What mends each of the tables where it is damaged."""

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from benchmarks.bench_reference_site import BestEstimate, errors
 from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
-from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
+from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, knots_of
 from roadscan.model.errors import ConfigError
 
 S = 10**9
@@ -58,7 +59,9 @@ def scattered(seed: int = 1, ties_: int = 150, seen: int = 30) -> Observations:
     )  # fmt: skip
 
 
-def dense(observations: Observations, knots: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dense(
+    observations: Observations, knots: list[np.ndarray], mountings: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean and covariance of all knots' corrections (run, knot, component), and covariance of the predictions.
 
     By the conditional distribution of jointly normal numbers, from covariances alone: no normal equations.
@@ -86,9 +89,22 @@ def dense(observations: Observations, knots: list[np.ndarray]) -> tuple[np.ndarr
         seen = np.flatnonzero((observations.place == point) & (observations.survey_sigma_m > 0))
         d = observations.partials[seen, 0, :3] * observations.survey_sigma_m[seen][:, None]
         noise[np.ix_(seen, seen)] += d @ d.T
+    if mountings is not None:
+        by = by_mountings(observations, len(mountings)) * mountings.ravel()
+        noise += by @ by.T
     gain = np.linalg.solve(a @ prior @ a.T + noise, a @ prior).T
     after = prior - gain @ a @ prior
     return gain @ observations.observed_m, after, a @ after @ a.T
+
+
+def by_mountings(observations: Observations, sensors: int) -> np.ndarray:
+    """Derivatives (n, 6 s) by the mountings of sensors."""
+    rows = np.zeros((observations.size, sensors, 6))
+    for n in range(observations.size):
+        for end in (0, 1):
+            if observations.sensor[n, end] >= 0:
+                rows[n, observations.sensor[n, end]] += observations.mount_partials[n, end]
+    return rows.reshape(observations.size, -1)
 
 
 def all_values(found: Adjustment) -> np.ndarray:
@@ -114,6 +130,53 @@ def test_solution_and_covariance_are_those_of_dense_least_squares() -> None:
         begin += 6 * k.size
     assert found.settled
     assert (found.weight == 1.0).all()
+
+
+def test_mountings_are_those_of_dense_least_squares() -> None:
+    """Of two sensors; the second one's heading is not estimated, and some ends were seen by a third one."""
+    rng = np.random.default_rng(5)
+    observations = scattered(4)
+    sensor = rng.integers(-1, 2, (observations.size, 2)).astype(np.int32)
+    sensor[observations.run == FIXED] = -1
+    by = rng.standard_normal((observations.size, 2, 6))
+    observations = replace(observations, sensor=sensor, mount_partials=by)
+    sigma = np.array([[0.002, 0.003, 0.002, 2e-4, 1e-4, 3e-4], [0.001, 0.002, 0.004, 2e-4, 3e-4, 0.0]])
+    known = [MountingPrior(name, own) for name, own in zip("ab", sigma, strict=True)]
+    found = adjust(observations, priors(), ALL_COUNT, known)
+    knots = [knots_of(p, 0.5) for p in priors()]
+    mean, covariance, _ = dense(observations, knots, sigma)
+    scale = np.tile([p.sigma for p in PROCESSES], mean.size // 6)
+    np.testing.assert_allclose(all_values(found) / scale, mean / scale, atol=1e-9)
+    np.testing.assert_allclose(
+        np.concatenate([s.ravel() for s in found.sigma]), np.sqrt(np.diag(covariance)), rtol=1e-7
+    )
+    rows = by_mountings(observations, 2) * sigma.ravel()
+    gain = np.linalg.solve(_total(observations, knots) + rows @ rows.T, rows).T
+    np.testing.assert_allclose(
+        found.mountings.error.ravel(), sigma.ravel() * (gain @ observations.observed_m), atol=1e-9
+    )
+    after = np.sqrt(np.maximum(1.0 - np.einsum("ij,ji->i", gain, rows), 0.0)) * sigma.ravel()
+    np.testing.assert_allclose(found.mountings.sigma.ravel(), after, rtol=1e-6)
+    assert found.mountings.error[1, 5] == found.mountings.sigma[1, 5] == 0.0
+
+
+def _total(observations: Observations, knots: list[np.ndarray]) -> np.ndarray:
+    """Covariance of the observations by poses, survey and their own σ."""
+    prior, a = [], _rows(observations, knots)
+    for k in knots:
+        times = (k - START) / S
+        whole = np.zeros((times.size, 6, times.size, 6))
+        for c, p in enumerate(PROCESSES):
+            whole[:, c, :, c] = p.sigma**2 * np.exp(-np.abs(times[:, None] - times) / p.tau_s)
+        prior.append(whole.reshape(6 * times.size, -1))
+    total = a @ block_diag(*prior) @ a.T
+    lines = [_line_variance(observations, n) for n in range(observations.size)]
+    total += np.diag(observations.sigma_m**2 + np.array(lines))
+    for point in np.unique(observations.place[observations.survey_sigma_m > 0]):
+        seen = np.flatnonzero((observations.place == point) & (observations.survey_sigma_m > 0))
+        d = observations.partials[seen, 0, :3] * observations.survey_sigma_m[seen][:, None]
+        total[np.ix_(seen, seen)] += d @ d.T
+    return total
 
 
 def test_each_observation_left_out_is_predicted_as_without_it() -> None:
@@ -431,3 +494,45 @@ def test_nothing_to_correct_is_refused() -> None:
 def test_what_no_run_explains_is_refused(change: dict[str, np.ndarray], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         adjust(replace(scattered(), **change), priors(), ALL_COUNT)
+
+
+def test_a_survey_of_control_whose_sigma_is_ten_times_too_small_is_not_taken_for_many_wrong_points() -> None:
+    road = Road(1500.0, 8, 10.0, 75.0, lane_m=3.5, survey_height_sigma_m=0.02, survey_place_sigma_m=0.03)
+    observations, stations, truth = drawn(road, 31)
+    stated = replace(observations, survey_sigma_m=observations.survey_sigma_m / 10.0)
+    found = adjust(stated, road.priors(), AdjustmentSettings(knot_spacing_s=0.5))
+    # A median of 42 squares errs by a third (1 σ), and so the σ by a sixth.
+    assert np.sqrt(found.variance_factors["control_survey"]) == pytest.approx(10.0, rel=0.4)
+    assert len(found.verdict.wrong) <= 1
+    off = heights_off(found, road, stations, truth)
+    assert np.sqrt(np.mean(off**2)) < 2.0 * np.mean([s[:, 2].mean() for s in found.sigma])
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_one_wrong_height_is_named_and_no_right_one_beyond_the_stated_chance(runs: int) -> None:
+    """Five points of 600 m, one of them wrong, in 14 draws, and 60 draws of right control."""
+    road = Road(600.0, runs, 10.0, 150.0, lane_m=3.5 if runs > 1 else 0.0, speed_m_s=25.0)
+    settings = AdjustmentSettings(knot_spacing_s=0.5)
+
+    def of_seed(seed: int, wrong_m: float) -> Adjustment:
+        rng = np.random.default_rng(seed)
+        truth = drawn_errors(road, np.concatenate([road.ties_m, road.control_m]), rng)
+        parts = ([ties(road, truth, rng)] if runs > 1 else []) + [control(road, truth, rng)]
+        observations = Observations.joined(parts)
+        wrong = (observations.place == 2) & (observations.kind == KINDS.index("control_height"))
+        observations.observed_m[wrong & (observations.run[:, 1] == FIXED)] += wrong_m
+        return adjust(observations, road.priors(), settings)
+
+    named = {0.02: 0, 0.05: 0, 0.1: 0, 1.0: 0}
+    right = 0
+    for wrong_m in named:
+        for seed in range(14):
+            found = of_seed(seed, wrong_m).verdict.left_out
+            named[wrong_m] += (2, "height") in found
+            right += bool(found - {(2, "height")})
+    assert [named[w] for w in (0.05, 0.1, 1.0)] == [14, 14, 14]
+    # Of one drive, which knows the height between neighbours to 4 mm, 20 mm are five σ.
+    assert named[0.02] >= 12
+    right += sum(bool(of_seed(100 + seed, 0.0).verdict.left_out) for seed in range(60))
+    # 116 draws, of which one in a hundred may name a right point: more than five have a chance of 0.1 %.
+    assert right <= 5

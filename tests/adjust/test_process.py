@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of, line_variance, precision_of
+from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of, line_variance, precision_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.settings.adjustment import AdjustmentSettings
 
@@ -60,3 +60,50 @@ def test_a_process_that_is_none_is_refused() -> None:
         prior(1.0, PROCESS, GaussMarkov(0.01, 0.0))
     with pytest.raises(ConfigError, match="ends"):
         RunPrior("one", 5, 4, (PROCESS,) * 6)
+
+
+def test_a_line_between_knots_of_unlike_sigma() -> None:
+    share, step_s, tau_s, sigma = 0.3, 2.0, 50.0, np.array([0.01, 0.013, 0.02])
+    three = np.array([0.0, share * step_s, step_s])
+    combination = np.array([share - 1.0, 1.0, -share]) * sigma
+    expected = combination @ covariance(three, tau_s) @ combination
+    found = line_variance(np.array(share), np.array(step_s), tau_s, (sigma[0], sigma[2]))
+    assert found == pytest.approx(expected, rel=1e-8)
+
+
+def outage() -> RunPrior:
+    """σ of the height is 15 mm, and in the middle 10 s of 100 s 150 mm."""
+    since = np.array([0.0, 44.9, 45.0, 55.0, 55.1, 100.0])
+    sigma = np.full((6, 6), np.nan)
+    sigma[:, 2] = [0.015, 0.015, 0.15, 0.15, 0.015, 0.015]
+    stated = StatedSigma(10**18 + (since * S).astype(np.int64), sigma)
+    return RunPrior("one", 10**18, 10**18 + 100 * S, (PROCESS,) * 6, stated)
+
+
+def test_an_outage_has_an_error_of_its_own() -> None:
+    """Its σ is as stated, and at 15 mm of it the error goes on as it was."""
+    one = outage()
+    epochs = 10**18 + np.array([10, 50, 90]) * S
+    np.testing.assert_allclose(one.sigma_at(epochs)[:, 2], [0.015, 0.15, 0.015])
+    np.testing.assert_allclose(one.sigma_at(epochs)[:, 0], 0.015)
+    parts = one.parts_at(epochs)
+    assert parts.shape == (3, 12)
+    np.testing.assert_allclose(np.hypot(parts[:, 2], parts[:, 8]), [0.015, 0.15, 0.015])
+    np.testing.assert_allclose(parts[:, 2], 0.015 * np.array([1.0, np.sqrt(2.0), 1.0]))
+    assert not parts[:, 6:8].any()
+
+
+def test_knots_are_closer_in_an_outage_and_bounded() -> None:
+    one = outage()
+    knots = (knots_of(one, 0.1) - 10**18) / S
+    assert (np.diff(knots) > 0).all()
+    assert (knots[0], knots[-1]) == (0.0, 100.0)
+    assert np.diff(knots)[(knots[:-1] > 46) & (knots[1:] < 54)].max() < 0.01
+    assert np.diff(knots)[knots[1:] < 44].min() == pytest.approx(0.1, rel=1e-3)
+    assert knots.size < 5 * 1000 + 1
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0])
+def test_a_stated_sigma_that_is_none_is_refused(wrong: float) -> None:
+    with pytest.raises(ConfigError, match="not positive"):
+        StatedSigma(np.array([10**18]), np.full((1, 6), wrong))

@@ -12,6 +12,7 @@ import numpy as np
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
 from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.control_work import (
@@ -24,9 +25,17 @@ from roadscan.jobs.adjust.control_work import (
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.mountings import (
+    calibrated_sigma,
+    held_values,
+    mounted_of,
+    mounting_findings,
+    mounting_lines,
+    publish_mountings,
+)
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
-from roadscan.jobs.adjust.publication import digest_of, foreign_runs, publish
+from roadscan.jobs.adjust.publication import digests_of, foreign_runs, publish
 from roadscan.jobs.adjust.seams import shown_seams
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
 from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
@@ -75,6 +84,8 @@ def solution_key(plan: SurveyPlan) -> str:
     ]
     return key_of(
         code_digest(f"{__name__}:adjust_survey"), config.model_dump(mode="json"), runs_of(plan), sources, beside,
+        [[name, s.lever_arm_sigma_m, s.boresight_sigma_deg] for name, s in sorted(plan.survey.rig.sensors.items())],
+        sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
         None if picked is None or not picked.is_file() else file_digest(picked), sorted(foreign_runs(plan.store)),
     )  # fmt: skip
 
@@ -88,7 +99,7 @@ def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
         return False
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
-    return whole and record.figures()["table"] == digest_of(plan.store)
+    return whole and record.figures()["table"] == digests_of(plan.store)
 
 
 def withdraw(session: Session) -> None:
@@ -96,6 +107,7 @@ def withdraw(session: Session) -> None:
     manifest, plan = session.manifest, session.plan
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, plan.survey.config.adjust)
+    publish_mountings(session.store, None, plan.survey.config.adjust)
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
@@ -107,11 +119,12 @@ def adjust_survey(session: Session) -> None:
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
     runs = runs_of(plan)
     priors = priors_of(plan, sources, runs)
-    work = plan_work(plan, sources, [max(p.sigmas[:2]) for p in priors])
+    work = plan_work(plan, sources, priors)
     failed = _collect(session, work)
-    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs)
+    mounted = mounted_of(plan, sources, foreign=bool(foreign))
+    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs, mounted)
     sightings, pictures = load_sightings(session.store, manifest, work.control)
-    evidence = Evidence(runs, priors, ties, tuple(sightings))
+    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
@@ -119,35 +132,38 @@ def adjust_survey(session: Session) -> None:
     if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
+        publish_mountings(session.store, None, plan.survey.config.adjust)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
         _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed)
         return
     solution = solve(plan, evidence)
     held = publish(session.store, solution.corrections, plan.survey.config.adjust)
-    points = control_rows(evidence, solution, held)
+    changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
+    added = held_values(mounted, changes)
+    points = control_rows(evidence, solution, held, added)
     tables = {
-        "tie_residuals": tie_rows(evidence, solution, held),
+        "tie_residuals": tie_rows(evidence, solution, held, added),
         "control_residuals": points,
-        "relative_accuracy": relative_rows(evidence, work.tracks, held),
+        "relative_accuracy": relative_rows(evidence, work.tracks, held, added),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
         "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
-    seams, not_drawn = shown_seams(work.ties, evidence, solution, held, session.compute)
+    seams, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
-    lines = [*_lines(work, evidence, solution, held, tables), *not_drawn]
-    doubts += [*solution.findings, *_of_points(work, sightings)]
+    lines = [*_lines(work, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    doubts += [*solution.findings, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
     _keep(session, key, held, (lines, doubts), failed)
 
 
-def plan_work(plan: SurveyPlan, sources: Sources, sigma_pose_m: Sequence[float]) -> Work:
+def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
     """Where passes overlap and where they come by control points: tasks for both."""
     tracks = tracks_of(plan, sources)
     config = plan.survey.config.adjust
     places = _places(tracks, config.places)
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan))
-    control = control_tasks(plan, sources, tracks, points, sigma_pose_m)
+    control = control_tasks(plan, sources, tracks, points, priors)
     return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points))
 
 
@@ -186,7 +202,7 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Fi
     """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
     lines, doubts = said
     detail = {
-        "runs": sorted(held), "table": digest_of(session.store), "lines": lines,
+        "runs": sorted(held), "table": digests_of(session.store), "lines": lines,
         "findings": [asdict(one) for one in doubts],
     }  # fmt: skip
     own = key if not failed else key_of(key, "failed")

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight
 from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.process import RunPrior
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 from roadscan.code_reach import code_digest
@@ -47,7 +48,7 @@ class ControlTask:
     settings: TargetSettings
     runs: tuple[str, ...]
     sigma_pose_m: tuple[float, ...]
-    """1 σ of the recorded poses on each horizontal axis, by run."""
+    """Of each pass 1 σ of its recorded poses on each horizontal axis."""
     point: ControlPoint
     passes: tuple[tuple[Traverse, ...], ...]
     """Of each pass the traverses of its sensors."""
@@ -140,9 +141,12 @@ def control_tasks(
     sources: Sources,
     tracks: Sequence[Track],
     points: Sequence[ControlPoint],
-    sigma_pose_m: Sequence[float],
+    priors: Sequence[RunPrior],
 ) -> list[ControlTask]:
-    """A task for each point that a pass came by, with the key of what is seen of it."""
+    """A task for each point that a pass came by, with the key of what is seen of it.
+
+    priors : of each run, in the order of the survey file.
+    """
     config = plan.survey.config.adjust
     runs = runs_of(plan)
     settings = TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
@@ -155,13 +159,18 @@ def control_tasks(
             continue
         files = tuple(near_files(sources, [t for own in passes for t in own], runs))
         own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
-        sigma = tuple(float(s) for s in sigma_pose_m)
+        sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
         seen = [one.key(road_key(one.source)) for one in files]
         key = key_of(
             shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, seen
         )
         tasks.append(ControlTask(plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key))
     return tasks
+
+
+def _sigma_pose_m(prior: RunPrior, traverse: Traverse) -> float:
+    ends = np.array([traverse.first_gps_ns, traverse.last_gps_ns], np.int64)
+    return float(prior.sigma_at(ends)[:, :2].max())
 
 
 def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
@@ -193,11 +202,11 @@ def sight_control(task: ControlTask) -> OutputRecord:
     reader = NearReader(task.store, task.ground, task.files, task.runs)
     circle = Circle(task.point.easting_m, task.point.northing_m, _radius_m(task.point, task.settings))
     found = []
-    for own, picked in zip(task.passes, task.picked, strict=True):
+    for own, picked, sigma_pose_m in zip(task.passes, task.picked, task.sigma_pose_m, strict=True):
         heads = [reader.of(traverse, circle) for traverse in own]
         # Profiles are dense and returns sparse: where a pass has both, the profiles show the point.
         dense = [h for h in heads if not h.returns and h.pose.size] or heads
-        found.append(sight(task.point, dense, task.settings, task.sigma_pose_m[own[0].run], picked))
+        found.append(sight(task.point, dense, task.settings, sigma_pose_m, picked))
     schema = table_schema(SIGHTINGS)
     rows = pa.Table.from_pylist([_row(one, task.runs) for one in found], schema=schema.arrow())
     content = parquet_bytes(rows, schema)

@@ -83,7 +83,7 @@ SOLUTION_SETTLED: Final = Witness(
 )
 STATED_SIGMA: Final = Witness(
     "stated_sigma",
-    input="trajectories, ties",
+    input="trajectories, control points",
     fault="A stated σ of poses or of observations is much too small.",
     asks="residuals against their σ: variance factors of each kind of observation and of each component of the poses",
     does="variance factors are estimated, and weights and published σ follow them",
@@ -106,6 +106,7 @@ _WORDS: Final = {
     "plane_tie": "distances of planes of two passes",
     "control_height": "heights measured at control points",
     "control_position": "places measured at control points",
+    "control_survey": "the survey of the control points",
     "north_m": "the poses, north",
     "east_m": "the poses, east",
     "down_m": "the poses, height",

@@ -22,6 +22,7 @@ from roadscan.adjust.quality import (
     vertical_accuracy,
 )
 from roadscan.jobs.adjust.solution import Evidence, Solution
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -32,10 +33,10 @@ _AT_THEIR_PLACE: Final = ("found", "picked")
 """A check point whose target lies elsewhere than surveyed says nothing of the poses' error in the plane."""
 
 
-def tie_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
-    """Of the table `tie_residuals`."""
+def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
+    """Of the table `tie_residuals`; mounted : (s, 6) what is added to the mountings."""
     ties = evidence.ties
-    after = left_after(ties.observations, held, evidence.runs)
+    after = left_after(ties.observations, held, evidence.runs, mounted)
     names = ("place", "kind", "first_run", "second_run", "easting_m", "northing_m", "accepted", "sigma_m")
     columns = {name: np.asarray(ties.columns[name]).tolist() for name in names}
     columns |= {"before_m": ties.observations.observed_m.tolist(), "after_m": after.tolist()}
@@ -43,12 +44,12 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
     return _rows(columns)
 
 
-def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held) -> Rows:
+def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
     """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run."""
     ties = evidence.ties
     own = ties.accepted
     observations = ties.observations.chosen(own)
-    after = left_after(observations, held, evidence.runs)
+    after = left_after(observations, held, evidence.runs, mounted)
     kinds = np.asarray(ties.columns["kind"])[own]
     rows: Rows = []
     for number in np.unique(observations.run[:, 0]).tolist():
@@ -120,14 +121,18 @@ def _by_distance(rows: Float64) -> list[DistanceClass]:
     return accuracy_by_distance(rows[:, 0], rows[:, 1], rows[:, 2].astype(np.int64))
 
 
-def control_rows(evidence: Evidence, solution: Solution, held: Held) -> Rows:
-    """Of the table `control_residuals`."""
-    return [_control_row(one, evidence, solution, held) for one in evidence.sightings]
+def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
+    """Of the table `control_residuals`; mounted : (s, 6) what is added to the mountings."""
+    return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
 
 
-def _control_row(one: Sighting, evidence: Evidence, solution: Solution, held: Held) -> dict[str, Any]:
+def _control_row(
+    one: Sighting, evidence: Evidence, solution: Solution, held: Held, mounted: Float64
+) -> dict[str, Any]:  # fmt: skip
     point, run = one.point, evidence.runs[one.run]
-    moved = moved_m(one, held.get(run))
+    seen_by = evidence.seen_by(one)
+    mounting = None if seen_by.number < 0 else (MountingChange.of(mounted[seen_by.number]), seen_by.lever_body_m)
+    moved = moved_m(one, held.get(run), mounting)
     height = point.height_m - one.height_m
     east, north = point.easting_m - one.easting_m, point.northing_m - one.northing_m
     own = solution.point(point.number, one.run) if point.role == "gcp" else None

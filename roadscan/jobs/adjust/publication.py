@@ -54,10 +54,10 @@ def publish(store: Store, solved: Mapping[str, Corrections], config: AdjustConfi
     return after
 
 
-def digest_of(store: Store) -> str:
-    """Digest of the table as it is; "" without one."""
-    path = held_path("corrections")
-    return hashlib.blake2b(store.read_bytes(path), digest_size=8).hexdigest() if store.exists(path) else ""
+def digests_of(store: Store) -> list[str]:
+    """Digests of the tables `corrections` and `mounting_corrections` as they are; "" without one."""
+    paths = [held_path(name) for name in ("corrections", "mounting_corrections")]
+    return [hashlib.blake2b(store.read_bytes(p), digest_size=8).hexdigest() if store.exists(p) else "" for p in paths]
 
 
 def _rows(run: str, own: Corrections, writer: str | None) -> list[dict[str, Any]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Traverse
@@ -17,8 +18,11 @@ from roadscan.jobs.adjust.near import Circle, NearReader
 from roadscan.jobs.adjust.solution import Evidence, Solution
 from roadscan.jobs.adjust.tie_work import DIAGONAL, TieTask
 from roadscan.jobs.engine.compute import Compute, reason_of
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
 from roadscan.products.pictures.seams import ShownSeam
+
+Float64 = npt.NDArray[np.float64]
 
 _CHOSEN: Final = ("the worst seam before", "a typical seam")
 
@@ -33,13 +37,22 @@ class SeamTask:
     place: Place
     ends: tuple[Traverse, Traverse]
     corrections: tuple[Corrections | None, Corrections | None]
+    mountings: tuple[tuple[MountingChange, Float64] | None, tuple[MountingChange, Float64] | None]
+    """Change of the mounting of each sensor, and its lever arm."""
 
 
 def shown_seams(
-    tasks: Sequence[TieTask], evidence: Evidence, solution: Solution, held: Held, compute: Compute
+    tasks: Sequence[TieTask],
+    evidence: Evidence,
+    solution: Solution,
+    held: tuple[Held, Mapping[str, MountingChange]],
+    compute: Compute,
 ) -> tuple[list[ShownSeam], list[str]]:
-    """What is to be drawn of the chosen seams, and why one is missing where its readings could not be read."""
-    wanted = list(seam_tasks(tasks, evidence, solution, held))
+    """What is to be drawn of the chosen seams, and why one is missing where its readings could not be read.
+
+    held : corrections of runs, and changes of mountings.
+    """
+    wanted = list(seam_tasks(tasks, evidence, solution, *held))
     found: dict[str, ShownSeam] = {}
     notes: list[str] = []
     for done in compute.map(view_seam, wanted):
@@ -51,8 +64,12 @@ def shown_seams(
 
 
 def seam_tasks(
-    tasks: Sequence[TieTask], evidence: Evidence, solution: Solution, held: Held
-) -> Iterator[SeamTask]:  # fmt: skip
+    tasks: Sequence[TieTask],
+    evidence: Evidence,
+    solution: Solution,
+    held: Held,
+    changes: Mapping[str, MountingChange],
+) -> Iterator[SeamTask]:
     """The height tie that differed most of those that count, and the one in the middle of them by their size."""
     observations, columns = evidence.ties.observations, evidence.ties.columns
     counting = (observations.kind == KINDS.index(HEIGHT)) & (solution.tie_weight > 0.0)
@@ -71,7 +88,18 @@ def seam_tasks(
             for end, word in enumerate(("first", "second"))
         ]  # fmt: skip
         first, second = (held.get(evidence.runs[one.run]) for one in ends)
-        yield SeamTask(name, task, place, (ends[0], ends[1]), (first, second))
+        one, other = (_mounting(evidence, end, changes) for end in ends)
+        yield SeamTask(name, task, place, (ends[0], ends[1]), (first, second), (one, other))
+
+
+def _mounting(
+    evidence: Evidence, end: Traverse, changes: Mapping[str, MountingChange]
+) -> tuple[MountingChange, Float64] | None:
+    change = changes.get(end.sensor)
+    if change is None:
+        return None
+    lever = evidence.mounted.lever_m(evidence.runs[end.run], end.sensor, np.array([end.first_gps_ns], np.int64))
+    return change, lever[0]
 
 
 def view_seam(task: SeamTask) -> SeamView | None:
@@ -80,7 +108,7 @@ def view_seam(task: SeamTask) -> SeamView | None:
     reader = NearReader(task.ties.store, task.ties.ground, task.ties.files, task.ties.runs)
     circle = Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)
     readings = reader.of(task.ends[0], circle), reader.of(task.ends[1], circle)
-    return seam_view(place, readings, task.corrections, task.ties.settings)
+    return seam_view(place, readings, task.corrections, task.ties.settings, task.mountings)
 
 
 def _shown(task: SeamTask, view: SeamView) -> ShownSeam:

@@ -9,15 +9,15 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, ControlErrors, adjust
-from roadscan.adjust.control import Sighting, observations_of
+from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.control import SeenBy, Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
 from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import GaussMarkov, RunPrior, knots_of
+from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.jobs.adjust.doubts import (
     CONTROL,
@@ -33,12 +33,13 @@ from roadscan.jobs.adjust.doubts import (
     solver_line,
     wrong_points,
 )
+from roadscan.jobs.adjust.mountings import Mounted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
-from roadscan.jobs.navigate.pose_sigma import median_pose_sigma
+from roadscan.jobs.navigate.pose_sigma import stated_pose_sigma
 from roadscan.jobs.plan.plan import SurveyPlan
-from roadscan.jobs.readings import load_recorded
+from roadscan.jobs.readings import TrajectorySource, load_recorded
 from roadscan.model.settings.adjust import AdjustConfig, PosePriors
 from roadscan.model.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.model.witness import Finding
@@ -46,8 +47,11 @@ from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
+Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
+_WIDENED: Final = 3
+"""Adjustments, at most, until no mounting is off by more than its σ allows."""
 _NONE: Final = (GaussMarkov(0.0, 1.0),) * 6
 
 
@@ -61,6 +65,14 @@ class Evidence:
     """Of each of them; without σ where a run is not adjusted."""
     ties: KnownTies
     sightings: tuple[Sighting, ...]
+    mounted: Mounted
+
+    def seen_by(self, one: Sighting) -> SeenBy:
+        """The sensor that saw a point."""
+        if one.status == "unseen":
+            return SeenBy(-1, np.zeros(3))
+        lever = self.mounted.lever_m(self.runs[one.run], one.sensor, np.array([one.epoch_gps_ns], np.int64))
+        return SeenBy(self.mounted.number(one.sensor), lever[0])
 
 
 @dataclass(frozen=True)
@@ -94,6 +106,8 @@ class Solution:
     lines: tuple[str, ...]
     """What the solution says of itself."""
     left_out: LeaveOneOut | None = None
+    mountings: MountingErrors | None = None
+    """What is wrong with the mountings of the sensors; None where they are not estimated."""
 
     def point(self, number: int, run: int) -> PointFigures | None:
         """Figures of a point as a run saw it."""
@@ -110,14 +124,21 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
             found.append(RunPrior(run, 0, 0, _NONE))
             continue
         spans = [span_of(s, files) for s, files in own]
-        stated = median_pose_sigma(plan.store, plan.records, trajectory)
-        found.append(RunPrior(run, min(a for a, _ in spans), max(b for _, b in spans), _processes(config, stated)))
+        stated = _stated(plan, trajectory) if config.source == "sigma" else None
+        first, last = min(a for a, _ in spans), max(b for _, b in spans)
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated))
     return tuple(found)
 
 
+def _stated(plan: SurveyPlan, trajectory: TrajectorySource) -> StatedSigma | None:
+    epochs, sigma = stated_pose_sigma(plan.store, plan.records, trajectory)
+    return StatedSigma(epochs, sigma) if epochs.size else None
+
+
 def _processes(
-    config: PosePriors, stated: Float64
+    config: PosePriors, stated: StatedSigma | None
 ) -> tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]:
+    """Those of the settings, with the median of the σ that the logs state of a component."""
     assumed = np.array(
         [
             config.sigma_horizontal_m,
@@ -128,9 +149,9 @@ def _processes(
             config.sigma_heading_deg,
         ]
     )
-    known = np.isfinite(stated) & (stated > 0.0) & (config.source == "sigma")
-    sigma = np.where(known, stated, assumed)
-    sigma[3:] = np.radians(sigma[3:])
+    assumed[3:] = np.radians(assumed[3:])
+    usual = np.full(assumed.size, np.nan) if stated is None else np.median(stated.sigma, axis=0)
+    sigma = np.where(np.isfinite(usual), usual, assumed)
     times = (config.position_time_s,) * 3 + (config.attitude_time_s,) * 3
     n, e, d, r, p, h = (GaussMarkov(float(s), t) for s, t in zip(sigma, times, strict=True))
     return n, e, d, r, p, h
@@ -145,7 +166,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         where a Helmert transformation has too few points.
     """
     config = plan.survey.config.adjust
-    control = observations_of(evidence.sightings)
+    control = observations_of(evidence.sightings, [evidence.seen_by(one) for one in evidence.sightings])
     sightings = _by_observation(evidence.sightings)
     role = np.array([one.point.role == "gcp" for one in sightings], bool)
     datum = datum_fault(evidence.sightings, config.control.largest_m)
@@ -156,10 +177,10 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found += _far_findings(far, evidence)
     if config.mode == "helmert":
         return _rigid_solution(plan, evidence, control, entering, found)
-    accepted = evidence.ties.accepted
+    entering_ties = _entering(evidence)
     adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
-    weight = np.zeros(accepted.size)
-    weight[accepted] = adjusted.weight[: int(accepted.sum())]
+    weight = np.zeros(entering_ties.size)
+    weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
     found += wrong_points(_wrong(evidence.sightings, adjusted, first))
     counting = len(_counting_points(adjusted.control))
@@ -179,19 +200,39 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
         leave_one_out(adjusted.control) if adjusted.control.place.size else None,
+        adjusted.mountings if adjusted.mountings.sensors else None,
     )  # fmt: skip
+
+
+def _entering(evidence: Evidence) -> Bool:
+    """Ties (t,) that enter: those that passed their tests, and for mountings those between heads of one pass."""
+    ties = evidence.ties
+    return ties.accepted | ties.of_heads if evidence.mounted.priors else ties.accepted
 
 
 def _adjusted(
     config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
 ) -> tuple[Adjustment, int]:
-    """The adjustment of all ties that passed their tests and of control, and the place that stands for point 0."""
+    """The adjustment of ties and control, and the place that stands for point 0.
+
+    A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
+    as what was found, and the adjustment is made once more.
+    """
     ties = evidence.ties.observations
     first = int(ties.place.max(initial=-1)) + 1
-    joined = Observations.joined([ties.chosen(evidence.ties.accepted), replace(control, place=control.place + first)])
+    joined = Observations.joined([ties.chosen(_entering(evidence)), replace(control, place=control.place + first)])
     rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
     settings = AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
-    return adjust(joined, evidence.priors, settings), first
+    priors = evidence.mounted.priors
+    for _ in range(_WIDENED):
+        found = adjust(joined, evidence.priors, settings, priors)
+        off = disproved(found.mountings)
+        if not off.any():
+            break
+        sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
+        priors = tuple(MountingPrior(one.sensor, own) for one, own in zip(priors, sigma, strict=True))
+    stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, 6)
+    return replace(found, mountings=replace(found.mountings, prior_sigma=stated)), first
 
 
 def _counting_points(control: ControlErrors) -> set[int]:
@@ -238,7 +279,9 @@ def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFi
 def _far_findings(far: Mapping[str, float], evidence: Evidence) -> list[Finding]:
     surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
     # The poses are as they were recorded.
-    sigma = max((float(prior.sigmas[2]) for prior in evidence.priors), default=0.0)
+    sigma = max(
+        (float(evidence.priors[one.run].sigma_at(_epoch(one))[0, 2]) for one in evidence.sightings), default=0.0
+    )
     points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
     return far_points(far) + exchanged(points)
 
@@ -304,8 +347,12 @@ def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidF
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
     seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
-    sigma = np.array([evidence.priors[one.run].sigmas[:3] for one in seen]).reshape(-1, 3)
+    sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
     return rigid_fit(seen, sigma, false_alarm)
+
+
+def _epoch(one: Sighting) -> Int64:
+    return np.array([one.epoch_gps_ns], np.int64)
 
 
 def _rigid_corrections(
@@ -329,6 +376,7 @@ def _rigid_corrections(
             sides = config.moved_arm_m * poses.level_from_body[:, :, 1]
             sigma = np.max([fit.helmert.sigma_of(places + way * sides) for way in (-1.0, 0.0, 1.0)], axis=0)
             largest = max(largest, float(sigma[:, 2].max()))
-            whole = np.concatenate([np.hypot(sigma, prior.sigmas[:3]), np.tile(prior.sigmas[3:], (len(sigma), 1))], 1)
+            recorded_sigma = prior.sigma_at(poses.epoch_gps_ns)
+            whole = np.concatenate([np.hypot(sigma, recorded_sigma[:, :3]), recorded_sigma[:, 3:]], 1)
             corrections[prior.run] = replace(own, sigma=whole)
     return corrections, largest

@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.observations import KINDS, Observations
+from roadscan.adjust.observations import KINDS, Observations, mount_partials
 from roadscan.adjust.places import Place
+from roadscan.adjust.tie import SAME_PASS
 from roadscan.adjust.ties import Ties, ties_at
 from roadscan.code_reach import code_digest
+from roadscan.jobs.adjust.mountings import Mounted, numbers_of
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
@@ -34,6 +36,7 @@ DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
 """Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
+_SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
 _TURNS: Final = tuple(
     f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
 )
@@ -111,6 +114,25 @@ def _finite(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.where(np.isfinite(values), values, np.nan) if values.dtype.kind == "f" else values
 
 
+def _by_mounting(
+    column: Mapping[str, npt.NDArray[Any]],
+    end: str,
+    geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
+    mounted: Mounted,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """Number (n,) of the sensor of one end, and derivatives (n, 6) by its mounting.
+
+    geometry : derivatives by a shift and by a turn of the pose, body axes, and epochs.
+    """
+    shifts, turns, epochs = geometry
+    runs, sensors = column[f"{end}_run"], column[f"{end}_sensor"]
+    lever = np.zeros(shifts.shape)
+    for run, sensor in sorted(set(zip(runs.tolist(), sensors.tolist(), strict=True))):
+        own = (runs == run) & (sensors == sensor)
+        lever[own] = mounted.lever_m(run, sensor, epochs[own])
+    return numbers_of(mounted, sensors.tolist()), mount_partials(shifts, turns, lever)
+
+
 @dataclass(frozen=True)
 class KnownTies:
     """All ties of a survey that could be measured."""
@@ -124,9 +146,17 @@ class KnownTies:
         """(n,) ties that passed their tests."""
         return np.asarray(self.columns["accepted"] == 1)
 
+    @property
+    def of_heads(self) -> npt.NDArray[np.bool_]:
+        """(n,) ties between heads of one pass: they say nothing of poses, and much of mountings."""
+        apart = self.columns["first_sensor"] != self.columns["second_sensor"]
+        return np.asarray((self.columns["why_not"] == SAME_PASS) & apart)
 
-def load_ties(store: Store, manifest: Manifest, units: Sequence[str], runs: Sequence[str]) -> KnownTies:
-    """Ties of some tasks, in order; runs are counted as in `runs`."""
+
+def load_ties(
+    store: Store, manifest: Manifest, units: Sequence[str], runs: Sequence[str], mounted: Mounted
+) -> KnownTies:
+    """Ties of some tasks, in order; runs are counted as in `runs`, sensors as in `mounted`."""
     records = [r for unit in units if (r := manifest.get(TIES, unit)) is not None and r.path]
     empty = table_schema(TIES).arrow().empty_table()
     rows = pa.concat_tables([empty, *(store.parse_table(read_recorded(store, r), r.path) for r in records)])
@@ -139,10 +169,14 @@ def load_ties(store: Store, manifest: Manifest, units: Sequence[str], runs: Sequ
     partials = np.concatenate([np.stack([direction, -direction], axis=1), turns], axis=2)
     ends = ("first", "second")
     group = np.unique(np.stack([column["place"], column["group"]]), axis=1, return_inverse=True)[1].ravel()
+    epochs = np.stack([column[f"{e}_epoch_gps_ns"] for e in ends], axis=-1)
+    shifts = np.stack([column[name] for name in _SHIFTS], axis=-1).reshape(-1, 2, 3)
+    mounts = [_by_mounting(column, e, (shifts[:, k], turns[:, k], epochs[:, k]), mounted) for k, e in enumerate(ends)]
     observations = Observations(
         np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8),
         np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2),
-        np.stack([column[f"{e}_epoch_gps_ns"] for e in ends], axis=-1),
-        partials, column["value_m"], column["sigma_m"], group.astype(np.int64), column["place"],
+        epochs, partials, column["value_m"], column["sigma_m"], group.astype(np.int64), column["place"],
+        sensor=np.stack([sensor for sensor, _ in mounts], axis=-1),
+        mount_partials=np.stack([by for _, by in mounts], axis=1),
     )  # fmt: skip
     return KnownTies(observations, column)

@@ -213,7 +213,7 @@ class _Block:
         trajectory, source = self._trajectories[number], self._sources[number]
         if trajectory is None or trajectory.epochs_gps_ns.size < 2:
             return np.full((epochs_gps_ns.size, 3), np.nan)
-        mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.mountings
+        mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.adjusted_mountings
         return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
 
     def _drives(self, own: _Columns, square: TileId) -> Float64:

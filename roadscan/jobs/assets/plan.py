@@ -172,8 +172,9 @@ def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, Trajectory
 
 
 def _corrections(plan: SurveyPlan, run: str) -> str:
-    own = plan.corrections.by_run.get(run)
-    if own is None:
+    own, mounted = plan.corrections.by_run.get(run), plan.corrections.by_sensor
+    if own is None and not mounted:
         return ""
-    arrays = (own.epochs_gps_ns, own.north_east_down_m, own.roll_pitch_heading_rad)
+    arrays = [] if own is None else [own.epochs_gps_ns, own.north_east_down_m, own.roll_pitch_heading_rad]
+    arrays += [mounted[sensor].values for sensor in sorted(mounted)]
     return bytes_digest(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))

@@ -23,6 +23,10 @@ _SIGMAS: Final = (
 )  # fmt: skip
 
 
+_STEP_NS: Final = 100_000_000
+"""σ of poses that are closer say the same: they change over seconds."""
+
+
 def pose_sigma(
     store: Store,
     records: Sequence[LogRecord],
@@ -62,6 +66,38 @@ def median_pose_sigma(store: Store, records: Sequence[LogRecord], source: Trajec
             if np.isnan(usual[k]) and np.isfinite(values[:, k]).any():
                 usual[k] = np.nanmedian(values[:, k])
     return usual
+
+
+def stated_pose_sigma(
+    store: Store, records: Sequence[LogRecord], source: TrajectorySource
+) -> tuple[Int64, Float64]:  # fmt: skip
+    """Epochs (k,) and 1 σ (k, 6) of a run's poses as its logs state it (m, radians), each tenth of a second at most.
+
+    Of each component those of the poses themselves, else those of an accuracy log; NaN of components that neither
+    states. What is not above 0 is no σ.
+    """
+    found: list[tuple[Int64, Float64] | None] = [None] * 6
+    for epochs, values in _stated(store, records, source):
+        for k in range(6):
+            known = np.isfinite(values[:, k]) & (values[:, k] > 0.0)
+            if found[k] is None and known.any():
+                found[k] = _thinned(epochs[known], values[known, k])
+    parts = [one[0] for one in found if one is not None]
+    every = np.unique(np.concatenate(parts)) if parts else np.zeros(0, np.int64)
+    sigma = np.full((every.size, 6), np.nan)
+    for k, one in enumerate(found):
+        if one is not None:
+            since, known_since = ((e - every[0]).astype(np.float64) for e in (every, one[0]))
+            sigma[:, k] = np.interp(since, known_since, one[1])
+    return every, _in_radians(sigma)
+
+
+def _thinned(epochs_gps_ns: Int64, sigma: Float64) -> tuple[Int64, Float64]:
+    """The largest σ of each tenth of a second, at its own epoch."""
+    steps, of_row = np.unique(epochs_gps_ns // _STEP_NS, return_inverse=True)
+    order = np.lexsort((epochs_gps_ns, -sigma, of_row))
+    first = order[np.searchsorted(of_row[order], np.arange(steps.size))]
+    return epochs_gps_ns[first], sigma[first]
 
 
 def _stated(store: Store, records: Sequence[LogRecord], source: TrajectorySource) -> list[tuple[Int64, Float64]]:

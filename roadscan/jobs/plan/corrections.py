@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.readings import ReadingSource, load_all_corrections
+from roadscan.jobs.readings import ReadingSource, load_all_corrections, load_mounting_changes
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S
+from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.movement import Allowance, allowance_for, largest
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.points.turns import TICK_NS, WINDOW_NS
@@ -25,17 +26,18 @@ UInt64 = npt.NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class KnownCorrections:
-    """Corrections of all runs, as the table holds them."""
+    """Corrections of all runs and of the mountings of all sensors, as the tables hold them."""
 
     by_run: Mapping[str, Corrections]
+    by_sensor: Mapping[str, MountingChange] = field(default_factory=dict)
 
     @classmethod
     def load(cls, store: Store) -> Self:
         """What the table says. Damage is told here, before tiles are asked to bear it."""
-        return cls(load_all_corrections(store))
+        return cls(load_all_corrections(store), load_mounting_changes(store))
 
-    def allowance(self, run: str) -> Allowance:
-        """Corrections that bounds on the recorded poses of a run leave room for.
+    def allowance(self, run: str, sensor: str) -> Allowance:
+        """Corrections that bounds on the recorded poses of a run and the stated mounting of a sensor leave room for.
 
         Raises
         ------
@@ -44,7 +46,8 @@ class KnownCorrections:
         """
         own = self.by_run.get(run)
         try:
-            return allowance_for(own)
+            change = self.by_sensor.get(sensor)
+            return allowance_for(own, (0.0, 0.0) if change is None else change.largest)
         except ValueError:
             shift, turn = largest(own)
             raise NavigationError(
@@ -54,19 +57,27 @@ class KnownCorrections:
             ) from None
 
     def digests(self, source: ReadingSource, spans_gps_ns: Int64, max_gap_s: float) -> UInt64:
-        """Digest (n,) of the corrections that place readings of spans (n, 2) of time; 0 where the run has none.
+        """Digest (n,) of the corrections that place readings of spans (n, 2) of time; 0 where there are none.
 
-        It is the sum of the digests of the knots around each span, with as much beyond it as interpolation looks at.
+        It is that of the mounting, and the sum of the digests of the knots around each span, with as much beyond it as
+        interpolation looks at.
         """
         own = self.by_run.get(source.run)
+        mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.sensor)
         if own is None or source.trajectory is None:
-            return np.zeros(len(spans_gps_ns), np.uint64)
+            return np.full(len(spans_gps_ns), mounted, np.uint64)
         wide = beyond_ns(source, max_gap_s)
         knots, sums = own.epochs_gps_ns, self._sums[source.run]
         first = np.searchsorted(knots, spans_gps_ns[:, 0] - wide, side="right") - 1
         last = np.searchsorted(knots, spans_gps_ns[:, 1] + wide, side="left")
         found: UInt64 = sums[np.minimum(last, knots.size - 1) + 1] - sums[np.maximum(first, 0)]
-        return found
+        return found + mounted
+
+    def _mounting_digest(self, sensor: str) -> np.uint64:
+        change = self.by_sensor.get(sensor)
+        if change is None:
+            return np.uint64(0)
+        return np.uint64(int.from_bytes(hashlib.blake2b(change.values.tobytes(), digest_size=8).digest(), "little"))
 
     @cached_property
     def _sums(self) -> dict[str, UInt64]:

@@ -236,8 +236,11 @@ def _sources(
 
 
 def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingSource:
-    """A source whose footprints leave room for the corrections of its poses."""
-    return source if source.trajectory is None else replace(source, allowance=corrections.allowance(source.run))
+    """A source with the correction of its mounting, whose footprints leave room for corrections."""
+    if source.trajectory is None:
+        return source
+    change = corrections.by_sensor.get(source.sensor)
+    return replace(source, allowance=corrections.allowance(source.run, source.sensor), mounting_change=change)
 
 
 def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:

@@ -21,8 +21,8 @@ class PosePriors(Strict):
     """What is known of the errors of the recorded poses: of each component a first-order Gauss–Markov process."""
 
     source: Literal["sigma", "stated"] = "sigma"
-    """`sigma`: the 1 σ that a run's logs state (SMRMSG, σ columns, a computed trajectory), the median over the run;
-    where they state none, and with `stated`, those below."""
+    """`sigma`: the 1 σ that a run's logs state of each pose (SMRMSG, σ columns, a computed trajectory); where they
+    state none, and with `stated`, those below."""
     sigma_horizontal_m: float = Field(default=0.02, ge=0.0, le=100.0)
     """1 σ of north and of east (m); 0: they are not corrected."""
     sigma_down_m: float = Field(default=0.03, ge=0.0, le=100.0)
@@ -35,6 +35,27 @@ class PosePriors(Strict):
     """Correlation time of the position's errors (s)."""
     attitude_time_s: float = Field(default=60.0, gt=0.0)
     """Correlation time of the attitude's errors (s)."""
+
+
+class MountingPriors(Strict):
+    """How well the mountings of sensors are known; the adjustment estimates what is wrong with them.
+
+    They are of sensors whose σ neither the rig file (`lever_arm_sigma_m`, `boresight_sigma_deg`) nor a calibration
+    states. A component of σ 0 is not estimated, whatever these state; nor is any in other modes than `joint`.
+    """
+
+    sigma_forward_m: float = Field(default=0.002, ge=0.0, le=1.0)
+    """1 σ of the lever arm, forward (m)."""
+    sigma_right_m: float = Field(default=0.002, ge=0.0, le=1.0)
+    """1 σ of the lever arm, to the right (m)."""
+    sigma_down_m: float = Field(default=0.002, ge=0.0, le=1.0)
+    """1 σ of the lever arm, down (m)."""
+    sigma_roll_deg: float = Field(default=0.01, ge=0.0, le=10.0)
+    """1 σ of the boresight about the body's x axis (degrees)."""
+    sigma_pitch_deg: float = Field(default=0.01, ge=0.0, le=10.0)
+    """1 σ of the boresight about the body's y axis (degrees)."""
+    sigma_heading_deg: float = Field(default=0.02, ge=0.0, le=10.0)
+    """1 σ of the boresight about the body's z axis (degrees)."""
 
 
 class TargetConfig(Strict):
@@ -103,6 +124,8 @@ class AdjustConfig(Strict):
     points with targets, nothing else."""
     priors: PosePriors = PosePriors()
     """Errors of the recorded poses."""
+    mountings: MountingPriors = MountingPriors()
+    """Errors of the sensors' mountings."""
     places: PlaceSettings = PlaceSettings()
     """Where passes are compared."""
     ties: TieSettings = TieSettings()

@@ -216,9 +216,11 @@ def _columns(path: Path, stated: Stated) -> FormatError | None:
     if len(names) < 2:
         return None
     tables = [f for f in log_formats().values() if f.column_sets and issubclass(f.options, TextOptions)]
-    if all(_is_number(name) for name in names):
+    if 2 * sum(_is_number(name) for name in names) > len(names):
         return FormatError(
-            f"the file holds {len(names)} columns of numbers, and no line names them",
+            f"the file holds {len(names)} columns of numbers, and no line names them: the first is {', '.join(names)}"
+            if not all(map(_is_number, names))
+            else f"the file holds {len(names)} columns of numbers, and no line names them",
             expected="a line of names with units, such as time_s or latitude_deg",
             change="add one, or state format = one of "
             + ", ".join(f.name for f in tables)

@@ -398,7 +398,7 @@ def _columns(path: Path, words: str) -> FileKind:
     following = first_fields(path, layout, 5)
     if any(len(name) > _LONGEST_NAME for name in layout.names) or not following:
         return FileKind(words, details)  # prose with a comma in its first line
-    if all(_is_number(name) for name in layout.names):
+    if 2 * sum(_is_number(name) for name in layout.names) > columns:
         return FileKind(f"text, {columns} columns of numbers without names", details)
     shown = ", ".join(layout.names[:20]) + (" …" if columns > 20 else "")
     return FileKind(f"text, {columns} columns named {shown}", details)

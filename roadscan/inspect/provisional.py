@@ -202,7 +202,7 @@ class _Search:
         self._seen: set[Hashable] = set()
         self.first_error: RoadscanError | None = None
         self.unanswered: RoadscanError | None = None
-        """The first refusal that nothing that may be assumed answers."""
+        """The first refusal that nothing that may be assumed answers, where time and CRS are as stated."""
         self.fault: FormatError | None = None
         """What is wrong with the file itself, whatever is stated."""
 
@@ -234,7 +234,12 @@ class _Search:
             found = self.run(changed, {dimension: error} | asked)
             if found is not None:
                 return found
-        self.unanswered = self.unanswered or error
+        as_stated = (trial.clock, trial.crs, trial.height) == (
+            self._stated.clock,
+            self._stated.crs,
+            self._stated.height,
+        )
+        self.unanswered = self.unanswered or (error if as_stated else None)
         return None
 
     def _look(self, trial: Stated) -> tuple[LogSource, LogHeader]:

@@ -213,6 +213,18 @@ def test_a_folder_of_pictures_says_which_stamps_it_needs(tmp_path: Path) -> None
     assert "one picture is no log" in words_of(tmp_path / "plain" / "DSC_0000.jpg")
 
 
+def test_control_points_of_surveyors_are_recognised(faults: Path) -> None:
+    """Words, decimal commas and a byte order mark; the survey file has to state no more than CRS and role."""
+    for name, points, east in (("german_semicolon_decimal_comma_bom", 3, 500_001.234), ("pnezd_named", 2, 500_001.234)):
+        (found,) = json.loads(roadscan("inspect", faults / f"{name}.csv", "--json").stdout)
+        assert found["formats"] == ["control_csv"]
+        assert {need["key"] for need in found["log"]["to_state"]} == {"crs", "options.role"}
+        table = found["log"]["tables"]["control_points"]
+        assert table["rows"] == points
+        assert table["extent"]["low"][0] == pytest.approx(east, abs=1e-6)
+    assert "5 columns of numbers, and no line names them" in words_of(faults / "pnezd_no_header.csv")
+
+
 def test_other_files_say_what_to_do(faults: Path) -> None:
     said: dict[str, Any] = {"track.gpx": "a GPX track", "ublox_ubx_nmea_mixed.log": "u-blox"}
     for name, part in said.items():

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from html import unescape
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from roadscan.jobs.condition.pictures import chosen_ruts
+from roadscan.jobs.report.blocks import Paragraph, Table
+from roadscan.jobs.report.sections.adjustment import agreement
 from roadscan.simulate import Scene, simulate
 from tests.answers import roadscan
 
@@ -78,6 +82,36 @@ def test_few_check_points_make_no_statement(survey_file: Path) -> None:
     assert "95 % (NSSDA)" not in page
     assert "95 % within" not in page
     assert "NSSDA takes 20 at least, ASPRS (2023) 30" in page
+
+
+def test_residuals_that_contradict_their_sigma_are_named(survey_file: Path, tmp_path: Path) -> None:
+    """The same survey, with residuals of its control points as those of poses that err by 50 mm."""
+    copy = tmp_path / "survey"
+    shutil.copytree(survey_file.parent, copy)
+    said = "A height after the adjustment contradicts its σ"
+    assert said not in page_of(survey_file)
+    (path,) = copy.rglob("tables/control_residuals/*.parquet")
+    rows = pq.read_table(path)
+    number = rows.column_names.index("height_after_m")
+    field = rows.schema.field(number)
+    pq.write_table(rows.set_column(number, field, pa.array([0.05] * rows.num_rows, field.type)), path)
+    done = roadscan("report", copy / survey_file.name)
+    assert done.exit_code == 0, done.output
+    assert said in page_of(copy / survey_file.name)
+
+
+def test_passes_that_differ_by_more_than_their_ties_err_are_named() -> None:
+    """Shifts of 9 mm beside a σ of 2 mm, which a reader would take for the passes' agreement."""
+    rows = [
+        {"kind": kind, "accepted": 1, "before_m": 0.012, "after_m": after, "sigma_m": 0.002}
+        for kind, after in (("shift", 0.009), ("height_tie", 0.003))
+    ]
+    table, *said = agreement(rows)
+    assert isinstance(table, Table)
+    assert ("shift", "1", "12.00", "9.00", "2.00") in table.rows
+    (warning,) = said
+    assert isinstance(warning, Paragraph)
+    assert "differ by 9.00 mm in the shifts, 4 times their σ of 2.00 mm" in warning.text
 
 
 def ruts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

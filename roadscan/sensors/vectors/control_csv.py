@@ -20,13 +20,19 @@ from roadscan.sensors.vectors.control import ControlFrame, ControlReader, RawCon
 
 Float64 = npt.NDArray[np.float64]
 
-NAME: Final = Quantity("name", "text", ("point", "id", "point_id"))
-WORDS: Final = (Quantity("code", "text", optional=True), Quantity("role", "text", optional=True))
+NAME: Final = Quantity("name", "text", ("point", "id", "point_id", "punkt", "punktnummer"))
+WORDS: Final = (
+    Quantity("code", "text", ("description",), optional=True), Quantity("role", "text", optional=True),
+)  # fmt: skip
+_EASTING: Final = Quantity("easting", "length", ("rechtswert",))
+_NORTHING: Final = Quantity("northing", "length", ("hochwert",))
 GEODETIC: Final = (Quantity("longitude", "angle", ("lon", "lng")), Quantity("latitude", "angle", ("lat",)))
-GRID: Final = (Quantity("easting", "length"), Quantity("northing", "length"))
-LOCAL: Final = (Quantity("easting", "length", ("x",)), Quantity("northing", "length", ("y",)))
-HEIGHT: Final = Quantity("height", "length", ("altitude",))
-LOCAL_HEIGHT: Final = Quantity("height", "length", ("z", "altitude"))
+GRID: Final = (_EASTING, _NORTHING)
+LOCAL: Final = (
+    Quantity("easting", "length", ("x", *_EASTING.also)), Quantity("northing", "length", ("y", *_NORTHING.also)),
+)  # fmt: skip
+HEIGHT: Final = Quantity("height", "length", ("altitude", "elevation", "höhe", "hoehe"))
+LOCAL_HEIGHT: Final = Quantity("height", "length", ("z", *HEIGHT.also))
 SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),
     Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),
@@ -60,7 +66,8 @@ class ControlCsv(LogFormat):
 
     Columns are found by names that carry the unit (``easting_m``, ``height_m``, ``latitude_deg``).
     Columns called just easting, northing, longitude or latitude are in the unit of the stated CRS;
-    so is a height, where the CRS has a height axis or is a local frame.
+    so is a height, where the CRS has a height axis or is a local frame. The words of surveyors are known, too:
+    point, elevation and description; Punkt, Rechtswert, Hochwert and Höhe.
     """
 
     name = "control_csv"

@@ -50,7 +50,7 @@ class Adjustment(Section):
         yield from _pictures(store, [f"{FOLDER}/seams.png"], seams)
         yield from _accuracy(_rows(session, "absolute_accuracy"))
         yield from _by_distance(_rows(session, "accuracy_by_distance"))
-        yield from _ties(_rows(session, "tie_residuals"))
+        yield from agreement(_rows(session, "tie_residuals"))
         yield from _seams(_rows(session, "relative_accuracy"))
         yield from _control(_rows(session, "control_residuals"))
         targets = sorted(r.path for r in manifest.of(PICTURES).values() if "/targets/" in r.path)
@@ -125,7 +125,7 @@ def _by_distance(rows: Rows) -> Iterator[Table]:
         )  # fmt: skip
 
 
-def _ties(rows: Rows) -> Iterator[Table | Paragraph]:
+def agreement(rows: Rows) -> Iterator[Table | Paragraph]:
     """Agreement of the passes over all ties that count, with the σ that these have."""
     kinds: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:

@@ -106,7 +106,7 @@ def test_every_control_point_is_drawn_in_the_colour_of_its_residual(page: Any) -
         assert np.abs(picture[round(y), round(x)] - colour).max() <= 3, (residual, wanted)
     entries = page.locator(".layer", has_text="Control and check points").locator(".entries").inner_text().split("\n")
     assert [one for one in entries if one] == [
-        "below −10 mm", "−10 to −3 mm", "−3 to 3 mm", "3 to 10 mm", "10 and above mm", "not known",
+        "below −10 mm", "−10 to −3 mm", "−3 to 3 mm", "3 to 10 mm", "10 mm and above", "not known",
     ]  # fmt: skip
 
 

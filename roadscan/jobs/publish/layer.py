@@ -28,8 +28,8 @@ BLUE, ORANGE, GREEN, RED, SKY, YELLOW, PURPLE, GREY = (
 )  # fmt: skip
 """Colours that all eyes tell apart (Okabe and Ito 2008), and a grey for what is not known."""
 
-BELOW_TO_ABOVE: Final = ("#2166ac", "#67a9cf", "#f7f7f7", "#ef8a62", "#b2182b")
-"""Five steps of a difference on both sides of zero that all eyes tell apart (ColorBrewer 2, RdBu)."""
+BELOW_TO_ABOVE: Final = ("#2166ac", "#67a9cf", "#e8d44d", "#ef8a62", "#b2182b")
+"""Five steps of a difference on both sides of zero (ColorBrewer 2, RdBu); the middle one shows on white and black."""
 
 GOOD_TO_POOR: Final = ("#4575b4", "#91bfdb", "#fee090", "#fc8d59", "#d73027")
 """Five steps that all eyes tell apart (ColorBrewer 2, RdYlBu)."""
@@ -104,8 +104,11 @@ def _classes(style: Style) -> Iterator[dict[str, Any]]:
     places = np.linspace(0, len(colours) - 1, len(limits) + 1).round().astype(int).tolist()
     for low, high, place in zip(ends[:-1], ends[1:], places, strict=True):
         least, most = (None if end is None else f"{factor * end:g}".replace("-", "−") for end in (low, high))
-        label = f"below {most}" if least is None else f"{least} and above" if most is None else f"{least} to {most}"
-        yield {"from": low, "to": high, "colour": colours[place], "label": f"{label} {unit}".strip()}
+        if most is None:
+            label = f"{least} {unit} and above" if unit else f"{least} and above"
+        else:
+            label = f"{f'below {most}' if least is None else f'{least} to {most}'} {unit}".strip()
+        yield {"from": low, "to": high, "colour": colours[place], "label": label}
 
 
 @dataclass(frozen=True)

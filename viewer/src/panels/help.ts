@@ -4,7 +4,7 @@ import { h } from '../core/dom'
 
 const KEYS: [string, string][] = [
   ['M  C  P  S', 'Map, point cloud, pictures, strips'],
-  ['/', 'Go to a place, a row or a station'],
+  ['/', 'Go to a name, an id, a kind, a place, a row or a station'],
   ['L', 'Layers (on small screens)'],
   ['Tab', 'From part to part; the map and the cloud take keys when they have the focus'],
   ['Arrows', 'Move the map or the cloud; in the strips, step along the road, with Shift by ten metres'],

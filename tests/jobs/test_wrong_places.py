@@ -195,21 +195,17 @@ def test_a_point_that_overflowed_is_left_out(faults: Path, tmp_path: Path) -> No
     assert points_of(folder).shape == (799, 3)
 
 
-@pytest.mark.parametrize("axis", "xyz")
+@pytest.mark.parametrize("axis", "xy")
 def test_far_points_of_a_cloud_are_left_out(faults: Path, tmp_path: Path, axis: str) -> None:
-    """Coordinates that did not overflow and lie in no place: 3,000 km and more away, or at 90 km of height."""
+    """Coordinates that did not overflow and lie 9,000 km away."""
     folder = copied(faults / "las_far_point", tmp_path / "far")
     cloud = laspy.read(folder / "c.las")
-    raw = np.array(cloud[axis.upper()])
-    wrong = np.flatnonzero(np.abs(raw.astype(np.int64)) > 2**31 - 5)
-    values = np.array(getattr(cloud, axis))
-    values[wrong] = np.median(values)
     fine = laspy.LasData(cloud.header, cloud.points.copy())
     fine.header.scales = np.array([0.01, 0.01, 0.01])
     for name in "xyz":
         own = np.array(getattr(cloud, name))
         own[np.abs(own - np.median(own)) > 1e5] = np.median(own)
-        own[[5, 6, 300]] += 9.0e6 if name == axis != "z" else 90_000.0 if name == axis else 0.0
+        own[[5, 6, 300]] += 9.0e6 if name == axis else 0.0
         setattr(fine, name, own)
     fine.write(folder / "c.las")
     command("ingest", folder)

@@ -30,6 +30,8 @@ from roadscan.cli import app
 from roadscan.jobs.ingest.pose_checks import pose_track
 from roadscan.navigation.leaps import find_leaps
 
+from .conftest import Simulated
+
 Float64 = npt.NDArray[np.float64]
 NAMES = ("time_s", "latitude_deg", "longitude_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
 PER_DEG_M = 111_200.0
@@ -277,3 +279,9 @@ def test_recordings_raise_no_doubt(recordings: Path, tmp_path: Path) -> None:
         track = pose_track(log["trajectory"], str(log.attributes["world_frame"]), np.zeros(0, np.int64))
         found = find_leaps(track)
         assert not found.position.any() and not found.attitude.any() and found.steps == (), log.path
+
+
+def test_a_simulated_drive_raises_no_doubt(simulated: Simulated, tmp_path: Path) -> None:
+    """Poses of the simulator with their noise, profiles and returns."""
+    told = command("ingest", simulated.copy_to(tmp_path / "survey").survey_file.parent)
+    assert told["findings"] == []

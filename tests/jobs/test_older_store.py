@@ -6,6 +6,7 @@ profilers and a lidar, run whole. Its raw logs are archived: what the store hold
 
 from __future__ import annotations
 
+import shutil
 import tarfile
 from pathlib import Path
 
@@ -33,6 +34,16 @@ def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "SURVEY.toml"
 
 
+def test_rows_of_archived_logs_stay(survey_file: Path, tmp_path: Path) -> None:
+    """Where the raw logs are gone, poses that were not checked are still the poses of the store."""
+    copy = tmp_path / "survey"
+    shutil.copytree(survey_file.parent, copy)
+    survey_status(Session.open(copy / "SURVEY.toml"))  # learns the bytes of the logs, as any command does
+    shutil.rmtree(copy / "raw")
+    state = survey_status(Session.open(copy / "SURVEY.toml"))
+    assert {log["state"] for log in state.logs} == {"ingested"}
+
+
 def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
     session = Session.open(survey_file)
     faults = verify_store(session.store)
@@ -40,7 +51,10 @@ def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
         faults
     )
     state = survey_status(Session.open(survey_file))
-    assert {log["state"] for log in state.logs} == {"ingested"}
+    # Poses were not checked then: their logs are read again.
+    waiting = {log["path"] for log in state.logs if log["state"] == "waiting"}
+    assert waiting == {"raw/run-1/trajectory.sbet", "raw/run-2/trajectory.sbet"}
+    assert {log["state"] for log in state.logs if log["path"] not in waiting} == {"ingested"}
     done = CliRunner().invoke(app, ["run", str(survey_file), "--workers", "0"])
     assert done.exit_code == 0, done.output
     assert survey_status(Session.open(survey_file)).is_complete

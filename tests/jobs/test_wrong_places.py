@@ -30,6 +30,8 @@ from roadscan.cli import app
 from roadscan.jobs.ingest.pose_checks import pose_track
 from roadscan.navigation.leaps import find_leaps
 
+from .conftest import Simulated
+
 Float64 = npt.NDArray[np.float64]
 NAMES = ("time_s", "latitude_deg", "longitude_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
 PER_DEG_M = 111_200.0
@@ -195,21 +197,17 @@ def test_a_point_that_overflowed_is_left_out(faults: Path, tmp_path: Path) -> No
     assert points_of(folder).shape == (799, 3)
 
 
-@pytest.mark.parametrize("axis", "xyz")
+@pytest.mark.parametrize("axis", "xy")
 def test_far_points_of_a_cloud_are_left_out(faults: Path, tmp_path: Path, axis: str) -> None:
-    """Coordinates that did not overflow and lie in no place: 3,000 km and more away, or at 90 km of height."""
+    """Coordinates that did not overflow and lie 9,000 km away."""
     folder = copied(faults / "las_far_point", tmp_path / "far")
     cloud = laspy.read(folder / "c.las")
-    raw = np.array(cloud[axis.upper()])
-    wrong = np.flatnonzero(np.abs(raw.astype(np.int64)) > 2**31 - 5)
-    values = np.array(getattr(cloud, axis))
-    values[wrong] = np.median(values)
     fine = laspy.LasData(cloud.header, cloud.points.copy())
     fine.header.scales = np.array([0.01, 0.01, 0.01])
     for name in "xyz":
         own = np.array(getattr(cloud, name))
         own[np.abs(own - np.median(own)) > 1e5] = np.median(own)
-        own[[5, 6, 300]] += 9.0e6 if name == axis != "z" else 90_000.0 if name == axis else 0.0
+        own[[5, 6, 300]] += 9.0e6 if name == axis else 0.0
         setattr(fine, name, own)
     fine.write(folder / "c.las")
     command("ingest", folder)
@@ -281,3 +279,9 @@ def test_recordings_raise_no_doubt(recordings: Path, tmp_path: Path) -> None:
         track = pose_track(log["trajectory"], str(log.attributes["world_frame"]), np.zeros(0, np.int64))
         found = find_leaps(track)
         assert not found.position.any() and not found.attitude.any() and found.steps == (), log.path
+
+
+def test_a_simulated_drive_raises_no_doubt(simulated: Simulated, tmp_path: Path) -> None:
+    """Poses of the simulator with their noise, profiles and returns."""
+    told = command("ingest", simulated.copy_to(tmp_path / "survey").survey_file.parent)
+    assert told["findings"] == []

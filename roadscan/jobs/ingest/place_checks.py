@@ -1,4 +1,4 @@
-"""Records that lie where no road is: points outside the area of their CRS or the Earth's crust, fixes at latitude 0,
+"""Records that lie where no road is: points outside the area of their CRS, fixes at latitude 0,
 longitude 0. One such place would size all that is made of an extent, so it is left out before its row is kept.
 """
 
@@ -17,7 +17,7 @@ from roadscan.model.crs import LOCAL_WORLD, crs_from_text
 from roadscan.model.errors import RoadscanError
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogHeader
-from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
+from roadscan.sensors.trajectories.poses import GRID_MAX_M
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
@@ -29,8 +29,8 @@ FAR_POINT: Final = Witness(
     "far_point",
     input="cloud",
     fault="Single points lie far away: a coordinate overflowed when a program wrote the file.",
-    asks="the area in which the cloud's CRS is used, as PROJ states it, and heights of roads",
-    does="a point over 10° outside that area, or below −1 km or above 20 km, is left out",
+    asks="the area in which the cloud's CRS is used, as PROJ states it",
+    does="a point over 10° outside that area is left out",
     told=("rejects",),
 )
 NO_FIX_GNSS: Final = Witness(
@@ -46,7 +46,6 @@ BEYOND_DEG: Final = 10.0
 """Points farther than this outside the area of their CRS are left out, as `preflight` refuses positions."""
 NO_FIX: Final = "the position is latitude 0, longitude 0, or the centre of the Earth: there was no fix"
 _OUTSIDE: Final = f"the point lies over {BEYOND_DEG:g}° outside the area of the cloud's CRS"
-_HEIGHT: Final = f"the point's height is outside {HEIGHT_MIN_M:,.0f} to {HEIGHT_MAX_M:,.0f} m"
 _NO_FIX_M: Final = 1e-3
 
 PLACED: Final = ("cloud", "gnss")
@@ -74,10 +73,9 @@ def without_fix(position_world_m: Float64) -> Bool:
 
 
 def _cloud_faults(batch: pa.RecordBatch, attributes: dict[str, Any]) -> list[Fault]:
-    x, y, z = _columns(batch, "x_m", "y_m", "z_m").T
+    x, y = _columns(batch, "x_m", "y_m").T
     west, south, east, north = _box_m(str(attributes.get("crs") or LOCAL_WORLD))
-    outside = ~((x >= west) & (x <= east) & (y >= south) & (y <= north))
-    return _faults((outside, _OUTSIDE), (~outside & ~((z >= HEIGHT_MIN_M) & (z <= HEIGHT_MAX_M)), _HEIGHT))
+    return _faults((~((x >= west) & (x <= east) & (y >= south) & (y <= north)), _OUTSIDE))
 
 
 def _columns(batch: pa.RecordBatch, *names: str) -> Float64:

@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.model.errors import RoadscanError
+from roadscan.model.witness import Finding
 from roadscan.sensors.base import LogFormat, LogSource, Reject, Rows, format_named, log_formats
 from roadscan.tables.schema import table_schema
 from tests.fuzz.mutations import changed
@@ -96,6 +97,8 @@ def read(log_format: LogFormat, source: LogSource) -> Read:
         if isinstance(item, Reject):
             _check_reject(item)
             out.reject(item)
+            continue
+        if isinstance(item, Finding):
             continue
         batches.setdefault(item.table, []).append(_checked(log_format, item, header.list_size))
     for name, parts in batches.items():

@@ -239,10 +239,19 @@ def _times(count: int) -> str:
 def _equal(a: pa.Array, b: pa.Array) -> Bool:
     """Whether values (n,) are the same; missing ones are."""
     if pa.types.is_nested(a.type):
-        return np.array([x == y for x, y in zip(a.to_pylist(), b.to_pylist(), strict=True)])
+        return _equal_lists(a, b)
     same = pc.fill_null(pc.equal(a, b), False)
     missing = pc.and_(pc.is_null(a, nan_is_null=True), pc.is_null(b, nan_is_null=True))
     return np.asarray(pc.or_(same, missing).to_numpy(zero_copy_only=False), dtype=bool)
+
+
+def _equal_lists(a: pa.Array, b: pa.Array) -> Bool:
+    """The same of lists of numbers; those of several lengths, or with missing ones among them, count as different."""
+    lengths = {*pc.unique(pc.list_value_length(a)).to_pylist(), *pc.unique(pc.list_value_length(b)).to_pylist()}
+    if len(lengths) > 1 or None in lengths:
+        return np.zeros(len(a), dtype=bool)
+    left, right = (one.flatten().to_numpy(zero_copy_only=False).reshape(len(a), -1) for one in (a, b))
+    return np.asarray((left == right).all(axis=1))
 
 
 @dataclass

@@ -11,7 +11,7 @@ return mode both returns are kept, and one that is written twice is kept once.
 See :mod:`roadscan.sensors.lidars.velodyne_hours`.
 
 **A clock that steps.** Where the stamps step against the capture's own clock, the capture is divided, and each part is
-held against GPRMC and the PPS byte (2: locked): parts that cannot be put on GPS time are rejected, packet by packet,
+compared with GPRMC and the PPS byte (2: locked): parts that cannot be put on GPS time are rejected, packet by packet,
 and named. A capture without position packets has only its own clock to compare with. Packets that stand twice count
 once. See `docs/clocks.md`, "Clocks that step".
 """

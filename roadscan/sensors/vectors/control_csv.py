@@ -20,12 +20,15 @@ from roadscan.sensors.vectors.control import ControlFrame, ControlReader, RawCon
 
 Float64 = npt.NDArray[np.float64]
 
-NAME: Final = Quantity("name", "text", ("point", "id", "point_id"))
-WORDS: Final = (Quantity("code", "text", optional=True), Quantity("role", "text", optional=True))
+NAME: Final = Quantity("name", "text", ("point", "id", "point_id", "punkt", "punktnummer"))
+WORDS: Final = (
+    Quantity("code", "text", ("description", "desc"), optional=True),
+    Quantity("role", "text", optional=True),
+)
 GEODETIC: Final = (Quantity("longitude", "angle", ("lon", "lng")), Quantity("latitude", "angle", ("lat",)))
-GRID: Final = (Quantity("easting", "length"), Quantity("northing", "length"))
+GRID: Final = (Quantity("easting", "length", ("rechtswert",)), Quantity("northing", "length", ("hochwert",)))
 LOCAL: Final = (Quantity("easting", "length", ("x",)), Quantity("northing", "length", ("y",)))
-HEIGHT: Final = Quantity("height", "length", ("altitude",))
+HEIGHT: Final = Quantity("height", "length", ("altitude", "elevation", "höhe"))
 LOCAL_HEIGHT: Final = Quantity("height", "length", ("z", "altitude"))
 SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),

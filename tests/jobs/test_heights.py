@@ -15,7 +15,7 @@ from roadscan.cli import app
 
 SURVEY = """id = "s"
 map = {{ {map} }}
-tiles = {{ cell_m = 1.0 }}
+tiles = {{ cell_m = 1.0, size_m = 500.0 }}
 products = {{ make = ["las"] }}
 {defaults}
 [[runs]]

@@ -47,10 +47,6 @@ PLACES = {
         US_FOOT_M,
         US_FOOT_M,
         "US survey foot",
-        TileId(30_512, 6_133),
-        US_FOOT_M,
-        US_FOOT_M,
-        "US survey foot",
     ),
     "local": Place(MapFrame(None, local_name="yard"), TileId(-3, 4), 1.0, 1.0, "metre"),
 }

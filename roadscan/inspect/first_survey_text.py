@@ -152,7 +152,7 @@ def _map(found: FoundFolder) -> Iterator[str]:
         yield _question('crs = "????"')
         yield '# The map of the products: a projected CRS ("EPSG:25832"), or, for poses that are not tied to the Earth,'
         yield '# local = { name = "local" } in place of crs.'
-    yield '# height = "orthometric"  # and geoid = "…", grids = "…"; of the products; else ellipsoidal'
+    yield '# height = "orthometric"  # and geoid = "…", grids = "…"; ellipsoidal unless it is stated'
 
 
 def _utm_line(log: FoundLog, frame: str, *, is_known: bool) -> Iterator[str]:

@@ -11,11 +11,11 @@ import datetime as dt
 import functools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -45,6 +45,7 @@ from roadscan.model.errors import ConfigError, CrsError, FormatError, RoadscanEr
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.rig import SensorKind
 from roadscan.model.survey import ControlConfig, LogConfig, Survey
+from roadscan.points.place import CloudFrame
 from roadscan.products.base import ProductContext
 from roadscan.sensors.base import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.tables.logs import read_log_records
@@ -247,6 +248,10 @@ def check_times(asked: Asked) -> Iterator[RoadscanError]:
         yield NothingPlacedError.of(found)
 
 
+def _cloud_of(survey: Survey, attributes: Mapping[str, Any]) -> CloudFrame:
+    return CloudFrame(attributes["crs"], attributes["height"], survey.geoid(attributes.get("geoid")))
+
+
 def check_datums(asked: Asked) -> Iterator[RoadscanError]:
     """Positions of every log can be brought into the map."""
     astray = [log for log, _, beyond_deg in asked.places if beyond_deg > FARTHEST_DEG]  # that is told, and is enough
@@ -255,6 +260,8 @@ def check_datums(asked: Asked) -> Iterator[RoadscanError]:
             continue
         if isinstance(log.config, LogConfig) and not asked.yields(log.run) & {*_PLACED, "cloud"}:
             continue  # nothing of its run goes to the map
+        if "cloud" in log.yields and _cloud_of(asked.survey, log.header.attributes).is_in(asked.frame):
+            continue
         stated = log.header.attributes.get("world_frame") or log.header.attributes.get("crs")
         crs = stated or (log.config.crs if isinstance(log.config, ControlConfig) else None)
         if crs is not None and not (crs == LOCAL_WORLD and asked.frame.is_local):

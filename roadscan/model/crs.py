@@ -84,7 +84,8 @@ def heights_of(crs: pyproj.CRS) -> StatedHeights:
     """Kind and unit of heights that a CRS states: a vertical one, one with a vertical part, or one of three axes."""
     if crs.is_bound and crs.source_crs is not None:
         return heights_of(crs.source_crs)
-    vertical = crs if crs.is_vertical else next((part for part in crs.sub_crs_list if part.is_vertical), None)
+    parts = crs.sub_crs_list or [crs]  # a compound CRS calls itself vertical
+    vertical = next((part for part in parts if part.is_vertical), None)
     if vertical is not None:
         unit_m = float(vertical.axis_info[-1].unit_conversion_factor)
         datum = vertical.datum.name if vertical.datum is not None else ""

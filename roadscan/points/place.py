@@ -389,8 +389,7 @@ class CloudFrame:
 
     def to_map(self, xyz_m: Float64, frame: MapFrame) -> Float64:
         """Easting, northing, height (n, 3) in the survey's map, metres."""
-        same_height = self.height == frame.height and not self._other_geoid(frame)
-        if (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height:
+        if self.is_in(frame):
             return xyz_m
         if self.height == "orthometric" and self.geoid is None:
             raise CrsError(
@@ -405,6 +404,11 @@ class CloudFrame:
         )
         world = world_frame_of(self.crs)
         return frame.map_from_world(world, own.world_from_map(world, xyz_m))
+
+    def is_in(self, frame: MapFrame) -> bool:
+        """Whether the coordinates are those of the map, heights included."""
+        same_height = self.height == frame.height and not self._other_geoid(frame)
+        return (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height
 
     def _other_geoid(self, frame: MapFrame) -> bool:
         """Whether the heights count from a grid whose content is not that of the map's."""

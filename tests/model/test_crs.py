@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def test_map_coordinates_agree_with_proj_and_return(
         np.testing.assert_allclose(enh[:, 2], llh[:, 2], atol=1e-6)
         np.testing.assert_allclose(frame.world_from_map(world, enh), xyz, atol=1e-6)
     assert frame.horizontal_unit_m == pytest.approx(unit_m, rel=1e-12)
-    assert frame.vertical_unit_m == 1.0
+    assert frame.vertical_unit_m == frame.horizontal_unit_m
 
 
 def test_geodetic_positions_return() -> None:
@@ -108,12 +109,17 @@ def test_a_coarse_change_of_datum_is_refused_unless_allowed() -> None:
         ({"crs": "EPSG:4326"}, "not projected"),
         ({"crs": "EPSG:25832+7837"}, "compound.*map.vertical_crs"),
         ({"crs": "EPSG:999999"}, "not known to PROJ"),
-        ({"crs": "EPSG:25832", "height": "orthometric"}, "no geoid is named.*geoid = "),
+        ({"crs": "EPSG:25832", "vertical_crs": "EPSG:7837"}, "is of orthometric heights, map.height is ellipsoidal"),
     ],
 )
 def test_map_frames_that_make_no_sense(arguments: dict[str, str], words: str) -> None:
     with pytest.raises(CrsError, match=words):
         MapFrame(**arguments)  # type: ignore[arg-type]
+
+
+def test_orthometric_heights_need_a_geoid_where_poses_come_into_the_map() -> None:
+    with pytest.raises(CrsError, match=r"no geoid is named.*geoid = "):
+        MapFrame(crs="EPSG:25832", height="orthometric").check_world(WGS84_WORLD)
 
 
 def test_a_position_outside_the_projection() -> None:
@@ -242,10 +248,11 @@ def test_outside_the_grid(plane_geoid: Geoid) -> None:
 
 
 def test_a_vertical_crs_is_named_and_changes_no_number(plane_geoid: Geoid) -> None:
-    _, xyz = world_points("EPSG:6319", "EPSG:6317", -73.6, 40.8)
-    plain, named = MapFrame(crs="EPSG:6539"), MapFrame(crs="EPSG:6539", vertical_crs="EPSG:6360")
-    world = world_frame_of("EPSG:6539")
-    np.testing.assert_array_equal(plain.map_from_world(world, xyz), named.map_from_world(world, xyz))
+    _, xyz = world_points("EPSG:4979", "EPSG:4978", 9.5, 47.2)
+    plain = MapFrame(crs="EPSG:32632", height="orthometric", geoid=plane_geoid)
+    named = replace(plain, vertical_crs="EPSG:7837")
+    np.testing.assert_array_equal(plain.map_from_world(WGS84_WORLD, xyz), named.map_from_world(WGS84_WORLD, xyz))
+    named = MapFrame(crs="EPSG:6539", height="orthometric", geoid=plane_geoid, vertical_crs="EPSG:6360")
     compound = pyproj.CRS(named.wkt())
     assert compound.is_compound
     assert [c.to_authority() for c in compound.sub_crs_list] == [("EPSG", "6539"), ("EPSG", "6360")]

@@ -40,9 +40,13 @@ US_FOOT_M = 1200 / 3937
 PLACES = {
     "utm_north": Place(MapFrame("EPSG:25832"), TileId(55_321, 602_011), 1.0, 1.0, "metre"),
     "utm_south": Place(MapFrame("EPSG:32734"), TileId(26_150, 624_377), 1.0, 1.0, "metre"),
-    "us_feet": Place(MapFrame("EPSG:6539"), TileId(30_512, 6_133), US_FOOT_M, 1.0, "metre"),
+    "us_feet": Place(MapFrame("EPSG:6539"), TileId(30_512, 6_133), US_FOOT_M, US_FOOT_M, "US survey foot"),
     "us_feet_heights_too": Place(
-        MapFrame("EPSG:6539", vertical_crs="EPSG:6360"), TileId(30_512, 6_133), US_FOOT_M, US_FOOT_M, "US survey foot"
+        MapFrame("EPSG:6539", height="orthometric", vertical_crs="EPSG:6360"),
+        TileId(30_512, 6_133),
+        US_FOOT_M,
+        US_FOOT_M,
+        "US survey foot",
     ),
     "local": Place(MapFrame(None, local_name="yard"), TileId(-3, 4), 1.0, 1.0, "metre"),
 }

@@ -104,7 +104,9 @@ def test_crs_is_the_maps(las, workshop, place, tmp_path):
         assert text.startswith('LOCAL_CS["yard"')
         assert crs.is_engineering
     else:
-        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
+        if not crs.is_compound:  # ellipsoidal heights: a third axis, in the horizontal unit
+            assert crs.axis_info[2].unit_conversion_factor == pytest.approx(place.unit_m, abs=1e-12)
         assert horizontal.to_epsg() == int(place.map.crs.split(":")[1])
         assert text.startswith(("PROJCS[", "COMPD_CS["))
     assert crs.is_compound == (place.map.vertical_crs is not None)
@@ -139,7 +141,7 @@ def test_coordinates_of_neighbours_share_one_lattice(las, workshop, places, tmp_
         moved = replace(place, tile=TileId(place.tile.column + shift, place.tile.row))
         write(las, workshop, moved, tmp_path / "tile")
         headers.append(laspy.read(tmp_path / "tile").header)
-    assert np.array_equal(headers[0].scales, [0.0002, 0.0002, 0.0001])  # next finer step below 0.1 mm in feet
+    assert np.array_equal(headers[0].scales, [0.0002, 0.0002, 0.0002])  # next finer step below 0.1 mm in feet
     assert np.array_equal(headers[0].scales, headers[1].scales)
     steps = (headers[1].offsets - headers[0].offsets) / headers[0].scales
     assert np.allclose(steps, np.rint(steps), atol=1e-6)

@@ -58,10 +58,10 @@ class OpenCrg(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """CRS, heights and the size of the grid's columns."""
+        head = CrgFile.open(source.path).header
         _epoch(source)
         crs = _crs(source)
         height = reference_height(source, crs)
-        head = CrgFile.open(source.path).header
         return LogHeader(
             {
                 "crs": crs,

@@ -363,7 +363,7 @@ def is_crg(path: Path) -> bool:
             start = stream.read(1 << 16).upper()
     except OSError:
         return False
-    return re.search(rb"^\$(ROAD_CRG|KD_DEFINITION)\b", start, re.MULTILINE) is not None
+    return re.search(rb"^\$(ROAD_CRG|ROAD_CRG_FILE|KD_DEFINITION)\b", start, re.MULTILINE) is not None
 
 
 def read_crg(path: Path) -> CurvedRegularGrid:

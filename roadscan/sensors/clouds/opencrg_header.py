@@ -29,6 +29,11 @@ LINE_BYTES: Final = 4096
 _MOST_ROWS: Final = 1 << 31
 _MOST_CHANNELS: Final = 1 << 16
 _DEFAULT_INCREMENT_M: Final = 0.01
+_REFERENCE: Final = "ROAD_CRG_FILE"
+"""Block that names the file with the data."""
+_MALFORMED_ZERO: Final = re.compile(r"(?<=[0-9.])[+-]E[+-]?0+$")
+"""An exponent of zero behind a sign too many (``2.000000000+e00``): C stops there, and the number is the same."""
+
 _HARMLESS_MODS: Final = {"grid_nan_mode", "grid_nan_offset"}
 _SECTION_AT: Final = re.compile(r"long section\s+at\s+v\s*=\s*(\S+)$")
 _SECTION: Final = re.compile(r"long section\s+(\d+)$")
@@ -122,6 +127,8 @@ def _blocks(stream: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
             blocks["CT"].append(line)
         elif name and not line.startswith("*") and (content := line.split("!")[0].strip()):
             blocks[name].append(content)
+    if _REFERENCE in blocks:  # such a file may have no data of its own, and no end of its header
+        return blocks, taken
     raise FormatError(
         "no line that begins '$$' ends the header", expected="an OpenCRG file with its data", file=path, record=0
     )
@@ -129,9 +136,9 @@ def _blocks(stream: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
 
 def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
     """Refuse files whose nodes do not stand in them as they are."""
-    if "ROAD_CRG_FILE" in blocks:
+    if _REFERENCE in blocks:
         raise FormatError(
-            f"the header only refers to the data file '{''.join(blocks['ROAD_CRG_FILE'])}'",
+            f"the header only refers to the data file '{''.join(blocks[_REFERENCE])}'",
             expected="a file with its own data",
             change="name that file as the log",
             file=path,
@@ -175,7 +182,7 @@ def assignments(lines: list[str], path: Path) -> dict[str, float]:
         key, equals, text = line.partition("=")
         if not equals:
             continue
-        word = (text.split() or [""])[0].upper().replace("D", "E")
+        word = _MALFORMED_ZERO.sub("", (text.split() or [""])[0].upper().replace("D", "E"))
         try:
             value = float(word)
         except ValueError:

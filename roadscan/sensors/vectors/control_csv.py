@@ -22,7 +22,7 @@ Float64 = npt.NDArray[np.float64]
 
 NAME: Final = Quantity("name", "text", ("point", "id", "point_id", "punkt", "punktnummer"))
 WORDS: Final = (
-    Quantity("code", "text", ("description",), optional=True), Quantity("role", "text", optional=True),
+    Quantity("code", "text", ("description", "desc"), optional=True), Quantity("role", "text", optional=True),
 )  # fmt: skip
 _EASTING: Final = Quantity("easting", "length", ("rechtswert",))
 _NORTHING: Final = Quantity("northing", "length", ("hochwert",))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +15,16 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 
+_SAME_SIGMA: Final = 0.05
+"""σ that differ by no more than this share are the same: evidence changes them a little with each new run."""
+
+
 def published(before: Corrections | None, solved: Corrections, moved_m: float, arm_m: float) -> Corrections:
     """Corrections to publish: knots of the solution where it moves a pose by more than stated, else those before.
 
     Between knots corrections are linear, so nowhere do they depart from the solution by more than at a knot. Where the
-    knots lie at other epochs, all are replaced.
+    knots lie at other epochs, all are replaced. σ is always that of the solution, but for a few percent: what is
+    doubted anew widens it, though no pose moves.
 
     Parameters
     ----------
@@ -30,11 +36,14 @@ def published(before: Corrections | None, solved: Corrections, moved_m: float, a
     shift = np.linalg.norm(solved.north_east_down_m - before.north_east_down_m, axis=1)
     turn = np.linalg.norm(solved.roll_pitch_heading_rad - before.roll_pitch_heading_rad, axis=1)
     moved = shift + arm_m * turn > moved_m
-    if not moved.any():
-        return before
     sigma = solved.sigma
     if sigma is not None and before.sigma is not None:
-        sigma = np.where(moved[:, None], sigma, before.sigma)
+        same = np.isclose(sigma, before.sigma, rtol=_SAME_SIGMA, atol=0.0, equal_nan=True).all(axis=1)
+        if not moved.any() and same.all():
+            return before
+        sigma = np.where((moved | ~same)[:, None], sigma, before.sigma)
+    elif not moved.any() and (sigma is None) == (before.sigma is None):
+        return before
     return Corrections(
         solved.epochs_gps_ns,
         np.where(moved[:, None], solved.north_east_down_m, before.north_east_down_m),

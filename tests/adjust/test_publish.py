@@ -33,6 +33,19 @@ def test_only_knots_that_move_are_replaced() -> None:
     assert np.abs(found.at(at)[0] - after.at(at)[0]).max() <= 0.0001
 
 
+def test_a_sigma_that_was_widened_is_published_though_no_pose_moves() -> None:
+    before = corrections(np.zeros(5))
+    after = corrections(np.full(5, 0.00001))
+    assert after.sigma is not None
+    after.sigma[1] *= 1.04
+    assert published(before, after, 0.0001, 5.0) is before
+    after.sigma[2] = 0.050
+    found = published(before, after, 0.0001, 5.0)
+    assert found.sigma is not None
+    assert found.sigma[:, 2].tolist() == [0.001, 0.001, 0.050, 0.001, 0.001]
+    assert found.north_east_down_m[:, 2].tolist() == [0.0] * 5
+
+
 def test_a_turn_counts_at_its_arm() -> None:
     before = corrections(np.zeros(5))
     assert published(before, corrections(np.zeros(5), 0.000019), 0.0001, 5.0) is before

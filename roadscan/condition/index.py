@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.lane_data import LaneData
+from roadscan.model.witness import Finding
 from roadscan.plugins import found_kinds
 
 Float64 = npt.NDArray[np.float64]
@@ -49,6 +50,8 @@ class Value(NamedTuple):
     """NaN where it is not known."""
     share: float
     reason: str = ""
+    finding: Finding | None = None
+    """What is doubted of the heights that it comes from; its subject, the lane, is filled in where it is written."""
 
 
 class ConditionIndex(ABC):

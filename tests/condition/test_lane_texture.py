@@ -195,3 +195,17 @@ def test_of_two_lines_the_inner_one_is_that_of_the_lane() -> None:
     assert found is not None
     assert found.middle_m == pytest.approx(1.7, abs=0.01)
     assert painted_line(np.full(away.size, 70.0), np.full(away.size, 70.0), away) is None
+
+
+def test_a_rut_that_deepens_does_not_change_the_texture() -> None:
+    """Cells of 50 mm: the slope of a rut's sides scatters their readings, and is no texture."""
+    found = {}
+    for depth_m in (0.0, 0.012, 0.025, 0.031):
+        ruts = [{"offset_m": 0.0, "width_m": 0.8, "depth_m": depth_m}] if depth_m else []
+        road = LaneOfCells(texture=TEXTURE_OF, ruts=ruts)
+        squares = texture_squares(road.table(0.05, 25), road.line, road.lane, (4.0, 10.0))
+        inside = np.abs(squares.offset_m) < 0.35
+        found[depth_m] = float(np.nanmean(squares.texture_mm[:, inside]))
+    assert found[0.012] == pytest.approx(found[0.0], rel=0.04)
+    assert found[0.025] == pytest.approx(found[0.0], rel=0.1)  # 5 % is the stated σ
+    assert found[0.031] == pytest.approx(found[0.025], rel=0.07)

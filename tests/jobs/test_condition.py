@@ -415,6 +415,8 @@ def test_a_second_survey_tells_what_changed_and_what_did_not(surveyed: RoughSurv
         assert np.abs(own - (now - was)[: own.size]).max() < 0.5
     smooth = frame[(frame["quantity"] == "mri_m_per_km") & frame["change"].notna()]
     assert len(smooth) and set(smooth["verdict"]) <= {"no change shown"}
+    rut = frame[frame["quantity"] == "rut_depth_mean_left_mm"].dropna(subset="change")
+    assert (rut["sigma_change"] < 0.5).all()
     changes.write(tmp_path / "changes.parquet")
     assert len(geopandas.read_parquet(tmp_path / "changes.parquet")) == len(frame)
     changes.write(tmp_path / "changes.csv")
@@ -460,3 +462,34 @@ def test_patches_that_have_lost_stones_are_outlined_on_the_map(surveyed: RoughSu
     assert own["ravelled_area_m2"].tolist()[1] == pytest.approx(2.24, abs=0.01)
     assert own["ravelling_patches"].tolist()[:3] == [0.0, 1.0, 0.0]
     assert own["ravelling_loss_cm3_per_m2"].tolist()[1] == pytest.approx(400.0 * 2.24 / (50.0 * 3.4), rel=0.05)
+
+
+@pytest.mark.witness("severe_step")
+@pytest.mark.parametrize(("kerb_m", "done"), [(0.15, "is kept"), (0.8, "is left out")])
+def test_a_kerb_that_is_crossed_is_kept_in_the_roughness_and_doubted(
+    surveyed: RoughSurvey, tmp_path: Path, kerb_m: float, done: str
+) -> None:
+    session = again(surveyed, tmp_path)
+    before = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    for record in session.manifest.of(stretches.PROFILES).values():
+        table = session.store.read_table(record.path)
+        raised = table["height_m"].to_numpy() + kerb_m * (table["station_m"].to_numpy() > 130.02)
+        column = table.schema.get_field_index("height_m")
+        table = table.set_column(column, table.schema.field("height_m"), pa.array(raised, from_pandas=True))
+        content = parquet_bytes(table, table_schema(stretches.PROFILES))
+        session.store.write_bytes(record.path, content)
+        session.manifest.add([record._replace(bytes=len(content), digest=bytes_digest(content))])
+    stage = stage_named("condition")
+    stage.run(session)
+    assert session.failures == []
+    after = session.store.read_table("products/condition_sections/condition_sections.parquet").to_pandas()
+    was, now = (table[table["lane"] == "2"].iloc[2] for table in (before, after))
+    assert f"at station 130.0 the road steps by more than {0.1 if kerb_m < 0.5 else 0.5:g} m" in now["reason"]
+    assert done in now["reason"]
+    if kerb_m < 0.5:
+        assert now["mri_m_per_km"] > was["mri_m_per_km"] + 3.0
+        assert now["iri_local_max_m_per_km"] > 40.0
+    findings = stage.findings(session.survey, (), session.manifest)
+    assert {one.witness for one in findings} == {"severe_step"}
+    assert {one.text.split()[0] for one in findings} == {"left", "right"}
+    assert all("road A1, lane 2" in one.line and done in one.line for one in findings)

@@ -8,7 +8,7 @@ sources: :mod:`roadscan.condition.iri`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -28,6 +28,16 @@ from roadscan.condition.of_sections.wheel_paths import (
 from roadscan.condition.quarter_car import RULES, SEVERE_M
 from roadscan.condition.ride import Ride, ride
 from roadscan.condition.segments import Segments
+from roadscan.model.witness import Witness
+
+SEVERE_STEP: Final = Witness(
+    name="severe_step",
+    input="condition",
+    fault="Neighbouring heights of a wheel path differ by more than a road does.",
+    asks=f"Heights of neighbours: more than {SEVERE_M:g} m apart they are a kerb, the edge of a pothole or a fault.",
+    does=f"A step of up to {RULES.highest_step_m:g} m is kept in the roughness, a higher one is left out of it.",
+    told=("findings",),
+)
 
 
 class Iri(ConditionIndex):
@@ -54,7 +64,8 @@ class Iri(ConditionIndex):
         paths = wheel_paths(lane, from_m, to_m)
         found = {side: _told(path) for side, path in paths.items()}
         for side, told in found.items():
-            yield Value(f"iri_{side}_m_per_km", "section", from_m, to_m, told.iri, told.sigma, told.share, told.reason)
+            yield Value(f"iri_{side}_m_per_km", "section", from_m, to_m, told.iri, told.sigma, told.share, told.reason,
+                        SEVERE_STEP.finds("", f"{side} wheel path: {told.steps}.") if told.steps else None)  # fmt: skip
         left, right = found["left"], found["right"]
         share, reason = min(left.share, right.share), left.reason or right.reason
         mean = float(mean_roughness_index(np.array(left.iri), np.array(right.iri)))
@@ -74,6 +85,7 @@ class _Told:
     def __init__(self, share: float, reason: str) -> None:
         self.local = self.sigma_local = np.nan
         self.cleared = Cleared(np.nan, np.nan, reason)
+        self.steps = ""
         self.share, self.reason = share, reason
 
     @property
@@ -100,16 +112,16 @@ def _told(path: WheelPath) -> _Told:
         return told
     most = greatest_of(rolling_iri(on)[[0, *range(2, 2 + NOISES)]][:, path.inside])
     told.local, told.sigma_local = float(most[0]), spread_of(most)
-    told.reason = _remarks(on, path)
+    noted = on.notes(path.ends)[0][0]
+    told.steps = _steps(on, path, noted)
+    start = f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins"
+    told.reason = "; ".join(one for one in (start if "start" in noted else "", told.steps) if one)
     return told
 
 
-def _remarks(on: Ride, path: WheelPath) -> str:
-    """What to know of a value that there is."""
-    noted = on.notes(path.ends)[0][0]
+def _steps(on: Ride, path: WheelPath, noted: str) -> str:
+    """Where the wheel path steps as roads do not, and what was done; empty where it does not."""
     found = []
-    if "start" in noted:
-        found.append(f"the profile begins in it: its first {RULES.start_m:g} m depend on how the car begins")
     station, way = path.profile.station_m, path.profile.distance_m
     broken = on.breaks[0]
     left_out = f"more than {RULES.highest_step_m:g} m, which no car rolls over, and is left out"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +38,7 @@ from roadscan.jobs.engine.compute import damaged_file, reason_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.settings.condition import SectionConfig
+from roadscan.model.witness import Finding
 from roadscan.products.base import ProductContext
 from roadscan.products.geo_table import read_geo_table
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
@@ -45,6 +47,8 @@ from roadscan.tables.store import Store, bytes_digest
 from roadscan.tables.writer import parquet_bytes
 
 VALUES: Final = "condition_values"
+_FINDINGS: Final = "findings"
+"""Member of a record's detail that holds them."""
 _GROUP_M: Final = 1000.0
 """Sections are computed together over about this length; ravelling takes the lane's texture of it."""
 
@@ -205,7 +209,16 @@ def _write(task: GroupTask, index: ConditionIndex, key: str, lane: LaneData) -> 
     content = parquet_bytes(values_table(group.lane, index, values), schema)
     target = f"{schema.location}/{group.unit(index.name)}.parquet"
     task.store.write_bytes(target, content, lasting=False)
-    return OutputRecord(VALUES, group.unit(index.name), key, target, len(content), bytes_digest(content))
+    lane_name = f"road {group.lane.road}, lane {group.lane.name}"
+    doubts = [asdict(replace(value.finding, subject=lane_name)) for value in values if value.finding is not None]
+    detail = json.dumps({_FINDINGS: doubts}) if doubts else ""
+    return OutputRecord(VALUES, group.unit(index.name), key, target, len(content), bytes_digest(content), detail)
+
+
+def value_findings(manifest: Manifest) -> list[Finding]:
+    """What is doubted of the heights that the values in the store come from."""
+    records = (record for _, record in sorted(manifest.of(VALUES).items()))
+    return [Finding.of(one) for record in records for one in record.figures().get(_FINDINGS, ())]
 
 
 def values_table(lane: Lane, index: ConditionIndex, values: Sequence[Value]) -> pa.Table:

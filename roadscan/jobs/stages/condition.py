@@ -17,7 +17,7 @@ from roadscan.jobs.condition.stretches import stretch_tasks, survey_stretches
 from roadscan.jobs.condition.surface_cells import check_surface_cells
 from roadscan.jobs.condition.tasks import P, PieceTask, S, run_units
 from roadscan.jobs.condition.tile_summary import write_tiles
-from roadscan.jobs.condition.values import GroupTask, values_of_group
+from roadscan.jobs.condition.values import GroupTask, value_findings, values_of_group
 from roadscan.jobs.condition.work import ConditionWork, plan_condition
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.products import product_context
@@ -26,7 +26,11 @@ from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
+<<<<<<< HEAD
 from roadscan.model.witness import Finding, Witness
+=======
+from roadscan.model.witness import Finding
+>>>>>>> condition
 from roadscan.tables.logs import LogRecord
 from roadscan.tables.manifest import Manifest
 
@@ -112,6 +116,10 @@ class Condition(Stage):
         except RoadscanError as error:
             return [error]
         return []
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Steps of wheel paths that are no road's."""
+        return value_findings(manifest)
 
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from roadscan.kernels.condition.sampling import MOST_CELLS, Cells, gather
+from roadscan.kernels.condition.sampling import MOST_CELLS, Cells, factorise, gather, solve
 from roadscan.kernels.options import inlined, inner, kernel
 
 BLOCK_M = 0.05
@@ -19,6 +19,10 @@ MOST_BLOCKS = 16
 """Blocks along an edge of a square, at the most."""
 FITTED = 9
 """Blocks with so many cells get a plane of their own."""
+BENT = 6
+"""Terms of a surface of second degree."""
+ENOUGH_BENT = 10
+"""Cells of a square that tell one."""
 LEAST_FREEDOM = 5.0
 """Readings beyond the first of their cells that tell the scatter within the cells of a block."""
 SOUND = 0.85
@@ -51,31 +55,35 @@ def plane(sums, b, slopes):
 
 
 @inner
-def neighbour_slopes(sums, blocks, slopes):
-    """Slopes of the blocks that hold too few cells for a plane, from the means of the blocks beside them.
+def bent_slopes(found, count, base, half, sums, blocks, slopes):
+    """Slopes of the blocks that hold too few cells for a plane, from a surface of second degree through the square.
 
-    Where there is none beside, that of the whole square, which stands in the last row. slopes : (blocks² + 1, 2).
+    A rut bends, so a plane through the whole square has another slope than its cells. Where the cells do not tell the
+    surface, it is that of the plane, which stands in the last row. slopes : (blocks² + 1, 2).
     """
     last = blocks * blocks
-    for i in range(blocks):
-        for j in range(blocks):
-            b = i * blocks + j
-            if sums[b, N] >= FITTED:
-                continue
-            for axis in range(2):
-                before, behind = b, b
-                if axis == 0:
-                    before = b - blocks if i > 0 and sums[b - blocks, N] > 0.0 else b
-                    behind = b + blocks if i < blocks - 1 and sums[b + blocks, N] > 0.0 else b
-                else:
-                    before = b - 1 if j > 0 and sums[b - 1, N] > 0.0 else b
-                    behind = b + 1 if j < blocks - 1 and sums[b + 1, N] > 0.0 else b
-                slopes[b, axis] = slopes[last, axis]
-                if before != behind and sums[before, N] > 0.0 and sums[behind, N] > 0.0:
-                    way = sums[behind, X + axis] / sums[behind, N] - sums[before, X + axis] / sums[before, N]
-                    rise = sums[behind, H] / sums[behind, N] - sums[before, H] / sums[before, N]
-                    if way > 0.0:
-                        slopes[b, axis] = rise / way
+    for b in range(last):
+        if sums[b, N] < FITTED:
+            slopes[b, 0], slopes[b, 1] = slopes[last, 0], slopes[last, 1]
+    if count < ENOUGH_BENT or sums[:last, N].min() >= FITTED:
+        return
+    normal, factor = np.zeros((BENT, BENT)), np.zeros((BENT, BENT))
+    right, terms, surface = np.zeros(BENT), np.zeros(BENT), np.zeros(BENT)
+    for k in range(count):
+        x, y = found.along[k], found.across[k]
+        terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = 1.0, x, y, x * x, x * y, y * y
+        for i in range(BENT):
+            right[i] += terms[i] * (found.height[k] - base)
+            for j in range(i + 1):
+                normal[i, j] += terms[i] * terms[j]
+    if factorise(normal, BENT, factor) < BENT:
+        return
+    solve(factor, BENT, right, surface)
+    for b in range(last):
+        if 1.0 <= sums[b, N] < FITTED:
+            x, y = sums[b, X] / sums[b, N] / half, sums[b, Y] / sums[b, N] / half
+            slopes[b, 0] = (surface[1] + 2.0 * surface[3] * x + surface[4] * y) / half
+            slopes[b, 1] = (surface[2] + surface[4] * x + 2.0 * surface[5] * y) / half
 
 
 @inner
@@ -256,7 +264,7 @@ def texture_of_squares(table, places, edge_m, out):
         fill_blocks(found, count, base, half, blocks, sums)
         for b in range(blocks * blocks + 1):
             plane(sums, b, slopes)
-        neighbour_slopes(sums, blocks, slopes)
+        bent_slopes(found, count, base, half, sums, blocks, slopes)
         known = 0
         for b in range(blocks * blocks):
             between, within = block_scatter(sums, b, slopes, cell)

@@ -26,11 +26,7 @@ from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.tiles import TaskResult
 from roadscan.model.errors import RoadscanError
 from roadscan.model.survey import Survey
-<<<<<<< HEAD
 from roadscan.model.witness import Finding, Witness
-=======
-from roadscan.model.witness import Finding
->>>>>>> condition
 from roadscan.tables.logs import LogRecord
 from roadscan.tables.manifest import Manifest
 
@@ -117,10 +113,6 @@ class Condition(Stage):
             return [error]
         return []
 
-    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Steps of wheel paths that are no road's."""
-        return value_findings(manifest)
-
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""
         if session.survey.config.condition is None:
@@ -146,7 +138,7 @@ class Condition(Stage):
         )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Figures of condition that no section has, by the limit that they missed."""
+        """Steps of wheel paths that no road has; and figures that no section has, by the limit that they missed."""
         if survey.config.condition is None or not manifest.of(LINES):
             return ()
         told = known_sections(manifest)
@@ -154,7 +146,7 @@ class Condition(Stage):
             said = f"No section of a lane was made: no drive of {LEAST_M:g} m or more lies on tiles that hold cells."
             return (NOT_MEASURED.finds("condition", said),)
         of_cracks = {q.name for one in condition_indices().values() if one.needs_cracks for q in one.quantities}
-        found = []
+        found = [*value_findings(manifest)]
         for reason, quantities in told[1].items():
             named = [name for name in quantities if name not in of_cracks]  # the product `cracks` is the user's choice
             if named:

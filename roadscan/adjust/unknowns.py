@@ -196,7 +196,7 @@ class Unknowns:
         unknown, derivative = np.full((n, 2, _SIZE), -1, np.int64), np.zeros((n, 2, _SIZE))
         unknown[here] = self.of_mountings[observations.sensor[here]]
         derivative[here] = observations.mount_partials[here] * self.mount_sigma[observations.sensor[here]]
-        return unknown.reshape(n, -1), derivative.reshape(n, -1)
+        return unknown.reshape(n, 2 * _SIZE), derivative.reshape(n, 2 * _SIZE)
 
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
         """Upper entries of the prior's inverse covariance: row, column, value, component.

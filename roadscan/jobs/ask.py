@@ -27,6 +27,7 @@ _MADE_BY: Final = {
     **dict.fromkeys(
         (
             "corrections",
+            "mounting_corrections",
             "ties",
             "tie_residuals",
             "control_sightings",

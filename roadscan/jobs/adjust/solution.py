@@ -12,6 +12,7 @@ import numpy.typing as npt
 from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
 from roadscan.adjust.control import SeenBy, Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
+from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
@@ -216,7 +217,8 @@ def _adjusted(
     """The adjustment of ties and control, and the place that stands for point 0.
 
     A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
-    as what was found, and the adjustment is made once more.
+    as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
+    sensors that are off: they are not estimated then, and the control is what is doubted.
     """
     ties = evidence.ties.observations
     first = int(ties.place.max(initial=-1)) + 1
@@ -226,6 +228,10 @@ def _adjusted(
     priors = evidence.mounted.priors
     for _ in range(_WIDENED):
         found = adjust(joined, evidence.priors, settings, priors)
+        shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
+        if len(priors) and any((one.sigma[shared] > 0.0).any() for one in priors):
+            priors = tuple(MountingPrior(one.sensor, _without(one.sigma, shared)) for one in priors)
+            continue
         off = disproved(found.mountings)
         if not off.any():
             break
@@ -233,6 +239,11 @@ def _adjusted(
         priors = tuple(MountingPrior(one.sensor, own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, 6)
     return replace(found, mountings=replace(found.mountings, prior_sigma=stated)), first
+
+
+def _without(sigma: Float64, axes: Sequence[int]) -> Float64:
+    """σ (6,) of a mounting, and 0 for components that are not to be estimated."""
+    return np.where(np.isin(np.arange(sigma.size), axes), 0.0, sigma)
 
 
 def _counting_points(control: ControlErrors) -> set[int]:

@@ -14,7 +14,7 @@ from roadscan.jobs.navigate.computed_trajectory import PlannedTrajectory
 from roadscan.jobs.navigate.navigation_pictures import draw_trajectories
 from roadscan.jobs.navigate.solve_trajectory import plan_solutions
 from roadscan.jobs.navigate.spline_trajectory import plan_splines
-from roadscan.model.errors import ConfigError, RoadscanError, RunError
+from roadscan.model.errors import ConfigError, DamagedError, RoadscanError, RunError
 from roadscan.model.survey import Survey
 from roadscan.tables.logs import NAVIGATION, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.tables.store import Store
@@ -98,7 +98,7 @@ def known_keys(survey: Survey, store: Store, logs: Logs | None = None) -> list[s
     keys = [log.key for log in planned if has_log(store, log.key)]
     try:
         solutions = plan_trajectories(survey, store, read_log_records(store, keys, damaged=[]))
-    except ConfigError:
+    except (ConfigError, DamagedError):  # the run, and `verify`, say so
         return keys
     return keys + [p.key for p in solutions if has_log(store, p.key)]
 

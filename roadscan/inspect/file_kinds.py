@@ -78,21 +78,12 @@ _MAGICS: Final[tuple[tuple[int, bytes, str], ...]] = (
     (0, b"psi", "a PSI container"),
     (0, b"\x7fELF", "a program"),
     (0, b"MZ", "a Windows program"),
-    (
-        0,
-        b"\xb5\x62",
-        "a u-blox recording (UBX), which is not read: have u-center or the receiver write its NMEA sentences, "
-        "or RTKLIB a .pos file of it",
-    ),
+    (0, b"\xb5\x62", "a u-blox recording (UBX)"),
     (0, b"<?xml", "an XML document"),
 )
 
 _XML_BYTES: Final = 2048
 """The root element of an XML document stands in so many bytes."""
-_GPX: Final = (
-    "a GPX track, which is not read: it has positions of some metres and neither attitude nor the kind of its heights; "
-    "have `gpsbabel -i gpx -o nmea` write NMEA of it, or take the receiver's own log"
-)
 _TAIL_BYTES: Final = (1 << 16) + 22
 _ENDS: Final = ((b"PAR1", b"PAR1", 4), (b"ARROW1", b"ARROW1", 6), (b"PK\x03\x04", b"PK\x05\x06", _TAIL_BYTES))
 """First bytes, what the end of such a file holds, and within how many bytes (a zip's comment may follow it)."""
@@ -201,7 +192,7 @@ def kind_of(path: Path) -> FileKind:
         if word in words:
             return _guarded(look, path, words)
     if words:
-        return FileKind(_GPX if b"<gpx" in head[:_XML_BYTES] else words)
+        return FileKind("a GPX track (XML)" if b"<gpx" in head[:_XML_BYTES] else words)
     if _is_text(head):
         return _text(path, head)
     if _tar_without_magic(path):

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import chi2
 
 from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
@@ -47,6 +48,8 @@ _SOME: Final = 1.0
 """Redundancy from which on the σ of poses that turned out too small is estimated, however roughly."""
 _ALSO: Final = 0.1
 """A component whose factor is below this share of the largest one keeps its stated σ: it follows the other's errors."""
+_SURE: Final = 0.99
+"""Share of right solutions whose corrections are no larger."""
 _MEDIAN: Final = 0.6745
 """Median of the absolute of a standard normal number."""
 
@@ -218,6 +221,12 @@ class Rounds:
         )
         found, self._kinds, self._processes = self._processes, kinds, processes
         return bool((found > _UNDERSTATED).any())
+
+    def contradicts_poses(self, estimate: Estimate) -> bool:
+        """Whether corrections of some component are larger than its process allows, by the quantile of χ²."""
+        ratio, redundancy = self._process_ratios(estimate.solution, estimate.inverse)
+        known = redundancy >= _SOME
+        return bool((ratio * redundancy > chi2.ppf(_SURE, np.maximum(redundancy, _SOME)))[known].any())
 
     def _process_ratios(self, solution: Float64, inverse: SelectedInverse) -> tuple[Float64, Float64]:
         """Squares over redundancy (6,) of each component's process with the factor of now, and the redundancy."""

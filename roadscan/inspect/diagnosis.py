@@ -35,8 +35,8 @@ _KNOWN_OTHERS: Final = {
     "GPX": (
         "its positions have no attitude and no σ, and are mostly those of a phone or a watch",
         "the log of a survey's receiver",
-        "export the receiver's log as RTKLIB .pos or NMEA (`gpsbabel -i gpx -o nmea` makes NMEA of the track alone), or "
-        "the trajectory with roll, pitch and heading as trajectory_csv",
+        "export the receiver's log as RTKLIB .pos or NMEA (`gpsbabel -i gpx -o nmea` makes NMEA of the track alone), "
+        "or the trajectory with roll, pitch and heading as trajectory_csv",
     ),
     "UBX": (
         "the receiver's binary messages are not read",

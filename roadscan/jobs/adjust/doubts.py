@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_faults import WrongPoint, listed, swapped
 from roadscan.adjust.control_test import HEIGHT, PLACE, AppliedOffset, ControlVerdict
+from roadscan.adjust.process import RunPrior
 from roadscan.model.witness import Finding, Witness
 
 Float64 = npt.NDArray[np.float64]
@@ -256,6 +257,16 @@ def solver_line(factors: Mapping[str, float], rounds: int, *, settled: bool) -> 
     told = [f"{_WORDS[name]} {factor:.2f}" for name, factor in factors.items() if factor != 1.0]
     end = f"settled after {rounds} rounds" if settled else f"not settled after {rounds} rounds"
     return f"solution {end}; variance factors: {', '.join(told) if told else 'as stated'}"
+
+
+def time_line(stated: Sequence[RunPrior], used: Sequence[RunPrior]) -> str:
+    """Correlation times that were taken in place of those of the settings, '' where none was."""
+    words = []
+    for name, component in (("position", 0), ("attitude", 3)):
+        pairs = {(a.taus_s[component], b.taus_s[component]) for a, b in zip(stated, used, strict=True)}
+        changed = sorted(pair for pair in pairs if pair[0] != pair[1])
+        words += [f"of {name} over {b:g} s in place of {a:g} s (adjust.priors.{name}_time_s)" for a, b in changed]
+    return f"errors of the poses vary faster than assumed: {', '.join(words)}; their σ is as stated" if words else ""
 
 
 def target_findings(sightings: Sequence[Sighting]) -> list[Finding]:

@@ -32,6 +32,7 @@ from roadscan.jobs.adjust.doubts import (
     power_line,
     solver_findings,
     solver_line,
+    time_line,
     wrong_points,
 )
 from roadscan.jobs.adjust.mountings import Mounted, disproved
@@ -196,7 +197,8 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
     lines = [
         solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
-        offset_line(adjusted.verdict), power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
+        time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict),
+        power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
     ]  # fmt: skip
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),

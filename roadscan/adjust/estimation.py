@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
@@ -226,7 +226,7 @@ class Rounds:
         """Whether corrections of some component are larger than its process allows, by the quantile of χ²."""
         ratio, redundancy = self._process_ratios(estimate.solution, estimate.inverse)
         known = redundancy >= _SOME
-        return bool((ratio * redundancy > chi2.ppf(_SURE, np.maximum(redundancy, _SOME)))[known].any())
+        return bool((ratio * redundancy > chdtri(np.maximum(redundancy, _SOME), 1.0 - _SURE))[known].any())
 
     def _process_ratios(self, solution: Float64, inverse: SelectedInverse) -> tuple[Float64, Float64]:
         """Squares over redundancy (6,) of each component's process with the factor of now, and the redundancy."""

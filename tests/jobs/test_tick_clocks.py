@@ -144,3 +144,20 @@ def test_a_wheel_that_slips_for_a_while_is_no_clock(tmp_path: Path) -> None:
     code, text = said(tmp_path, "run", "--workers", "0")
     assert code == 0
     assert "steps against" not in text
+
+
+@pytest.mark.witness("pose_stamps")
+@pytest.mark.parametrize("size_s", [3.0, 0.0])
+def test_a_gap_in_time_that_is_none_of_the_way_is_named(tmp_path: Path, size_s: float) -> None:
+    """Without ticks, the way across the gap says it; a gap in which the vehicle drives on is not named."""
+
+    def make(where: Path) -> None:
+        write_drive(where / "poses.csv", step(size_s))
+        if not size_s:
+            lines = (where / "poses.csv").read_text().splitlines(keepends=True)
+            (where / "poses.csv").write_text("".join(lines[:500] + lines[800:]))
+
+    changed(tmp_path, make=make)
+    code, text = said(tmp_path, "run", "--workers", "0")
+    assert code == 0, text
+    assert ("poses.csv: the stamps jump forward by about 3.00" in text) == (size_s > 0)

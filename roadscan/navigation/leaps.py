@@ -10,8 +10,8 @@ each other is left out, and where two long pieces do not fit, both stay: nothing
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -65,6 +65,10 @@ _GAP_STEPS: Final = 5.0
 _LEAST_GAP_S: Final = 1.0
 _VELOCITY_LINKS: Final = 3
 """Links over which the velocity at the end of a segment is taken."""
+_LEAST_STALL_M: Final = 0.5
+"""The way across a gap has to be shorter by so much than a vehicle needs."""
+_STALL_M_PER_S: Final = 2.0
+"""Slower, a vehicle may have stood still in the gap."""
 _MOST_SHARE: Final = 0.25
 """Where more poses than that would be left out, it is no leap but how this log is."""
 _MOST_SEGMENTS: Final = 1_000
@@ -105,6 +109,20 @@ class Step(NamedTuple):
     """Stated 1 σ of the positions there, 0 where none is stated."""
 
 
+class Stall(NamedTuple):
+    """A gap in time after which the poses go on where no vehicle can be: the stamps jump, and not the vehicle."""
+
+    after: int
+    """Row of the pose after it."""
+    gap_s: float
+    way_m: float
+    """Way across it."""
+    least_m: float
+    """Least way of a vehicle that brakes and drives off again as hard as it can."""
+    speed_m_per_s: float
+    """Mean of the speeds before and after."""
+
+
 @dataclass(frozen=True)
 class Leaps:
     """What is wrong with the poses of a track."""
@@ -121,6 +139,8 @@ class Leaps:
     """Steps of which nothing shows which side is right; the stated σ excludes them."""
     covered: tuple[Step, ...]
     """Leaps of position that a vehicle excludes and the stated σ does not."""
+    stalls: tuple[Stall, ...] = ()
+    """Gaps in time that a vehicle excludes."""
 
 
 def find_leaps(track: PoseTrack) -> Leaps:
@@ -132,7 +152,24 @@ def find_leaps(track: PoseTrack) -> Leaps:
     links = _Links.of(track)
     segments = _segments(links, n)
     kept = _kept(links, segments)
-    return _leaps(links, segments, kept, n)
+    return replace(_leaps(links, segments, kept, n), stalls=tuple(_stalls(links, segments)))
+
+
+def _stalls(links: _Links, segments: Sequence[_Segment]) -> Iterator[Stall]:
+    """Gaps across which the way is shorter than a vehicle needs to brake from the speed before it, and to drive off."""
+    for a, b in itertools.pairwise(segments):
+        link = a.last
+        before, after = (_velocity(links.track, a, at_end=True), _velocity(links.track, b, at_end=False))
+        if not links.gap[link] or before is None or after is None:
+            continue
+        first, last = (float(np.linalg.norm(velocity)) for velocity, _ in (before, after))
+        elapsed, track = float(links.elapsed_s[link]), links.track
+        slowest = max(first + last - _ACCELERATION_M_PER_S2 * elapsed, 0.0) / 2.0
+        least = (first**2 + last**2 - 2.0 * slowest**2) / (2.0 * _ACCELERATION_M_PER_S2)
+        way = float(np.linalg.norm(track.position_world_m[b.first] - track.position_world_m[a.last]))
+        sigma = float(np.hypot(track.sigma_m[a.last], track.sigma_m[b.first]))
+        if way + _SIGMA_TIMES * sigma + _LEAST_STALL_M < least and min(first, last) > _STALL_M_PER_S:
+            yield Stall(b.first, elapsed, way, least, (first + last) / 2.0)
 
 
 def rotation_vectors(before: Float64, after: Float64) -> Float64:

@@ -248,7 +248,8 @@ def profiler_twice(random: Random, folder: Path) -> str:
 
 def heads_exchanged(random: Random, folder: Path) -> str:
     """The logs of the two heads are exchanged."""
-    left, right = (folder / "raw" / (run := _run(random)) / f"{head}.parquet" for head in HEADS)
+    run = _run(random)
+    left, right = (folder / "raw" / run / f"{head}.parquet" for head in HEADS)
     content = left.read_bytes()
     left.write_bytes(right.read_bytes())
     right.write_bytes(content)

@@ -15,10 +15,11 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.jobs.ingest.place_checks import NO_FIX, without_fix
+from roadscan.model.counted import counted
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.gpstime import iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
-from roadscan.navigation.leaps import Leaps, PoseTrack, Step, find_leaps
+from roadscan.navigation.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
 from roadscan.sensors.base import Rows
 from roadscan.tables.writer import LogWriter
 
@@ -43,6 +44,14 @@ POSE_STEP: Final = Witness(
     fault="Positions or angles step to another level and go on there, as where a fix is lost or found again.",
     asks="the motion before and after, the stated σ, and the acceleration and turning of which a vehicle is able",
     does="the step is named with its size and σ; all poses are used, since nothing shows which side is right",
+    told=("findings",),
+)
+POSE_STAMPS: Final = Witness(
+    "pose_stamps",
+    input="trajectory",
+    fault="The clock of the poses is set forward within a log: a gap in time across which the vehicle hardly moves.",
+    asks="the speeds before and after the gap, and the shortest way on which a vehicle brakes and drives off again",
+    does="the jump is named with its size; all poses are used, since nothing shows which side is right",
     told=("findings",),
 )
 
@@ -107,6 +116,7 @@ class _Found:
     """Size (m, rad) and epoch of the largest leap by reason."""
     steps: list[tuple[int, Step]] = field(default_factory=list)
     covered: list[tuple[int, Step]] = field(default_factory=list)
+    stalls: list[tuple[int, Stall]] = field(default_factory=list)
 
     def add(self, epochs: Int64, leaps: Leaps) -> None:
         """Take what was found in a file."""
@@ -119,6 +129,7 @@ class _Found:
                 self.largest[reason] = max(self.largest.get(reason, (0.0, 0)), (float(size[k]), int(epochs[k])))
         self.steps += [(int(epochs[one.after]), one) for one in leaps.steps]
         self.covered += [(int(epochs[one.after]), one) for one in leaps.covered]
+        self.stalls += [(int(epochs[one.after]), one) for one in leaps.stalls]
 
     def findings(self, told: Sequence[tuple[str, int, int, int]]) -> list[Finding]:
         """One for the poses that were left out, one for each kind of steps."""
@@ -145,6 +156,8 @@ class _Found:
         if self.covered:
             end = "which a vehicle does not do, and the stated σ allows; all poses are used"
             found.append(POSE_STEP.finds("", f"{_step_words(self.covered)}, {end}"))
+        if self.stalls:
+            found.append(POSE_STAMPS.finds("", _stall_words(self.stalls)))
         return found
 
 
@@ -161,6 +174,19 @@ def _step_words(steps: Sequence[tuple[int, Step]]) -> str:
         return f"the poses step {words}"
     more = f", and {len(steps) - _NAMED:,} times more" if len(steps) > _NAMED else ""
     return f"the poses step {len(steps):,} times: {words}{more}"
+
+
+def _stall_words(stalls: Sequence[tuple[int, Stall]]) -> str:
+    """How far the stamps jump, at the largest gap."""
+    epoch, one = max(stalls, key=lambda stall: stall[1].gap_s)
+    more = f", and {counted(len(stalls) - 1, 'time')} more" if len(stalls) > 1 else ""
+    jump_s = one.gap_s - one.way_m / one.speed_m_per_s
+    return (
+        f"the stamps jump forward by about {jump_s:.3f} s at {iso_from_gps_ns(epoch)}{more}: the vehicle drives "
+        f"{one.speed_m_per_s:.1f} m/s before and after, and moves {one.way_m:.2f} m in the {one.gap_s:.3f} s between, "
+        f"where it needs {one.least_m:.1f} m to brake and drive off; a clock was set, which side is right nothing "
+        "shows, and all poses are used"
+    )
 
 
 def _size_words(step: Step) -> str:
@@ -201,8 +227,9 @@ def _judge(own: pa.Table, rows: pa.Table, world: str, no_fix: Int64) -> tuple[In
     steps, covered = (
         tuple(one for one in each if inside[one.after]) for each in (found.steps, found.covered)
     )  # fmt: skip
+    stalls = tuple(one for one in found.stalls if inside[one.after])
     return epochs, Leaps(
-        found.position & inside, found.attitude & inside, found.shift_m, found.turn_rad, steps, covered
+        found.position & inside, found.attitude & inside, found.shift_m, found.turn_rad, steps, covered, stalls
     )
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.calibrate.calibrate import outdated_calibrations
+from roadscan.jobs.navigate.tick_clocks import check_tick_clocks, tick_findings
 from roadscan.jobs.plan.plan import empty_passes
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.footprints import PRODUCT, index_footprints, stale_footprints, unplaced_logs
+from roadscan.model.survey import Survey
+from roadscan.model.witness import Finding
+from roadscan.tables.logs import LogRecord
+from roadscan.tables.manifest import Manifest
 
 
 def faults_of_plan(session: Session) -> list[tuple[str, str]]:
@@ -32,6 +37,7 @@ class Footprints(Stage):
             session.note(note)
         found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
         session.renew("footprints")
+        found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
@@ -48,6 +54,10 @@ class Footprints(Stage):
                 f"{stale:,} data files have no footprints, or old ones: more tiles than these may be due"
             )
         return state
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Clocks that wheel ticks and poses contradict."""
+        return tick_findings(records, manifest)
 
     def folders(self) -> Sequence[str]:
         """One file a data file."""

@@ -71,7 +71,9 @@ def run_stage(session: Session, stage: Stage) -> None:
 def _tell_findings(session: Session, stage: Stage) -> None:
     try:
         listed = set(known_keys(session.survey, session.store, session.logs))
-    except DamagedError:  # the stage that makes the damaged table anew comes later; logs have their findings all the same
+    except (
+        DamagedError
+    ):  # the stage that makes the damaged table anew comes later; logs have their findings all the same
         listed = {log.key for log in session.logs[0]}
     records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
     for one in findings_of(session.survey, records, session.manifest, [stage]):

@@ -33,6 +33,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
+_DOWN: Final = COMPONENTS.index("down_m")
 SURVEY_FACTOR: Final = "control_survey"
 """Name of the factor of the surveys' stated variances."""
 
@@ -356,9 +357,15 @@ def _of_observations(
 def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
     prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
     there = numbers >= 0
-    error, sigma = np.zeros(prior.shape), np.zeros(prior.shape)
+    error = np.zeros(prior.shape)
     error[there] = estimate.solution[numbers[there]] * prior[there]
-    sigma[there] = np.sqrt(estimate.inverse.at(numbers[there], numbers[there])) * prior[there]
+    variance = np.zeros(prior.shape)
+    variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
+    # What all heights have in common is not estimated: it is known as well as it was.
+    heights = prior[:, _DOWN] > 0.0
+    if heights.any():
+        variance[heights, _DOWN] += 1.0 / (1.0 / prior[heights, _DOWN] ** 2).sum()
+    sigma = np.sqrt(variance)
     return MountingErrors(tuple(one.sensor for one in unknowns.mountings), prior, error, sigma)
 
 

@@ -27,6 +27,8 @@ _SIZE = len(COMPONENTS)
 _DOWN = 2
 _ALONG = 0.5
 """A direction with so much of an axis tells of the σ of that coordinate; every direction has it of one or two."""
+_NOT_COMMON = 1e6
+"""Weight, in units of the prior's, of the condition that the heights of all sensors are not off together."""
 HEIGHT_ALONE = np.arange(_SIZE) == _DOWN
 """Components that a vertical adjustment corrects."""
 
@@ -214,14 +216,23 @@ class Unknowns:
                     row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
                     value = np.concatenate([diagonal, beside])
                     parts.append((row, column, value, np.full(row.size, component, np.int64)))
-        mounted = self.of_mountings[self.of_mountings >= 0]
-        if mounted.size:
-            parts.append((mounted, mounted, np.ones(mounted.size), np.full(mounted.size, _SIZE, np.int64)))
-        if not parts:
-            empty = np.zeros(0, np.int64)
-            return empty, empty, np.zeros(0), empty
+        parts.append(self._of_mounting_priors())
         rows, columns, values, components = zip(*parts, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values), np.concatenate(components)
+
+    def _of_mounting_priors(self) -> tuple[Int64, Int64, Float64, Int64]:
+        """Entries of the mountings: each has its σ, and no height is common to all sensors.
+
+        Were all lever arms too long, all heights would be off: that is an error of the poses' heights, which are among
+        the unknowns, and known less well.
+        """
+        mounted, heights = self.of_mountings[self.of_mountings >= 0], self.of_mountings[:, _DOWN]
+        there = heights >= 0
+        common = 1.0 / self.mount_sigma[there, _DOWN]
+        i, j = np.triu_indices(common.size)
+        row, column = np.append(mounted, heights[there][i]), np.append(mounted, heights[there][j])
+        shared = _NOT_COMMON * common[i] * common[j] / (common @ common) if common.size else np.zeros(0)
+        return row, column, np.append(np.ones(mounted.size), shared), np.full(row.size, _SIZE, np.int64)
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
         """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point."""

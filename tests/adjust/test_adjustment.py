@@ -90,11 +90,24 @@ def dense(
         d = observations.partials[seen, 0, :3] * observations.survey_sigma_m[seen][:, None]
         noise[np.ix_(seen, seen)] += d @ d.T
     if mountings is not None:
-        by = by_mountings(observations, len(mountings)) * mountings.ravel()
-        noise += by @ by.T
+        by = by_mountings(observations, len(mountings))
+        noise += by @ covariance_of(mountings) @ by.T
     gain = np.linalg.solve(a @ prior @ a.T + noise, a @ prior).T
     after = prior - gain @ a @ prior
     return gain @ observations.observed_m, after, a @ after @ a.T
+
+
+def covariance_of(mountings: np.ndarray) -> np.ndarray:
+    """Covariance (6 s, 6 s) of mountings whose σ (s, 6) are given and whose heights have no error in common.
+
+    It is that of independent errors under the condition that the weighted mean of the heights is 0, to a thousandth.
+    """
+    covariance = np.diag(mountings.ravel() ** 2)
+    height = np.zeros(mountings.shape)
+    height[:, 2] = 1.0 / mountings[:, 2]
+    mean = height.ravel() / mountings.ravel().clip(1e-30) / (height[:, 2] @ height[:, 2])
+    with_mean = covariance @ mean
+    return covariance - np.outer(with_mean, with_mean) / (mean @ with_mean) * (1.0 - 1e-6)
 
 
 def by_mountings(observations: Observations, sensors: int) -> np.ndarray:
@@ -150,12 +163,13 @@ def test_mountings_are_those_of_dense_least_squares() -> None:
     np.testing.assert_allclose(
         np.concatenate([s.ravel() for s in found.sigma]), np.sqrt(np.diag(covariance)), rtol=1e-7
     )
-    rows = by_mountings(observations, 2) * sigma.ravel()
-    gain = np.linalg.solve(_total(observations, knots) + rows @ rows.T, rows).T
-    np.testing.assert_allclose(
-        found.mountings.error.ravel(), sigma.ravel() * (gain @ observations.observed_m), atol=1e-9
-    )
-    after = np.sqrt(np.maximum(1.0 - np.einsum("ij,ji->i", gain, rows), 0.0)) * sigma.ravel()
+    rows, prior = by_mountings(observations, 2), covariance_of(sigma)
+    gain = np.linalg.solve(_total(observations, knots) + rows @ prior @ rows.T, rows @ prior).T
+    np.testing.assert_allclose(found.mountings.error.ravel(), gain @ observations.observed_m, atol=1e-9)
+    after = np.sqrt(np.maximum(np.diag(prior - gain @ rows @ prior), 0.0)).reshape(2, 6)
+    # What the heights have in common stays as well known as it was.
+    after[:, 2] = np.hypot(after[:, 2], 1.0 / np.sqrt((1.0 / sigma[:, 2] ** 2).sum()))
+    after = after.ravel()
     np.testing.assert_allclose(found.mountings.sigma.ravel(), after, rtol=1e-6)
     assert found.mountings.error[1, 5] == found.mountings.sigma[1, 5] == 0.0
 

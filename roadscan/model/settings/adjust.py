@@ -42,11 +42,14 @@ class MountingPriors(Strict):
 
     They are of sensors whose σ neither the rig file (`lever_arm_sigma_m`, `boresight_sigma_deg`) nor a calibration
     states. A component of σ 0 is not estimated, whatever these state; nor is any in other modes than `joint`.
+
+    Heads stand on one beam, and where they stand on it is measured to a millimetre. How the beam stands beside the
+    positions' reference is known less well, but in the plane no evidence tells that from the error of the poses.
     """
 
-    sigma_forward_m: float = Field(default=0.002, ge=0.0, le=1.0)
+    sigma_forward_m: float = Field(default=0.001, ge=0.0, le=1.0)
     """1 σ of the lever arm, forward (m)."""
-    sigma_right_m: float = Field(default=0.002, ge=0.0, le=1.0)
+    sigma_right_m: float = Field(default=0.001, ge=0.0, le=1.0)
     """1 σ of the lever arm, to the right (m)."""
     sigma_down_m: float = Field(default=0.002, ge=0.0, le=1.0)
     """1 σ of the lever arm, down (m)."""

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,8 @@ make = ["tile_table"]
 
 [condition]
 """
+ALWAYS: Final = frozenset({("condition_not_measured", "condition")})
+"""What a run says of the demo without a fault: its heads are too coarse for cracks and texture. It names no fault."""
 RUN_S: Final = 900.0
 """A run that lasts longer has failed."""
 
@@ -74,11 +76,13 @@ def trials(folder: Path, count: int, seed: int, kinds: tuple[FaultKind, ...] = K
     survey = prepare(folder)
     said = run(survey)
     clean = Products.read(_store(survey))
-    if said.code or said.named or clean is None:
+    if said.code or said.named - ALWAYS or clean is None:
         raise AssertionError(f"the demo without a fault: exit code {said.code}, {said.error}, {sorted(said.named)}")
+    always = {f"{what}: {subject}" for what, subject in ALWAYS}
     order = np.random.default_rng(seed).permutation(len(kinds))
     for number in range(count):
-        yield trial(folder, number, seed, kinds[order[number % len(kinds)]], clean)
+        one = trial(folder, number, seed, kinds[order[number % len(kinds)]], clean)
+        yield replace(one, named=tuple(line for line in one.named if line not in always))
 
 
 def trial(folder: Path, number: int, seed: int, kind: FaultKind, clean: Products) -> Trial:

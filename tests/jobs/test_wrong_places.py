@@ -274,11 +274,12 @@ def test_recordings_raise_no_doubt(recordings: Path, tmp_path: Path) -> None:
         file.write_bytes(gzip.decompress((recordings / "two_pass" / f"{name}_poses.csv.gz").read_bytes()))
         unit = "ns" if "radar" in name else "us"
         clock = {"system": "unix_utc", "unit": unit}
-        logs.append(rs.read_log(file, clock=clock, crs="EPSG:32617", options={"axes": axes}))
+        logs.append(rs.read_log(file, clock=clock, crs="EPSG:32617", height="ellipsoidal", options={"axes": axes}))
     for log in logs:
         track = pose_track(log["trajectory"], str(log.attributes["world_frame"]), np.zeros(0, np.int64))
         found = find_leaps(track)
         assert not found.position.any() and not found.attitude.any() and found.steps == (), log.path
+        assert found.stalls == (), log.path
 
 
 def test_a_simulated_drive_raises_no_doubt(simulated: Simulated, tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.calibrate.calibrate import outdated_calibrations
-from roadscan.jobs.navigate.tick_clocks import check_tick_clocks, tick_findings
 from roadscan.jobs.plan.plan import empty_passes
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
 from roadscan.jobs.tiles.footprints import PRODUCT, index_footprints, stale_footprints, unplaced_logs
+from roadscan.jobs.tiles.tick_clocks import check_tick_clocks, tick_findings
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
 from roadscan.tables.logs import LogRecord

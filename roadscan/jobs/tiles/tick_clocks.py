@@ -93,7 +93,7 @@ def check_tick_clocks(
 
 
 def _tasks(plan: SurveyPlan) -> list[TickTask]:
-    code = code_digest("roadscan.jobs.navigate.tick_clocks:tick_clock")
+    code = code_digest("roadscan.jobs.tiles.tick_clocks:tick_clock")
     return [
         TickTask(
             plan.store, source, source.trajectory, tuple(sorted(files, key=lambda file: file.span or (0, 0))),

@@ -34,6 +34,10 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _DOWN: Final = COMPONENTS.index("down_m")
+_AT_ONCE: Final = 200
+"""Control points that are judged with the covariance of all of them: three coordinates each are 600 rows."""
+_NEIGHBOURS: Final = 50
+"""Of more, so many at most are judged together."""
 SURVEY_FACTOR: Final = "control_survey"
 """Name of the factor of the surveys' stated variances."""
 
@@ -189,7 +193,7 @@ def adjust(
     first = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
     first.check(observations)
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
-    verdict = judged(_survey_errors(unknowns, alone, rounds), settings)
+    verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)
     applied = applied_offset(verdict, settings, settings.reject_beyond)
     estimate, response = _with_control(unknowns, alone, rounds, verdict, applied)
     values, covariance, with_next = _of_knots(unknowns, estimate)
@@ -283,14 +287,35 @@ def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
     return point.astype(np.int64), axis.astype(np.int64), unknowns.control.sigma_m[point, axis]
 
 
-def _survey_errors(unknowns: Unknowns, alone: Estimate, rounds: Rounds) -> SurveyErrors:
-    """What poses and ties say of the surveys."""
+def _survey_errors(
+    unknowns: Unknowns, observations: Observations, alone: Estimate, rounds: Rounds
+) -> tuple[list[SurveyErrors], SurveyErrors]:
+    """What poses and ties say of the surveys: groups of neighbours, and points that stand for all of them.
+
+    Many points are too many for one covariance. A point that is wrong is told by its neighbours; an offset of all is
+    told by points that are spread over all.
+    """
     point, axis, sigma = _surveyed(unknowns)
-    if not point.size:
-        return SurveyErrors(point, axis, sigma, np.zeros((0, 0)), sigma)
-    away = alone.solution[unknowns.of_control[point, axis]] * sigma
-    unit = rounds.survey_covariance()
-    return SurveyErrors(point, axis, away, sigma[:, None] * 0.5 * (unit + unit.T) * sigma, sigma**2)
+    in_time = _in_time(unknowns.control, observations)
+    few = in_time.size <= _AT_ONCE
+    groups = [in_time] if few else np.array_split(in_time, -(-in_time.size // _NEIGHBOURS))
+    spread = in_time[np.linspace(0, in_time.size - 1, min(in_time.size, _AT_ONCE)).round().astype(np.int64)]
+    rows = [np.flatnonzero(np.isin(point, own)) for own in (*groups, *([] if few else [spread]))]
+    numbers = unknowns.of_control[point, axis]
+    found = []
+    for own, unit in zip(rows, rounds.covariances([numbers[own] for own in rows]), strict=True):
+        away = alone.solution[numbers[own]] * sigma[own]
+        covariance = sigma[own][:, None] * 0.5 * (unit + unit.T) * sigma[own]
+        found.append(SurveyErrors(point[own], axis[own], away, covariance, sigma[own] ** 2))
+    return (found, found[0]) if few else (found[:-1], found[-1])
+
+
+def _in_time(control: ControlPoints, observations: Observations) -> Int64:
+    """Control points in the order in which a run first came by them."""
+    first = np.full(control.place.size, np.iinfo(np.int64).max)
+    seen = control.of_observation >= 0
+    np.minimum.at(first, control.of_observation[seen], observations.epoch_gps_ns[seen].max(axis=1))
+    return np.argsort(first, kind="stable").astype(np.int64)
 
 
 def _with_control(

@@ -8,6 +8,7 @@ normal distribution that right control passes with a stated chance, all tests to
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -154,58 +155,75 @@ def quantile(chance: float, tests: int, numbers: int = 1) -> float:
     return float(np.sqrt(chdtri(numbers, -np.expm1(np.log1p(-chance) / max(tests, 1)))))
 
 
-def judged(errors: SurveyErrors, rules: AdjustmentSettings) -> ControlVerdict:
+def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: AdjustmentSettings) -> ControlVerdict:
     """Which points are wrong, and whether all of them are off together.
+
+    Parameters
+    ----------
+    groups : of neighbours, which single points are held against; together all points.
+    spread : points that an offset of all is told by; those of the only group, or some of each.
 
     Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
     fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
     `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`. Where many points are found
     wrong, the stated σ of the survey is asked as well.
     """
-    datum = rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
-    errors = replace(errors, covariance_m2=errors.covariance_m2 + datum)
-    found, parts = _with_factor(errors, rules, 1.0), len(errors.parts())
+    groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
+    found, parts = _with_factor(groups, spread, rules, 1.0), sum(len(own.parts()) for own in groups)
     many = parts >= _MANY and len(found.left_out) > _FEW * parts
     if not many or rules.estimate_variance_components is False:
         return found
-    factor = _survey_factor(errors)
-    return _with_factor(errors, rules, factor) if factor > 1.0 else found
+    factor = _survey_factor(groups)
+    return _with_factor(groups, spread, rules, factor) if factor > 1.0 else found
 
 
-def _with_factor(errors: SurveyErrors, rules: ControlRules, factor: float) -> ControlVerdict:
+def _in_datum(errors: SurveyErrors, rules: ControlRules) -> SurveyErrors:
+    """With what the datum of the control may be off by."""
+    datum = rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
+    return replace(errors, covariance_m2=errors.covariance_m2 + datum)
+
+
+def _surveyed(errors: SurveyErrors, factor: float) -> SurveyErrors:
+    """With a factor of the surveys' stated variances."""
+    return replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
+
+
+def _with_factor(
+    groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: ControlRules, factor: float
+) -> ControlVerdict:
     """The verdict with a factor of the surveys' stated variances."""
-    errors = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
-    false_alarm = rules.false_alarm
-    fixed = _snooped(errors, false_alarm, free=False)
-    at_once = common_offset(errors, _kept(errors, fixed))
-    free = _snooped(errors, false_alarm, free=True)
-    freely = common_offset(errors, _kept(errors, free))
+    groups, spread = [_surveyed(own, factor) for own in groups], _surveyed(spread, factor)
+    tests = max(sum(len(own.parts()) for own in groups), 1)
+    lengths = {len(axes): quantile(rules.false_alarm, tests, len(axes)) for axes in COMPONENTS.values()}
+    fixed = [one for own in groups for one in _snooped(own, lengths, free=False)]
+    at_once = common_offset(spread, _kept(spread, fixed))
+    free = [one for own in groups for one in _snooped(own, lengths, free=True)]
+    freely = common_offset(spread, _kept(spread, free))
     limits = {name: quantile(rules.datum_false_alarm, len(COMPONENTS), len(axes)) for name, axes in COMPONENTS.items()}
     doubted = {name: [one.sigmas(name) > limits[name] for one in (at_once, freely)] for name in COMPONENTS}
     offsets = sum(late for _, late in doubted.values())
     simpler = offsets > 0 and (len(free) + offsets < len(fixed) or any(early for early, _ in doubted.values()))
     wrong, offset = (free, freely) if simpler else (fixed, at_once)
-    tests = max(len(errors.parts()), 1)
     return ControlVerdict(
         tuple(wrong), offset, tuple(name for name in COMPONENTS if offset.sigmas(name) > limits[name]),
-        {name: (limits[name] + _POWER) * offset.sigma_m(name) for name in COMPONENTS},
-        quantile(false_alarm, tests), factor,
+        {name: (limits[name] + _POWER) * offset.sigma_m(name) for name in COMPONENTS}, lengths[1], factor,
     )  # fmt: skip
 
 
-def _survey_factor(errors: SurveyErrors) -> float:
+def _survey_factor(groups: Sequence[SurveyErrors]) -> float:
     """Factor of the stated variances of all surveys: 1, or more where most points contradict one another.
 
     Wrong points are few. Where the median of all normalised leave-one-out residuals is far too large, it is the σ of
     the survey that is wrong.
     """
-    parts = errors.parts()
 
     def spread(factor: float) -> float:
-        whole = replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
-        squares = _explained(whole, parts, np.ones(errors.point.size, bool), free=True)
-        usual = np.array([chdtri(rows.size, 0.5) for _, _, rows in parts])
-        return float(np.median(squares / usual))
+        ratios = []
+        for own in groups:
+            parts = own.parts()
+            squares = _explained(_surveyed(own, factor), parts, np.ones(own.point.size, bool), free=True)
+            ratios.append(squares / np.array([chdtri(rows.size, 0.5) for _, _, rows in parts]))
+        return float(np.median(np.concatenate(ratios)))
 
     if spread(1.0) <= _UNDERSTATED:
         return 1.0
@@ -237,9 +255,12 @@ def _kept(errors: SurveyErrors, wrong: list[WrongSurvey]) -> Bool:
     return kept
 
 
-def _snooped(errors: SurveyErrors, false_alarm: float, *, free: bool) -> list[WrongSurvey]:
+def _snooped(errors: SurveyErrors, lengths: Mapping[int, float], *, free: bool) -> list[WrongSurvey]:
     """Wrong points, the worst first: each is left out before the others are judged.
 
+    Parameters
+    ----------
+    lengths : from which on a normalised residual of one, or of two numbers, is that of a wrong point.
     free : all points may have an offset in common.
     """
     parts, wrong = errors.parts(), list[WrongSurvey]()
@@ -248,22 +269,16 @@ def _snooped(errors: SurveyErrors, false_alarm: float, *, free: bool) -> list[Wr
     while True:
         kept = _kept(errors, wrong)
         squares = _explained(errors, parts, kept, free=free)
-        excess = np.array(
-            [_excess(s, r.size, false_alarm, len(parts)) for s, (_, _, r) in zip(squares, parts, strict=True)]
-        )
+        limit = np.array([lengths[rows.size] for _, _, rows in parts])
+        excess = np.sqrt(squares) / limit
         if excess.max() <= 1.0:
             break
         worst = int(excess.argmax())
         alike = [k for k in np.flatnonzero(excess > 1.0) if k != worst and parts[k][1] == parts[worst][1]]
         others = tuple(parts[k][0] for k in alike if squares[worst] - squares[k] < _APART)
-        point, component, rows = parts[worst]
-        limit = quantile(false_alarm, len(parts), rows.size)
-        wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), limit, others))
-    return _without_the_right(errors, parts, wrong, false_alarm, free=free)
-
-
-def _excess(square: float, numbers: int, false_alarm: float, tests: int) -> float:
-    return float(np.sqrt(square) / quantile(false_alarm, tests, numbers))
+        point, component, _ = parts[worst]
+        wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), float(limit[worst]), others))
+    return _without_the_right(errors, parts, wrong, lengths, free=free)
 
 
 def _explained(errors: SurveyErrors, parts: list[tuple[int, str, Int64]], kept: Bool, *, free: bool) -> Float64:
@@ -294,7 +309,7 @@ def _without_the_right(
     errors: SurveyErrors,
     parts: list[tuple[int, str, Int64]],
     wrong: list[WrongSurvey],
-    false_alarm: float,
+    lengths: Mapping[int, float],
     *,
     free: bool,
 ) -> list[WrongSurvey]:
@@ -308,7 +323,7 @@ def _without_the_right(
         kept = _kept(errors, rest)
         kept[parts[number][2]] = True
         squares = _explained(errors, parts, kept, free=free)
-        fits = _excess(squares[number], parts[number][2].size, false_alarm, len(parts)) <= 1.0
+        fits = np.sqrt(squares[number]) <= lengths[parts[number][2].size]
         if fits and len(rest) < len(found) and not one.alternatives:
             found = rest
         else:

@@ -7,7 +7,7 @@ another, and no weight that both get round by round tells which of them is wrong
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -159,11 +159,9 @@ class Rounds:
                 break
         return estimate
 
-    def survey_covariance(self) -> Float64:
-        """Covariance (m, m) of the errors of all surveyed coordinates, in their σ, by the last solution."""
-        unknowns = self.problem.unknowns
-        numbers = unknowns.of_control[unknowns.of_control >= 0]
-        return np.array([self._equations.solve(row)[numbers] for row in _unit_rows(numbers, unknowns.size)])
+    def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
+        """Covariance (m, m) of the unknowns of each group, in their σ, by the last solution."""
+        return self._equations.covariances(groups)
 
     def response(self, shift: Float64) -> Float64:
         """By how much the last solution (u,) moves where surveys state `shift` more of an error, in their σ."""
@@ -279,13 +277,6 @@ class Rounds:
                 self._processes[component] = _stepped(factor, float(ratio), float(told), enough=self._enough)
         after = np.concatenate([self._kinds, self._processes])
         return float(np.abs(np.log(after / before)).max())
-
-
-def _unit_rows(numbers: Int64, size: int) -> Iterator[Float64]:
-    for number in numbers.tolist():
-        row = np.zeros(size)
-        row[number] = 1.0
-        yield row
 
 
 def _stepped(

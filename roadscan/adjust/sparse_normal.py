@@ -6,6 +6,7 @@ selected inverse is in `kernels/adjust/selected_inverse.py`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 import scipy
 
 from roadscan.kernels.adjust.normal_equations import add_observations
-from roadscan.kernels.adjust.selected_inverse import entries, selected_inverse, variances
+from roadscan.kernels.adjust.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -120,6 +121,26 @@ class NormalEquations:
         diagonal, below = np.zeros(self.size), np.zeros(rows.size)
         selected_inverse(starts, rows, lower.data, np.asarray(pivots, np.float64), diagonal, below)
         return SelectedInverse(place, starts, rows, diagonal, below)
+
+    def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
+        """Covariance (m, m) of the unknowns of each group: (L⁻¹ E)ᵀ D⁻¹ (L⁻¹ E), E their unit vectors."""
+        lower, pivots, order = self._solver.factors()
+        place = np.empty(self.size, np.int64)
+        place[np.asarray(order)] = np.arange(self.size)
+        starts, rows = lower.indptr.astype(np.int64), lower.indices.astype(np.int32)
+        roots, found = 1.0 / np.sqrt(np.asarray(pivots, np.float64)), []
+        for group in groups:
+            lengths = np.zeros(group.size, np.int64)
+            path_lengths(starts, rows, place[group], lengths)
+            first = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+            at, values = np.zeros(first[-1], np.int64), np.zeros(first[-1])
+            solved_units(starts, rows, lower.data, place[group], first, at, values)
+            reached = np.zeros(self.size, bool)
+            reached[at] = True
+            halves = np.zeros((int(reached.sum()), group.size))
+            halves[(np.cumsum(reached) - 1)[at], np.repeat(np.arange(group.size), lengths)] = values * roots[at]
+            found.append(np.asarray(halves.T @ halves))
+        return found
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
 from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, knots_of
+from roadscan.adjust.sparse_normal import NormalEquations
 from roadscan.model.errors import ConfigError
 
 S = 10**9
@@ -550,3 +552,27 @@ def test_one_wrong_height_is_named_and_no_right_one_beyond_the_stated_chance(run
     right += sum(bool(of_seed(100 + seed, 0.0).verdict.left_out) for seed in range(60))
     # 116 draws, of which one in a hundred may name a right point: more than five have a chance of 0.1 %.
     assert right <= 5
+
+
+def test_three_thousand_points_are_judged_by_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wrong ones are named, no others, and no covariance is of more than 200 points."""
+    road = Road(30_000.0, 1, 20.0, 10.0, speed_m_s=25.0)
+    rng = np.random.default_rng(1)
+    observations = control(road, drawn_errors(road, road.control_m, rng), rng)
+    wrong = {3: 0.05, 1500: -0.03, 1501: 0.05, 2998: 1.0}
+    for place, by_m in wrong.items():
+        own = (observations.place == place) & (observations.kind == KINDS.index("control_height"))
+        observations.observed_m[own] += by_m
+    sizes: list[int] = []
+    whole = NormalEquations.covariances
+
+    def covariances(self: NormalEquations, groups: Sequence[np.ndarray]) -> list[np.ndarray]:
+        sizes.extend(own.size for own in groups)
+        return whole(self, groups)
+
+    monkeypatch.setattr(NormalEquations, "covariances", covariances)
+    found = adjust(observations, road.priors(), AdjustmentSettings(knot_spacing_s=1.0))
+    assert found.verdict.left_out == {(place, "height") for place in wrong}
+    assert not found.verdict.doubted
+    assert max(sizes) <= 600
+    assert len(sizes) >= 60

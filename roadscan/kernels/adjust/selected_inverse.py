@@ -99,3 +99,47 @@ def variances(first, unknown, derivative, starts, rows, diagonal, below, found):
                 place = place_of(rows, starts[j], starts[j + 1], i)
                 total += 2.0 * derivative[a] * derivative[b] * (below[place] if place >= 0 else np.nan)
         found[n] = total
+
+
+@kernel
+def path_lengths(starts, rows, places, lengths):
+    """Count the columns of L that each unit vector reaches when L y = e is solved: its path in the elimination tree.
+
+    Parameters
+    ----------
+    starts, rows : strictly lower triangle of L in compressed columns, rows ascending.
+    places : (m,) where the 1 of each unit vector stands.
+    lengths : (m,) out.
+    """
+    for number in range(places.size):
+        j, length = places[number], 1
+        while starts[j + 1] > starts[j]:
+            j = rows[starts[j]]
+            length += 1
+        lengths[number] = length
+
+
+@kernel
+def solved_units(starts, rows, lower, places, first, at, values):
+    """Fill the solutions of L y = e for unit vectors, along their paths in the elimination tree.
+
+    Parameters
+    ----------
+    starts, rows, lower, places : as above.
+    first : (m + 1,) where the solution of each begins.
+    at, values : (sum of the lengths,) out, places and values.
+    """
+    work = np.zeros(starts.size - 1)
+    for number in range(places.size):
+        j, out = places[number], first[number]
+        work[j] = 1.0
+        while True:
+            value = work[j]
+            work[j] = 0.0
+            at[out], values[out] = j, value
+            out += 1
+            if starts[j + 1] == starts[j]:
+                break
+            for p in range(starts[j], starts[j + 1]):
+                work[rows[p]] -= lower[p] * value
+            j = rows[starts[j]]

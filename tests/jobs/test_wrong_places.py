@@ -188,9 +188,17 @@ def test_records_keep_their_numbers_behind_a_damaged_one(survey: Path) -> None:
     assert [record for record, _ in rejects_of(survey)] == [50, 100]
 
 
+def far_cloud(faults: Path, folder: Path) -> Path:
+    """A copy of the cloud with a far point, whose kind of height its survey file states."""
+    copied(faults / "las_far_point", folder)
+    stated = (folder / "SURVEY.toml").read_text().replace('path = "c.las"', 'path = "c.las"\nheight = "ellipsoidal"')
+    (folder / "SURVEY.toml").write_text(stated)
+    return folder
+
+
 @pytest.mark.witness("far_point")
 def test_a_point_that_overflowed_is_left_out(faults: Path, tmp_path: Path) -> None:
-    folder = copied(faults / "las_far_point", tmp_path / "far")
+    folder = far_cloud(faults, tmp_path / "far")
     command("run", folder, "--workers", "0")
     ((_, why),) = rejects_of(folder)
     assert "outside the area" in why
@@ -200,7 +208,7 @@ def test_a_point_that_overflowed_is_left_out(faults: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize("axis", "xy")
 def test_far_points_of_a_cloud_are_left_out(faults: Path, tmp_path: Path, axis: str) -> None:
     """Coordinates that did not overflow and lie 9,000 km away."""
-    folder = copied(faults / "las_far_point", tmp_path / "far")
+    folder = far_cloud(faults, tmp_path / "far")
     cloud = laspy.read(folder / "c.las")
     fine = laspy.LasData(cloud.header, cloud.points.copy())
     fine.header.scales = np.array([0.01, 0.01, 0.01])

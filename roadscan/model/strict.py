@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -29,6 +29,14 @@ class Strict(BaseModel):
         allow_inf_nan=False,
         ser_json_inf_nan="constants",
     )
+
+    later: ClassVar[frozenset[str]] = frozenset()
+    """Fields that came when there were stores already: they are no part of a key while they have their default."""
+
+    def shaping(self) -> dict[str, Any]:
+        """JSON values of the settings, for keys: without later fields that have their default."""
+        unset = {name for name in self.later if getattr(self, name) == type(self).model_fields[name].default}
+        return self.model_dump(mode="json", exclude=unset)
 
     @classmethod
     def parse(cls, values: dict[str, Any], *, file: str | Path | None = None) -> Self:

@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final, Literal, TypeAlias, cast
+from typing import IO, Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -82,6 +82,8 @@ ENCODING: Final = Witness(
 
 class TextOptions(Strict):
     """Settings of a text file with columns."""
+
+    later: ClassVar[frozenset[str]] = frozenset({"decimal", "encoding"})
 
     delimiter: str | None = None
     """Character between columns: "," ";" "|", a tabulator, or " " for any run of blanks. Found from

@@ -16,7 +16,7 @@ from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import GaussMarkov, RunPrior
-from roadscan.adjust.ties import Ties, ties_at
+from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.model.settings.adjustment import AdjustmentSettings
 from roadscan.model.settings.tie_settings import PlaceSettings, TieSettings
 

@@ -205,6 +205,8 @@ def lines_of_table(data: bytes) -> int | None:
     rejected whatever it is.
     """
     data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\n" not in data:  # lines end with a carriage return alone
+        data = data.replace(b"\r", b"\n")
     at = 0
     for line in data.splitlines(keepends=True):
         at += len(line)

@@ -146,7 +146,9 @@ def test_control_csv(points: list[tuple[str, float, float, float]]) -> None:
     writer.writerows([name, "gcp", easting, northing, height] for name, easting, northing, height in points)
     with folder() as place:
         (place / "a.csv").write_text(sink.getvalue(), encoding="utf-8", newline="")
-        log = read_log("control_csv", place / "a.csv", crs="EPSG:25832", map=MapFrame(crs="EPSG:25832"))
+        log = read_log(
+            "control_csv", place / "a.csv", crs="EPSG:25832", height="ellipsoidal", map=MapFrame(crs="EPSG:25832")
+        )
     assert log.rejects == []
     assert log.table.column("name").to_pylist() == [p[0].strip() for p in points]
     found = np.stack([log.column(c) for c in ("easting_m", "northing_m", "height_m")], axis=-1)

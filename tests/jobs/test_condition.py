@@ -489,7 +489,11 @@ def test_a_kerb_that_is_crossed_is_kept_in_the_roughness_and_doubted(
     if kerb_m < 0.5:
         assert now["mri_m_per_km"] > was["mri_m_per_km"] + 3.0
         assert now["iri_local_max_m_per_km"] > 40.0
-    findings = stage.findings(session.survey, (), session.manifest)
+    findings = [
+        one
+        for one in stage.findings(session.survey, (), session.manifest)
+        if one.witness != "condition_not_measured"  # cells of 50 mm have no texture
+    ]
     assert {one.witness for one in findings} == {"severe_step"}
     assert {one.text.split()[0] for one in findings} == {"left", "right"}
     assert all("road A1, lane 2" in one.line and done in one.line for one in findings)

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
@@ -304,6 +306,9 @@ def test_a_log_of_one_stamp_fails_beside_others(tmp_path: Path) -> None:
     scans = '[[runs.logs]]\npath = "scans'
     changed(tmp_path, (scans, log + scans))
     write_scans(tmp_path / "more.parquet", FIRST_GPS_S + 0.3, step_ns=0)
+    rows = pq.read_table(tmp_path / "more.parquet")  # equal rows would be one that stands many times
+    ranges = pa.FixedSizeListArray.from_arrays((20_000 + np.arange(30 * 40) // 40).astype(np.uint16), 40)
+    pq.write_table(rows.set_column(1, rows.schema.field(1), ranges), tmp_path / "more.parquet")
     for command in ("run", "--dry-run"), ("run", "--workers", "0"):
         code, text = said(tmp_path, *command)
         assert code == 2

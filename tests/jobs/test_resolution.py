@@ -56,7 +56,7 @@ def of(**changed: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-GRID = 'options = { heading = "grid" }'
+GRID = 'height = "ellipsoidal"\noptions = { heading = "grid" }'
 
 
 def test_fine_values_are_not_named(tmp_path: Path) -> None:
@@ -106,6 +106,8 @@ def test_the_table_of_degrees_with_32_bits(faults: Path, tmp_path: Path) -> None
 def test_the_scale_of_a_cloud(faults: Path, tmp_path: Path, scale: float, words: str) -> None:
     for file in (faults / "las_far_point").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
+    stated = (tmp_path / "SURVEY.toml").read_text().replace('path = "c.las"', 'path = "c.las"\nheight = "ellipsoidal"')
+    (tmp_path / "SURVEY.toml").write_text(stated)
     cloud = laspy.read(tmp_path / "c.las")
     places = np.array(cloud.xyz)
     places[np.abs(places - np.median(places, axis=0)) > 1e5] = 300.0

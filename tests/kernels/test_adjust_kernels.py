@@ -8,7 +8,7 @@ import qdldl
 import scipy
 
 from roadscan.kernels.adjust.normal_equations import add_observations
-from roadscan.kernels.adjust.selected_inverse import entries, selected_inverse, variances
+from roadscan.kernels.adjust.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
 
 SIZE = 40
 
@@ -63,3 +63,20 @@ def test_selected_entries_are_those_of_the_inverse(matrix: scipy.sparse.csc_arra
     first, found = np.array([0, unknown.size], np.int64), np.zeros(1)
     variances(first, unknown, derivative, starts, rows, diagonal, below, found)
     assert found[0] == pytest.approx(derivative @ inverse[np.ix_(unknown, unknown)] @ derivative, rel=1e-10)
+
+
+def test_solutions_for_unit_vectors_are_columns_of_the_inverse_of_the_factor(matrix: scipy.sparse.csc_array) -> None:
+    lower, _, _ = qdldl.Solver(scipy.sparse.csc_matrix(matrix)).factors()
+    starts, rows = lower.indptr.astype(np.int64), lower.indices.astype(np.int32)
+    places = np.array([0, 3, SIZE - 1], np.int64)
+    lengths = np.zeros(places.size, np.int64)
+    path_lengths(starts, rows, places, lengths)
+    first = np.concatenate([[0], np.cumsum(lengths)])
+    at, values = np.zeros(first[-1], np.int64), np.zeros(first[-1])
+    solved_units(starts, rows, lower.data, places, first, at, values)
+    inverse = np.linalg.inv(lower.toarray() + np.eye(SIZE))
+    for number, place in enumerate(places.tolist()):
+        column = np.zeros(SIZE)
+        own = slice(first[number], first[number + 1])
+        column[at[own]] = values[own]
+        np.testing.assert_allclose(column, inverse[:, place], atol=1e-12)

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from roadscan.condition.cell_table import cell_table
 from roadscan.kernels.condition.road_frame import place
 from roadscan.kernels.condition.ruts import straightedge, stretched_wire, water, wire_places
-from roadscan.kernels.condition.sampling import CellTable, sample
+from roadscan.kernels.condition.sampling import CellTable, factorise, sample
 from roadscan.kernels.condition.steps import step_heights
 from roadscan.model.ids import TileId
 from roadscan.tiles.cells import TileCells
@@ -173,3 +173,12 @@ def test_a_step_is_told_with_its_height() -> None:
     assert out[k, 0] == pytest.approx(0.005, abs=1e-9)
     assert out[k, 2] == pytest.approx(0.005, rel=0.05)
     assert np.isnan(out[:2]).all() and 0.0 < out[k, 1] < 0.001
+
+
+def test_a_factor_is_that_of_cholesky_as_far_as_rows_are_independent() -> None:
+    points = np.random.default_rng(2).standard_normal((30, 4))
+    normal, factor = points.T @ points, np.zeros((4, 4))
+    assert factorise(normal, 4, factor) == 4
+    np.testing.assert_allclose(factor, np.linalg.cholesky(normal), rtol=1e-12)
+    points[:, 2] = points[:, 0] + points[:, 1]
+    assert factorise(points.T @ points, 4, factor) == 2

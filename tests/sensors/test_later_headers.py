@@ -144,7 +144,7 @@ def test_other_tables_of_text(tmp_path: Path, name: str, header: str, other: str
 def test_control_points_behind_another_header(tmp_path: Path) -> None:
     first, second = "name,easting_m,northing_m,height_m", "name,northing_m,easting_m,height_m"
     (tmp_path / "c.csv").write_text(f"{first}\nP1,500000,5300000,300\n{second}\nP2,5300000,500000,300\n")
-    said = {"crs": "EPSG:32632", "map": MapFrame("EPSG:32632")}
+    said = {"crs": "EPSG:32632", "height": "ellipsoidal", "map": MapFrame("EPSG:32632")}
     log = read_log("control_csv", tmp_path / "c.csv", {"role": "gcp"}, **said)
     assert log.table.num_rows == 1
     assert sum(one.records for one in log.rejects) == 2

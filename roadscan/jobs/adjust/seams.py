@@ -12,7 +12,7 @@ import numpy.typing as npt
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.seams import SeamView, seam_view
-from roadscan.adjust.tie import HEIGHT
+from roadscan.adjust.ties.tie import HEIGHT
 from roadscan.jobs.adjust.figures import Held
 from roadscan.jobs.adjust.near import Circle, NearReader
 from roadscan.jobs.adjust.solution import Evidence, Solution

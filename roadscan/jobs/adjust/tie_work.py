@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from roadscan.adjust.observations import KINDS, Observations, mount_partials
 from roadscan.adjust.places import Place
-from roadscan.adjust.tie import SAME_PASS
-from roadscan.adjust.ties import Ties, ties_at
+from roadscan.adjust.ties.at_place import Ties, ties_at
+from roadscan.adjust.ties.tie import SAME_PASS
 from roadscan.code_reach import code_digest
 from roadscan.jobs.adjust.mountings import Mounted, numbers_of
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files

@@ -157,8 +157,8 @@ def _plan_log(
         [(c.name, c.type) for c in table_schema(t).columns] + [table_schema(t).partition_s] for t in format_.yields
     ]
     shaping = [
-        format_.name, format_.version, content, options.model_dump(mode="json"), source.clock,
-        config.crs, config.height, grid_key(source.geoid), run, sensor, schemas,
+        format_.name, format_.version, content, options.shaping(), source.clock,
+        config.crs, config.height or "ellipsoidal", grid_key(source.geoid), run, sensor, schemas,
         [survey.config.map.model_dump(mode="json"), map_grid] if source.map else None,
         *([source.defaults] if source.defaults != SourceDefaults() else []),
     ]  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
 from roadscan.adjust.pictures import Picture, pictures_of
 from roadscan.adjust.registration import Shift, disagree, shift_of
-from roadscan.adjust.tie import SHIFT, End, Tie
+from roadscan.adjust.ties.tie import SHIFT, End, Tie
 from roadscan.model.settings.tie_settings import TieSettings
 
 DISAGREE: Final = "relief and paint disagree"

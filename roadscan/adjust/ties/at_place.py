@@ -10,13 +10,13 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.height_ties import height_tie
 from roadscan.adjust.observations import KINDS, Observations, partials
 from roadscan.adjust.patches import PassReadings, patch_of
 from roadscan.adjust.places import Place
-from roadscan.adjust.plane_ties import plane_ties
-from roadscan.adjust.shift_ties import KINDS_OF_PICTURES, Pictures, shift_ties
-from roadscan.adjust.tie import SAME_PASS, Tie
+from roadscan.adjust.ties.height import height_tie
+from roadscan.adjust.ties.plane import plane_ties
+from roadscan.adjust.ties.shift import KINDS_OF_PICTURES, Pictures, shift_ties
+from roadscan.adjust.ties.tie import SAME_PASS, Tie
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.settings.tie_settings import TieSettings
 

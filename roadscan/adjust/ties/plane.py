@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
-from roadscan.adjust.tie import COUNTS, PLANE, TOO_FAR, End, Tie
+from roadscan.adjust.ties.tie import COUNTS, PLANE, TOO_FAR, End, Tie
 from roadscan.kernels.adjust.plane_moments import add_moments, leave_out_far
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.settings.tie_settings import TieSettings

@@ -1,0 +1,1 @@
+"""Ties: what two passes say of one another at a place."""

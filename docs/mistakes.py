@@ -24,7 +24,7 @@ from unittest import mock
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pyproj
+from pyproj import datadir
 
 FIRST_GPS_S: Final = 1_461_922_218
 """2026-05-04 09:30:00 UTC."""
@@ -69,7 +69,7 @@ class Mistake:
     """File that must not be read."""
 
 
-_PROJ_FOLDERS = " or ".join([*pyproj.datadir.get_data_dir().split(os.pathsep), pyproj.datadir.get_user_data_dir()])
+_PROJ_FOLDERS = " or ".join([*datadir.get_data_dir().split(os.pathsep), datadir.get_user_data_dir()])  # type: ignore[attr-defined]
 """Where PROJ keeps grids, as messages name it."""
 
 

@@ -171,6 +171,16 @@ def disproved(found: MountingErrors) -> npt.NDArray[np.bool_]:
     return np.asarray((error > found.prior_sigma) & (error > DOUBTED * shown))
 
 
+def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
+    """Sensors (s,) of which evidence alone, without the prior, contradicts the stated mounting in a component."""
+    prior, own = found.prior_sigma, np.minimum(found.sigma, found.prior_sigma)
+    shown = (prior > 0.0) & (own < prior)
+    precision = 1.0 / np.where(shown, own, 1.0) ** 2 - 1.0 / np.where(shown, prior, 2.0) ** 2
+    # The prior holds an estimate back by the share of its precision.
+    away = np.abs(found.error) * (1.0 + 1.0 / (precision * np.where(shown, prior, 2.0) ** 2)) * np.sqrt(precision)
+    return np.asarray((shown & (away > DOUBTED)).any(axis=1))
+
+
 def mounting_findings(found: MountingErrors | None) -> list[Finding]:
     """Mountings that are off by more than was stated."""
     said: list[Finding] = []

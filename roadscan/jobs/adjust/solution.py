@@ -35,7 +35,7 @@ from roadscan.jobs.adjust.doubts import (
     time_line,
     wrong_points,
 )
-from roadscan.jobs.adjust.mountings import Mounted, disproved
+from roadscan.jobs.adjust.mountings import Mounted, contradicted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
@@ -220,7 +220,8 @@ def _adjusted(
 
     A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
-    sensors that are off: they are not estimated then, and the control is what is doubted.
+    sensors that are off: they are not estimated then, and the control is what is doubted. A sensor whose mounting
+    nothing contradicts keeps the stated one: what would be estimated is the noise of the evidence.
     """
     ties = evidence.ties.observations
     first = int(ties.place.max(initial=-1)) + 1
@@ -240,7 +241,19 @@ def _adjusted(
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
         priors = tuple(MountingPrior(one.sensor, own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, 6)
-    return replace(found, mountings=replace(found.mountings, prior_sigma=stated)), first
+    estimated, wrong = found.mountings, contradicted(found.mountings)
+    if priors and not wrong.all():
+        priors = tuple(
+            MountingPrior(one.sensor, one.sigma if is_wrong else np.zeros(6))
+            for one, is_wrong in zip(priors, wrong, strict=True)
+        )
+        found = adjust(joined, evidence.priors, settings, priors)
+        estimated = replace(
+            estimated,
+            error=np.where(wrong[:, None], found.mountings.error, 0.0),
+            sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
+        )
+    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:

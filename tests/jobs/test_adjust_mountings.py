@@ -77,7 +77,7 @@ def test_a_wrong_boresight_is_found_named_and_applied(survey: Simulated) -> None
     assert heading["sigma_heading_rad"] > 0.9 * heading["prior_sigma_heading_rad"]
     said = [one for one in known_findings(Manifest(survey.store())) if one.witness == "mounting"]
     assert [one.subject for one in said] == ["profiler_right"]
-    assert "boresight roll -0.04" in said[0].text
+    assert "boresight roll -0.05" in said[0].text
     assert np.mean(np.abs(cell_errors(survey, survey.store()))) < 0.003
 
 

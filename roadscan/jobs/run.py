@@ -14,7 +14,7 @@ from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, findings_of, stages
 from roadscan.jobs.tiles.selection import SelectionError
 from roadscan.model.counted import counted
-from roadscan.model.errors import DamagedError, RoadscanError, RunError
+from roadscan.model.errors import RoadscanError, RunError
 from roadscan.tables.logs import read_log_records
 from roadscan.tables.manifest import begin_changes, end_changes, write_failures
 from roadscan.tables.mend import mend_records
@@ -69,12 +69,9 @@ def run_stage(session: Session, stage: Stage) -> None:
 
 
 def _tell_findings(session: Session, stage: Stage) -> None:
-    try:
-        listed = set(known_keys(session.survey, session.store, session.logs))
-    except (
-        DamagedError
-    ):  # the stage that makes the damaged table anew comes later; logs have their findings all the same
-        listed = {log.key for log in session.logs[0]}
+    if type(stage).findings is Stage.findings:  # it asks nobody: no record need be read
+        return
+    listed = set(known_keys(session.survey, session.store, session.logs))
     records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
     for one in findings_of(session.survey, records, session.manifest, [stage]):
         session.note(one.line)

@@ -556,14 +556,26 @@ def geographic_of(world: str) -> pyproj.CRS:
     return pyproj.CRS.from_json_dict(parts)
 
 
-def _transformer(source: pyproj.CRS, target: pyproj.CRS, limit_m: float) -> pyproj.Transformer:
+def best_operation(source: pyproj.CRS, target: pyproj.CRS) -> pyproj.Transformer | None:
+    """The operation from one CRS to another that PROJ puts first of those whose accuracy it knows; None where there is
+    none. Coordinates are in the order x, y.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: we never do
+        warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: roadscan never does
         group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-    known = [t for t in group.transformers if t.accuracy >= 0]
-    if known and known[0].accuracy <= limit_m:
-        return known[0]
-    found = f"known to {known[0].accuracy:g} m only" if known else "not known to PROJ"
+    return next((one for one in group.transformers if one.accuracy >= 0), None)
+
+
+def accuracy_words(operation: pyproj.Transformer | None) -> str:
+    """How well an operation is known, for messages."""
+    return "not known to PROJ" if operation is None else f"known to {operation.accuracy:g} m only"
+
+
+def _transformer(source: pyproj.CRS, target: pyproj.CRS, limit_m: float) -> pyproj.Transformer:
+    best = best_operation(source, target)
+    if best is not None and best.accuracy <= limit_m:
+        return best
+    found = accuracy_words(best)
     raise CrsError(
         f"the change of datum from {source.name} to {target.name} is {found}",
         expected=f"a datum change within map.max_datum_error_m = {limit_m:g}",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -10,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 import shapely
-from pyproj.transformer import TransformerGroup
 
 from roadscan.inventory.home import HomeError
-from roadscan.model.crs import MapFrame, crs_from_text
+from roadscan.model.crs import MapFrame, accuracy_words, best_operation, crs_from_text
 from roadscan.model.errors import CrsError
 from roadscan.model.witness import Witness
 
@@ -96,15 +94,12 @@ def _parts(crs: pyproj.CRS, frame: MapFrame, layer: str, home: str) -> tuple[pyp
 
 
 def _operation(source: pyproj.CRS, target: pyproj.CRS, limit_m: float, layer: str, home: str) -> pyproj.Transformer:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: roadscan never does
-        group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-    known = [one for one in group.transformers if one.accuracy >= 0]
-    if known and known[0].accuracy <= limit_m:
-        return known[0]
-    how = f"known to {known[0].accuracy:g} m only" if known else "not known to PROJ"
+    best = best_operation(source, target)
+    if best is not None and best.accuracy <= limit_m:
+        return best
     raise HomeError(
-        f"the layer '{layer}' is in {_title(source)}, and the way from there into the map's {_title(target)} is {how}",
+        f"the layer '{layer}' is in {_title(source)}, and the way from there into the map's {_title(target)} is "
+        f"{accuracy_words(best)}",
         expected=f"an operation within map.max_datum_error_m = {limit_m:g}",
         change=_WAY_OUT,
         file=home,

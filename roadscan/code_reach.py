@@ -3,7 +3,12 @@
 The unit is a definition: a function, a class, or a name that a module assigns. Starting from the function or class
 that makes an output, every definition whose name occurs in one that is reached is reached as well, annotations
 included (what a function is handed has the class that its annotation names). So an edit counts for an output only if
-its making can come across the edited lines. Comments and docstrings do not count.
+its making can come across the edited lines.
+
+A definition counts by its shape: its syntax tree, in which each definition of ours that it names is a number, in the
+order in which they are reached. So comments, docstrings, line breaks, the file in which a definition stands and its
+name do not count: to move or to rename one leaves every output current. Names of attributes, of arguments and of local
+variables count.
 
 What is found by looking into a folder or at an entry point (formats, products, stages) is not reached, since no name
 leads there: each of these belongs to the keys of its own outputs.
@@ -21,7 +26,9 @@ import gc
 import hashlib
 import importlib.util
 import json
+import re
 import secrets
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,41 +85,76 @@ def name_of(kind: type) -> str:
 @functools.cache
 def _digest_of(entries: tuple[str, ...]) -> str:
     digest = hashlib.blake2b(digest_size=8)
-    for place, text in sorted(reached_code(entries).items()):
-        digest.update(f"{place}\0{text}\0".encode())
+    for text in reached_code(entries).values():
+        digest.update(f"{text}\0".encode())
     return digest.hexdigest()
 
 
 def reached_code(entries: Iterable[str]) -> dict[str, str]:
-    """Source text, without comments and docstrings, of each definition ("module:name") that `entries` reach."""
-    found: dict[str, str] = {}
-    waiting = [_place_of(entry) for entry in entries]
-    seen: set[Place] = set()
+    """Shape of each definition ("module:name") that `entries` reach, in the order in which they are reached."""
+    waiting = deque(_place_of(entry) for entry in entries)
+    numbers: dict[Place, int] = {}
     while waiting:
-        place = waiting.pop()
-        if place in seen:
+        place = _origin(waiting.popleft())
+        if place in numbers or _is_carrier(place):
             continue
-        seen.add(place)
-        name, definition = place
-        if name in CARRIERS or f"{name}:{definition}" in CARRIERS:
-            continue
-        module = _module(name)
-        if definition is None:
-            waiting += [(name, own) for own in module.texts]
-        elif definition in module.texts:
-            found[f"{name}:{definition}"] = module.texts[definition]
-            waiting += [*module.uses[definition], (name, _EFFECTS)]
-        elif definition in module.imports:  # handed on by a module that imports it
-            waiting.append(module.imports[definition])
-    return found
+        numbers[place] = len(numbers)
+        shapes = _module(place[0]).shapes
+        if place[1] is None:
+            waiting += [(place[0], own) for own in shapes]
+        else:
+            waiting += [used for shape in shapes.get(place[1], ()) for used in shape.uses.values()]
+            waiting.append((place[0], _EFFECTS))
+    return {f"{name}:{own}": _numbered((name, own), numbers) for name, own in numbers if own in _module(name).shapes}
+
+
+def _origin(place: Place) -> Place:
+    """Where a name is defined that a module only hands on."""
+    name, definition = place
+    if definition is None or _is_carrier(place):
+        return place
+    module = _module(name)
+    handed_on = None if definition in module.shapes else module.imports.get(definition)
+    return _origin(handed_on) if handed_on else place
+
+
+def _is_carrier(place: Place) -> bool:
+    return place[0] in CARRIERS or f"{place[0]}:{place[1]}" in CARRIERS
+
+
+def _numbered(place: Place, numbers: dict[Place, int]) -> str:
+    """The shapes of a definition, with the number of each definition of ours in place of its name."""
+    module, texts = _module(place[0]), []
+    for shape in module.shapes[place[1] or ""]:
+        words = [shape.libraries.get(name, name) for name in shape.names]
+        for at, name in enumerate(shape.names):
+            if name in shape.uses and (used := _origin(shape.uses[name])) in numbers:
+                words[at] = f"#{numbers[used]}"
+        parts = _NAME.split(shape.text)  # texts and, between them, numbers of names
+        parts[1::2] = [words[int(number)] for number in parts[1::2]]
+        texts.append("".join(parts))
+    return "\n".join(texts)
+
+
+@dataclass
+class _Shape:
+    """What a statement of a module defines: its text, and what the names in it stand for."""
+
+    text: str
+    """Its syntax tree, with a mark for each of `names`."""
+    names: list[str]
+    uses: dict[str, Place] = field(default_factory=dict)
+    """Names of definitions of ours."""
+    libraries: dict[str, str] = field(default_factory=dict)
+    """Names that imports bring from libraries: in full."""
 
 
 @dataclass
 class _Module:
-    """Definitions of a module: their texts, and what they use, by name."""
+    """Definitions of a module."""
 
-    texts: dict[str, str] = field(default_factory=dict)
-    uses: dict[str, list[Place]] = field(default_factory=dict)
+    shapes: dict[str, list[_Shape]] = field(default_factory=dict)
+    """By name; more than one where several statements define it."""
     imports: dict[str, Place] = field(default_factory=dict)
     """What a name that the module imports stands for."""
 
@@ -141,34 +183,31 @@ def _module(name: str) -> _Module:
     if file is None:
         raise LookupError(f"there is no module {name}")
     outline = _outline_of(name, file.read_bytes(), _package_of(name, file))
-    module = _Module(texts={_EFFECTS: ""}, uses={_EFFECTS: []}, imports=_meant(outline.brought))
-    known = {one.name for one in outline.definitions}
+    imports, libraries = _meant(outline.brought)
+    module = _Module(shapes={_EFFECTS: []}, imports=imports)
+    known = {one.name: (name, one.name) for one in outline.definitions}
     for own, text, names, brought in outline.definitions:
-        within, found = _meant(brought), dict[Place, None]()
-        for used in names:
-            if used in within:
-                found[within[used]] = None
-            elif used in known:
-                found[name, used] = None
-            elif used in module.imports:
-                found[module.imports[used]] = None
-        module.texts[own] = module.texts.get(own, "") + text
-        module.uses[own] = module.uses.get(own, []) + list(found)
+        within, within_libraries = _meant(brought)
+        ours = imports | known | within
+        shape = _Shape(text, names, {one: ours[one] for one in names if one in ours}, libraries | within_libraries)
+        module.shapes.setdefault(own, []).append(shape)
     return module
 
 
-def _meant(brought: Iterable[Brought]) -> dict[str, Place]:
-    """What each name stands for that imports bring, as far as a package of ours defines it."""
-    found: dict[str, Place] = {}
+def _meant(brought: Iterable[Brought]) -> tuple[dict[str, Place], dict[str, str]]:
+    """What each name stands for that imports bring: a place in a package of ours, or the full name in a library."""
+    places: dict[str, Place] = {}
+    libraries: dict[str, str] = {}
     for name, source, inside in brought:
-        if inside is None:
-            if _file_of(source):
-                found[name] = (source, None)
-        elif _file_of(below := f"{source}.{inside}"):
-            found[name] = (below, None)
-        elif _file_of(source):
-            found[name] = (source, inside)
-    return found
+        if inside is None and _file_of(source):
+            places[name] = (source, None)
+        elif inside is not None and _file_of(below := f"{source}.{inside}"):
+            places[name] = (below, None)
+        elif inside is not None and _file_of(source):
+            places[name] = (source, inside)
+        else:
+            libraries[name] = f"{source}.{inside}" if inside else source
+    return places, libraries
 
 
 def _outline_of(name: str, source: bytes, package: str) -> _Outline:
@@ -204,20 +243,19 @@ def _kept_outlines() -> Path | None:
 
 def _read_outline(source: str, package: str) -> _Outline:
     with _uncollected():
-        lines, tree = source.splitlines(), ast.parse(source)
+        tree = ast.parse(source)
         brought = [one for node in tree.body for one in _brought(node, package)]
-        return _Outline(brought, [one for node in tree.body for one in _definitions(node, lines, package)])
+        return _Outline(brought, [one for node in tree.body for one in _definitions(node, package)])
 
 
-def _definitions(node: ast.stmt, lines: list[str], package: str) -> Iterator[_Definition]:
+def _definitions(node: ast.stmt, package: str) -> Iterator[_Definition]:
     if not (defined := _names_of(node)):
         return
-    parts = list(_parts(node))
-    text = _text(node, parts, lines)
-    names = list(dict.fromkeys(name for part in parts for name in _names_in(part)))
-    brought = [one for part in parts if isinstance(part, _IMPORTS) for one in _brought(part, package)]
+    names = dict[str, int]()
+    text = "".join(_shape(node, names, ("name",)))
+    brought = [one for part in ast.walk(node) if isinstance(part, _IMPORTS) for one in _brought(part, package)]
     for own in defined:
-        yield _Definition(own, text, names, brought)
+        yield _Definition(own, text, list(names), brought)
 
 
 @contextlib.contextmanager
@@ -230,20 +268,6 @@ def _uncollected() -> Iterator[None]:
     finally:
         if resting:
             gc.enable()
-
-
-def _parts(node: ast.AST) -> Iterator[ast.AST]:
-    """A statement and all below it, but operators and contexts."""
-    waiting = [node]
-    while waiting:
-        part = waiting.pop()
-        yield part
-        for name in part._fields:
-            below = getattr(part, name, None)
-            if isinstance(below, list):
-                waiting += [one for one in below if isinstance(one, ast.AST)]
-            elif isinstance(below, ast.AST) and name not in ("ctx", "op"):
-                waiting.append(below)
 
 
 def _names_of(node: ast.stmt) -> list[str]:
@@ -263,28 +287,39 @@ def _names_of(node: ast.stmt) -> list[str]:
     return [_EFFECTS]
 
 
-def _text(node: ast.stmt, parts: Iterable[ast.AST], lines: list[str]) -> str:
-    """Lines of a definition, without docstrings and lines that hold nothing but a comment."""
-    decorators = getattr(node, "decorator_list", [])
-    first = min([node.lineno, *(d.lineno for d in decorators)])
-    told = {
-        number
-        for part in parts  # docstrings, and the texts under fields
-        if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)
-        for number in range(part.lineno, (part.end_lineno or 0) + 1)
-    }
-    kept = (lines[number - 1].rstrip() for number in range(first, (node.end_lineno or first) + 1) if number not in told)
-    return "\n".join(line for line in kept if line and not line.lstrip().startswith("#")) + "\n"
+def _shape(part: object, names: dict[str, int], without: Iterable[str] = ()) -> Iterator[str]:
+    """Text of a syntax tree without docstrings, and with a mark for each name, which `names` numbers.
+
+    It does not differ between versions of Python, as that of :func:`ast.dump` does.
+    """
+    match part:
+        case ast.Expr(value=ast.Constant(value=str())) | ast.Import() | ast.ImportFrom():
+            return  # what an import brings stands behind the names
+        case ast.Name(id=name):
+            yield f"\1{names.setdefault(name, len(names))}\2"
+        case ast.AST():
+            yield f"{type(part).__name__}("
+            for name, below in ast.iter_fields(part):
+                if below is None or below == [] or name in _UNCOUNTED or name in without:
+                    continue
+                yield f"{name}="
+                if name == "annotation" and isinstance(below, ast.Constant):
+                    below = ast.parse(str(below.value), mode="eval").body  # noqa: PLW2901
+                yield from _shape(below, names)
+            yield ")"
+        case list():
+            for one in part:
+                yield from _shape(one, names)
+            yield ";"
+        case _:
+            yield f"{part!r},"
+
+
+_NAME = re.compile("\1(\\d+)\2")
+_UNCOUNTED = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 
 
 _IMPORTS = (ast.Import, ast.ImportFrom, ast.If)
-
-
-def _names_in(part: ast.AST) -> Iterator[str]:
-    if isinstance(part, ast.Name):
-        yield part.id
-    elif isinstance(part, ast.arg | ast.AnnAssign) and isinstance(part.annotation, ast.Constant):
-        yield from (n.id for n in ast.walk(ast.parse(str(part.annotation.value))) if isinstance(n, ast.Name))
 
 
 def _brought(node: ast.AST, package: str) -> Iterator[Brought]:
@@ -311,7 +346,7 @@ def _absolute(node: ast.ImportFrom, package: str) -> str:
 
 def _place_of(entry: str) -> Place:
     module, _, name = entry.partition(":")
-    if not _file_of(module) or (name and name not in _module(module).texts | _module(module).imports):
+    if not _file_of(module) or (name and name not in _module(module).shapes | _module(module).imports):
         raise LookupError(f"there is no definition {entry}")
     return module, name or None
 

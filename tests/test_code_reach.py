@@ -110,11 +110,32 @@ def test_an_edit_of_what_is_reached_counts(package: Path, file: str, old: str, n
         ("origin.py", "return 1", "return 2"),
         ("maker.py", '"""Docstring."""', '"""Another\n    text."""'),
         ("origin.py", "    return size", "    # why\n\n    return size"),
+        ("maker.py", "SCALE * helper(kind.size)", "(\n            SCALE * helper(kind.size)\n        )"),
+        ("maker.py", "SCALE", "FACTOR"),
     ],
-    ids=["constant of another", "another", "neighbour", "docstring", "comment"],
+    ids=["constant of another", "another", "neighbour", "docstring", "comment", "line breaks", "name"],
 )
 def test_an_edit_beside_it_does_not(package: Path, file: str, old: str, new: str) -> None:
     assert not edited(package / file, old, new)
+
+
+def test_a_file_that_moves_does_not_count(package: Path) -> None:
+    before = digest()
+    (package / "room").mkdir()
+    (package / "origin.py").rename(package / "room" / "source.py")
+    (package / "handed.py").unlink()
+    maker = package / "maker.py"
+    text = maker.read_text().replace("added_package.handed import helper", "added_package.room.source import help_out")
+    maker.write_text(text.replace("helper(", "help_out("))
+    source = package / "room" / "source.py"
+    source.write_text(source.read_text().replace("def helper", "def help_out"))
+    assert digest() == before
+
+
+def test_another_function_of_a_library_counts(package: Path) -> None:
+    maker = package / "maker.py"
+    maker.write_text("from math import floor as whole\n" + maker.read_text().replace("late()", "whole(late())"))
+    assert edited(maker, "import floor as", "import ceil as")
 
 
 def test_a_new_file_does_not_count(package: Path) -> None:
@@ -160,7 +181,7 @@ def test_outlines_are_kept_for_the_next_process(package: Path, tmp_path: Path, m
         kept.write_bytes(damaged)
         assert digest() == before
         assert kept.read_bytes() == whole
-    other = whole.replace(b"SCALE = 2", b"SCALE = 3")
+    other = whole.replace(b"value=2,", b"value=3,")
     kept.write_bytes(other)
     assert digest() != before
     kept.parent.chmod(0o777)

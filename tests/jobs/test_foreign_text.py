@@ -227,8 +227,8 @@ def test_control_points_of_surveyors_are_recognised(faults: Path) -> None:
 @pytest.mark.parametrize(
     ("first", "order"),
     [
-        ("2736120.40,673450.25", ["point", "northing", "easting", "elevation", "description"]),
-        ("673450.25,2736120.40", ["point", "easting", "northing", "elevation", "description"]),
+        ("2736120.40,673450.25", ["point", "northing", "easting", "elevation_m", "description"]),
+        ("673450.25,2736120.40", ["point", "easting", "northing", "elevation_m", "description"]),
         ("5736120.40,3473450.25", None),
     ],
 )
@@ -245,9 +245,11 @@ def test_points_that_no_line_names_are_read_in_the_order_that_their_size_tells(
     words = "????" if order is None else ", ".join(f'"{name}"' for name in order)
     assert words in lines["options.names"]
     if order is not None:
+        (tmp_path / "t.csv").write_text(poses(utc).replace("48.000", "24.730").replace(",9.0,", ",76.717,"))
         (tmp_path / "SURVEY.toml").write_text(
-            'id = "s"\n[map]\ncrs = "EPSG:32643"\n[[control]]\npath = "points.csv"\ncrs = "EPSG:32643"\n'
-            f'height = "ellipsoidal"\noptions.role = "gcp"\n{lines["options.names"]}\n'
+            'id = "s"\nruns = [{ id = "r", logs = [{ path = "t.csv", crs = "EPSG:4979" }] }]\n'
+            '[map]\ncrs = "EPSG:32643"\n[[control]]\npath = "points.csv"\ncrs = "EPSG:32643"\nheight = "ellipsoidal"\n'
+            f'options.role = "gcp"\n{lines["options.names"]}\n'
         )
         assert roadscan("ingest", tmp_path / "SURVEY.toml").exit_code == 0
         points = rs.open_survey(tmp_path / "SURVEY.toml").table("control_points")

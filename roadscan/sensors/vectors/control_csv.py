@@ -39,9 +39,9 @@ SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),
     Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),
 )
-PNEZD: Final = ["point", "northing", "easting", "elevation", "description"]
-PENZD: Final = ["point", "easting", "northing", "elevation", "description"]
-"""The customary columns of surveyors' files, which no line names."""
+PNEZD: Final = ["point", "northing", "easting", "elevation_m", "description"]
+PENZD: Final = ["point", "easting", "northing", "elevation_m", "description"]
+"""The customary columns of surveyors' files, which no line names. The unit of heights is a proposal for the user."""
 _EASTINGS_M: Final = (1e5, 1e6)
 """Eastings of UTM and of most national grids; northings are beyond, from 9 km off the equator on."""
 _LEAST_GRID_M: Final = 1e3
@@ -127,7 +127,7 @@ def _plan(source: LogSource) -> _Plan:
         raise FormatError(
             f"no line names the columns; the first is {', '.join(layout.names)}",
             expected="point, northing, easting, elevation and description, or easting first",
-            change="state the order in options.names",
+            change="state the order, and the unit of heights (elevation_m or elevation_ft), in options.names",
             file=source.path,
             missing=Missing("options.names", proposed or None, tuple(orders)),
         )

@@ -296,7 +296,8 @@ def pose_track(
 
     def columns(*names: str) -> Float64:
         values = [rows.column(name).to_numpy(zero_copy_only=False) for name in names]
-        return np.stack(values, axis=-1).astype(np.float64)[own]
+        found: Float64 = np.stack(values, axis=-1).astype(np.float64)[own]
+        return found
 
     position, is_local = columns("x_world_m", "y_world_m", "z_world_m"), world == LOCAL_WORLD
     quaternion, sigma_rad, level = np.tile([1.0, 0.0, 0.0, 0.0], (own.size, 1)), np.zeros(own.size), None

@@ -81,7 +81,7 @@ def _of_target(store: Store, path: str) -> str:
 def _accuracy(rows: Rows) -> Iterator[Table | Paragraph]:
     if not rows:
         return
-    is_statement = any(r["count"] >= NSSDA_CHECK_POINTS for r in rows)
+    is_statement = any(r["count"] >= NSSDA_CHECK_POINTS for r in rows if r["points"] != "datum")
     yield Table(
         ("points", "component", "poses", "count", "mean", "mean absolute", "RMSE",
          *(["95 % (NSSDA)"] if is_statement else []), "largest"),

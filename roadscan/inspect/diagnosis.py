@@ -39,7 +39,7 @@ _KNOWN_OTHERS: Final = {
         "or the trajectory with roll, pitch and heading as trajectory_csv",
     ),
     "UBX": (
-        "the receiver's binary messages are not read",
+        "of the receiver's binary messages only its solutions (NAV-PVT) are read, and its beginning holds none",
         "positions",
         "compute them with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NMEA",
     ),

@@ -334,7 +334,8 @@ class _Search:
             name = one.key.removeprefix("options.")
             if name not in self._stated.options and name in self._format.options.model_fields:
                 proposed = () if one.proposed is None else (one.proposed,)
-                for value in dict.fromkeys([*proposed, *one.choices, *option_choices(self._format, name)]):
+                values = [*proposed, *one.choices, *option_choices(self._format, name)]
+                for value in {repr(value): value for value in values}.values():  # lists have no hash
                     yield dataclasses.replace(trial, options=trial.options | {name: value})
 
     def _needs(
@@ -395,7 +396,8 @@ class _Search:
         said = any(one.choices for one in error.asks_for(f"options.{name}"))
         choices = "" if said else " or ".join(toml(value) for value in option_choices(self._format, name))
         reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
-        value = next((one.proposed for one in error.asks_for(f"options.{name}") if one.proposed is True), "????")
+        proposed = [one.proposed for one in error.asks_for(f"options.{name}")]
+        value = next((one for one in proposed if one is True or isinstance(one, list)), "????")
         return Need(f"options.{name}", f"options.{name} = {toml(value)}", reason, is_of_time), {name}
 
 

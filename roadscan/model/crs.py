@@ -21,7 +21,9 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 from pyproj.crs.crs import CompoundCRS
+from pyproj.database import query_crs_info
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
+from pyproj.enums import PJType
 from pyproj.exceptions import CRSError as ProjCrsError
 from pyproj.exceptions import ProjError
 from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
@@ -269,6 +271,30 @@ class Anchor:
         c, s = math.cos(math.radians(self.heading_deg)), math.sin(math.radians(self.heading_deg))
         enu_from_local = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return ecef_from_enu @ enu_from_local, origin
+
+
+def check_not_mirrored(crs: str) -> None:
+    """Refuse a CRS whose axes point south, then west.
+
+    Krovak's projection counts south, then west: on such a map a road's left is its right.
+
+    Raises
+    ------
+    CrsError
+        with the CRS of the same projection that counts east and north, where EPSG has one.
+    """
+    known = crs_from_text(crs, "map.crs")
+    axes = [axis.direction.lower() for axis in known.axis_info[:2]]
+    if axes != ["south", "west"]:
+        return
+    name = f"{known.name} East North"
+    twins = [one for one in query_crs_info("EPSG", PJType.PROJECTED_CRS) if one.name == name]
+    change = f'state map.crs = "EPSG:{twins[0].code}" ({name})' if twins else "state one that counts east and north"
+    raise CrsError(
+        f"map.crs '{crs}' ({known.name}) counts south, then west: on such a map left and right are exchanged",
+        expected="a map whose axes point east and north",
+        change=f"{change}; logs and control points may stay in theirs",
+    )
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.clock_evidence import MotionEvidence, PairEvidence
-from roadscan.model.crs import Anchor, Geoid, MapFrame
+from roadscan.model.crs import Anchor, Geoid, MapFrame, check_not_mirrored
 from roadscan.model.errors import ConfigError, nearest
 from roadscan.model.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.model.ids import LanePass, PassId, RunId
@@ -53,7 +53,8 @@ class MapConfig(Strict):
     """Map frame of the survey and its heights."""
 
     crs: str | None = None
-    """Projected CRS, such as "EPSG:25832"; its own unit is used in the products."""
+    """Projected CRS, such as "EPSG:25832"; its own unit is used in the products. One that counts south, then west
+    (EPSG:5513, EPSG:2065), is refused: left and right would be exchanged."""
     local: LocalConfig | None = None
     """A local engineering frame, in place of `crs`, or the frame of local poses beside it."""
     height: Literal["ellipsoidal", "orthometric"] = "ellipsoidal"
@@ -78,7 +79,15 @@ class MapConfig(Strict):
         return Geoid.found(name, None if self.grids is None else folder / self.grids)
 
     def frame(self, folder: Path) -> MapFrame:
-        """The map frame these settings describe, of a survey file in `folder`."""
+        """The map frame these settings describe, of a survey file in `folder`.
+
+        Raises
+        ------
+        CrsError
+            if the CRS is none of a map, or its axes are mirrored: left and right would be exchanged.
+        """
+        if self.crs is not None:
+            check_not_mirrored(self.crs)
         anchor = None
         if self.local is not None and self.local.anchor is not None:
             anchor = Anchor(**self.local.anchor.model_dump())

@@ -1,10 +1,12 @@
 """Poses of a log that no vehicle can have taken: those that leap away and back, and steps after which it goes on.
 
 Three things must exclude a pose together: its neighbours, the motion of a vehicle, and the σ that the log states. Each
-link between two poses is compared with the velocities just before and just after it. A link that contradicts both is
-cut, and what lies between two cuts is a segment. The explanation of least cost says which segments are the drive: to
-leave out a pose costs 1, to believe that positions step costs `STEP_COST`. So a short burst between two pieces that fit
-each other is left out, and where two long pieces do not fit, both stay: nothing shows which of them is right.
+link between two poses is compared with the velocities just before and just after it, with a polynomial of degree four
+through three poses on each side, and with the integral of the velocities that the log states. A link that contradicts
+them by more than a vehicle's acceleration explains is cut, and what lies between two cuts is a segment. The explanation
+of least cost says which segments are the drive: to leave out a pose costs 1, to believe that positions step costs
+`STEP_COST`. So a short burst between two pieces that fit each other is left out, and where two long pieces do not fit,
+both stay: nothing shows which of them is right.
 """
 
 from __future__ import annotations
@@ -38,6 +40,19 @@ END_POSES: Final = 5
 
 _ACCELERATION_M_PER_S2: Final = 12.0
 """More than the tyres of a car hold (1.2 g)."""
+_STATED: Final = 0.175
+"""Times that acceleration and the squared time of a link: what it moves beyond the mean of the velocities at both ends.
+A change in the middle gives 1/8; 1,200 drawn drives that brake with 9.8 m/s², stop, and swerve with 8 m/s² reach
+0.169."""
+_UNEVEN: Final = 0.42
+"""The same beyond a polynomial through three poses on each side, where acceleration comes and goes within the window:
+those drives reach 0.398. The time is that of the longest link; links differ by up to `_EVEN_LINKS` times."""
+_EVEN_LINKS: Final = 2.0
+_WINDOW: Final = 6
+"""Poses of such a polynomial and its step."""
+_AGREEING: Final = 0.5
+"""What stated velocities contradict is a leap where positions alone show at least this share of it; where they do not,
+it is the velocity that is wrong."""
 _TURN_RAD_PER_S2: Final = np.array([30.0, 30.0, 10.0])
 """Roll and pitch over a pothole; heading of a vehicle that swerves."""
 _MOST_TURN_RAD: Final = np.radians([10.0, 10.0, 60.0])
@@ -92,6 +107,8 @@ class PoseTrack(NamedTuple):
     """(n,) stated 1 σ of the attitude; 0 where none is stated."""
     is_local: bool
     """True where z of the world frame points up; else it is geocentric."""
+    velocity_world_m_per_s: Float64 | None = None
+    """(n, 3) stated velocities, NaN where one is missing; None of a log without any."""
 
 
 class Step(NamedTuple):
@@ -213,6 +230,8 @@ class _Links:
     """(n − 1,) usual contradiction of the positions there."""
     noise_rad: Float64
     """(n − 1, 3) usual contradiction of the attitudes there, about body axes."""
+    stated: _StatedMotion
+    """What the stated velocities say."""
 
     @classmethod
     def of(cls, track: PoseTrack) -> _Links:
@@ -232,8 +251,9 @@ class _Links:
         usual = _medians(elapsed[:, None])[:, 0]
         jitter = _noise(np.abs(elapsed - usual)[:, None])[:, 0]
         late_s = _JITTER_TIMES * jitter
-        reach = np.where(jitter > _IRREGULAR * usual, _longest_of_three(elapsed), elapsed)
-        noise_m += late_s * _slower(shift, elapsed) / _NOISE_TIMES
+        reach = np.where(jitter > _IRREGULAR * usual, _greatest(elapsed, 1), elapsed)
+        late_m = late_s * _slower(shift, elapsed)
+        noise_m += late_m / _NOISE_TIMES
         noise_rad += (late_s * _slower(turn, elapsed) / _NOISE_TIMES)[:, None]
         bound_m = _bound_m(reach, both) + _NOISE_TIMES * noise_m
         bound_rad = _bound_rad(reach, both) + _NOISE_TIMES * noise_rad
@@ -243,14 +263,22 @@ class _Links:
             _leap_sizes(*_rises(before_m, after_m, up), _slope_bound_m(shift, up) + _NOISE_TIMES * noise_m[:, None]),
         )
         leap_rad = _leap_sizes(before_rad, after_rad, bound_rad)
+        uneven = _unevenness(track, elapsed, gap)
+        stated = _StatedMotion.of(track, elapsed, gap, late_m)
         leap_m, leap_rad = np.where(gap, 0.0, leap_m), np.where(gap, 0.0, leap_rad)
         leap_m = np.where(far, np.maximum(leap_m, length), leap_m)
         sigma_m, sigma_rad = (np.maximum(s[:-1], s[1:]) for s in (track.sigma_m, track.sigma_rad))
-        covered = (leap_m > 0) & (leap_m <= bound_m + _SIGMA_TIMES * sigma_m) & (sigma_m > 0)
+        excluded = leap_m > bound_m + _SIGMA_TIMES * sigma_m
+        for size, bound in (
+            stated.leaps(shift, uneven, before_m, after_m), _uneven_leaps(uneven, elapsed, late_m, leap_m > 0)
+        ):  # fmt: skip
+            excluded |= size > bound + _SIGMA_TIMES * sigma_m
+            leap_m = np.where(leap_m > 0, leap_m, size)
+        covered = (leap_m > 0) & ~excluded & (sigma_m > 0)
         leap_rad = np.where(leap_rad <= _SIGMA_TIMES * sigma_rad, 0.0, leap_rad)
         leap = _Misfit(np.where(covered, 0.0, leap_m), leap_rad)
         sizes = np.where(covered, leap_m, 0.0)
-        return cls(track, elapsed, gap, (far & ~covered) | turned, leap, sizes > 0, noise_m, noise_rad)
+        return cls(track, elapsed, gap, (far & ~covered) | turned, leap, sizes > 0, noise_m, noise_rad, stated)
 
     @property
     def cut(self) -> Bool:
@@ -261,6 +289,103 @@ class _Links:
         """The step between two poses."""
         shift, turn = (float(np.max(values[before:after])) for values in self.leap)
         return Step(before, after, shift, turn, float(max(self.track.sigma_m[before], self.track.sigma_m[after])))
+
+
+@dataclass(frozen=True)
+class _StatedMotion:
+    """What stated velocities say of the way along each link."""
+
+    way_m: Float64
+    """(n − 1, 3) integral of the velocities, NaN where there is none."""
+    bound_m: Float64
+    """(n − 1,) what a change of acceleration and the usual contradiction explain."""
+
+    @classmethod
+    def of(cls, track: PoseTrack, elapsed_s: Float64, gap: Bool, late_m: Float64) -> _StatedMotion:
+        """Of all links but gaps."""
+        velocity = track.velocity_world_m_per_s
+        if velocity is None:
+            return cls(np.full((elapsed_s.size, 3), np.nan), np.full(elapsed_s.size, np.inf))
+        way = np.where(gap[:, None], np.nan, 0.5 * elapsed_s[:, None] * (velocity[:-1] + velocity[1:]))
+        away = np.linalg.norm(np.diff(track.position_world_m, axis=0) - way, axis=1)
+        known = np.flatnonzero(np.isfinite(away))
+        bound = np.full(elapsed_s.size, np.inf)
+        if known.size:
+            noise = _noise(away[known][:, None])[:, 0]
+            physical = _STATED * _ACCELERATION_M_PER_S2 * elapsed_s[known] ** 2
+            bound[known] = _LEAST_LEAP_M + np.maximum(physical, _NOISE_TIMES * noise) + late_m[known]
+        return cls(way, bound)
+
+    def leaps(self, shift: Float64, uneven: Float64, before: Float64, after: Float64) -> tuple[Float64, Float64]:
+        """Sizes (k,) of links that contradict the stated velocities, and of which positions alone show a part; bounds.
+
+        The size of the others is 0.
+        """
+        away = np.nan_to_num(shift - self.way_m)
+        size = np.linalg.norm(away, axis=1)
+        seen = np.where(np.isfinite(uneven), uneven, _mean(before, after))
+        agreeing = np.einsum("ij,ij->i", seen, away) >= _AGREEING * size**2
+        return np.where((size > self.bound_m) & agreeing, size, 0.0), self.bound_m
+
+    def misses(self, inside: slice, shift: Float64) -> tuple[float, float]:
+        """By how much a shift (3,) over links contradicts their velocities, and what explains that; inf without."""
+        away = float(np.linalg.norm(shift - self.way_m[inside].sum(axis=0)))
+        return (away, float(self.bound_m[inside].sum())) if np.isfinite(away) else (np.inf, 0.0)
+
+
+def _unevenness(track: PoseTrack, elapsed_s: Float64, gap: Bool) -> Float64:
+    """Step (k, 3) at each link beside the polynomial of degree four through three poses on each side of it, in m.
+
+    It is the divided difference of order five over its response to a step of 1. NaN where poses are missing, or do not
+    follow one another evenly.
+    """
+    found = np.full((elapsed_s.size, 3), np.nan)
+    count = elapsed_s.size + 1 - (_WINDOW - 1)
+    if count < 1:
+        return found
+    t = (track.epochs_gps_ns - track.epochs_gps_ns[0]) / NS_PER_S
+    at = t[: count + _WINDOW - 1]
+    nodes = [at[i : i + count] for i in range(_WINDOW)]
+    scale = (nodes[-1] - nodes[0]) / (_WINDOW - 1)
+    weights = [
+        1.0 / np.prod([(nodes[i] - nodes[j]) / scale for j in range(_WINDOW) if j != i], axis=0) for i in range(_WINDOW)
+    ]
+    position = track.position_world_m - np.median(track.position_world_m, axis=0)
+    total = sum(weights[i][:, None] * position[i : i + count] for i in range(_WINDOW))
+    links = np.lib.stride_tricks.sliding_window_view(elapsed_s, _WINDOW - 1)
+    broken = np.lib.stride_tricks.sliding_window_view(gap, _WINDOW - 1).any(axis=1)
+    uneven = broken | (links.max(axis=1) > _EVEN_LINKS * links.min(axis=1))
+    middle = _WINDOW // 2
+    found[middle - 1 : middle - 1 + count] = np.where(uneven[:, None], np.nan, total / sum(weights[middle:])[:, None])
+    return found
+
+
+def _uneven_leaps(
+    uneven: Float64, elapsed_s: Float64, late_m: Float64, found: Bool
+) -> tuple[Float64, Float64]:  # fmt: skip
+    """Sizes (k,) of links that step beside a polynomial through their neighbours, and the bounds of all links.
+
+    A step shows at the two links on each side of it too: so it is the greatest of five, its neighbours are known, and
+    none of the five was `found` to leap otherwise. The size of the others is 0.
+    """
+    size = np.linalg.norm(uneven, axis=1)
+    known = np.flatnonzero(np.isfinite(size))
+    if not known.size:
+        return np.zeros(size.size), np.full(size.size, np.inf)
+    longest = _greatest(elapsed_s, 2)
+    bound = np.full(size.size, np.inf)
+    physical = _UNEVEN * _ACCELERATION_M_PER_S2 * longest[known] ** 2
+    noise = _NOISE_TIMES * _noise(size[known][:, None])[:, 0]  # at a low rate it is the motion itself
+    bound[known] = _LEAST_LEAP_M + np.maximum(physical, noise) + 2.0 * late_m[known]
+    leaps = (size > bound) & (size >= (1.0 - 1e-6) * _greatest(np.nan_to_num(size), 2))
+    leaps &= (_greatest(np.isnan(size).astype(float), 1) == 0) & (_greatest(found.astype(float), 2) == 0)
+    return np.where(leaps, size, 0.0), bound
+
+
+def _greatest(values: Float64, beside: int) -> Float64:
+    """The greatest (k,) of each value and so many on each side."""
+    padded = np.pad(values, beside, mode="edge")
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * beside + 1).max(axis=1))
 
 
 def _against_neighbours(steps: Float64, elapsed_s: Float64, gap: Bool) -> tuple[Float64, Float64]:
@@ -278,12 +403,6 @@ def _mean(before: Float64, after: Float64) -> Float64:
     count = np.isfinite(before).astype(float) + np.isfinite(after)
     mean: Float64 = total / np.maximum(count, 1.0)
     return mean
-
-
-def _longest_of_three(elapsed_s: Float64) -> Float64:
-    """The longest (k,) of each link and its two neighbours."""
-    padded = np.concatenate([elapsed_s[:1], elapsed_s, elapsed_s[-1:]])
-    return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
 
 
 def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
@@ -312,8 +431,7 @@ def _medians(values: Float64) -> Float64:
 def _noise(contradiction: Float64) -> Float64:
     """Usual contradiction (k, c) about each link: the greatest of three neighbouring medians."""
     medians = _block_medians(contradiction)
-    padded = np.concatenate([medians[:1], medians, medians[-1:]])
-    wide = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    wide = np.stack([_greatest(column, 1) for column in medians.T], axis=-1)
     return np.asarray(wide[np.arange(len(contradiction)) // _NOISE_LINKS])
 
 
@@ -468,8 +586,10 @@ def _bridge(links: _Links, a: _Segment, b: _Segment) -> tuple[bool, bool]:
     sigma_rad = float(max(track.sigma_rad[a.last], track.sigma_rad[b.first]))
     most_m = float(_bound_m(elapsed, both)[0]) + _NOISE_TIMES * wider * float(links.noise_m[inside].max())
     most_rad = _bound_rad(elapsed, both)[0] + _NOISE_TIMES * wider * links.noise_rad[inside].max(axis=0)
-    fits = miss_m <= most_m + _SIGMA_TIMES * sigma_m and bool((miss_rad <= most_rad + _SIGMA_TIMES * sigma_rad).all())
-    return fits, fits and _far_better(links, inside, miss_m, float(np.linalg.norm(miss_rad)))
+    stated_m, explained_m = links.stated.misses(inside, shift)
+    near = miss_m <= most_m + _SIGMA_TIMES * sigma_m or stated_m <= explained_m + _SIGMA_TIMES * sigma_m
+    fits = near and bool((miss_rad <= most_rad + _SIGMA_TIMES * sigma_rad).all())
+    return fits, fits and _far_better(links, inside, min(miss_m, stated_m), float(np.linalg.norm(miss_rad)))
 
 
 def _far_better(links: _Links, inside: slice, miss_m: float, miss_rad: float) -> bool:

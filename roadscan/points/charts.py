@@ -26,6 +26,8 @@ STEP_M = 100.0
 
 _MOST_BOXES = 1 << 27
 """Boxes of the table at most (0.5 GB): the box of a drive over 100 km across all axes."""
+_FOLDED = (127, 251, 509)
+"""Edges (boxes) of tables that are tried where poses lie farther apart: places that no road joins."""
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -37,7 +39,7 @@ class Charts:
     lattice: Float64
     """(4,) box edge (m), and the indices of the first box along x, y, z."""
     table: npt.NDArray[np.int32]
-    """(nx, ny, nz) chart of each box, −1 where none is needed."""
+    """(nx, ny, nz) chart of each box, its indices modulo the shape; −1 where none is needed."""
     centres: Float64
     """(c, 3) world, m."""
     coefficients: Float64
@@ -57,21 +59,35 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     unique = np.unique((visited[:, None, :] + steps).reshape(-1, 3), axis=0)
     first = unique.min(axis=0)
-    if math.prod((unique.max(axis=0) - first + 1).tolist()) > _MOST_BOXES:
-        far_km = float(np.linalg.norm((unique.max(axis=0) - first) * BOX_M)) / 1000
-        raise NavigationError(
-            f"poses that are needed together lie {far_km:,.0f} km apart",
-            expected="a drive: poses of some minutes lie near one another",
-            change="`roadscan status` names the steps of the trajectory; take what is wrong out of its log",
-        )
-    table = np.full(unique.max(axis=0) - first + 1, -1, dtype=np.int32)
-    table[tuple((unique - first).T)] = np.arange(len(unique))
+    table = _table(unique - first)
     made = [_chart(frame, world, (int(b[0]), int(b[1]), int(b[2]))) for b in unique]
     return Charts(
         lattice=np.array([BOX_M, *first], dtype=np.float64),
         table=table,
         centres=((unique + 0.5) * BOX_M).astype(np.float64),
         coefficients=np.stack(made),
+    )
+
+
+def _table(boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+    """(nx, ny, nz) number of each box (b, 3), from 0, at its indices modulo the shape; −1 elsewhere.
+
+    The shape is that of all boxes. Where poses step by hundreds of kilometres it is smaller, such that no two boxes
+    share a place: what is between them is never looked at.
+    """
+    whole = (boxes.max(axis=0) + 1).tolist()
+    shapes = [whole] if math.prod(whole) <= _MOST_BOXES else [[edge] * 3 for edge in _FOLDED]
+    for shape in shapes:
+        folded = boxes % shape
+        if shape is whole or len(np.unique(folded, axis=0)) == len(boxes):
+            table = np.full(shape, -1, dtype=np.int32)
+            table[tuple(folded.T)] = np.arange(len(boxes))
+            return table
+    far_km = float(np.linalg.norm(boxes.max(axis=0) * BOX_M)) / 1000
+    raise NavigationError(
+        f"poses that are needed together lie {far_km:,.0f} km apart",
+        expected="a drive: poses of some minutes lie near one another",
+        change="`roadscan status` names the steps of the trajectory; take what is wrong out of its log",
     )
 
 

@@ -225,6 +225,8 @@ class Rows:
     """Bytes from one row to the next, 0 where it varies."""
     records: npt.NDArray[np.int64] | None = None
     """(n,) record number of each row, where they do not follow one another."""
+    velocity_level_m_per_s: npt.NDArray[np.float32] | None = None
+    """(n, 3) stated velocity of each row, north, east, down: a witness of its position, which no table holds."""
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:

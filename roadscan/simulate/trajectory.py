@@ -166,7 +166,7 @@ def _stated(drive: Drive, here: Poses, errors: _Errors) -> tuple[Float64, Rotati
 def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float64:
     """SBET records (n, 17); platform heading = true heading + wander angle.
 
-    Velocities are along the wander frame (x at azimuth −wander, y to its right, z down); accelerations are the
+    Velocities are along the wander frame (x at azimuth −wander, y to its left, z up); accelerations are the
     body's relative to the Earth, without gravity, and rates likewise, in body axes.
     """
     before, here, after = (drive.poses(epochs + shift) for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS))
@@ -176,7 +176,7 @@ def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float6
     stated = drive.earth.geographic_from_ecef(position)
     heading, pitch, roll = (level.inv() * attitude).as_euler("ZYX").T
     velocity = level.inv().apply((after.position_ecef_m - before.position_ecef_m) / (2 * dt))
-    along_wander = Rotation.from_euler("z", wander).apply(velocity)
+    along_wander = Rotation.from_euler("z", wander).apply(velocity) * [1.0, -1.0, -1.0]
     acceleration, rates = _body_motion(before, here, after, dt)
     return np.column_stack(
         [

@@ -58,6 +58,7 @@ from tests.sensors import (
     test_scans,
     test_sick_lms,
     test_smrmsg,
+    test_ubx,
     test_velodyne_pcap,
 )
 from tests.sensors.e57_files import PAGE, PAYLOAD, small_e57
@@ -519,6 +520,7 @@ def _poses() -> Iterator[Sample]:
     yield Sample(
         "rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP
     )
+    yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)
 

@@ -222,7 +222,40 @@ def test_control_points_of_surveyors_are_recognised(faults: Path) -> None:
         table = found["log"]["tables"]["control_points"]
         assert table["rows"] == points
         assert table["extent"]["low"][0] == pytest.approx(east, abs=1e-6)
-    assert "5 columns of numbers, and no line names them" in words_of(faults / "pnezd_no_header.csv")
+
+
+@pytest.mark.parametrize(
+    ("first", "order"),
+    [
+        ("2736120.40,673450.25", ["point", "northing", "easting", "elevation_m", "description"]),
+        ("673450.25,2736120.40", ["point", "easting", "northing", "elevation_m", "description"]),
+        ("5736120.40,3473450.25", None),
+    ],
+)
+def test_points_that_no_line_names_are_read_in_the_order_that_their_size_tells(
+    faults: Path, tmp_path: Path, first: str, order: list[str] | None
+) -> None:
+    """PNEZD. Where both numbers may be either, as in Gauss-Krüger coordinates, the order is asked for."""
+    file = tmp_path / "points.csv"
+    file.write_text((faults / "pnezd_no_header.csv").read_text().replace("2736120.40,673450.25", first, 1))
+    (found,) = json.loads(roadscan("inspect", file, "--json").stdout)
+    assert found["formats"] == ["control_csv"]
+    lines = {need["key"]: need["line"] for need in found["log"]["to_state"]}
+    assert set(lines) == {"crs", "options.names", "options.role"}
+    words = "????" if order is None else ", ".join(f'"{name}"' for name in order)
+    assert words in lines["options.names"]
+    if order is not None:
+        (tmp_path / "t.csv").write_text(poses(utc).replace("48.000", "24.730").replace(",9.0,", ",76.717,"))
+        (tmp_path / "SURVEY.toml").write_text(
+            'id = "s"\nruns = [{ id = "r", logs = [{ path = "t.csv", crs = "EPSG:4979" }] }]\n'
+            '[map]\ncrs = "EPSG:32643"\n[[control]]\npath = "points.csv"\ncrs = "EPSG:32643"\nheight = "ellipsoidal"\n'
+            f'options.role = "gcp"\n{lines["options.names"]}\n'
+        )
+        assert roadscan("ingest", tmp_path / "SURVEY.toml").exit_code == 0
+        points = rs.open_survey(tmp_path / "SURVEY.toml").table("control_points")
+        own = points[points.name == "1"].iloc[0]
+        assert (own.easting_m, own.northing_m, own.height_m) == pytest.approx((673450.25, 2736120.40, 648.5), abs=1e-6)
+        assert own.code == "Corner"
 
 
 def test_other_files_say_what_to_do(faults: Path) -> None:

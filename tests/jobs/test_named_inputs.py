@@ -21,7 +21,7 @@ from roadscan.cli import app
         ("pnezd_named.csv", "Ground control and check points as CSV"),
         ("german_semicolon_decimal_comma_bom.csv", "Ground control and check points as CSV"),
         ("track.gpx", "gpsbabel -i gpx -o nmea"),
-        ("ublox_ubx_nmea_mixed.log", "a u-blox recording (UBX)"),
+        ("ublox_ubx_nmea_mixed.log", "u-blox recording (UBX): navigation solutions of NAV-PVT"),
     ],
 )
 def test_inspect_says_what_it_is(faults: Path, file: str, words: str) -> None:

@@ -17,8 +17,6 @@ from roadscan.cli import app
 
 FIRST_GPS_S = 1_461_922_218
 PLACES = {
-    "EPSG:5513": (15.0, 49.8, "EPSG:4156"),
-    "EPSG:2065": (15.0, 49.8, "EPSG:4156"),
     "EPSG:5514": (15.0, 49.8, "EPSG:4156"),
     "EPSG:2225": (-122.0, 41.0, "EPSG:4269"),
     "EPSG:6559": (-121.0, 45.0, "EPSG:6318"),
@@ -62,6 +60,15 @@ def test_products_open_where_the_road_is(tmp_path: Path, crs: str) -> None:
     check_place(crs, *degrees(pyproj.CRS(tiles.crs), crs, middle.x.to_numpy(), middle.y.to_numpy()), 40.0)
 
 
+@pytest.mark.parametrize(("crs", "twin"), [("EPSG:5513", "EPSG:5514"), ("EPSG:2065", "EPSG:5221")])
+def test_a_map_on_which_left_is_right_is_refused(tmp_path: Path, crs: str, twin: str) -> None:
+    """Krovak's southing and westing: roughness of the left wheel path would be that of the right one."""
+    survey = survey_in(tmp_path, crs, *PLACES["EPSG:5514"])
+    done = CliRunner().invoke(app, ["run", str(survey), "--workers", "0"])
+    assert done.exit_code != 0
+    assert "left and right are exchanged" in str(done.exception) and f'map.crs = "{twin}"' in str(done.exception)
+
+
 def degrees(written: pyproj.CRS, crs: str, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Longitude and latitude by the CRS that a product names."""
     return pyproj.Transformer.from_crs(written.to_2d(), PLACES[crs][2], always_xy=True).transform(x, y)
@@ -79,9 +86,8 @@ def check_place(crs: str, lon: np.ndarray, lat: np.ndarray, within_m: float) -> 
     assert along_m.max() < 1.2 + within_m
 
 
-def made(folder: Path, crs: str) -> Path:
-    """The store of a survey of a metre's drive, through the command line."""
-    lon, lat, geographic = PLACES[crs]
+def survey_in(folder: Path, crs: str, lon: float, lat: float, geographic: str) -> Path:
+    """The survey file of a metre's drive."""
     n = 101
     header = "time_s,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"
     lines = [f"{FIRST_GPS_S + 0.01 * k:.2f},{lat + 9e-8 * k:.10f},{lon:.10f},{HEIGHT_M},0,0,0" for k in range(n)]
@@ -108,6 +114,11 @@ sensor = "roof"
 """,
         encoding="utf-8",
     )
-    result = CliRunner().invoke(app, ["run", str(folder / "SURVEY.toml"), "--workers", "0"])
+    return folder / "SURVEY.toml"
+
+
+def made(folder: Path, crs: str) -> Path:
+    """The store of a survey of a metre's drive, through the command line."""
+    result = CliRunner().invoke(app, ["run", str(survey_in(folder, crs, *PLACES[crs])), "--workers", "0"])
     assert result.exit_code == 0, f"{result.output}{result.exception}"
     return folder / "store/survey=s"

@@ -11,6 +11,7 @@ import gzip
 import io
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,37 @@ def test_a_step_is_named_with_its_size_and_all_poses_stay(survey: Path) -> None:
     assert len(rs.open_survey(survey / "SURVEY.toml").table("trajectory")) == 201
 
 
+def test_velocities_that_a_log_states_tell_a_smaller_step(survey: Path) -> None:
+    """Every twentieth pose, at 5 Hz, with the velocities of a spline through all of them."""
+    poses = mended(survey)
+    per_degree = np.array([PER_DEG_M, PER_DEG_M * np.cos(np.radians(poses[0, 1])), -1.0])
+    stated = (CubicSpline(poses[:, 0], poses[:, 1:4] * per_degree).derivative()(poses[:, 0]))[::20]
+    poses = poses[::20]
+    poses[6:, 2] += 0.25 / PER_DEG_M / np.cos(np.radians(poses[0, 1]))
+    names = ",".join((*NAMES, "velocity_north_m_per_s", "velocity_east_m_per_s", "velocity_down_m_per_s"))
+    for columns, named in ((np.column_stack([poses, stated]), True), (poses, False)):
+        header = names if named else ",".join(NAMES)
+        np.savetxt(survey / "t.csv", columns, fmt="%.12f", delimiter=",", header=header, comments="")
+        told = [one["text"] for one in command("ingest", survey)["findings"] if one["witness"] == "pose_step"]
+        assert [("by 0.2" in one) for one in told] == [True] * named
+
+
+@pytest.mark.parametrize("degrees", [9.0, -25.0])
+def test_readings_on_both_sides_of_a_step_of_a_thousand_kilometres_are_placed(survey: Path, degrees: float) -> None:
+    poses = mended(survey)
+    poses[120:, 1] += degrees
+    write_poses(survey, poses)
+    told = command("run", survey, "--workers", "0")
+    ((finding),) = [one for one in told["findings"] if one["witness"] == "pose_step"]
+    assert ("by 1,000,5" if degrees > 0 else "by 2,752,0") in finding["text"]
+    epochs = np.sort(pq.read_table(survey / "r.parquet").column("epoch_gps_ns").to_numpy() / 1e9)
+    sides = [placed_anew(survey, side) for side in (poses[:120], poses[120:])]
+    truth = np.concatenate([sides[0][epochs < poses[119, 0]], sides[1][epochs > poses[120, 0]]])
+    points = points_of(survey)
+    assert len(points) > 740
+    assert cKDTree(truth).query(points)[0].max() < 1.5e-4
+
+
 def test_sound_poses_raise_no_doubt(survey: Path) -> None:
     mended(survey)
     told = command("ingest", survey)
@@ -239,6 +271,52 @@ def test_a_fix_at_null_island_is_left_out(tmp_path: Path, recordings: Path) -> N
     command("ingest", tmp_path)
     ((_, why),) = rejects_of(tmp_path)
     assert "there was no fix" in why
+
+
+def gnss_survey(recordings: Path, folder: Path, move: Callable[[list[list[str]]], None]) -> Path:
+    """400 epochs of a recording of RTK positions, changed."""
+    lines = gzip.decompress((recordings / "drive" / "gnss_rtk.pos.gz").read_bytes()).decode().splitlines()
+    first = next(k for k, line in enumerate(lines) if not line.startswith("%"))
+    words = [line.split() for line in lines[first + 200 : first + 600]]
+    move(words)
+    (folder / "g.pos").write_text("\n".join([*lines[:first], *("  ".join(one) for one in words)]) + "\n")
+    (folder / "SURVEY.toml").write_text(
+        'id = "s"\nstore = "store"\n[map]\ncrs = "EPSG:32613"\n[rig.sensors.antenna]\nkind = "gnss"\n'
+        '[[runs]]\nid = "r"\n[[runs.logs]]\npath = "g.pos"\nsensor = "antenna"\ncrs = "EPSG:4979"\n'
+    )
+    return folder
+
+
+@pytest.mark.witness("gnss_leap")
+@pytest.mark.parametrize(("count", "size_m"), [(1, 1.5), (3, 4.0), (1, 300.0)])
+def test_gnss_positions_that_leap_are_left_out(tmp_path: Path, recordings: Path, count: int, size_m: float) -> None:
+    """An epoch, and three, of a recording at 4 Hz lie elsewhere; its stated σ are kept."""
+
+    def move(words: list[list[str]]) -> None:
+        for one in words[150 : 150 + count]:
+            one[2] = f"{float(one[2]) + size_m / PER_DEG_M:.9f}"
+
+    told = command("ingest", gnss_survey(recordings, tmp_path, move))
+    ((finding),) = told["findings"]
+    assert finding["witness"] == "gnss_leap" and finding["left_out"] == count
+    table = rs.open_survey(tmp_path / "SURVEY.toml").table("rejects")
+    assert int(table["records"].sum()) == count and "leaps away" in table["reason"].iloc[0]
+
+
+def test_gnss_positions_that_step_are_named_and_all_are_used(tmp_path: Path, recordings: Path) -> None:
+    def move(words: list[list[str]]) -> None:
+        for one in words[150:]:
+            one[2] = f"{float(one[2]) + 3.0 / PER_DEG_M:.9f}"
+
+    told = command("ingest", gnss_survey(recordings, tmp_path, move))
+    ((finding),) = told["findings"]
+    assert finding["witness"] == "gnss_leap" and finding["left_out"] == 0 and "step by " in finding["text"]
+    assert len(rs.open_survey(tmp_path / "SURVEY.toml").table("gnss")) == 400
+
+
+def test_a_recording_of_gnss_raises_no_doubt(tmp_path: Path, recordings: Path) -> None:
+    told = command("ingest", gnss_survey(recordings, tmp_path, lambda _: None))
+    assert told["findings"] == [] and len(rs.open_survey(tmp_path / "SURVEY.toml").table("gnss")) == 400
 
 
 def test_two_sites_far_apart_have_a_report(survey: Path) -> None:

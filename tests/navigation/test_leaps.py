@@ -155,3 +155,75 @@ def test_rotation_vectors_are_those_of_scipy() -> None:
     expected = (before.inv() * after).as_rotvec()
     got = rotation_vectors(before.as_quat(scalar_first=True), -after.as_quat(scalar_first=True))
     np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def stated(track: PoseTrack) -> PoseTrack:
+    """The track with the velocities of its positions, as a navigation solution states them."""
+    velocity = np.gradient(track.position_world_m, track.epochs_gps_ns / 1e9, axis=0)
+    return track._replace(velocity_world_m_per_s=velocity)
+
+
+@pytest.mark.parametrize(("hz", "step_m", "without_m"), [(1.0, 2.5, 6.0), (5.0, 0.25, 0.4), (100.0, 0.12, 0.13)])
+@pytest.mark.parametrize("seed", range(4))
+def test_stated_velocities_tell_smaller_leaps(hz: float, step_m: float, without_m: float, seed: int) -> None:
+    """Bursts of one to five poses, and steps, in any direction; larger ones without velocities."""
+    rng = np.random.default_rng(seed)
+    sound = drive(hz)
+    for track, size_m in ((stated(sound), step_m), (sound, without_m)):
+        direction = rng.normal(size=3)
+        direction *= size_m / np.linalg.norm(direction)
+        at, count = int(rng.integers(30, 350)), int(rng.integers(1, 6))
+        burst = find_leaps(moved(track, slice(at, at + count), direction))
+        assert rows_of(burst.position) == list(range(at, at + count))
+        step = find_leaps(moved(track, slice(at, None), direction))
+        assert [one.after for one in step.steps] == [at] and not step.position.any()
+        assert step.steps[0].shift_m == pytest.approx(size_m, abs=0.3 * size_m)
+
+
+@pytest.mark.parametrize("hz", [1.0, 10.0, 100.0])
+def test_a_wrong_velocity_is_no_leap_of_positions(hz: float) -> None:
+    """A velocity that is anywhere, velocities that are zero for a while, and those of another frame."""
+    track = stated(drive(hz))
+    assert track.velocity_world_m_per_s is not None
+    rng = np.random.default_rng(3)
+    for rows, factor in ((slice(120, 121), -3.0), (slice(100, 160), 0.0), (slice(None), 0.0), (slice(None), -1.0)):
+        velocity = track.velocity_world_m_per_s.copy()
+        velocity[rows] *= factor
+        found = find_leaps(track._replace(velocity_world_m_per_s=velocity))
+        assert not found.position.any() and found.steps == ()
+    lost = np.where(rng.random((400, 1)) < 0.5, np.nan, track.velocity_world_m_per_s)
+    assert find_leaps(track._replace(velocity_world_m_per_s=lost)).steps == ()
+
+
+@pytest.mark.parametrize("hz", [1.0, 5.0])
+def test_a_driver_who_brakes_and_swerves_as_hard_as_tyres_hold_leaps_nowhere(hz: float) -> None:
+    """Drawn drives: brakes of up to 9.8 m/s² that begin within 0.1 s, stops, and 8 m/s² to either side."""
+    rng, dt, seconds = np.random.default_rng(11), 0.01, 120
+    t = np.arange(0.0, seconds, dt)
+    for _ in range(25):
+        asked = np.zeros(t.size)
+        at = 0
+        while at < t.size:
+            until = at + int(rng.uniform(0.3, 8.0) / dt)
+            asked[at:until] = rng.choice(
+                [0.0, -9.8, -rng.uniform(2.0, 9.8), rng.uniform(0.5, 4.0)], p=[0.5, 0.1, 0.1, 0.3]
+            )
+            at = until
+        asked = np.convolve(asked, np.ones(10) / 10, "same")
+        speed = np.empty(t.size)
+        now = rng.uniform(5.0, 35.0)
+        for k in range(t.size):
+            now = min(max(0.0, now + asked[k] * dt), 40.0)
+            speed[k] = now
+        turning = np.repeat(rng.uniform(-1.0, 1.0, seconds // 4), 400) * np.minimum(8.0 / np.maximum(speed, 2.0), 0.8)
+        course = np.cumsum(np.convolve(turning, np.ones(30) / 30, "same")) * dt
+        velocity = np.stack([speed * np.cos(course), speed * np.sin(course), 0.0 * t], axis=-1)
+        own = slice(int(rng.integers(int(1 / hz / dt))), None, int(1 / hz / dt))
+        count = t[own].size
+        track = PoseTrack(
+            np.round(t[own] * 1e9).astype(np.int64), np.cumsum(velocity, axis=0)[own] * dt,
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), np.zeros(count), np.zeros(count), True,
+        )  # fmt: skip
+        for one in (track, track._replace(velocity_world_m_per_s=velocity[own])):
+            found = find_leaps(one)
+            assert not found.position.any() and found.steps == ()

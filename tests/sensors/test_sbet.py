@@ -65,6 +65,20 @@ def test_two_real_points(recordings: Path) -> None:
         assert (log.attitudes[i] * (ecef_from_ned * ned).inv()).magnitude() < 1e-12
 
 
+def test_velocities_of_two_real_points_are_those_of_their_positions(recordings: Path) -> None:
+    """Along the axes of the wander frame as the recording has them; the points lie 5 ms apart."""
+    log = read_log(
+        "sbet", recordings / "formats" / "two_points.sbet", clock=Clock(TimeSystem.GPS_WEEK, week=1500), crs="EPSG:4979"
+    )
+    (rows,) = log.rows
+    assert rows.velocity_level_m_per_s is not None
+    stated = rows.velocity_level_m_per_s.astype(np.float64).mean(axis=0)
+    time, latitude, longitude = PUBLISHED[:, 0], PUBLISHED[:, 1], PUBLISHED[:, 2]
+    level = Rotation.from_euler("ZY", [longitude[0], -latitude[0] - math.pi / 2])
+    moved = level.inv().apply(log.positions[1] - log.positions[0]) / (time[1] - time[0])
+    np.testing.assert_allclose(stated, moved, atol=0.03)
+
+
 def test_true_heading_is_platform_heading_less_wander_angle(tmp_path: Path) -> None:
     path = write(tmp_path / "a.sbet", [record(100.0, heading=1.0, wander=0.4), record(101.0, heading=0.6, wander=0.0)])
     turned, straight = read_log("sbet", path, **STATED).attitudes

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_faults import WrongPoint, listed, swapped
-from roadscan.adjust.control_test import HEIGHT, PLACE, AppliedOffset, ControlVerdict
+from roadscan.adjust.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict
 from roadscan.adjust.process import RunPrior
 from roadscan.model.witness import Finding, Witness
 
@@ -168,15 +168,34 @@ def offset_findings(verdict: ControlVerdict, applied: AppliedOffset, points: int
     return found
 
 
-def offset_line(verdict: ControlVerdict) -> str:
+def offset_line(verdict: ControlVerdict, applied: AppliedOffset) -> str:
     """How well control and poses agree as a whole, and which offset would have passed unseen; "" without control."""
+    known = datum_figures(verdict, applied)
     parts = [
         f"{_offset(verdict, name)} ± {1e3 * verdict.offset.sigma_m(name):.1f} mm in {name} (an offset is found four "
-        f"times of five from {1e3 * verdict.detectable_m[name]:.0f} mm on)"
+        f"times of five from {1e3 * verdict.detectable_m[name]:.0f} mm on; σ of the tiles is against the control, of "
+        f"which the poses confirm the datum to {1e3 * known[name][1]:.0f} mm)"
         for name in (HEIGHT, PLACE)
-        if np.isfinite(verdict.offset.sigma_m(name))
+        if name in known
     ]
     return f"control against the poses as a whole: {', '.join(parts)}" if parts else ""
+
+
+def datum_figures(verdict: ControlVerdict, applied: AppliedOffset) -> dict[str, tuple[float, float]]:
+    """Poses minus control as a whole (m; of a place its length), and 1 σ (m) of the datum, by component that is known.
+
+    What poses say of an offset that nobody knew before is its size with their σ: its mean square is the sum of both
+    squares. Where the poses are followed, or the control is not used, it is their σ alone.
+    """
+    found = {}
+    for name, axes in COMPONENTS.items():
+        sigma = verdict.offset.sigma_m(name)
+        if np.isfinite(sigma):
+            offset = verdict.offset.offset_m[list(axes)]
+            size = float(offset[0]) if name == HEIGHT else float(np.hypot(*offset))
+            by_poses = name in (*applied.estimated, *applied.refused)
+            found[name] = size, sigma if by_poses else float(np.hypot(size, sigma))
+    return found
 
 
 def _offset(verdict: ControlVerdict, component: str) -> str:

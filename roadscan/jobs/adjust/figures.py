@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.control import Sighting, moved_m
+from roadscan.adjust.control_test import HEIGHT
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
@@ -193,6 +194,16 @@ def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
         found.append(_accuracy("left_out", "height", "adjusted", left.vertical))
     if left is not None and left.horizontal is not None:
         found.append(_accuracy("left_out", "horizontal", "adjusted", left.horizontal))
+    control = {one.point.number for one in evidence.sightings if one.point.role == "gcp"}
+    for name, (away, sigma) in solution.datum.items():
+        found.append(
+            {
+                "points": "datum", "component": "height" if name == HEIGHT else "horizontal", "poses": "adjusted",
+                "count": len(control),
+                "mean_m": away, "mean_absolute_m": abs(away), "rmse_m": sigma, "largest_m": None, "nssda_95_m": None,
+                "asprs_rmse_m": None,
+            }
+        )  # fmt: skip
     return found
 
 

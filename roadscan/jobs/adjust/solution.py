@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ from roadscan.jobs.adjust.doubts import (
     CONTROL,
     CONTROL_DATUM,
     HELMERT_TURN,
+    datum_figures,
     exchanged,
     far_points,
     not_held,
@@ -108,6 +109,8 @@ class Solution:
     lines: tuple[str, ...]
     """What the solution says of itself."""
     left_out: LeaveOneOut | None = None
+    datum: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Poses minus control as a whole, and 1 σ of the datum (m): see :func:`datum_figures`."""
     mountings: MountingErrors | None = None
     """What is wrong with the mountings of the sensors; None where they are not estimated."""
 
@@ -197,12 +200,13 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
     lines = [
         solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
-        time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict),
+        time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict, adjusted.applied),
         power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
     ]  # fmt: skip
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
         leave_one_out(adjusted.control) if adjusted.control.place.size else None,
+        datum_figures(adjusted.verdict, adjusted.applied),
         adjusted.mountings if adjusted.mountings.sensors else None,
     )  # fmt: skip
 
@@ -351,7 +355,7 @@ def _rigid_solution(
         )  # fmt: skip
     return Solution(
         corrections, np.zeros(evidence.ties.observations.size), points, control, tuple(found),
-        tuple(line for line in (offset_line(adjusted.verdict),) if line), leave_one_out(fit.control),
+        tuple(line for line in (offset_line(adjusted.verdict, adjusted.applied),) if line), leave_one_out(fit.control),
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
-from roadscan.jobs.ingest.pose_checks import PoseRecords, check_poses
+from roadscan.jobs.ingest.pose_checks import FIXES, POSES, PoseRecords, check_poses
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
@@ -155,9 +155,10 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
         _take(writer, item, header, poses, order)
     writer.findings += [*order.findings(), *([found] if (found := repeats.finding()) else [])]
     writer.finish()
-    if writer.rows["trajectory"]:
-        check_poses(writer, str(header.attributes["world_frame"]), poses)
-        writer.finish()
+    for table in (POSES, FIXES):
+        if writer.rows[table]:
+            check_poses(writer, table, str(header.attributes["world_frame"]), poses)
+            writer.finish()
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header

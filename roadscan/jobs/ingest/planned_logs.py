@@ -11,6 +11,7 @@ from roadscan.jobs.engine.fingerprint import grid_key, key_of
 from roadscan.jobs.ingest.clock_pairs import log_clock
 from roadscan.jobs.ingest.place_checks import PLACED
 from roadscan.jobs.ingest.place_checks import VERSION as PLACE_CHECKS
+from roadscan.jobs.ingest.pose_checks import FIXES, POSES
 from roadscan.jobs.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.jobs.ingest.sources import Known, Sources, open_sources
 from roadscan.model.errors import ConfigError, RoadscanError
@@ -164,19 +165,28 @@ def _plan_log(
     ]  # fmt: skip
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     key = key_of(*shaping, *_checks_of(format_))
-    if not path.exists() and has_log(store, unchecked := key_of(*shaping)) and not has_log(store, key):
-        key = unchecked  # it was archived after it was read, before there were these checks: its rows stay
+    if not path.exists() and not has_log(store, key):
+        # It was archived after it was read, before there were these checks: its rows stay.
+        earlier = (key_of(*shaping, *checks) for checks in _earlier_checks(format_))
+        key = next((one for one in earlier if has_log(store, one)), key)
     return PlannedLog(run, name, config, format_, source, key, content, size, stamp)
 
 
 def _checks_of(format_: LogFormat) -> list[list[object]]:
     """Versions of the checks that leave out rows of a format: part of the key of its logs."""
     found: list[list[object]] = []
-    if "trajectory" in format_.yields:
+    if {POSES, FIXES} & set(format_.yields):
         found.append(["poses", POSE_CHECKS])
     if set(PLACED) & set(format_.yields):
         found.append(["places", PLACE_CHECKS])
     return found
+
+
+def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
+    """What :func:`_checks_of` was in earlier versions, the latest first."""
+    first: list[list[object]] = [["poses", 1]] if POSES in format_.yields else []
+    first += [["places", 1]] if set(PLACED) & set(format_.yields) else []
+    return [first, []]
 
 
 def log_source(

@@ -22,7 +22,7 @@ class Charts(NamedTuple):
     lattice: tuple[float, ...]
     """(4,) edge of a box (m), and the indices of the first box along the world's x, y and z."""
     table: npt.NDArray[np.int32]
-    """(nx, ny, nz) chart of each box, −1 where none was made."""
+    """(nx, ny, nz) chart of each box, its indices modulo the shape; −1 where none was made."""
     centres_world_m: npt.NDArray[np.float64]
     """(c, 3) centres of the boxes."""
     coefficients: npt.NDArray[np.float64]
@@ -40,11 +40,19 @@ def box_of(px, py, pz, lattice):
 
 
 @inlined
-def chart_index(box, table):
-    """Chart of a box, −1 where none was made; table : of :class:`Charts`."""
+def chart_index(box, lattice, table, centres):
+    """Chart of a box, −1 where none was made; lattice, table, centres : of :class:`Charts`."""
     x, y, z = box
-    inside = 0 <= x < table.shape[0] and 0 <= y < table.shape[1] and 0 <= z < table.shape[2]
-    return table[x, y, z] if inside else np.int32(-1)
+    chart = table[x % table.shape[0], y % table.shape[1], z % table.shape[2]]
+    if chart < 0:
+        return chart
+    edge = lattice[0]
+    own = (
+        abs((x + lattice[1] + 0.5) * edge - centres[chart, 0]) <= 0.5 * edge
+        and abs((y + lattice[2] + 0.5) * edge - centres[chart, 1]) <= 0.5 * edge
+        and abs((z + lattice[3] + 0.5) * edge - centres[chart, 2]) <= 0.5 * edge
+    )
+    return chart if own else np.int32(-1)
 
 
 @inlined

@@ -54,7 +54,7 @@ def profile_forms(epoch, k, georeference):
     c = interval(poses.coefficients, k)
     u = (epoch - poses.knots[k]) / (poses.knots[k + 1] - poses.knots[k])
     px, py, pz = position_at(c, u)
-    chart = chart_index(box_of(px, py, pz, charts.lattice), charts.table)
+    chart = chart_index(box_of(px, py, pz, charts.lattice), charts.lattice, charts.table, charts.centres_world_m)
     if chart < 0:
         return False, NO_FORMS
     r = attitude_at(c, u)

@@ -148,8 +148,8 @@ def stretch(k, since, until, arm, step_m, bend_m, poses, motion):
 @inner
 def chart_near(px, py, pz, within, charts):
     """Chart of a world position, or of one `within` metres along the axes; −1 where there is none."""
-    lattice, table = charts.lattice, charts.table
-    chart = chart_index(box_of(px, py, pz, lattice), table)
+    lattice, table, centres = charts.lattice, charts.table, charts.centres_world_m
+    chart = chart_index(box_of(px, py, pz, lattice), lattice, table, centres)
     for corner in range(8):
         if chart < 0:
             chart = chart_index(
@@ -159,7 +159,9 @@ def chart_near(px, py, pz, within, charts):
                     pz + (within if corner & 4 else -within),
                     lattice,
                 ),
+                lattice,
                 table,
+                centres,
             )
     return chart
 

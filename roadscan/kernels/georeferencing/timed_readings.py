@@ -102,7 +102,7 @@ def pose_step(epoch, k, georeference, nodes, motion):
         begin = np.float64(number * length)
         c = interval(coefficients, k)
         px, py, pz = position_at(c, (begin + 0.5 * length) / gap)
-        chart = np.int64(chart_index(box_of(px, py, pz, lattice), table))
+        chart = np.int64(chart_index(box_of(px, py, pz, lattice), lattice, table, centres))
         if chart >= 0:
             height_chart = expansion(charts, chart, 2)
             for a in range(4):

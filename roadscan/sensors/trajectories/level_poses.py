@@ -41,6 +41,14 @@ SIGMAS: Final = (
 ANGLE_SIGMAS: Final = tuple(Quantity(f"sigma_{q.name}", "angle", optional=True) for q in ATTITUDE)
 
 
+VELOCITIES: Final = (
+    Quantity("velocity_north", "speed", ("vn", "v_north"), optional=True),
+    Quantity("velocity_east", "speed", ("ve", "v_east"), optional=True),
+    Quantity("velocity_down", "speed", ("vd", "v_down"), optional=True),
+    Quantity("velocity_up", "speed", ("vu", "v_up"), optional=True),
+)
+
+
 def position_of(crs: str) -> tuple[Quantity, ...]:
     """The three quantities of a position in a CRS, two horizontal ones first."""
     if crs == LOCAL_WORLD:
@@ -49,8 +57,8 @@ def position_of(crs: str) -> tuple[Quantity, ...]:
 
 
 def pose_quantities(crs: str) -> tuple[Quantity, ...]:
-    """All quantities of a pose in a CRS but its time: position, attitude and their σ."""
-    return (*position_of(crs), *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS)
+    """All quantities of a pose in a CRS but its time: position, attitude, their σ, and velocity."""
+    return (*position_of(crs), *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS, *VELOCITIES)
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,13 @@ def level_poses(
         with np.errstate(over="ignore"):
             return number(found.column) * found.scale
 
+    def velocity() -> Float64 | None:
+        north, east, down, up = (quantity(q.name) if q.name in columns else None for q in VELOCITIES)
+        down = -up if down is None and up is not None else down
+        if north is None or east is None:
+            return None
+        return np.stack([north, east, np.full_like(north, np.nan) if down is None else down])
+
     roll, pitch, heading = (quantity(q.name) for q in ATTITUDE)
     check_rph(roll, pitch, heading, sieve)
     with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
@@ -93,4 +108,5 @@ def level_poses(
         attitude=attitude,
         sigmas={f"{q.name}_m": quantity(q.name) for q in SIGMAS if q.name in columns}
         | {f"{q.name}_deg": np.degrees(quantity(q.name)) for q in ANGLE_SIGMAS if q.name in columns},
+        velocity=velocity(),
     )

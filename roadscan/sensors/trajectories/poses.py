@@ -387,6 +387,8 @@ class RawPoses:
     """(4, n) unit quaternions."""
     sigmas: dict[str, Float64]
     """1 σ of position (m) and attitude (degrees) by column name, (n,) with NaN where missing."""
+    velocity: Float64 | None = None
+    """(3, n) stated velocity north, east, down in m/s, NaN where missing; None where the log has none."""
 
 
 class BlockPlacer:
@@ -432,8 +434,9 @@ class BlockPlacer:
 
 
 def block_rows(
-    table: str, columns: Mapping[str, pa.Array], records: Int64, offsets: Int64, record_bytes: int = 0
-) -> Rows:
+    table: str, columns: Mapping[str, pa.Array], records: Int64, offsets: Int64, record_bytes: int = 0,
+    velocity: Float64 | None = None,
+) -> Rows:  # fmt: skip
     """Rows of the sound records of a block.
 
     Parameters
@@ -441,8 +444,11 @@ def block_rows(
     columns : by name, of n values each.
     records, offsets : (n,) record numbers, growing, and byte offsets (−1 without any).
     record_bytes : bytes from one record to the next, 0 where it varies.
+    velocity : (3, n) north, east, down in m/s.
     """
     unbroken = int(records[-1] - records[0]) == records.size - 1
+    with np.errstate(over="ignore"):  # of damaged records: such a velocity is no witness
+        beside = None if velocity is None else np.ascontiguousarray(velocity.T, dtype=np.float32)
     return Rows(
         table,
         pa.record_batch(dict(columns)),
@@ -450,6 +456,7 @@ def block_rows(
         first_offset=int(offsets[0]),
         record_bytes=record_bytes if unbroken else 0,
         records=None if unbroken else records,
+        velocity_level_m_per_s=beside,
     )
 
 
@@ -510,7 +517,8 @@ class PoseReader:
             sigmas |= self._accuracy(epochs)
         for name, sigma in sigmas.items():
             arrays[name] = pa.array(sigma.astype(np.float32), from_pandas=True)  # NaN becomes null
-        return block_rows("trajectory", arrays, raw.records[good], raw.offsets[good], self._record_bytes)
+        velocity = None if raw.velocity is None else raw.velocity[:, good]
+        return block_rows("trajectory", arrays, raw.records[good], raw.offsets[good], self._record_bytes, velocity)
 
 
 def unit_quaternions(quaternion: Float64, sieve: Sieve) -> Float64:

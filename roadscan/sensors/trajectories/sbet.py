@@ -37,9 +37,10 @@ RECORD_BYTES: Final = 8 * FIELDS
 CHUNK_RECORDS: Final = 16_384
 """Records read at once: their columns stay in the processor's cache."""
 
-# Field numbers of a record. Velocities (4–6), accelerations (11–13) and rates (14–16) are not used.
+# Field numbers of a record. Accelerations (11–13) and rates (14–16) are not used.
 TIME, LATITUDE, LONGITUDE, HEIGHT, ROLL, PITCH, PLATFORM_HEADING, WANDER = 0, 1, 2, 3, 7, 8, 9, 10
-_USED: Final = [TIME, LATITUDE, LONGITUDE, HEIGHT, ROLL, PITCH, PLATFORM_HEADING, WANDER]
+VELOCITY: Final = (4, 5, 6)
+_USED: Final = [TIME, LATITUDE, LONGITUDE, HEIGHT, ROLL, PITCH, PLATFORM_HEADING, WANDER, *VELOCITY]
 
 _LIMITS: Final = np.array(
     [2 * WEEK_S, math.pi / 2, 2 * math.pi, HEIGHT_MAX_M]  # time, latitude, longitude, height
@@ -63,9 +64,9 @@ class SbetOptions(Strict):
 class Sbet(LogFormat):
     """Little-endian records of 17 doubles without a header.
 
-    Time (s), latitude, longitude (rad), ellipsoidal height (m), velocity in the wander frame, roll,
-    pitch, platform heading, wander angle (rad), acceleration, angular rate. True heading = platform
-    heading − wander angle. Body axes are forward, right, down.
+    Time (s), latitude, longitude (rad), ellipsoidal height (m), velocity in the wander frame (x north,
+    y west, z up at wander angle 0), roll, pitch, platform heading, wander angle (rad), acceleration, angular
+    rate. True heading = platform heading − wander angle. Body axes are forward, right, down.
     """
 
     name = "sbet"
@@ -133,7 +134,7 @@ def _items(
         if isinstance(fields, Reject):
             yield fields
             continue
-        time, latitude, longitude, height, roll, pitch, platform_heading, wander = fields
+        time, latitude, longitude, height, roll, pitch, platform_heading, wander, *velocity = fields
         with np.errstate(invalid="ignore", over="ignore"):
             heading = platform_heading - wander
         sieve = Sieve(time.size)
@@ -148,12 +149,20 @@ def _items(
             position=np.stack([longitude, latitude, height]),
             attitude=attitude,
             sigmas={},
+            velocity=_level_velocity(wander, *velocity),
         )
         yield from reader.items(raw, sieve)
         if accuracy is not None:
             yield from accuracy.rejects()
     if accuracy is not None:
         yield from accuracy.finish()
+
+
+def _level_velocity(wander_rad: Float64, x: Float64, y: Float64, z: Float64) -> Float64:
+    """(3, n) north, east, down of velocities along the axes of the wander frame: x, y to the left of it, z up."""
+    with np.errstate(invalid="ignore", over="ignore"):  # infinities of damaged records
+        cosine, sine = np.cos(wander_rad), np.sin(wander_rad)
+        return np.stack([cosine * x - sine * y, -sine * x - cosine * y, -z])
 
 
 def _reader(source: LogSource, accuracy: CarriedAccuracy | None) -> PoseReader:

@@ -37,7 +37,7 @@ class TrajectoryCsvOptions(TextOptions):
     columns: dict[str, ColumnOption] = {}
     """Which column holds which quantity, where its name does not say so: time; longitude, latitude,
     height, or easting, northing, height; roll, pitch, heading; sigma_north, sigma_east, sigma_down;
-    sigma_roll, sigma_pitch, sigma_heading.
+    sigma_roll, sigma_pitch, sigma_heading; velocity_north, velocity_east, velocity_down or velocity_up.
     For example { latitude = { name = "Lat", unit = "deg" } }."""
     heading: North | None = None
     """North that the heading is counted from, clockwise: "true" or "grid". Needed for a projected CRS;

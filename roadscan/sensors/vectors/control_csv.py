@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final
@@ -12,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.model.crs import crs_from_text
+from roadscan.model.errors import FormatError, Missing
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.columns import ColumnOption, Found, Quantity, find_columns, fits
 from roadscan.sensors.records import options_of
 from roadscan.sensors.text_table import Kind, TextBlock, TextLayout, TextOptions, sniff_layout, text_blocks, text_layout
+from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
 from roadscan.sensors.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
 
 Float64 = npt.NDArray[np.float64]
@@ -37,6 +39,12 @@ SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),
     Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),
 )
+PNEZD: Final = ["point", "northing", "easting", "elevation_m", "description"]
+PENZD: Final = ["point", "easting", "northing", "elevation_m", "description"]
+"""The customary columns of surveyors' files, which no line names. The unit of heights is a proposal for the user."""
+_EASTINGS_M: Final = (1e5, 1e6)
+"""Eastings of UTM and of most national grids; northings are beyond, from 9 km off the equator on."""
+_LEAST_GRID_M: Final = 1e3
 _NOT_CONTROL: Final = ("roll", "pitch", "heading", "qw", "r11", "gpstime", "timestamp")
 
 
@@ -67,7 +75,8 @@ class ControlCsv(LogFormat):
     Columns are found by names that carry the unit (``easting_m``, ``height_m``, ``latitude_deg``).
     Columns called just easting, northing, longitude or latitude are in the unit of the stated CRS;
     so is a height, where the CRS has a height axis or is a local frame. The words of surveyors are known, too:
-    point, elevation and description; Punkt, Rechtswert, Hochwert and Höhe.
+    point, elevation and description; Punkt, Rechtswert, Hochwert and Höhe. Where no line names the columns (PNEZD:
+    point, northing, easting, elevation, description), options.names states their order.
     """
 
     name = "control_csv"
@@ -80,6 +89,8 @@ class ControlCsv(LogFormat):
     def sniff(self, path: Path) -> bool:
         """True if there are names and positions, and neither attitude nor time."""
         layout = sniff_layout(path)
+        if layout is not None and _nameless(layout.names) is not None:
+            return True
         if layout is None or any(stem in name.lower() for name in layout.names for stem in _NOT_CONTROL):
             return False
         plain = ("longitude", "latitude", "easting", "northing", "height")
@@ -111,11 +122,46 @@ def _plan(source: LogSource) -> _Plan:
     frame = ControlFrame.of(source)
     position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
     layout = text_layout(source.path, options)
+    if options.names is None and (proposed := _nameless(layout.names)) is not None:
+        orders = [order[: len(layout.names)] for order in (PNEZD, PENZD)]
+        raise FormatError(
+            f"no line names the columns; the first is {', '.join(layout.names)}",
+            expected="point, northing, easting, elevation and description, or easting first",
+            change="state the order, and the unit of heights (elevation_m or elevation_ft), in options.names",
+            file=source.path,
+            missing=Missing("options.names", proposed or None, tuple(orders)),
+        )
     columns = find_columns(
         (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, _units(frame)
     )
     need_role("role" in columns, options.role, source.path)
     return _Plan(layout, columns, frame, options.role or "")
+
+
+def _nameless(first: Sequence[str]) -> list[str] | None:
+    """Names of the columns of a surveyors' file whose first line is a point; [] where their order is not clear.
+
+    None of any other file. A point is a name, two lengths of a grid, a height, and words or nothing.
+    """
+    if not 4 <= len(first) <= 5 or _number(first[0].strip()) % 1.0 > 0.0:
+        return None
+    one, other, height = (_number(word) for word in first[1:4])
+    is_grid = all(_LEAST_GRID_M < abs(value) < GRID_MAX_M for value in (one, other))
+    is_described = len(first) == 5 and any(letter.isalpha() for letter in first[4]) and math.isnan(_number(first[4]))
+    if not is_grid or not HEIGHT_MIN_M < height < HEIGHT_MAX_M or not is_described:
+        return None
+    low, high = _EASTINGS_M
+    if abs(one) > high and low <= abs(other) < high:
+        return PNEZD[: len(first)]
+    return PENZD[: len(first)] if abs(other) > high and low <= abs(one) < high else []
+
+
+def _number(word: str) -> float:
+    """A number as it is written, NaN for other words."""
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def _units(frame: ControlFrame) -> dict[str, float]:

@@ -25,7 +25,7 @@ _FEWEST_RMSE: Final = 3
 """With fewer, an RMSE has no σ of its own that is worth stating."""
 _ODD_SIGMAS: Final = 3.0
 """A residual of more σ than this is named."""
-_NAMES: Final = {"check": "check points", "left_out": "each GCP left out"}
+_NAMES: Final = {"check": "check points", "left_out": "each GCP left out", "datum": "all GCPs against the poses"}
 
 Rows = Sequence[dict[str, Any]]
 
@@ -81,15 +81,15 @@ def _of_target(store: Store, path: str) -> str:
 def _accuracy(rows: Rows) -> Iterator[Table | Paragraph]:
     if not rows:
         return
-    is_statement = any(r["count"] >= NSSDA_CHECK_POINTS for r in rows)
+    is_statement = any(r["count"] >= NSSDA_CHECK_POINTS for r in rows if r["points"] != "datum")
     yield Table(
         ("points", "component", "poses", "count", "mean", "mean absolute", "RMSE",
          *(["95 % (NSSDA)"] if is_statement else []), "largest"),
         [
             (
                 _NAMES[r["points"]], r["component"], r["poses"], f"{r['count']:,}", _mm(r["mean_m"]),
-                _mm(r["mean_absolute_m"]), _rmse(r["rmse_m"], r["count"]),
-                *([_mm(r["nssda_95_m"]) if r["count"] >= NSSDA_CHECK_POINTS else "–"] if is_statement else []),
+                _mm(r["mean_absolute_m"]), _rmse(r["rmse_m"], r["count"] if r["points"] != "datum" else 0),
+                *([_mm(r["nssda_95_m"] if r["count"] >= NSSDA_CHECK_POINTS else None)] if is_statement else []),
                 _mm(r["largest_m"]),
             )
             for r in sorted(rows, key=lambda r: (r["points"], r["component"], r["poses"] != "recorded"))

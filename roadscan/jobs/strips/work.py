@@ -24,6 +24,7 @@ from roadscan.jobs.readings import Ground, Placer, RawSlice, TrajectorySource, g
 from roadscan.jobs.session import Session
 from roadscan.jobs.strips.lag import Lag, lag_of
 from roadscan.jobs.strips.strip import HALF_WIDTH_M, Strip, Way
+from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.ids import TileId
 from roadscan.tables.logs import DataFile
@@ -82,7 +83,7 @@ class StripTask:
 
 def compare_strips(session: Session, manifest: Manifest) -> list[tuple[str, str]]:
     """Compare the sensors on some stretches of each run where that was not done; returns what failed."""
-    tasks = list(_tasks(session))
+    tasks = list(_tasks(session)) if manifest.of(FOOTPRINTS) else []
     manifest.remove(manifest.beside([PRODUCT], {task.unit for task in tasks}))
     stale = [task for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
     failed = run_bundles(
@@ -94,14 +95,19 @@ def compare_strips(session: Session, manifest: Manifest) -> list[tuple[str, str]
 def _tasks(session: Session) -> Iterator[StripTask]:
     plan, code = session.plan, code_digest(f"{__name__}:compare_strip")
     files = {one.path: one for _, own in plan.sources for one in own}
-    runs = sorted({s.run for s, _ in plan.sources if s.trajectory is not None})
+    by_run: dict[str, list[RawSlice]] = defaultdict(list)
+    trajectories: dict[str, TrajectorySource] = {}
+    for one in plan.slices():
+        if one.source.trajectory is not None and one.spans:
+            by_run[one.source.run].append(one)
+            trajectories[one.source.run] = one.source.trajectory
+    runs = sorted(by_run)
     for place, run in enumerate(runs):
-        own = [one for one in plan.slices() if one.source.run == run and one.spans]
-        poses = next((one.source.trajectory for one in own), None)
-        sigma_m = (0.0, 0.0) if poses is None else _sigma(plan, poses)
-        for number, (first, last) in enumerate(_stretches(own) if own else ()):
-            way = None if poses is None else _way(plan.store, plan.ground, poses, (first, last))
-            if poses is None or way is None:
+        own, poses = by_run[run], trajectories[run]
+        sigma_m = _sigma(plan, poses)
+        for number, (first, last) in enumerate(_stretches(own)):
+            way = _way(plan.store, plan.ground, poses, (first, last))
+            if way is None:
                 continue
             pad = first - _PAD_NS, last + _PAD_NS
             slices = [near for one in own if (near := _within(one, files[one.file], pad))]
@@ -159,6 +165,8 @@ def _within(one: RawSlice, file: DataFile, span: tuple[int, int]) -> RawSlice | 
 
 def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
     """Row groups of some runs that may touch the tiles along a way."""
+    if not runs:
+        return []
     tiles, size_m = session.tiles, session.survey.config.tiles.size_m
     corners = np.floor(np.stack([way.easting_m, way.northing_m], axis=-1) / size_m).astype(np.int64)
     around = {TileId(c + i, r + k) for c, r in np.unique(corners, axis=0).tolist() for i in _BESIDE for k in _BESIDE}

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from roadscan.jobs.strips.lag import Lag
 from roadscan.jobs.strips.whose import Blamed, Difference, End, Suspect, whose
 from roadscan.jobs.strips.work import PRODUCT, Pair, SeenBy
 from roadscan.model.gpstime import iso_from_gps_ns
@@ -50,9 +51,11 @@ _LEAST_READINGS: Final = 1000
 _LEAST_PLACED: Final = 0.05
 """A profiler of which fewer readings have a return within its range looks elsewhere, or is covered."""
 _LEAST_ON_ROAD: Final = 0.05
-"""Readings beside the way of which fewer lie below the body's origin are of no road."""
+"""Readings beside the way of which fewer lie at heights of a road are of no road."""
 _LEVEL_M: Final = 0.3
 """Levels of the road differ by less between sensors of one vehicle: crowns, kerbs, springs."""
+_LEVEL_SHARE: Final = 0.2
+"""A lidar of whose readings beside the way fewer lie at one level sees no ground at all."""
 _ASTRAY: Final = 0.02
 """Share of a profiler's readings that lie more than 0.1 m off their cell: spray and dust are fewer. A lidar also sees
 parts of the vehicle, and people beside it."""
@@ -110,7 +113,15 @@ def strip_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Fin
         found += _scattered(stretches, set(blind), names)
     speed = float(np.median([one.speed_m_per_s for one in stretches])) if stretches else 0.0
     shifts = whose(list(_shifts(stretches, set(blind))), _SHIFT_M)
-    return [*found, *(_finding(ALONG_TRAVEL, one, names, lambda blamed: _shift_words(blamed, speed)) for one in shifts)]
+    far = [lag for one in stretches for pair in one.pairs for lag in pair.lags if abs(lag.lag_m) > _SHIFT_M]
+    repeats = any(lag.repeats for lag in far)
+    return [
+        *found,
+        *(
+            _finding(ALONG_TRAVEL, one, names, lambda blamed: _shift_words(blamed, speed, repeats=repeats))
+            for one in shifts
+        ),
+    ]
 
 
 def _stretch(figures: Mapping[str, Any]) -> _Stretch:
@@ -120,8 +131,12 @@ def _stretch(figures: Mapping[str, Any]) -> _Stretch:
         tuple(figures["sigma_m"]),
         figures["speed_m_per_s"],
         sensors,
-        tuple(Pair(**one) for one in figures["pairs"]),
+        tuple(map(_pair, figures["pairs"])),
     )
+
+
+def _pair(figures: Mapping[str, Any]) -> Pair:
+    return Pair(**{**figures, "lags": tuple(Lag(*lag) for lag in figures["lags"])})
 
 
 # --- no road --------------------------------------------------------------------------------------------
@@ -132,9 +147,10 @@ def _blind(seen: Mapping[tuple[str, str], Sequence[SeenBy]]) -> Iterator[tuple[t
     for log, own in seen.items():
         given, placed = sum(s.given for s in own), sum(s.placed for s in own)
         beside, readings = sum(s.beside for s in own), sum(s.readings for s in own)
-        if given < _LEAST_READINGS:
-            continue
-        if placed < _LEAST_PLACED * given:
+        is_profiler = own[0].is_profiler
+        if given < _LEAST_READINGS or not (is_profiler or max(s.level_share for s in own) > _LEVEL_SHARE):
+            continue  # a lidar may be there to see façades
+        if is_profiler and placed < _LEAST_PLACED * given:
             yield (
                 log,
                 (
@@ -142,7 +158,7 @@ def _blind(seen: Mapping[tuple[str, str], Sequence[SeenBy]]) -> Iterator[tuple[t
                     "looks elsewhere, is covered, or range_min_m and range_max_m are wrong"
                 ),
             )
-        elif readings < _LEAST_ON_ROAD * beside or (beside < _LEAST_READINGS and any(levels[o] for o in levels)):
+        elif readings < _LEAST_ON_ROAD * beside or (is_profiler and beside < _LEAST_READINGS):
             above = [-s.below_m for s in own if s.below_m is not None]
             where = (
                 f"most of them {np.median(above):+.2f} m above the body's origin" if above else "none beside the way"
@@ -257,17 +273,18 @@ def _height_words(one: Blamed) -> str:
 
 def _shifts(stretches: Sequence[_Stretch], blind: set[tuple[str, str]]) -> Iterator[Difference]:
     for one, pair in _of_seeing(stretches, blind):
-        for shift_m, sigma_m, _ in pair.lags:
+        for lag in pair.lags:
             ends = _ends(one, pair, by_way=True)
-            yield Difference(ends, shift_m, sigma_m, _of_poses(stretches, ends, 0))
+            yield Difference(ends, lag.lag_m, lag.sigma_m, _of_poses(stretches, ends, 0))
 
 
-def _shift_words(one: Blamed, speed_m_per_s: float) -> str:
+def _shift_words(one: Blamed, speed_m_per_s: float, *, repeats: bool) -> str:
+    more = "; marks repeat there, and the least shift is told" if repeats else ""
     return (
         f"readings lie {one.value:+.3f} m (σ {one.sigma:.3f} m) along the travel from where the other sensors and runs "
         f"have the same road, by {one.support} comparisons of heights and intensities: their stamps are "
         f"{1e3 * one.value / speed_m_per_s:+.1f} ms late against the poses at {speed_m_per_s:.1f} m/s, or their place "
-        "along the travel is off (lever arm, boresight pitch)"
+        f"along the travel is off (lever arm, boresight pitch){more}"
     )
 
 

@@ -35,6 +35,8 @@ class Lag(NamedTuple):
     sigma_m: float
     likeness: float
     """Correlation at this lag."""
+    repeats: bool
+    """True where another lag is about as likely: dashes of paint repeat, and the least lag was taken."""
 
 
 def lag_of(one: Float64, other: Float64) -> Lag | None:
@@ -59,7 +61,8 @@ def lag_of(one: Float64, other: Float64) -> Lag | None:
     scale = (_BLOCKS - 1) / np.sqrt(_BLOCKS)
     if abs(at) > ALONG_M and rises.mean() < _SIGMAS * scale * rises.std():
         return None  # as alike where it is as elsewhere
-    return Lag(at, float(np.hypot(scale * places.std(), _LEAST_SIGMA_M)), float(np.nanmax(whole)))
+    sigma_m = float(np.hypot(scale * places.std(), _LEAST_SIGMA_M))
+    return Lag(at, sigma_m, float(np.nanmax(whole)), _summits(whole).size > 1)
 
 
 def _sharp(picture: Float64, width: int) -> Float64:
@@ -99,13 +102,19 @@ def _likeness(sums: Float64) -> Float64:
     return np.where(sums[:, 0] >= _LEAST_CELLS, (ab - a * b / n) / spread, np.nan)
 
 
+def _summits(likeness: Float64) -> npt.NDArray[np.int64]:
+    """Places of the summits that are about as high as the highest."""
+    padded = np.pad(np.nan_to_num(likeness, nan=-1.0), 1, constant_values=-1.0)
+    is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    return np.flatnonzero(is_top & (padded[1:-1] >= _EQUAL * padded.max()))
+
+
 def _summit(likeness: Float64) -> float:
     """Lag (m) of the summit nearest to none of those that are about the highest, between the cells by a parabola."""
-    padded = np.pad(np.nan_to_num(likeness, nan=-1.0), 1, constant_values=-1.0)
-    is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]) & (padded[1:-1] >= _EQUAL * padded.max())
     middle = likeness.size // 2
-    k = min(np.flatnonzero(is_top).tolist(), key=lambda step: abs(step - middle))
-    before, top, after = padded[k : k + 3]
+    k = min(_summits(likeness).tolist(), key=lambda step: abs(step - middle))
+    if not 0 < k < likeness.size - 1:
+        return float((k - middle) * ALONG_M)
+    before, top, after = np.nan_to_num(likeness[k - 1 : k + 2], nan=-1.0)
     bend = before - 2 * top + after
-    between = (before - after) / (2 * bend) if bend < 0.0 and 0 < k < likeness.size - 1 else 0.0
-    return float((k - middle + between) * ALONG_M)
+    return float((k - middle + ((before - after) / (2 * bend) if bend < 0.0 else 0.0)) * ALONG_M)

@@ -22,7 +22,9 @@ COLUMNS: Final = round(2 * HALF_WIDTH_M / ACROSS_M)
 _VERTEX_M: Final = 0.5
 """Vertices of the way: within them a bend of 10 m leaves the chord by 3 mm."""
 _BELOW_M: Final = 5.0
-"""Readings above the body's origin, or farther below it, are of no road on which the vehicle drives."""
+_ABOVE_M: Final = 1.0
+"""Readings that lie farther below the body's origin, or above it, are of no road on which the vehicle drives; the
+origin may be at the height of the road."""
 _LEAST_READINGS: Final = 2
 """Fewer make no cell."""
 ASTRAY_M: Final = 0.1
@@ -88,8 +90,8 @@ class Way:
         column = np.floor((right + HALF_WIDTH_M) / ACROSS_M).astype(np.int64)
         inside = (row >= 0) & (row < self.cells) & (column >= 0) & (column < COLUMNS)
         below = self.height_m[vertex] - points[:, 2]
-        level = _level(below[inside])
-        inside &= (below > 0.0) & (below < _BELOW_M)
+        level, share = _level(below[inside])
+        inside &= (below > -_ABOVE_M) & (below < _BELOW_M)
         cell, height = (row * COLUMNS + column)[inside], points[inside, 2]
         ahead = vertex * _VERTEX_M - np.interp(
             epochs_gps_ns[found].astype(np.float64), self.epoch_gps_ns, _VERTEX_M * np.arange(self.epoch_gps_ns.size),
@@ -99,7 +101,7 @@ class Way:
         heights, lights, astray = _cells(cell, height, light[inside], self.cells * COLUMNS)
         shape = self.cells, COLUMNS
         return Strip(
-            heights.reshape(shape), lights.reshape(shape), level, int(inside.sum()), int(own.sum()),
+            heights.reshape(shape), lights.reshape(shape), level, share, int(inside.sum()), int(own.sum()),
             int((astray & own).sum()),
         )  # fmt: skip
 
@@ -112,21 +114,24 @@ class Strip:
     intensity: Float64
     below_m: float
     """Depth below the body's origin at which most readings lie, negative above it; NaN without a reading."""
+    level_share: float
+    """Share of the readings within the strip that lie there."""
     readings: int
-    """Readings on the strip, below the body."""
+    """Readings on the strip, at heights where a road can be."""
     own_lane: int
     """Those of them below the vehicle and close to it, as it drove the way itself."""
     astray: int
     """Those that lie far from the others of their cell there."""
 
 
-def _level(below_m: Float64) -> float:
-    """The depth near which most readings lie."""
+def _level(below_m: Float64) -> tuple[float, float]:
+    """The depth near which most readings lie, and the share of them that do."""
     if not below_m.size:
-        return float("nan")
+        return float("nan"), 0.0
     step = np.floor(below_m / _LEVEL_STEP_M).astype(np.int64)
     most = np.bincount(step - step.min()).argmax() + step.min()
-    return float(np.median(below_m[np.abs(step - most) <= 1]))
+    there = np.abs(step - most) <= 1
+    return float(np.median(below_m[there])), float(there.mean())
 
 
 def _cells(cell: Int64, height_m: Float64, light: Float64, size: int) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:

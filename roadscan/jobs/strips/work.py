@@ -203,10 +203,11 @@ class SeenBy:
     beside: int
     """Those that lie within the strip, at any height."""
     readings: int
-    """Those that lie on the strip, below the body."""
+    """Those of them at heights where a road can be."""
     own_lane: int
     astray: int
     below_m: float | None
+    level_share: float
     way: int
     """+1: the run drove along the way, −1: against it."""
 
@@ -268,7 +269,7 @@ def _seen_by(task: StripTask, placer: Placer, way: Way, slices: Sequence[RawSlic
     below = float(strip.below_m) if np.isfinite(strip.below_m) else None
     return SeenBy(
         source.run, source.sensor, source.table == "scans", slices[0].file, middle, given, len(found.points_m),
-        int(near.sum()), strip.readings, strip.own_lane, strip.astray, below, direction,
+        int(near.sum()), strip.readings, strip.own_lane, strip.astray, below, strip.level_share, direction,
     ), strip  # fmt: skip
 
 

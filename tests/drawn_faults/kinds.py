@@ -40,6 +40,9 @@ class FaultKind:
     name: str
     draw: Callable[[Random, Path], str]
     """Change the files of the survey in a folder; returns what was done, in words with sizes."""
+    witnesses: frozenset[str]
+    """Those that name it for what it is; none: any does. `rejected` is a reason of rejects, `failed` a unit that could
+    not be made, `error` the message that ended the run."""
 
 
 def _log_uniform(random: Random, least: float, most: float) -> float:
@@ -438,13 +441,37 @@ def same_log_twice(random: Random, folder: Path) -> str:
     return f"run-2 names the log {head} of run-1"
 
 
-KINDS: Final = tuple(
-    FaultKind(draw.__name__, draw)
-    for draw in (
-        pose_spike, pose_step, attitude_spike, null_pose, trajectory_late, trajectory_clock_step, pose_gap, poses_twice,
-        stated_sigma, profiler_late, profiler_clock_stands, profiler_scale, profiler_wrong_readings, profiler_stuck,
-        profiler_twice, heads_exchanged, lidar_clock_step, lidar_packets_twice, lidar_cut_off, control_point,
-        control_datum, control_exchanged, lever_arm, boresight, axes_flipped, wrong_date, wrong_system, bytes_flipped,
-        same_log_twice,
-    )
-)  # fmt: skip
+_ANYTHING: Final = ""
+_RIGHT: Final = {
+    pose_spike: "pose_leap pose_step",
+    pose_step: "pose_step pose_leap tick_clock",
+    attitude_spike: "pose_leap pose_step",
+    null_pose: "pose_leap gnss_no_fix",
+    trajectory_late: "tick_clock along_travel no_pose failed error",
+    trajectory_clock_step: "pose_stamps tick_clock pose_step pose_leap along_travel time_goes_back no_pose",
+    pose_gap: "no_pose",
+    poses_twice: "time_goes_back rows_twice",
+    stated_sigma: "stated_sigma",
+    profiler_late: "tick_clock along_travel no_pose",
+    profiler_clock_stands: "one_stamp",
+    profiler_scale: "mounting readings_agree sees_road",
+    profiler_wrong_readings: "readings_agree",
+    profiler_stuck: "repeated_profiles",
+    profiler_twice: "time_goes_back rows_twice",
+    heads_exchanged: "mounting readings_agree sees_road",
+    lidar_clock_step: "lidar_clock_step lidar_gprmc along_travel no_pose error failed",
+    lidar_packets_twice: "lidar_packets_twice",
+    lidar_cut_off: "rejected",
+    control_point: "control_point control_target control_place",
+    control_datum: "control_datum control_place control_target",
+    control_exchanged: "control_point",
+    lever_arm: "mounting readings_agree sees_road along_travel",
+    boresight: "mounting readings_agree sees_road along_travel",
+    axes_flipped: "sees_road readings_agree failed error",
+    wrong_date: "no_pose lidar_gprmc failed error",
+    wrong_system: "no_pose control_place failed error",
+    bytes_flipped: _ANYTHING,
+    same_log_twice: "same_content",
+}
+
+KINDS: Final = tuple(FaultKind(draw.__name__, draw, frozenset(right.split())) for draw, right in _RIGHT.items())

@@ -53,11 +53,25 @@ class Trial:
     """How the run named it."""
     changed: tuple[str, ...]
     """Figures that differ by more than their σ allows."""
+    right: frozenset[str]
+    """Witnesses that name this kind of fault for what it is; none: any does."""
 
     @property
     def is_silent(self) -> bool:
         """True where figures differ and the run says nothing."""
         return bool(self.changed) and not self.named
+
+    @property
+    def is_named_otherwise(self) -> bool:
+        """True where the run says something, but no witness speaks that would know."""
+        return bool(self.named and self.right) and self.right.isdisjoint(line.partition(": ")[0] for line in self.named)
+
+    @property
+    def state(self) -> str:
+        """In a word."""
+        if self.named:
+            return "OTHERWISE" if self.is_named_otherwise else "named"
+        return "SILENT" if self.is_silent else "harmless"
 
 
 def prepare(folder: Path) -> Path:
@@ -71,8 +85,10 @@ def prepare(folder: Path) -> Path:
     return survey
 
 
-def trials(folder: Path, count: int, seed: int, kinds: tuple[FaultKind, ...] = KINDS) -> Iterator[Trial]:
-    """Draw faults and try each: every kind in turn, so that none is left out by chance."""
+def trials(
+    folder: Path, count: int, seed: int, kinds: tuple[FaultKind, ...] = KINDS, first: int = 0
+) -> Iterator[Trial]:
+    """Draw faults from a number on and try each: every kind in turn, so that none is left out by chance."""
     survey = prepare(folder)
     said = run(survey)
     clean = Products.read(_store(survey))
@@ -80,7 +96,7 @@ def trials(folder: Path, count: int, seed: int, kinds: tuple[FaultKind, ...] = K
         raise AssertionError(f"the demo without a fault: exit code {said.code}, {said.error}, {sorted(said.named)}")
     always = {f"{what}: {subject}" for what, subject in ALWAYS}
     order = np.random.default_rng(seed).permutation(len(kinds))
-    for number in range(count):
+    for number in range(first, first + count):
         one = trial(folder, number, seed, kinds[order[number % len(kinds)]], clean)
         yield replace(one, named=tuple(line for line in one.named if line not in always))
 
@@ -95,9 +111,9 @@ def trial(folder: Path, number: int, seed: int, kind: FaultKind, clean: Products
     other = Products.read(_store(survey))
     named = [f"{what}: {subject}" for what, subject in sorted(said.named)]
     if said.code:
-        named.insert(0, said.error or f"exit code {said.code}")
+        named.insert(0, f"error: {said.error or f'exit code {said.code}'}")
     changed = ["there is no tile"] if other is None else list(differences(clean, other))
-    return Trial(number, kind.name, words, tuple(named), tuple(changed))
+    return Trial(number, kind.name, words, tuple(named), tuple(changed), kind.witnesses)
 
 
 def run(survey: Path) -> Said:

@@ -8,6 +8,8 @@ from roadscan.jobs.calibrate.calibrate import outdated_calibrations
 from roadscan.jobs.plan.plan import empty_passes
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
+from roadscan.jobs.strips.findings import strip_findings
+from roadscan.jobs.strips.work import compare_strips
 from roadscan.jobs.tiles.footprints import PRODUCT, index_footprints, stale_footprints, unplaced_logs
 from roadscan.jobs.tiles.tick_clocks import check_tick_clocks, tick_findings
 from roadscan.model.survey import Survey
@@ -38,6 +40,7 @@ class Footprints(Stage):
         found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
         session.renew("footprints")
         found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
+        found += compare_strips(session, manifest)
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
@@ -56,8 +59,8 @@ class Footprints(Stage):
         return state
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Clocks that wheel ticks and poses contradict."""
-        return tick_findings(records, manifest)
+        """Clocks that wheel ticks and poses contradict, and sensors that the others contradict."""
+        return [*tick_findings(records, manifest), *strip_findings(records, manifest)]
 
     def folders(self) -> Sequence[str]:
         """One file a data file."""

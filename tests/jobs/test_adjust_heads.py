@@ -117,7 +117,7 @@ def test_a_scale_of_all_runs_is_a_scale_or_a_height_of_the_head(sound: Path, tmp
     folder = copied(sound, tmp_path / "survey")
     scaled(folder, ("run-1", "run-2"))
     _, text = adjusted(folder)
-    (line,) = (one for one in text.splitlines() if "do not tell which of these is off" in one)
+    line = next(one for one in text.splitlines() if "do not tell which of these is off" in one)
     assert "lever arm down of profiler_left" in line
     assert "range scale of profiler_left" in line
     assert step_m(mountings(folder), "*") == pytest.approx(RANGE_M * (1.0 - FACTOR), abs=0.0005)

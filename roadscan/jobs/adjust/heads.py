@@ -17,10 +17,10 @@ import numpy.typing as npt
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.swath import WHOLE
-from roadscan.adjust.ties.at_place import Ties, ties_at
+from roadscan.adjust.ties.at_place import Ties
 from roadscan.adjust.ties.tie import HEIGHT
-from roadscan.jobs.adjust.near import Circle, NearReader, Sources, near_files
-from roadscan.jobs.adjust.tie_work import DIAGONAL, KnownTies
+from roadscan.jobs.adjust.near import NearReader, Sources, near_files
+from roadscan.jobs.adjust.tie_work import KnownTies, ties_of
 from roadscan.jobs.adjust.tracks import runs_of, tracks_of
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
@@ -147,13 +147,7 @@ def _tried(plan: SurveyPlan, sources: Sources, step: Step) -> Step | None:
     places = places[:: max(1, -(-len(places) // _TRIED))]
     files = near_files(swapped, [t for place in places for t in place.traverses], runs)
     reader = NearReader(plan.store, plan.ground, files, runs)
-    found = Ties.joined(
-        [
-            ties_at(place, [reader.of(traverse, circle) for traverse in place.traverses], config.ties)
-            for place in places
-            for circle in [Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)]
-        ]
-    ).observations
+    found = Ties.joined([ties_of(reader, place, config.ties) for place in places]).observations
     heights = found.observed_m[(found.kind == KINDS.index(HEIGHT)) & np.isfinite(found.observed_m)]
     if not heights.size:
         return None

@@ -33,6 +33,8 @@ TIES: Final = "ties"
 
 _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
+_SEAM_CELLS: Final = 40
+"""A seam is compared where both heads saw so many cells: a strip that is one cell wide holds 160 along 4 m."""
 DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
@@ -84,12 +86,7 @@ def tie_tasks(plan: SurveyPlan, sources: Sources, places: Sequence[Place], runs:
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write what was found (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
-    parts = [
-        ties_at(place, [reader.of(t, circle) for t in place.traverses], task.settings)
-        for place in task.places
-        for circle in [Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)]
-    ]
-    found = Ties.joined(parts)
+    found = Ties.joined([ties_of(reader, place, task.settings) for place in task.places])
     if not found.observations.size:
         return OutputRecord(TIES, task.unit, task.key, "", 0, "")
     schema = table_schema(TIES)
@@ -97,6 +94,14 @@ def collect_ties(task: TieTask) -> OutputRecord:
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(TIES, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def ties_of(reader: NearReader, place: Place, settings: TieSettings) -> Ties:
+    """Ties of one place."""
+    circle = Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)
+    if place.seam:
+        settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
+    return ties_at(place, [reader.of(traverse, circle) for traverse in place.traverses], settings)
 
 
 def _rows(found: Ties, runs: Sequence[str]) -> pa.Table:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import duckdb
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -16,6 +15,7 @@ import pytest
 from roadscan.jobs.adjust.outcome import known_findings
 from roadscan.model.witness import Finding
 from roadscan.simulate import Scene, simulate
+from roadscan.tables.held import read_held
 from roadscan.tables.manifest import Manifest
 from tests.answers import roadscan
 from tests.drawn_faults.kinds import _ranges, _with
@@ -58,10 +58,8 @@ def adjusted(folder: Path, workers: int = 0) -> tuple[list[Finding], str]:
 
 def mountings(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """Rows of the table by run and sensor; none where there is none."""
-    if not list(folder.glob("store/*/tables/mounting_corrections/*")):
-        return {}
-    found = duckdb.sql(f"FROM '{folder}/store/*/tables/mounting_corrections/*.parquet'").fetch_arrow_table()
-    return {(row["run"], row["sensor"]): row for row in found.to_pylist()}
+    table = read_held(Simulated(folder / "SURVEY.toml").store(), "mounting_corrections")
+    return {(row["run"], row["sensor"]): row for row in ([] if table is None else table.to_pylist())}
 
 
 def scaled(folder: Path, runs: tuple[str, ...], head: str = HEADS[0]) -> None:

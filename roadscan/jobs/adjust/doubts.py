@@ -36,7 +36,8 @@ CONTROL_DATUM: Final = Witness(
     "control_datum",
     input="control points",
     fault="All control is off together: another datum, geoid, CRS or antenna height.",
-    asks="the poses, whose σ and correlation time say how well they know the mean height and place of a drive",
+    asks="the poses, whose σ and correlation time say how well they know the mean height and place of a drive; where "
+    "heights alone are compared, the slopes of the road",
     does="control that is off by more than adjust.control.largest_m is not used; for less, adjust.control.datum_offset "
     "says whether it is followed, with an σ that holds the offset, or whether the offset is estimated",
     told=("findings",),
@@ -86,7 +87,8 @@ STATED_SIGMA: Final = Witness(
     "stated_sigma",
     input="trajectories, control points",
     fault="A stated σ of poses or of observations is much too small.",
-    asks="residuals against their σ: variance factors of each kind of observation and of each component of the poses",
+    asks="residuals against their σ: variance factors of each kind of observation, of each component of the poses, and "
+    "of the poses of each run",
     does="variance factors are estimated, and weights and published σ follow them",
     told=("findings",),
 )

@@ -49,10 +49,10 @@ _CALIBRATED_SIGMAS: Final = (
 MOUNTING: Final = Witness(
     "mounting",
     input="rig file",
-    fault="The mounting of a sensor is not what the rig file or the calibration states.",
+    fault="The mounting of a sensor, or the scale of its ranges, is not what the rig file or the calibration states.",
     asks="passes side by side, heads of one pass and ground control, all in one adjustment",
-    does="the mounting is estimated with its stated σ as prior, and readings are placed with it; one that is off by "
-    "more than three σ of what was stated is named",
+    does="mounting and scale are estimated with their stated σ as prior, and readings are placed with them; one that "
+    "is off by more than three σ of what was stated is named",
     told=("findings",),
 )
 

@@ -39,6 +39,8 @@ DOUBTED: Final = 3.0
 """A mounting that is off by more than so many σ of what was stated is named."""
 _CHANCE: Final = 0.0027
 """Of evidence that contradicts right mountings: that of 3 σ."""
+_MOST_WRONG: Final = 3
+"""Of more sensors that are wrong at once, which they are is not sought: all are estimated."""
 _FREE: Final = 100.0
 """An error within so many prior σ is as good as unknown."""
 _CALIBRATED_SIGMAS: Final = (
@@ -253,7 +255,7 @@ def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
         return none
     told = _Told.of(found)
     fall, determined = told.explained(np.arange(told.sensor.size))
-    for size in range(count + 1):
+    for size in range(min(count, _MOST_WRONG) + 1):
         holding = []
         for chosen in combinations(range(count), size):
             own, known = told.explained(np.flatnonzero(np.isin(told.sensor, chosen)))

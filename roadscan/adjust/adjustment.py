@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from roadscan.adjust.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
@@ -38,6 +39,8 @@ _AT_ONCE: Final = 200
 """Control points that are judged with the covariance of all of them: three coordinates each are 600 rows."""
 _NEIGHBOURS: Final = 50
 """Of more, so many at most are judged together."""
+_SCALED: Final = 3
+"""So many times at most the stated σ of single runs are made larger, until none is too small."""
 SURVEY_FACTOR: Final = "control_survey"
 """Name of the factor of the surveys' stated variances."""
 
@@ -71,13 +74,16 @@ class ControlErrors:
 class MountingErrors:
     """What the adjustment says of the mountings of s sensors."""
 
-    sensors: tuple[str, ...]
+    sensors: tuple[tuple[str, str], ...]
+    """Run, "*" for all, and sensor."""
     prior_sigma: Float64
-    """(s, 6) as it came in, `MOUNTED`; 0: not estimated."""
+    """(s, 7) as it came in, `MOUNTED`; 0: not estimated."""
     error: Float64
-    """(s, 6) what has to be added to the mounting (m, rad); 0 where not estimated."""
+    """(s, 7) what has to be added to the mounting (m, rad, share); 0 where not estimated."""
     sigma: Float64
-    """(s, 6) 1 σ of the mounting then; that of the prior where nothing tells of it."""
+    """(s, 7) 1 σ of the mounting then; that of the prior where nothing tells of it."""
+    covariance: Float64
+    """(7 s, 7 s) of the errors of all sensors, without the height that all of them have in common."""
 
 
 @dataclass(frozen=True)
@@ -120,13 +126,16 @@ class Adjustment:
     active: Bool
     """(runs, 6) components that were estimated."""
     response: tuple[Float64, ...]
-    """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north,
-    east, down."""
+    """(k, 6, 5) of each run: by how much its corrections move for a metre of a common offset of the control, north,
+    east, down, and for a metre by which points of which heights alone are used lie elsewhere, north, east."""
+    run_factors: Float64
+    """(runs, 6) by which the stated variances of single runs' poses were multiplied."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
         """(k, 6) 1 σ of each run's knots, with that of an offset of the control."""
-        shared = [np.einsum("kia,ab,kib->ki", r, self.applied.covariance_m2, r) for r in self.response]
+        common = block_diag(self.applied.covariance_m2, self.verdict.shift.covariance_m2)
+        shared = [np.einsum("kia,ab,kib->ki", r, common, r) for r in self.response]
         return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
 
     def corrections(self, run: str) -> Corrections:
@@ -183,6 +192,39 @@ def adjust(
     ConfigError
         for an observation that is not a number, of no known run, or outside of its run's time.
     """
+    found, wider = _once(observations, priors, settings, mountings), np.ones((len(priors), len(COMPONENTS)))
+    if settings.estimate_variance_components is not None or settings.mode != "joint" or len(priors) < 2:
+        return found
+    for _ in range(_SCALED):
+        more = _by_group(found.run_factors)
+        if (more == 1.0).all():
+            break
+        own = [p.wider(f) for p, f in zip(priors, wider * more, strict=True)]
+        other = _once(observations, own, settings, mountings)
+        if any((found.run_factors[:, axes] > 1.0).any() for axes in _still_doubted(found, other)):
+            break
+        found, wider = other, wider * more
+    return replace(found, run_factors=wider**2)
+
+
+def _still_doubted(before: Adjustment, after: Adjustment) -> list[tuple[int, ...]]:
+    """Axes in which control is doubted as a whole, also with larger σ of a run: these do not explain it."""
+    return [SURVEYED[name] for name in before.verdict.doubted if name in after.verdict.doubted]
+
+
+def _by_group(factors: Float64) -> Float64:
+    """Factors (runs, 6), the largest of position and of attitude for all three: who states one too small states all."""
+    position, attitude = factors[:, :3].max(axis=1), factors[:, 3:].max(axis=1)
+    return np.repeat(np.stack([position, attitude], axis=1), 3, axis=1)
+
+
+def _once(
+    observations: Observations,
+    priors: Sequence[RunPrior],
+    settings: AdjustmentSettings,
+    mountings: Sequence[MountingPrior],
+) -> Adjustment:
+    """An adjustment with the stated σ of each run's poses."""
     order = _canonical(observations)
     ordered = observations.chosen(order)
     which = _used(ordered, settings.mode)
@@ -203,12 +245,14 @@ def adjust(
     factors = dict(
         zip((*KINDS, *COMPONENTS), [*estimate.kind_factors[:SURVEY], *estimate.process_factors], strict=True)
     ) | {SURVEY_FACTOR: verdict.survey_factor}
+    factors_of_runs = _understated_runs(unknowns, rounds, verdict, estimate)
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
+        factors_of_runs,
     )  # fmt: skip
 
 
@@ -306,7 +350,8 @@ def _survey_errors(
     for own, unit in zip(rows, rounds.covariances([numbers[own] for own in rows]), strict=True):
         away = alone.solution[numbers[own]] * sigma[own]
         covariance = sigma[own][:, None] * 0.5 * (unit + unit.T) * sigma[own]
-        found.append(SurveyErrors(point[own], axis[own], away, covariance, sigma[own] ** 2))
+        lean = np.where((axis[own] == _DOWN)[:, None], unknowns.control.lean[point[own]], 0.0)
+        found.append(SurveyErrors(point[own], axis[own], away, covariance, sigma[own] ** 2, lean))
     return (found, found[0]) if few else (found[:-1], found[-1])
 
 
@@ -318,21 +363,44 @@ def _in_time(control: ControlPoints, observations: Observations) -> Int64:
     return np.argsort(first, kind="stable").astype(np.int64)
 
 
+def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str]) -> Float64:
+    """1 for each surveyed coordinate (m,) that is right, and 0 for what is wrong or refused."""
+    point, axis, _ = _surveyed(unknowns)
+    component = {a: name for name, axes in SURVEYED.items() for a in axes}
+    names = [component[a] for a in axis.tolist()]
+    pairs = zip(point.tolist(), names, strict=True)
+    return np.array([n not in refused and (p, n) not in verdict.left_out for p, n in pairs], np.float64)
+
+
 def _with_control(
     unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
 ) -> tuple[Estimate, tuple[Float64, ...]]:
     """The solution with surveys that are right, and by how much each knot follows an offset of all of them."""
     point, axis, sigma = _surveyed(unknowns)
-    left_out = verdict.left_out
-    component = {a: name for name, axes in SURVEYED.items() for a in axes}
-    names = [component[a] for a in axis.tolist()]
-    counts = [n not in applied.refused and (p, n) not in left_out for p, n in zip(point.tolist(), names, strict=True)]
-    weight = np.array(counts, np.float64)
+    weight = _counting(unknowns, verdict, applied.refused)
     if not weight.any():
-        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
-    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, verdict.survey_factor, alone.rounds)
-    moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
+        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 5)) for k in unknowns.knots)
+    lean = np.where((axis == _DOWN)[:, None], unknowns.control.lean[point], 0.0)
+    stated = (applied.offset_m[axis] + lean @ verdict.shift.shift_m) / sigma
+    estimate = rounds.with_surveys(weight, stated, verdict.survey_factor, alone.rounds)
+    moving = [*(axis == a for a in range(3)), *lean.T]
+    moved = [_of_solution(unknowns, rounds.response(own / sigma)) for own in moving]
     return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+
+
+def _understated_runs(unknowns: Unknowns, rounds: Rounds, verdict: ControlVerdict, estimate: Estimate) -> Float64:
+    """By how much (runs, 6) the stated σ of single runs' poses are too small.
+
+    Control that the poses contradict as a whole is followed first: where all runs are off by it, they are right and it
+    is not, and where one of them is, it is the other way round.
+    """
+    found = rounds.understated(estimate)
+    if (found > 1.0).any() or not verdict.doubted:
+        return found
+    counts = _counting(unknowns, verdict, ())
+    found = rounds.understated(rounds.with_surveys(counts, np.zeros(counts.size), 1.0, estimate.rounds))
+    every = (found > 1.0).all(axis=0, where=unknowns.active) & unknowns.active.any(axis=0)
+    return np.where(every, 1.0, found)
 
 
 def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
@@ -382,16 +450,18 @@ def _of_observations(
 def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
     prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
     there = numbers >= 0
+    i, j = np.broadcast_arrays(numbers.reshape(-1, 1), numbers.reshape(1, -1))
+    both, covariance = (i >= 0) & (j >= 0), np.zeros(i.shape)
+    covariance[both] = estimate.inverse.at(i[both], j[both])
+    covariance *= np.outer(prior, prior)
     error = np.zeros(prior.shape)
     error[there] = estimate.solution[numbers[there]] * prior[there]
     variance = np.zeros(prior.shape)
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
     # What all heights have in common is not estimated: it is known as well as it was.
-    heights = prior[:, _DOWN] > 0.0
-    if heights.any():
-        variance[heights, _DOWN] += 1.0 / (1.0 / prior[heights, _DOWN] ** 2).sum()
-    sigma = np.sqrt(variance)
-    return MountingErrors(tuple(one.sensor for one in unknowns.mountings), prior, error, sigma)
+    for own in unknowns.sharing:
+        variance[own, _DOWN] += 1.0 / (1.0 / prior[own, _DOWN] ** 2).sum()
+    return MountingErrors(tuple(one.key for one in unknowns.mountings), prior, error, np.sqrt(variance), covariance)
 
 
 def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:

@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import FIXED, KINDS, Observations, mount_partials, partials
+from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, Observations, mount_partials, partials
 from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.targets.find import find_target
@@ -18,7 +18,7 @@ from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.navigation.mounting_change import MountingChange
+from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -214,12 +214,12 @@ def _unseen(point: ControlPoint, head: PassReadings) -> Sighting:
 
 
 def moved_m(
-    one: Sighting, corrections: Corrections | None, mounting: tuple[MountingChange, Float64] | None = None
+    one: Sighting, corrections: Corrections | None, mounting: tuple[MountingChange, Seat] | None = None
 ) -> Float64:
     """How corrections move what a sighting saw: easting, northing, height (3,) (m); of a point that was not placed the
     height at its surveyed place, on a road that slopes.
 
-    mounting : change of that of the sensor that saw it, and its lever arm (3,).
+    mounting : change of that of the sensor that saw it, and its seat.
     """
     if (corrections is None and mounting is None) or not np.isfinite(one.arm_body_m).all():
         return np.zeros(3)
@@ -228,8 +228,8 @@ def moved_m(
         shift, turn = corrections.at(np.array([one.epoch_gps_ns]))
         level = level + shift + one.level_from_body @ np.cross(turn[0], one.arm_body_m)
     if mounting is not None:
-        change, lever = mounting
-        level = level + change.moves_level(one.level_from_body[None], one.arm_body_m[None], lever)
+        change, seat = mounting
+        level = level + change.moves_level(one.level_from_body[None], one.arm_body_m[None], seat)
     easting, northing, height = map_from_level(level, one.convergence_rad)[0]
     if not one.is_placed and np.isfinite(one.slope_east):
         height -= one.slope_east * easting + one.slope_north * northing
@@ -242,8 +242,8 @@ class SeenBy:
 
     number: int
     """Among those whose mounting is estimated; −1: it is not."""
-    lever_body_m: Float64
-    """(3,) its lever arm."""
+    seat: Seat
+    """Its lever arm, and the direction of its beams, (3,) each."""
 
 
 def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | None = None) -> Observations:
@@ -263,8 +263,10 @@ def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | N
     seen = [one for one in sightings for _ in range(one.observed)]
     turned = np.array([one.level_from_body for one in seen])
     in_body = np.einsum("nji,nj->ni", turned, joined.partials[:, 0, :3])
-    by_mounting = np.zeros((joined.size, 2, 6))
-    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], np.array([s.lever_body_m for s in each]))
+    along = np.einsum("ni,ni->n", in_body, np.array([one.arm_body_m for one in seen]))
+    seat = Seat(np.array([s.seat.lever_body_m for s in each]), np.array([s.seat.beam_body for s in each]))
+    by_mounting = np.zeros((joined.size, 2, len(MOUNTED)))
+    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], along, seat)
     sensor = np.array([[s.number, -1] for s in each], np.int32)
     return replace(joined, sensor=sensor, mount_partials=by_mounting)
 
@@ -279,7 +281,10 @@ def _of_one(number: int, one: Sighting) -> list[Observations]:
             lift = float(1.0 / np.linalg.norm(normal))
         direction = level_from_map(normal * lift, one.convergence_rad)
         value, sigma = lift * (point.height_m - one.height_m), lift * one.sigma_height_m
-        parts.append(_observation("control_height", one, direction, value, (sigma, point.sigma_height_m), 2 * number))
+        # On a road that slopes, the height at a place that is surveyed wrong is another one.
+        misplaced = 0.0 if one.is_placed else point.sigma_horizontal_m * float(np.hypot(*normal[0, :2]))
+        surveyed = float(np.hypot(point.sigma_height_m, misplaced))
+        parts.append(_observation("control_height", one, direction, value, (sigma, surveyed), 2 * number))
     if one.is_placed:
         away = np.array([point.easting_m - one.easting_m, point.northing_m - one.northing_m])
         variance, axes = np.linalg.eigh(one.covariance_m2)

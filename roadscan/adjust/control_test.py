@@ -27,7 +27,7 @@ COMPONENTS: Final = {HEIGHT: (2,), PLACE: (0, 1)}
 """Axes (north, east, down) of what may be wrong by itself: the height of a point, or its place."""
 _POWER: Final = 0.8416
 """Standard normal quantile of 80 %: an offset so many σ above the limit is found so often."""
-_APART: Final = 9.21
+APART: Final = 9.21
 """Two points of which one is wrong are told apart where one explains this much more of the squared residuals:
 a hundred times as likely (2 ln 100)."""
 _MANY: Final = 8
@@ -42,6 +42,10 @@ _BISECTIONS: Final = 12
 _LEAST_CONTRADICTED_M: Final = 0.03
 """Poses of a vehicle, whatever σ they state, do not know the mean height of a drive so well that they would contradict
 control that is off by less."""
+_SLOPES: Final = 5
+"""Heights from which on a shift in the plane is sought: it and an offset are three numbers."""
+_LARGEST_SHIFT_M: Final = 3.0
+"""1 σ of a shift of the control in the plane before anything is known of it (m): antennas, epochs of a datum."""
 _KNOWN: Final = 1e-9
 """Share of its variance that a residual has to keep to say anything of its observation."""
 
@@ -60,6 +64,9 @@ class SurveyErrors:
     """(m, m) of what poses and ties say, without that of the survey."""
     survey_m2: Float64
     """(m,) stated variance of the survey."""
+    lean: Float64
+    """(m, 2) by how much `away_m` is off for a metre by which the point lies north, and east, of where it was surveyed:
+    of heights alone the slope of the road, else 0."""
 
     def parts(self) -> list[tuple[int, str, Int64]]:
         """Point, component, and rows of each height and each place."""
@@ -113,6 +120,27 @@ class CommonOffset:
 
 
 @dataclass(frozen=True)
+class PlaneShift:
+    """How far all points of which heights alone are compared lie from where they were surveyed."""
+
+    shift_m: Float64
+    """(2,) surveyed minus true, north and east; 0 where nothing tells of one."""
+    covariance_m2: Float64
+    """(2, 2)"""
+    sigmas: float = 0.0
+    """Length of the shift in its σ, as a standard normal number would be as rare."""
+
+    def taken_from(self, errors: SurveyErrors) -> SurveyErrors:
+        """What the surveys' heights are off by without it."""
+        more = errors.lean @ self.covariance_m2 @ errors.lean.T
+        away = errors.away_m - errors.lean @ self.shift_m
+        return replace(errors, away_m=away, covariance_m2=errors.covariance_m2 + more)
+
+
+NOT_SHIFTED: Final = PlaneShift(np.zeros(2), np.zeros((2, 2)))
+
+
+@dataclass(frozen=True)
 class ControlVerdict:
     """What the control's surveys are worth."""
 
@@ -127,6 +155,13 @@ class ControlVerdict:
     """Normalised leave-one-out residual of a height from which on a point is wrong."""
     survey_factor: float
     """Of the stated variances of all surveys."""
+    shift: PlaneShift = NOT_SHIFTED
+    """That is told by the heights of points on slopes."""
+
+    @property
+    def faults(self) -> int:
+        """Number of points that are wrong, and of components that are doubted."""
+        return len(self.wrong) + len(self.doubted)
 
     @property
     def left_out(self) -> set[tuple[int, str]]:
@@ -169,12 +204,52 @@ def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: Adjustme
     wrong, the stated σ of the survey is asked as well.
     """
     groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
-    found, parts = _with_factor(groups, spread, rules, 1.0), sum(len(own.parts()) for own in groups)
+    found, shift = _with_shift(groups, spread, rules)
+    groups = [shift.taken_from(own) for own in groups]
+    spread, parts = shift.taken_from(spread), sum(len(own.parts()) for own in groups)
     many = parts >= _MANY and len(found.left_out) > _FEW * parts
     if not many or rules.estimate_variance_components is False:
         return found
     factor = _survey_factor(groups)
-    return _with_factor(groups, spread, rules, factor) if factor > 1.0 else found
+    return replace(_with_factor(groups, spread, rules, factor), shift=shift) if factor > 1.0 else found
+
+
+def _with_shift(
+    groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: AdjustmentSettings
+) -> tuple[ControlVerdict, PlaneShift]:
+    """The verdict, and a shift of all heights' places.
+
+    It holds where it explains what is doubted, with the chance of `rules.datum_false_alarm`, and leaves fewer faults;
+    where nothing else is doubted, right control has it with the chance of `rules.false_alarm`.
+    """
+    plain = _with_factor(groups, spread, rules, 1.0)
+    every = np.ones(spread.point.size, bool)
+    for kept in (every, _kept(spread, list(plain.wrong))):
+        shift = plane_shift(_surveyed(spread, 1.0), kept)
+        if shift.sigmas > quantile(rules.datum_false_alarm if plain.faults else rules.false_alarm, 1, 2):
+            moved = [shift.taken_from(own) for own in groups]
+            other = _with_factor(moved, shift.taken_from(spread), rules, 1.0)
+            if other.faults < max(plain.faults, 1):
+                return replace(other, shift=shift), shift
+    return plain, NOT_SHIFTED
+
+
+def plane_shift(errors: SurveyErrors, kept: Bool) -> PlaneShift:
+    """The shift in the plane that explains heights on slopes best, beside an offset of all of them."""
+    rows = kept & (errors.axis == COMPONENTS[HEIGHT][0])
+    if rows.sum() < _SLOPES or not errors.lean[rows].any():
+        return NOT_SHIFTED
+    design = np.column_stack([errors.lean[rows], np.ones(int(rows.sum()))])
+    weighed = np.linalg.solve(errors.covariance_m2[np.ix_(rows, rows)], design)
+    normal = design.T @ weighed
+    # Where slopes do not tell both axes, or not from an offset of the heights, the prior says that there is none.
+    normal[:2, :2] += np.eye(2) / _LARGEST_SHIFT_M**2
+    covariance = np.linalg.inv(normal)
+    shift = (covariance @ weighed.T @ errors.away_m[rows])[:2]
+    own = covariance[:2, :2]
+    # Its own variance by right control: that of the prior is not among it.
+    right = own - own @ own / _LARGEST_SHIFT_M**2
+    return PlaneShift(shift, own, float(np.sqrt(max(shift @ np.linalg.solve(right, shift), 0.0))))
 
 
 def _in_datum(errors: SurveyErrors, rules: ControlRules) -> SurveyErrors:
@@ -275,7 +350,7 @@ def _snooped(errors: SurveyErrors, lengths: Mapping[int, float], *, free: bool) 
             break
         worst = int(excess.argmax())
         alike = [k for k in np.flatnonzero(excess > 1.0) if k != worst and parts[k][1] == parts[worst][1]]
-        others = tuple(parts[k][0] for k in alike if squares[worst] - squares[k] < _APART)
+        others = tuple(parts[k][0] for k in alike if squares[worst] - squares[k] < APART)
         point, component, _ = parts[worst]
         wrong.append(WrongSurvey(point, component, float(np.sqrt(squares[worst])), float(limit[worst]), others))
     return _without_the_right(errors, parts, wrong, lengths, free=free)

@@ -226,6 +226,32 @@ class Rounds:
         known = redundancy >= _SOME
         return bool((ratio * redundancy > chdtri(np.maximum(redundancy, _SOME), 1.0 - _SURE))[known].any())
 
+    def understated(self, estimate: Estimate) -> Float64:
+        """By how much (runs, 6) the stated σ of components of single runs are too small; 1 where nothing says so.
+
+        Corrections are then larger than the process allows, by the quantile of χ² over all runs and components, and σ
+        too small by what :data:`_UNDERSTATED` says, beside the factor that all runs have.
+        """
+        own = self._component < len(COMPONENTS)
+        row, column, component = self._row[own], self._column[own], self._component[own]
+        run = np.searchsorted(self.problem.unknowns.first, row, side="right") - 1
+        twice = np.where(row == column, 1.0, 2.0) * self._value[own] / self._processes[component]
+        shape = len(self.problem.unknowns.priors), len(COMPONENTS)
+        cell = run * shape[1] + component
+        squares, lost, unknowns = (
+            np.bincount(cell, values, shape[0] * shape[1]).reshape(shape)
+            for values in (
+                twice * estimate.solution[row] * estimate.solution[column],
+                twice * estimate.inverse.at(row, column),
+                (row == column).astype(np.float64),
+            )
+        )
+        told = unknowns - lost
+        known = told >= _SOME
+        chance = -np.expm1(np.log(_SURE) / max(int(known.sum()), 1))
+        limit = np.maximum(chdtri(np.maximum(told, _SOME), chance), _UNDERSTATED * told)
+        return np.where(known & (squares > limit), np.sqrt(squares / np.maximum(told, _SOME)), 1.0)
+
     def _process_ratios(self, solution: Float64, inverse: SelectedInverse) -> tuple[Float64, Float64]:
         """Squares over redundancy (6,) of each component's process with the factor of now, and the redundancy."""
         twice = np.where(self._row == self._column, 1.0, 2.0) * self._value

@@ -9,8 +9,10 @@ An observation with direction n (unit, local level) sees n · d of each of its e
 six corrections are n and arm × (Rᵀ n) (Skaloud & Lichti 2006, linearised). Its second end counts negatively: after the
 correction, the two ends agree along n.
 
-The mounting of the sensor that saw an end moves the point as well: by a change of the lever arm, and by a small turn
-about the axes of the body, at the sensor's origin. Those derivatives are Rᵀ n and (arm − lever arm) × (Rᵀ n).
+The mounting of the sensor that saw an end moves the point as well: by a change of the lever arm, by a small turn about
+the axes of the body at the sensor's origin, and by a scale of its ranges. Those derivatives are Rᵀ n,
+(arm − lever arm) × (Rᵀ n), and that along the direction of the point's way from the sensor, of which a head with
+parallel beams lengthens the part along its beams alone.
 """
 
 from __future__ import annotations
@@ -22,20 +24,23 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.navigation.mounting_change import Seat
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Int32 = npt.NDArray[np.int32]
 UInt8 = npt.NDArray[np.uint8]
 
-KINDS: Final = ("height_tie", "shift_tie", "plane_tie", "control_height", "control_position")
+KINDS: Final = ("height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie")
 """Height of one pass against another's; shift of one picture or relief against another's; distance of two planes;
-height, or a component of the place, of a control point."""
+height, or a component of the place, of a control point; height of one head against that of another of the same pass."""
 
 COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 """The unknowns of a pose, in the order of the partial derivatives."""
 
-MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
-"""The unknowns of a mounting: lever arm, then a turn that follows the boresight, both along the axes of the body."""
+MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "heading_rad", "range_scale")
+"""The unknowns of a mounting: lever arm and a turn that follows the boresight, both along the axes of the body, and the
+share by which ranges are longer."""
 
 FIXED: Final = -1
 """Run of an end that no correction moves: a control point."""
@@ -68,13 +73,13 @@ class Observations:
     are given."""
     sensor: Int32 = field(default_factory=lambda: np.zeros((0, 2), np.int32))
     """(n, 2) number of the sensor that saw each end; −1 where its mounting is not asked for, as where none is given."""
-    mount_partials: Float64 = field(default_factory=lambda: np.zeros((0, 2, 6)))
-    """(n, 2, 6) derivatives by `MOUNTED` of that sensor, the sign of the end included."""
+    mount_partials: Float64 = field(default_factory=lambda: np.zeros((0, 2, len(MOUNTED))))
+    """(n, 2, 7) derivatives by `MOUNTED` of that sensor, the sign of the end included."""
 
     def __post_init__(self) -> None:
         if len(self.sensor) != self.kind.size or len(self.mount_partials) != self.kind.size:
             object.__setattr__(self, "sensor", np.full((self.kind.size, 2), -1, np.int32))
-            object.__setattr__(self, "mount_partials", np.zeros((self.kind.size, 2, 6)))
+            object.__setattr__(self, "mount_partials", np.zeros((self.kind.size, 2, len(MOUNTED))))
         if self.survey_sigma_m.size != self.kind.size:
             if self.survey_sigma_m.size:
                 raise ValueError(f"{self.survey_sigma_m.size} σ of a survey for {self.kind.size} observations")
@@ -112,16 +117,19 @@ class Observations:
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
-def mount_partials(in_body: Float64, arm_turns: Float64, lever_body_m: Float64) -> Float64:
-    """Derivatives (n, 6) of the movement along a direction by the mounting of a sensor.
+def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, seat: Seat) -> Float64:
+    """Derivatives (n, 7) of the movement along a direction by the mounting of a sensor.
 
     Parameters
     ----------
     in_body : (n, 3) the direction in body axes.
     arm_turns : (n, 3) derivatives by a turn of the pose: arm × direction.
-    lever_body_m : (n, 3) lever arm of the sensor.
+    arm_along_m : (n,) arm · direction.
+    seat : of the sensor, rows (n, 3).
     """
-    return np.concatenate([in_body, arm_turns - np.cross(lever_body_m, in_body)], axis=-1)
+    arm = arm_along_m[:, None] * in_body + np.cross(in_body, arm_turns)
+    by_scale = np.einsum("ni,ni->n", in_body, seat.by_scale(arm))
+    return np.column_stack([in_body, arm_turns - np.cross(seat.lever_body_m, in_body), by_scale])
 
 
 def partials(direction_level: Float64, level_from_body: Float64, arm_body_m: Float64) -> Float64:

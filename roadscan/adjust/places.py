@@ -92,6 +92,8 @@ class Place:
     """Half the edge of the square."""
     traverses: tuple[Traverse, ...]
     """Two or more, in the order of tracks and time; one where a lidar sees the place for a while."""
+    seam: bool = False
+    """Whether heads of one pass meet there, in a strip too narrow for other ties."""
 
     def quality_only(self, return_s: float) -> bool:
         """Whether the traverses are heads of one run at one time: one correction moves them all."""

@@ -119,6 +119,13 @@ class RunPrior:
         n, e, d, r, p, h = (replace(o, tau_s=o.tau_s / t) for o, t in zip(self.processes, times, strict=True))
         return replace(self, processes=(n, e, d, r, p, h))
 
+    def wider(self, factors: Float64) -> RunPrior:
+        """The same with σ that are (6,) times as large."""
+        pairs = zip(self.processes, factors.tolist(), strict=True)
+        n, e, d, r, p, h = (replace(o, sigma=o.sigma * factor) for o, factor in pairs)
+        stated = None if self.stated is None else replace(self.stated, sigma=self.stated.sigma * factors)
+        return replace(self, processes=(n, e, d, r, p, h), stated=stated)
+
     @property
     def taus_s(self) -> Float64:
         """(6,) correlation times (s)."""
@@ -127,11 +134,18 @@ class RunPrior:
 
 @dataclass(frozen=True)
 class MountingPrior:
-    """What is known of the mounting of a sensor, which all runs share, before the adjustment."""
+    """What is known of the mounting of a sensor before the adjustment."""
 
     sensor: str
     sigma: Float64
-    """(6,) 1 σ of its errors (m, rad), in the order of `MOUNTED`; 0: not estimated."""
+    """(7,) 1 σ of its errors (m, rad, share), in the order of `MOUNTED`; 0: not estimated."""
+    run: str = "*"
+    """Run in which it is mounted so; "*": all that have none of their own."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Run and sensor."""
+        return self.run, self.sensor
 
 
 def knots_of(prior: RunPrior, spacing_s: float) -> Int64:

@@ -60,7 +60,7 @@ def left_after(
 ) -> Float64:
     """What is left (n,) of each observation once poses and mountings are corrected (m).
 
-    runs are counted as in `runs`; mountings : (s, 6) what is added to those that `Observations.sensor` counts.
+    runs are counted as in `runs`; mountings : (s, 7) what is added to those that `Observations.sensor` counts.
     """
     left = observations.observed_m.copy()
     for end in (0, 1) if mountings is not None and len(mountings) else ():

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
 from roadscan.model.settings.tie_settings import TieSettings
-from roadscan.navigation.mounting_change import MountingChange
+from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -45,7 +45,7 @@ def seam_view(
     readings: tuple[PassReadings, PassReadings],
     corrections: tuple[Corrections | None, Corrections | None],
     settings: TieSettings,
-    mountings: tuple[tuple[MountingChange, Float64] | None, tuple[MountingChange, Float64] | None] = (None, None),
+    mountings: tuple[tuple[MountingChange, Seat] | None, tuple[MountingChange, Seat] | None] = (None, None),
 ) -> SeamView | None:
     """Both passes at a place, without and with their corrections; None where they have no cell in common."""
     states = [readings, tuple(moved(*one) for one in zip(readings, corrections, mountings, strict=True))]
@@ -62,11 +62,11 @@ def seam_view(
 
 
 def moved(
-    readings: PassReadings, corrections: Corrections | None, mounting: tuple[MountingChange, Float64] | None = None
+    readings: PassReadings, corrections: Corrections | None, mounting: tuple[MountingChange, Seat] | None = None
 ) -> PassReadings:
     """The readings of a traverse, placed with corrected poses; corrections are small, so turns are linear.
 
-    mounting : change of that of the sensor, and its lever arm (3,).
+    mounting : change of that of the sensor, and its seat.
     """
     if (corrections is None and mounting is None) or not readings.pose.size:
         return readings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,8 @@ Float64 = npt.NDArray[np.float64]
 
 _SHARE = 2.0
 """Per cent of the readings that lie beyond either side."""
+WHOLE: Final = 1.0 / (1.0 - 0.02 * _SHARE)
+"""All evenly spread readings of a profile reach so many times as far as the strip that holds most of them."""
 
 
 @dataclass(frozen=True)

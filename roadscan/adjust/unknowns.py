@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import COMPONENTS, FIXED, Observations
+from roadscan.adjust.observations import COMPONENTS, FIXED, MOUNTED, Observations
 from roadscan.adjust.process import MountingPrior, RunPrior, knots_of, line_variance, precision_of, stretches
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.model.errors import ConfigError
@@ -24,6 +24,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _SIZE = len(COMPONENTS)
+_MOUNT_SIZE = len(MOUNTED)
 _DOWN = 2
 _ALONG = 0.5
 """A direction with so much of an axis tells of the σ of that coordinate; every direction has it of one or two."""
@@ -43,6 +44,9 @@ class ControlPoints:
     """(c,) run that it stands for, −1: all."""
     sigma_m: Float64
     """(c, 3) of its survey, north, east, down; 0 where no observation tells of the coordinate."""
+    lean: Float64
+    """(c, 2) by how much its height, down, seems off for a metre by which it lies north, and east, of where it was
+    surveyed: the slope of the road, where the height alone is compared, and 0 where the place is."""
     of_observation: Int64
     """(n,) point of each observation, −1: none."""
 
@@ -61,7 +65,12 @@ class ControlPoints:
         for axis in range(3):
             which = along[:, axis]
             np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
-        return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, index)
+        upright, direction = seen.copy(), directions_of(observations)
+        upright[seen] = along[:, _DOWN]
+        lean, count = np.zeros((len(points), 2)), np.bincount(index[upright], minlength=len(points))
+        np.add.at(lean, index[upright], direction[upright, :2] / direction[upright, _DOWN:])
+        lean /= np.maximum(count, 1)[:, None]
+        return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, lean, index)
 
 
 def directions_of(observations: Observations) -> Float64:
@@ -120,12 +129,12 @@ class Unknowns:
 
     @cached_property
     def mount_sigma(self) -> Float64:
-        """(s, 6) prior σ of the mountings."""
-        return np.array([one.sigma for one in self.mountings]).reshape(-1, _SIZE)
+        """(s, 7) prior σ of the mountings."""
+        return np.array([one.sigma for one in self.mountings]).reshape(-1, _MOUNT_SIZE)
 
     @cached_property
     def of_mountings(self) -> Int64:
-        """(s, 6) unknown of each component of the mountings, −1: none."""
+        """(s, 7) unknown of each component of the mountings, −1: none."""
         there = self.mount_sigma > 0.0
         numbers = np.full(there.shape, -1, np.int64)
         numbers[there] = self.first_mounting + np.arange(int(there.sum()))
@@ -190,15 +199,15 @@ class Unknowns:
         return Rows.of(np.hstack([unknown, mounted]), np.hstack([derivative, by_mounting])), variance
 
     def _of_mounted(self, observations: Observations) -> tuple[Int64, Float64]:
-        """Unknowns and derivatives (n, 12), of the mountings of both ends; (n, 0) where none is estimated."""
+        """Unknowns and derivatives (n, 14), of the mountings of both ends; (n, 0) where none is estimated."""
         n = observations.size
         if not self.mountings:
             return np.zeros((n, 0), np.int64), np.zeros((n, 0))
         here = observations.sensor >= 0
-        unknown, derivative = np.full((n, 2, _SIZE), -1, np.int64), np.zeros((n, 2, _SIZE))
+        unknown, derivative = np.full((n, 2, _MOUNT_SIZE), -1, np.int64), np.zeros((n, 2, _MOUNT_SIZE))
         unknown[here] = self.of_mountings[observations.sensor[here]]
         derivative[here] = observations.mount_partials[here] * self.mount_sigma[observations.sensor[here]]
-        return unknown.reshape(n, 2 * _SIZE), derivative.reshape(n, 2 * _SIZE)
+        return unknown.reshape(n, 2 * _MOUNT_SIZE), derivative.reshape(n, 2 * _MOUNT_SIZE)
 
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
         """Upper entries of the prior's inverse covariance: row, column, value, component.
@@ -224,19 +233,28 @@ class Unknowns:
         """Entries of the mountings: each has its σ, and no height is common to all sensors.
 
         Were all lever arms too long, all heights would be off: that is an error of the poses' heights, which are among
-        the unknowns, and known less well.
+        the unknowns, and known less well. A sensor whose height is not estimated tells the two apart.
         """
-        mounted, heights = self.of_mountings[self.of_mountings >= 0], self.of_mountings[:, _DOWN]
-        there = heights >= 0
-        common = 1.0 / self.mount_sigma[there, _DOWN]
-        i, j = np.triu_indices(common.size)
-        row, column = np.append(mounted, heights[there][i]), np.append(mounted, heights[there][j])
-        shared = _NOT_COMMON * common[i] * common[j] / (common @ common) if common.size else np.zeros(0)
-        return row, column, np.append(np.ones(mounted.size), shared), np.full(row.size, _SIZE, np.int64)
+        mounted = self.of_mountings[self.of_mountings >= 0]
+        parts = [(mounted, mounted, np.ones(mounted.size))]
+        for own in self.sharing:
+            heights, common = self.of_mountings[own, _DOWN], 1.0 / self.mount_sigma[own, _DOWN]
+            i, j = np.triu_indices(common.size)
+            parts.append((heights[i], heights[j], _NOT_COMMON * common[i] * common[j] / (common @ common)))
+        row, column, value = (np.concatenate(p) for p in zip(*parts, strict=True))
+        return row, column, value, np.full(row.size, _SIZE, np.int64)
+
+    @cached_property
+    def sharing(self) -> list[Int64]:
+        """Sensors (k,) whose heights could be off together: those of all runs, and those of each run with its own."""
+        return sharing(tuple(one.run for one in self.mountings), self.mount_sigma)
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
-        """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point."""
-        parts = [_pairs(self.of_control, self.of_control), _pairs(self.of_mountings, self.of_mountings)]
+        """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point, of all
+        mountings.
+        """
+        mounted = self.of_mountings.reshape(1, -1)
+        parts = [_pairs(self.of_control, self.of_control), _pairs(mounted, mounted)]
         for run in range(len(self.priors)):
             numbers = self.of_run(run)
             parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]
@@ -278,6 +296,12 @@ class Unknowns:
                         record=int(outside[0]),
                     )
         _refuse_strange_values(observations)
+
+
+def sharing(runs: Sequence[str], mount_sigma: Float64) -> list[Int64]:
+    """Sensors (k,) of mountings that hold in one run, or in all, where the heights of all of them are estimated."""
+    groups = [np.flatnonzero([run == one for run in runs]) for one in dict.fromkeys(runs)]
+    return [own for own in groups if (mount_sigma[own, _DOWN] > 0.0).all()]
 
 
 def _refuse_strange_values(observations: Observations) -> None:

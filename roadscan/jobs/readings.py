@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +54,9 @@ CORRECTION_SIGMAS: Final = tuple(
     f"sigma_{name}" for name in ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 )
 """Columns of the table `corrections`."""
-MOUNTING_COLUMNS: Final = ("lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad")
+MOUNTING_COLUMNS: Final = (
+    "lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad", "range_scale",
+)  # fmt: skip
 """Columns of the table `mounting_corrections`."""
 _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz", *_SIGMA_COLUMNS]
 
@@ -107,7 +109,15 @@ class ReadingSource:
     @property
     def adjusted_mountings(self) -> Mountings:
         """The mountings as an adjustment changed them: they go with corrected poses."""
-        return self.mountings if self.mounting_change is None else self.mounting_change.applied(self.mountings)
+        if self.mounting_change is None:
+            return self.mountings
+        return self.mounting_change.applied(self.mountings, parallel=self.has_parallel_beams)
+
+    @property
+    def has_parallel_beams(self) -> bool:
+        """Whether all readings are measured along the sensor's z, so that only z is a range."""
+        geometry = geometry_of(self)
+        return geometry is not None and geometry.kind == "cartesian"
 
     @property
     def attribute(self) -> dict[str, Any]:
@@ -353,13 +363,29 @@ def _sigma(rows: pa.Table) -> npt.NDArray[np.float64] | None:
     return np.stack([pc.fill_null(rows.column(c), np.nan).to_numpy() for c in CORRECTION_SIGMAS], axis=-1)
 
 
-def load_mounting_changes(store: Store) -> dict[str, MountingChange]:
-    """What an adjustment adds to the mountings of sensors, by sensor."""
+MountingChanges: TypeAlias = Mapping[tuple[str, str], MountingChange]
+"""By run, "*" for all that have none of their own, and sensor."""
+
+
+def load_mounting_changes(store: Store) -> MountingChanges:
+    """What an adjustment adds to the mountings of sensors."""
     table = read_held(store, "mounting_corrections")
-    return {
-        row["sensor"]: MountingChange.of(np.array([row[name] for name in MOUNTING_COLUMNS]))
-        for row in ([] if table is None else table.to_pylist())
-    }
+    return {key_of_row(row): mounting_change_of(row) for row in ([] if table is None else table.to_pylist())}
+
+
+def key_of_row(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Run, "*" for all, and sensor of a row of `mounting_corrections`."""
+    return row.get("run") or "*", row["sensor"]
+
+
+def change_of(changes: MountingChanges, run: str, sensor: str) -> MountingChange | None:
+    """What is added to the mounting of a sensor in a run; None: it holds as it is stated."""
+    return changes.get((run, sensor), changes.get(("*", sensor)))
+
+
+def mounting_change_of(row: Mapping[str, Any]) -> MountingChange:
+    """The change that a row of `mounting_corrections` states; rows without a scale have none."""
+    return MountingChange.of(np.array([row.get(name) or 0.0 for name in MOUNTING_COLUMNS]))
 
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:

@@ -116,6 +116,9 @@ class Sensor(Strict):
     """1 σ of `lever_arm_body_m`, as good as it was measured (forward, right, down; m); a calibration starts from it."""
     boresight_sigma_deg: tuple[float, float, float] | None = None
     """1 σ of the boresight's roll, pitch, heading (degrees); a calibration starts from it."""
+    range_scale_sigma: float | None = Field(default=None, ge=0.0, le=0.1)
+    """1 σ of the scale of its ranges, as a share: the accuracy that its maker states for a measured range. The
+    adjustment starts from it."""
     imu: ImuErrors | ImuGrade | None = None
     """Errors of an IMU: a grade ("navigation", "tactical", "industrial", "mems"), or a table from its data sheet."""
     interior: Interior | None = None

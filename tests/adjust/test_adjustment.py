@@ -100,7 +100,7 @@ def dense(
 
 
 def covariance_of(mountings: np.ndarray) -> np.ndarray:
-    """Covariance (6 s, 6 s) of mountings whose σ (s, 6) are given and whose heights have no error in common.
+    """Covariance (7 s, 7 s) of mountings whose σ (s, 7) are given and whose heights have no error in common.
 
     It is that of independent errors under the condition that the weighted mean of the heights is 0, to a thousandth.
     """
@@ -113,8 +113,8 @@ def covariance_of(mountings: np.ndarray) -> np.ndarray:
 
 
 def by_mountings(observations: Observations, sensors: int) -> np.ndarray:
-    """Derivatives (n, 6 s) by the mountings of sensors."""
-    rows = np.zeros((observations.size, sensors, 6))
+    """Derivatives (n, 7 s) by the mountings of sensors."""
+    rows = np.zeros((observations.size, sensors, 7))
     for n in range(observations.size):
         for end in (0, 1):
             if observations.sensor[n, end] >= 0:
@@ -153,9 +153,9 @@ def test_mountings_are_those_of_dense_least_squares() -> None:
     observations = scattered(4)
     sensor = rng.integers(-1, 2, (observations.size, 2)).astype(np.int32)
     sensor[observations.run == FIXED] = -1
-    by = rng.standard_normal((observations.size, 2, 6))
+    by = rng.standard_normal((observations.size, 2, 7))
     observations = replace(observations, sensor=sensor, mount_partials=by)
-    sigma = np.array([[0.002, 0.003, 0.002, 2e-4, 1e-4, 3e-4], [0.001, 0.002, 0.004, 2e-4, 3e-4, 0.0]])
+    sigma = np.array([[0.002, 0.003, 0.002, 2e-4, 1e-4, 3e-4, 5e-4], [0.001, 0.002, 0.004, 2e-4, 3e-4, 0.0, 1e-3]])
     known = [MountingPrior(name, own) for name, own in zip("ab", sigma, strict=True)]
     found = adjust(observations, priors(), ALL_COUNT, known)
     knots = [knots_of(p, 0.5) for p in priors()]
@@ -168,7 +168,7 @@ def test_mountings_are_those_of_dense_least_squares() -> None:
     rows, prior = by_mountings(observations, 2), covariance_of(sigma)
     gain = np.linalg.solve(_total(observations, knots) + rows @ prior @ rows.T, rows @ prior).T
     np.testing.assert_allclose(found.mountings.error.ravel(), gain @ observations.observed_m, atol=1e-9)
-    after = np.sqrt(np.maximum(np.diag(prior - gain @ rows @ prior), 0.0)).reshape(2, 6)
+    after = np.sqrt(np.maximum(np.diag(prior - gain @ rows @ prior), 0.0)).reshape(2, 7)
     # What the heights have in common stays as well known as it was.
     after[:, 2] = np.hypot(after[:, 2], 1.0 / np.sqrt((1.0 / sigma[:, 2] ** 2).sum()))
     after = after.ravel()
@@ -576,3 +576,29 @@ def test_three_thousand_points_are_judged_by_their_neighbours(monkeypatch: pytes
     assert not found.verdict.doubted
     assert max(sizes) <= 600
     assert len(sizes) >= 60
+
+
+def _drawn(seed: int, factor: float) -> tuple[Adjustment, np.ndarray]:
+    """Three runs of 400 m, σ of the second one's poses stated so many times as large; and its true errors of height."""
+    rng, road = np.random.default_rng(seed), Road(400.0, 3, 10.0, 100.0)
+    drawn = drawn_errors(road, np.concatenate([road.ties_m, road.control_m]), rng)
+    known = road.priors()
+    known[1] = known[1].wider(np.full(6, factor))
+    seen = Observations.joined([ties(road, drawn, rng), control(road, drawn, rng)])
+    found = adjust(seen, known, AdjustmentSettings(knot_spacing_s=1.0))
+    station = (found.epochs_gps_ns[1] - known[1].first_gps_ns) / 1e9 * road.speed_m_s
+    return found, found.values[1][:, 2] - np.interp(station, drawn.station_m, drawn.error[1, :, 2])
+
+
+def test_sigmas_that_one_run_states_too_small_are_told_and_made_larger() -> None:
+    """Times 0.19: where the poses are off by what their true σ makes likely, the run is told, and no other one."""
+    for seed in (1, 5, 7, 10):
+        found, error = _drawn(seed, 0.19)
+        assert 2.0 < np.sqrt(found.run_factors[1, 2]) < 12.0
+        assert (np.delete(found.run_factors, 1, axis=0) == 1.0).all()
+        assert np.sqrt(np.mean(error**2)) < 2.0 * found.sigma[1][:, 2].mean()
+        assert not found.verdict.doubted
+
+
+def test_right_sigmas_of_runs_stay() -> None:
+    assert all((_drawn(seed, 1.0)[0].run_factors == 1.0).all() for seed in range(20, 26))

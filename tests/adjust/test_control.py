@@ -70,7 +70,9 @@ def test_a_point_without_a_target_gives_its_height_along_the_normal() -> None:
     found = observations_of([one])
     lift = 1 / np.sqrt(1 + SLOPE[0] ** 2 + SLOPE[1] ** 2)
     assert found.observed_m == pytest.approx([-0.013 * lift], abs=1e-7)
-    assert found.survey_sigma_m.tolist() == [0.002]
+    # Its place is surveyed with a σ of its own, which the slope makes one of height.
+    steep = np.hypot(*SLOPE) * POINT.sigma_horizontal_m
+    assert found.survey_sigma_m == pytest.approx([np.hypot(0.002, steep)])
     # A pass that is moved east by 0.1 m sees the road there lower by the slope: no height is left.
     held = {"a": shifted(0.1, 0.0, -0.013 + 0.1 * SLOPE[0], one.convergence_rad)}
     assert left_after(found, held, ["a"]) == pytest.approx([0.0], abs=1e-9)

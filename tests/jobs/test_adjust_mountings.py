@@ -25,7 +25,7 @@ CHANGES: dict[str, object] = {
     "adjust__ties": {"cell_m": 0.05},
     "products__make": ["tile_table"],
 }
-COMPONENTS = ("forward_m", "right_m", "down_m", "roll_deg", "pitch_deg", "heading_deg")
+COMPONENTS = ("forward_m", "right_m", "down_m", "roll_deg", "pitch_deg", "heading_deg", "range_scale")
 
 
 def site() -> Scene:
@@ -77,7 +77,7 @@ def test_a_wrong_boresight_is_found_named_and_applied(survey: Simulated) -> None
     assert heading["sigma_heading_rad"] > 0.9 * heading["prior_sigma_heading_rad"]
     said = [one for one in known_findings(Manifest(survey.store())) if one.witness == "mounting"]
     assert [one.subject for one in said] == ["profiler_right"]
-    assert "boresight roll -0.05" in said[0].text
+    assert f"boresight roll {roll:+.4f}° (σ {sigma:.4f}°" in said[0].text
     assert np.mean(np.abs(cell_errors(survey, survey.store()))) < 0.003
 
 

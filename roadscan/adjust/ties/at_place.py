@@ -50,7 +50,7 @@ class Ties:
     def joined(cls, parts: Sequence[Self]) -> Self:
         """All of them, in order; groups are numbered anew."""
         if not parts:
-            return cls(Observations.none(), _columns([], Observations.none(), np.zeros((0, 2, 3))))
+            return cls(Observations.none(), _columns([], Observations.none(), np.zeros((0, 2, 3)), np.zeros((0, 2))))
         observations = Observations.joined([p.observations for p in parts])
         columns = {name: np.concatenate([p.columns[name] for p in parts]) for name in parts[0].columns}
         return cls(observations, columns | {"group": observations.group})
@@ -117,7 +117,7 @@ def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
         return Ties.joined([])
     n = len(found)
     direction = np.array([tie.direction_level for tie in found])
-    derivatives, in_body = np.zeros((n, 2, 6)), np.zeros((n, 2, 3))
+    derivatives, in_body, along = np.zeros((n, 2, 6)), np.zeros((n, 2, 3)), np.zeros((n, 2))
     for side in (0, 1):
         ends = [tie.ends[side] for tie in found]
         point, pose = np.array([end.point_m for end in ends]), np.array([end.pose for end in ends])
@@ -127,8 +127,10 @@ def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
             arm = readings.arm_body_m(point[own], pose[own])
             derivatives[own, side] = partials(direction[own], readings.level_from_body[pose[own]], arm)
             in_body[own, side] = np.einsum("nji,nj->ni", readings.level_from_body[pose[own]], direction[own])
+            along[own, side] = np.einsum("ni,ni->n", arm, in_body[own, side])
     derivatives[:, 1] *= -1.0
     in_body[:, 1] *= -1.0
+    along[:, 1] *= -1.0
     observations = Observations(
         np.array([KINDS.index(t.kind) for t in found], np.uint8),
         np.array([[e.readings.run for e in t.ends] for t in found], np.int32),
@@ -139,10 +141,12 @@ def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
         np.array([t.group for t in found], np.int64),
         np.full(n, place.number, np.int64),
     )
-    return Ties(observations, _columns(found, observations, in_body))
+    return Ties(observations, _columns(found, observations, in_body, along))
 
 
-def _columns(found: Sequence[Tie], observations: Observations, in_body: Float64) -> dict[str, npt.NDArray[Any]]:
+def _columns(
+    found: Sequence[Tie], observations: Observations, in_body: Float64, along_m: Float64
+) -> dict[str, npt.NDArray[Any]]:
     """Columns of the table, with runs as indices."""
     point = np.array([t.ends[0].point_m for t in found]).reshape(-1, 3)
     direction = np.array([t.direction_level for t in found]).reshape(-1, 3)
@@ -150,6 +154,7 @@ def _columns(found: Sequence[Tie], observations: Observations, in_body: Float64)
     axes = [(end, axis) for end in ("first", "second") for axis in ("forward", "right", "down")]
     return {
         **{f"{end}_by_{axis}": column for (end, axis), column in zip(axes, in_body.reshape(-1, 6).T, strict=True)},
+        **{f"{end}_arm_along_m": column for end, column in zip(("first", "second"), along_m.T, strict=True)},
         "place": observations.place,
         "group": observations.group,
         "kind": np.array([t.kind for t in found], dtype=object),

@@ -25,6 +25,7 @@ from roadscan.jobs.adjust.control_work import (
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
 from roadscan.jobs.adjust.mountings import (
     calibrated_sigma,
     held_values,
@@ -84,7 +85,10 @@ def solution_key(plan: SurveyPlan) -> str:
     ]
     return key_of(
         code_digest(f"{__name__}:adjust_survey"), config.model_dump(mode="json"), runs_of(plan), sources, beside,
-        [[name, s.lever_arm_sigma_m, s.boresight_sigma_deg] for name, s in sorted(plan.survey.rig.sensors.items())],
+        [
+            [name, s.lever_arm_sigma_m, s.boresight_sigma_deg, s.range_scale_sigma]
+            for name, s in sorted(plan.survey.rig.sensors.items())
+        ],
         sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
         None if picked is None or not picked.is_file() else file_digest(picked), sorted(foreign_runs(plan.store)),
     )  # fmt: skip
@@ -122,13 +126,22 @@ def adjust_survey(session: Session) -> None:
     work = plan_work(plan, sources, priors)
     failed = _collect(session, work)
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
-    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs, mounted)
+    units = [t.unit for t in work.ties]
+    ties = load_ties(session.store, manifest, units, runs, mounted)
+    steps = steps_of(ties, plan.survey.config.adjust.ties.return_s)
+    swapped = exchanged(plan, sources, steps)
+    useless = {one.run for one, _ in swapped}
+    odd = odd_steps([one for one in steps if one.run not in useless])
+    if mounted.priors and odd:
+        mounted = mounted.apart((one.run, head) for one, _ in odd for head in one.heads)
+        ties = load_ties(session.store, manifest, units, runs, mounted)
+    ties = ties.of_seams({p.number for t in work.ties for p in t.places if p.seam}, COMMON_M)
     sightings, pictures = load_sightings(session.store, manifest, work.control)
-    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted)
+    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted, frozenset(map(runs.index, useless)))
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
-    ]
+    ] + head_findings(swapped, odd)
     if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
@@ -149,8 +162,8 @@ def adjust_survey(session: Session) -> None:
         "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
-    seams, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
-    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
+    shown, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), pictures)
     lines = [*_lines(work, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
     doubts += [*solution.findings, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
     _keep(session, key, held, (lines, doubts), failed)
@@ -168,11 +181,12 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
-    """Places of dense sensors, then those of lidars, which are larger: they are numbered through."""
+    """Places of dense sensors, those of lidars, which are larger, and the seams of heads: they are numbered through."""
     dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
     ahead = settings.model_copy(update={"per_km": settings.lidar_per_km})
     sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], ahead)
-    return [*dense, *(replace(place, number=len(dense) + place.number) for place in sparse)]
+    found = [*dense, *sparse, *seams(tracks, dense, settings)]
+    return [replace(place, number=number) for number, place in enumerate(found)]
 
 
 def _collect(session: Session, work: Work) -> bool:

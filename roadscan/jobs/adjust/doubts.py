@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_faults import WrongPoint, listed, swapped
-from roadscan.adjust.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict
+from roadscan.adjust.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
 from roadscan.adjust.process import RunPrior
 from roadscan.model.witness import Finding, Witness
 
@@ -36,7 +36,8 @@ CONTROL_DATUM: Final = Witness(
     "control_datum",
     input="control points",
     fault="All control is off together: another datum, geoid, CRS or antenna height.",
-    asks="the poses, whose σ and correlation time say how well they know the mean height and place of a drive",
+    asks="the poses, whose σ and correlation time say how well they know the mean height and place of a drive; where "
+    "heights alone are compared, the slopes of the road",
     does="control that is off by more than adjust.control.largest_m is not used; for less, adjust.control.datum_offset "
     "says whether it is followed, with an σ that holds the offset, or whether the offset is estimated",
     told=("findings",),
@@ -86,7 +87,8 @@ STATED_SIGMA: Final = Witness(
     "stated_sigma",
     input="trajectories, control points",
     fault="A stated σ of poses or of observations is much too small.",
-    asks="residuals against their σ: variance factors of each kind of observation and of each component of the poses",
+    asks="residuals against their σ: variance factors of each kind of observation, of each component of the poses, and "
+    "of the poses of each run",
     does="variance factors are estimated, and weights and published σ follow them",
     told=("findings",),
 )
@@ -105,6 +107,7 @@ _WORDS: Final = {
     "height_tie": "heights of one pass against another",
     "shift_tie": "shifts of one pass against another",
     "plane_tie": "distances of planes of two passes",
+    "head_tie": "heights of one head against another of the same pass",
     "control_height": "heights measured at control points",
     "control_position": "places measured at control points",
     "control_survey": "the survey of the control points",
@@ -165,6 +168,40 @@ def offset_findings(verdict: ControlVerdict, applied: AppliedOffset, points: int
             text += "The control is followed, and σ holds the offset"
         unused = points if name in (*applied.refused, *applied.estimated) else 0
         found.append(CONTROL_DATUM.finds(CONTROL, f"{text} (adjust.control.datum_offset)", left_out=unused))
+    return found
+
+
+def shift_findings(shift: PlaneShift) -> list[Finding]:
+    """Findings on control whose heights tell that it lies elsewhere in the plane."""
+    if not shift.sigmas:
+        return []
+    north, east = 1e3 * shift.shift_m
+    sigma = 1e3 * np.sqrt(np.diag(shift.covariance_m2))
+    return [
+        CONTROL_DATUM.finds(
+            CONTROL, f"heights on slopes tell that the control lies {north:+.0f} mm north (σ {sigma[0]:.0f} mm) and "
+            f"{east:+.0f} mm east (σ {sigma[1]:.0f} mm) of the road that it was surveyed on ({shift.sigmas:.1f} σ); "
+            "its heights are compared there, and σ holds what is not known of the shift",
+        )
+    ]  # fmt: skip
+
+
+def run_findings(runs: Sequence[str], factors: Float64) -> list[Finding]:
+    """Findings on runs whose poses are worse than their σ say; factors : (runs, 6) of the stated variances."""
+    found = []
+    for run, own in zip(runs, factors, strict=True):
+        words = [
+            f"{name} is {np.sqrt(own[k]):.1f} times too small"
+            for name, k in (("position", 0), ("attitude", 3))
+            if own[k] > 1.0
+        ]
+        if words:
+            found.append(
+                STATED_SIGMA.finds(
+                    f"run '{run}'", f"by ties and control, the stated σ of the {' and of the '.join(words)}; the poses "
+                    "of this run count with the larger one",
+                )
+            )  # fmt: skip
     return found
 
 

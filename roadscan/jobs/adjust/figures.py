@@ -35,7 +35,7 @@ _AT_THEIR_PLACE: Final = ("found", "picked")
 
 
 def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
-    """Of the table `tie_residuals`; mounted : (s, 6) what is added to the mountings."""
+    """Of the table `tie_residuals`; mounted : (s, 7) what is added to the mountings."""
     ties = evidence.ties
     after = left_after(ties.observations, held, evidence.runs, mounted)
     names = ("place", "kind", "first_run", "second_run", "easting_m", "northing_m", "accepted", "sigma_m")
@@ -123,7 +123,7 @@ def _by_distance(rows: Float64) -> list[DistanceClass]:
 
 
 def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
-    """Of the table `control_residuals`; mounted : (s, 6) what is added to the mountings."""
+    """Of the table `control_residuals`; mounted : (s, 7) what is added to the mountings."""
     return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
 
 
@@ -132,7 +132,7 @@ def _control_row(
 ) -> dict[str, Any]:  # fmt: skip
     point, run = one.point, evidence.runs[one.run]
     seen_by = evidence.seen_by(one)
-    mounting = None if seen_by.number < 0 else (MountingChange.of(mounted[seen_by.number]), seen_by.lever_body_m)
+    mounting = None if seen_by.number < 0 else (MountingChange.of(mounted[seen_by.number]), seen_by.seat)
     moved = moved_m(one, held.get(run), mounting)
     height = point.height_m - one.height_m
     east, north = point.easting_m - one.easting_m, point.northing_m - one.northing_m

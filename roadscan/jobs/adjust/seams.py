@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +18,8 @@ from roadscan.jobs.adjust.near import Circle, NearReader
 from roadscan.jobs.adjust.solution import Evidence, Solution
 from roadscan.jobs.adjust.tie_work import DIAGONAL, TieTask
 from roadscan.jobs.engine.compute import Compute, reason_of
-from roadscan.navigation.mounting_change import MountingChange
+from roadscan.jobs.readings import MountingChanges, change_of
+from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.navigation.trajectory import Corrections
 from roadscan.products.pictures.seams import ShownSeam
 
@@ -37,7 +38,7 @@ class SeamTask:
     place: Place
     ends: tuple[Traverse, Traverse]
     corrections: tuple[Corrections | None, Corrections | None]
-    mountings: tuple[tuple[MountingChange, Float64] | None, tuple[MountingChange, Float64] | None]
+    mountings: tuple[tuple[MountingChange, Seat] | None, tuple[MountingChange, Seat] | None]
     """Change of the mounting of each sensor, and its lever arm."""
 
 
@@ -45,7 +46,7 @@ def shown_seams(
     tasks: Sequence[TieTask],
     evidence: Evidence,
     solution: Solution,
-    held: tuple[Held, Mapping[str, MountingChange]],
+    held: tuple[Held, MountingChanges],
     compute: Compute,
 ) -> tuple[list[ShownSeam], list[str]]:
     """What is to be drawn of the chosen seams, and why one is missing where its readings could not be read.
@@ -68,7 +69,7 @@ def seam_tasks(
     evidence: Evidence,
     solution: Solution,
     held: Held,
-    changes: Mapping[str, MountingChange],
+    changes: MountingChanges,
 ) -> Iterator[SeamTask]:
     """The height tie that differed most of those that count, and the one in the middle of them by their size."""
     observations, columns = evidence.ties.observations, evidence.ties.columns
@@ -92,14 +93,12 @@ def seam_tasks(
         yield SeamTask(name, task, place, (ends[0], ends[1]), (first, second), (one, other))
 
 
-def _mounting(
-    evidence: Evidence, end: Traverse, changes: Mapping[str, MountingChange]
-) -> tuple[MountingChange, Float64] | None:
-    change = changes.get(end.sensor)
+def _mounting(evidence: Evidence, end: Traverse, changes: MountingChanges) -> tuple[MountingChange, Seat] | None:
+    run = evidence.runs[end.run]
+    change = change_of(changes, run, end.sensor)
     if change is None:
         return None
-    lever = evidence.mounted.lever_m(evidence.runs[end.run], end.sensor, np.array([end.first_gps_ns], np.int64))
-    return change, lever[0]
+    return change, evidence.mounted.seat(run, end.sensor, end.first_gps_ns)
 
 
 def view_seam(task: SeamTask) -> SeamView | None:

@@ -16,9 +16,9 @@ from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.level import level_poses
-from roadscan.adjust.observations import FIXED, Observations
+from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, StatedSigma, knots_of
+from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.jobs.adjust.doubts import (
     CONTROL,
@@ -31,12 +31,14 @@ from roadscan.jobs.adjust.doubts import (
     offset_findings,
     offset_line,
     power_line,
+    run_findings,
+    shift_findings,
     solver_findings,
     solver_line,
     time_line,
     wrong_points,
 )
-from roadscan.jobs.adjust.mountings import Mounted, contradicted, disproved
+from roadscan.jobs.adjust.mountings import Cause, Mounted, cause_line, causes, contradicted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
 from roadscan.jobs.adjust.tracks import span_of
@@ -46,6 +48,7 @@ from roadscan.jobs.readings import TrajectorySource, load_recorded
 from roadscan.model.settings.adjust import AdjustConfig, PosePriors
 from roadscan.model.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.model.witness import Finding
+from roadscan.navigation.mounting_change import NO_SEAT
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -69,13 +72,15 @@ class Evidence:
     ties: KnownTies
     sightings: tuple[Sighting, ...]
     mounted: Mounted
+    useless: frozenset[int] = frozenset()
+    """Runs whose readings are not where they seem: neither their ties nor their control counts."""
 
     def seen_by(self, one: Sighting) -> SeenBy:
         """The sensor that saw a point."""
         if one.status == "unseen":
-            return SeenBy(-1, np.zeros(3))
-        lever = self.mounted.lever_m(self.runs[one.run], one.sensor, np.array([one.epoch_gps_ns], np.int64))
-        return SeenBy(self.mounted.number(one.sensor), lever[0])
+            return SeenBy(-1, NO_SEAT)
+        seat = self.mounted.seat(self.runs[one.run], one.sensor, one.epoch_gps_ns)
+        return SeenBy(self.mounted.number(self.runs[one.run], one.sensor), seat)
 
 
 @dataclass(frozen=True)
@@ -178,18 +183,20 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     far = {} if datum else far_in_height(evidence.sightings, config.control.largest_m)
     names = np.array([one.point.name for one in sightings], dtype=object)
     entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
+    entering &= ~np.isin(control.run.max(axis=1), list(evidence.useless))
     found = [CONTROL_DATUM.finds(CONTROL, datum, left_out=len(set(names.tolist())))] if datum else []
     found += _far_findings(far, evidence)
     if config.mode == "helmert":
         return _rigid_solution(plan, evidence, control, entering, found)
     entering_ties = _entering(evidence)
-    adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
     found += wrong_points(_wrong(evidence.sightings, adjusted, first))
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
+    found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
     found += solver_findings(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled)
@@ -201,7 +208,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     lines = [
         solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
         time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict, adjusted.applied),
-        power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
+        power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()), cause_line(named),
     ]  # fmt: skip
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
@@ -214,13 +221,14 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
 def _entering(evidence: Evidence) -> Bool:
     """Ties (t,) that enter: those that passed their tests, and for mountings those between heads of one pass."""
     ties = evidence.ties
-    return ties.accepted | ties.of_heads if evidence.mounted.priors else ties.accepted
+    useful = ~np.isin(ties.observations.run, list(evidence.useless)).any(axis=1)
+    return useful & (ties.accepted | ties.of_heads if evidence.mounted.priors else ties.accepted)
 
 
 def _adjusted(
     config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
-) -> tuple[Adjustment, int]:
-    """The adjustment of ties and control, and the place that stands for point 0.
+) -> tuple[Adjustment, int, tuple[Cause, ...]]:
+    """The adjustment of ties and control, the place that stands for point 0, and what may be wrong with mountings.
 
     A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
@@ -237,18 +245,19 @@ def _adjusted(
         found = adjust(joined, evidence.priors, settings, priors)
         shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
         if len(priors) and any((one.sigma[shared] > 0.0).any() for one in priors):
-            priors = tuple(MountingPrior(one.sensor, _without(one.sigma, shared)) for one in priors)
+            priors = tuple(replace(one, sigma=_without(one.sigma, shared)) for one in priors)
             continue
         off = disproved(found.mountings)
         if not off.any():
             break
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
-        priors = tuple(MountingPrior(one.sensor, own) for one, own in zip(priors, sigma, strict=True))
-    stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, 6)
+        priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
+    stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
     estimated, wrong = found.mountings, contradicted(found.mountings)
+    named = causes(found.mountings)
     if priors and not wrong.all():
         priors = tuple(
-            MountingPrior(one.sensor, one.sigma if is_wrong else np.zeros(6))
+            replace(one, sigma=one.sigma if is_wrong else np.zeros(len(MOUNTED)))
             for one, is_wrong in zip(priors, wrong, strict=True)
         )
         found = adjust(joined, evidence.priors, settings, priors)
@@ -257,11 +266,11 @@ def _adjusted(
             error=np.where(wrong[:, None], found.mountings.error, 0.0),
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
-    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first
+    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:
-    """σ (6,) of a mounting, and 0 for components that are not to be estimated."""
+    """σ (7,) of a mounting, and 0 for components that are not to be estimated."""
     return np.where(np.isin(np.arange(sigma.size), axes), 0.0, sigma)
 
 
@@ -341,7 +350,7 @@ def _rigid_solution(
     found += wrong_points(_left_out_of(evidence.sightings, points))
     # What poses and ties say of the control as a whole; a rigid movement follows the control whatever they say.
     following = config.model_copy(update={"control": config.control.model_copy(update={"datum_offset": "follow"})})
-    adjusted, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
+    adjusted, _, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
     found += offset_findings(adjusted.verdict, adjusted.applied, len(points))
     corrections, sides_m = _rigid_corrections(plan, evidence, fit)
     prior = max((float(p.sigmas[2]) for p in evidence.priors), default=0.0)

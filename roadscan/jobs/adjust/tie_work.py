@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,15 +13,16 @@ import pyarrow as pa
 from roadscan.adjust.observations import KINDS, Observations, mount_partials
 from roadscan.adjust.places import Place
 from roadscan.adjust.ties.at_place import Ties, ties_at
-from roadscan.adjust.ties.tie import SAME_PASS
+from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.code_reach import code_digest
-from roadscan.jobs.adjust.mountings import Mounted, numbers_of
+from roadscan.jobs.adjust.mountings import Mounted
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.readings import Ground
 from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.navigation.mounting_change import Seat
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store, bytes_digest
@@ -32,11 +33,14 @@ TIES: Final = "ties"
 
 _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
+_SEAM_CELLS: Final = 40
+"""A seam is compared where both heads saw so many cells: a strip that is one cell wide holds 160 along 4 m."""
 DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
 """Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
 _SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
+_ARMS: Final = ("first_arm_along_m", "second_arm_along_m")
 _TURNS: Final = tuple(
     f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
 )
@@ -82,12 +86,7 @@ def tie_tasks(plan: SurveyPlan, sources: Sources, places: Sequence[Place], runs:
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write what was found (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
-    parts = [
-        ties_at(place, [reader.of(t, circle) for t in place.traverses], task.settings)
-        for place in task.places
-        for circle in [Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)]
-    ]
-    found = Ties.joined(parts)
+    found = Ties.joined([ties_of(reader, place, task.settings) for place in task.places])
     if not found.observations.size:
         return OutputRecord(TIES, task.unit, task.key, "", 0, "")
     schema = table_schema(TIES)
@@ -95,6 +94,14 @@ def collect_ties(task: TieTask) -> OutputRecord:
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(TIES, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def ties_of(reader: NearReader, place: Place, settings: TieSettings) -> Ties:
+    """Ties of one place."""
+    circle = Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)
+    if place.seam:
+        settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
+    return ties_at(place, [reader.of(traverse, circle) for traverse in place.traverses], settings)
 
 
 def _rows(found: Ties, runs: Sequence[str]) -> pa.Table:
@@ -117,20 +124,23 @@ def _finite(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _by_mounting(
     column: Mapping[str, npt.NDArray[Any]],
     end: str,
-    geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
+    geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
     mounted: Mounted,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Number (n,) of the sensor of one end, and derivatives (n, 6) by its mounting.
+    """Number (n,) of the sensor of one end, and derivatives (n, 7) by its mounting.
 
-    geometry : derivatives by a shift and by a turn of the pose, body axes, and epochs.
+    geometry : derivatives by a shift and by a turn of the pose, body axes, the arm along the direction, and epochs.
     """
-    shifts, turns, epochs = geometry
+    shifts, turns, along, epochs = geometry
     runs, sensors = column[f"{end}_run"], column[f"{end}_sensor"]
-    lever = np.zeros(shifts.shape)
+    seat = Seat(np.zeros(shifts.shape), np.full(shifts.shape, np.nan))
+    number = np.full(len(runs), -1, np.int32)
     for run, sensor in sorted(set(zip(runs.tolist(), sensors.tolist(), strict=True))):
         own = (runs == run) & (sensors == sensor)
-        lever[own] = mounted.lever_m(run, sensor, epochs[own])
-    return numbers_of(mounted, sensors.tolist()), mount_partials(shifts, turns, lever)
+        number[own] = mounted.number(run, sensor)
+        one = mounted.seats(run, sensor, epochs[own])
+        seat.lever_body_m[own], seat.beam_body[own] = one.lever_body_m, one.beam_body
+    return number, mount_partials(shifts, turns, along, seat)
 
 
 @dataclass(frozen=True)
@@ -145,6 +155,21 @@ class KnownTies:
     def accepted(self) -> npt.NDArray[np.bool_]:
         """(n,) ties that passed their tests."""
         return np.asarray(self.columns["accepted"] == 1)
+
+    def of_seams(self, places: Set[int], sigma_m: float) -> KnownTies:
+        """The same, heights of heads of one pass as ties of a kind of their own.
+
+        Those of two heads at some places have an error in common: what they say together is known no better than it.
+        """
+        own = np.isin(self.observations.place, list(places)) & self.of_heads
+        names = ("first_run", "first_sensor", "second_sensor", "kind")
+        columns = [np.unique(self.columns[name], return_inverse=True)[1] for name in names]
+        group = np.unique(np.stack(columns)[:, own], axis=1, return_inverse=True)[1].ravel()
+        sigma = self.observations.sigma_m.copy()
+        sigma[own] = np.hypot(sigma[own], sigma_m * np.sqrt(np.bincount(group)[group]))
+        upright = self.of_heads & (self.observations.kind == KINDS.index(HEIGHT))
+        kind = np.where(upright, np.uint8(KINDS.index("head_tie")), self.observations.kind)
+        return replace(self, observations=replace(self.observations, sigma_m=sigma, kind=kind))
 
     @property
     def of_heads(self) -> npt.NDArray[np.bool_]:
@@ -171,7 +196,10 @@ def load_ties(
     group = np.unique(np.stack([column["place"], column["group"]]), axis=1, return_inverse=True)[1].ravel()
     epochs = np.stack([column[f"{e}_epoch_gps_ns"] for e in ends], axis=-1)
     shifts = np.stack([column[name] for name in _SHIFTS], axis=-1).reshape(-1, 2, 3)
-    mounts = [_by_mounting(column, e, (shifts[:, k], turns[:, k], epochs[:, k]), mounted) for k, e in enumerate(ends)]
+    mounts = [
+        _by_mounting(column, e, (shifts[:, k], turns[:, k], column[_ARMS[k]], epochs[:, k]), mounted)
+        for k, e in enumerate(ends)
+    ]
     observations = Observations(
         np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8),
         np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2),

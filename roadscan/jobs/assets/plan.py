@@ -172,7 +172,7 @@ def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, Trajectory
 
 
 def _corrections(plan: SurveyPlan, run: str) -> str:
-    own, mounted = plan.corrections.by_run.get(run), plan.corrections.by_sensor
+    own, mounted = plan.corrections.by_run.get(run), plan.corrections.mountings
     if own is None and not mounted:
         return ""
     arrays = [] if own is None else [own.epochs_gps_ns, own.north_east_down_m, own.roll_pitch_heading_rad]

@@ -11,10 +11,15 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.readings import ReadingSource, load_all_corrections, load_mounting_changes
+from roadscan.jobs.readings import (
+    MountingChanges,
+    ReadingSource,
+    change_of,
+    load_all_corrections,
+    load_mounting_changes,
+)
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S
-from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.movement import Allowance, allowance_for, largest
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.points.turns import TICK_NS, WINDOW_NS
@@ -29,7 +34,7 @@ class KnownCorrections:
     """Corrections of all runs and of the mountings of all sensors, as the tables hold them."""
 
     by_run: Mapping[str, Corrections]
-    by_sensor: Mapping[str, MountingChange] = field(default_factory=dict)
+    mountings: MountingChanges = field(default_factory=dict)
 
     @classmethod
     def load(cls, store: Store) -> Self:
@@ -46,7 +51,7 @@ class KnownCorrections:
         """
         own = self.by_run.get(run)
         try:
-            change = self.by_sensor.get(sensor)
+            change = change_of(self.mountings, run, sensor)
             return allowance_for(own, (0.0, 0.0) if change is None else change.largest)
         except ValueError:
             shift, turn = largest(own)
@@ -63,7 +68,7 @@ class KnownCorrections:
         interpolation looks at.
         """
         own = self.by_run.get(source.run)
-        mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.sensor)
+        mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.run, source.sensor)
         if own is None or source.trajectory is None:
             return np.full(len(spans_gps_ns), mounted, np.uint64)
         wide = beyond_ns(source, max_gap_s)
@@ -73,8 +78,8 @@ class KnownCorrections:
         found: UInt64 = sums[np.minimum(last, knots.size - 1) + 1] - sums[np.maximum(first, 0)]
         return found + mounted
 
-    def _mounting_digest(self, sensor: str) -> np.uint64:
-        change = self.by_sensor.get(sensor)
+    def _mounting_digest(self, run: str, sensor: str) -> np.uint64:
+        change = change_of(self.mountings, run, sensor)
         if change is None:
             return np.uint64(0)
         return np.uint64(int.from_bytes(hashlib.blake2b(change.values.tobytes(), digest_size=8).digest(), "little"))

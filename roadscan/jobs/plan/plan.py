@@ -25,6 +25,7 @@ from roadscan.jobs.readings import (
     RawSlice,
     ReadingSource,
     TrajectorySource,
+    change_of,
     load_mountings,
 )
 from roadscan.model.errors import ConfigError, RunError
@@ -239,7 +240,7 @@ def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingS
     """A source with the correction of its mounting, whose footprints leave room for corrections."""
     if source.trajectory is None:
         return source
-    change = corrections.by_sensor.get(source.sensor)
+    change = change_of(corrections.mountings, source.run, source.sensor)
     return replace(source, allowance=corrections.allowance(source.run, source.sensor), mounting_change=change)
 
 

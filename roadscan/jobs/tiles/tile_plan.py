@@ -178,7 +178,7 @@ def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.
     order = np.argsort(f.slice_index, kind="stable")
     ends = np.searchsorted(f.slice_index[order], np.arange(len(f.slices)), side="right").tolist()
     for one, (first, end) in zip(f.slices, itertools.pairwise([0, *ends]), strict=True):
-        if one.source.run in plan.corrections.by_run or one.source.sensor in plan.corrections.by_sensor:
+        if one.source.run in plan.corrections.by_run or one.source.mounting_change is not None:
             own = order[first:end]
             spans = np.column_stack([f.first_epoch_gps_ns[own], f.last_epoch_gps_ns[own]])
             found[own] = plan.corrections.digests(one.source, spans, plan.ground.max_gap_s)

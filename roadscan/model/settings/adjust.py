@@ -40,8 +40,9 @@ class PosePriors(Strict):
 class MountingPriors(Strict):
     """How well the mountings of sensors are known; the adjustment estimates what is wrong with them.
 
-    They are of sensors whose σ neither the rig file (`lever_arm_sigma_m`, `boresight_sigma_deg`) nor a calibration
-    states. A component of σ 0 is not estimated, whatever these state; nor is any in other modes than `joint`.
+    They are of sensors whose σ neither the rig file (`lever_arm_sigma_m`, `boresight_sigma_deg`, `range_scale_sigma`)
+    nor a calibration states. A component of σ 0 is not estimated, whatever these state; nor is any in other modes than
+    `joint`.
 
     Heads stand on one beam, and where they stand on it is measured to a millimetre. How the beam stands beside the
     positions' reference is known less well, but in the plane no evidence tells that from the error of the poses.
@@ -59,6 +60,9 @@ class MountingPriors(Strict):
     """1 σ of the boresight about the body's y axis (degrees)."""
     sigma_heading_deg: float = Field(default=0.02, ge=0.0, le=10.0)
     """1 σ of the boresight about the body's z axis (degrees)."""
+    sigma_range_scale: float = Field(default=0.0005, ge=0.0, le=0.1)
+    """1 σ of the scale of ranges, as a share: makers state 0.01 to 0.1 % of the measuring range for the linearity of
+    profilers."""
 
 
 class TargetConfig(Strict):

@@ -18,6 +18,10 @@ class PlaceSettings(Strict):
     """Places per kilometre for sensors that see ahead, whose planes are compared."""
     lidar_radius_m: float = Field(default=8.0, gt=0.0, le=100.0)
     """Half the edge of the square that their planes are taken from (m)."""
+    seams_per_km: float = Field(default=50.0, gt=0.0, le=2000.0)
+    """Places per kilometre where heads of one pass that overlap by a few centimetres are held against one another."""
+    seam_radius_m: float = Field(default=2.0, gt=0.0, le=20.0)
+    """Half the length of road that is compared at each of them (m): a narrow strip has to be long."""
     margin_m: float = Field(default=0.3, ge=0.0)
     """Readings are taken from so much farther ahead and behind: passes lie apart by what their poses are off (m)."""
     least_overlap_m: float = Field(default=0.2, gt=0.0)

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from roadscan.adjust.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
+from roadscan.adjust.fixed_runs import FixedRun, fixed_runs
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
 from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
@@ -122,6 +123,8 @@ class Adjustment:
     response: tuple[Float64, ...]
     """(k, 6, 3) of each run: by how much its corrections move for a metre of a common offset of the control, north,
     east, down."""
+    fixed: tuple[FixedRun, ...] = ()
+    """What is known of the errors of the runs that are held."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
@@ -195,8 +198,8 @@ def adjust(
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
     verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)
     applied = applied_offset(verdict, settings, settings.reject_beyond)
-    estimate, response = _with_control(unknowns, alone, rounds, verdict, applied)
-    values, covariance, with_next = _of_knots(unknowns, estimate)
+    estimate, solution, response = _with_control(unknowns, alone, rounds, verdict, applied)
+    values, covariance, with_next = _of_knots(unknowns, estimate, solution)
     told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
     back = np.empty(order.size, np.int64)
     back[order] = np.arange(order.size)
@@ -206,9 +209,10 @@ def adjust(
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
-        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate),
+        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate, solution),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
+        fixed_runs(unknowns, _of_solution(unknowns, estimate.solution)),
     )  # fmt: skip
 
 
@@ -320,19 +324,28 @@ def _in_time(control: ControlPoints, observations: Observations) -> Int64:
 
 def _with_control(
     unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
-) -> tuple[Estimate, tuple[Float64, ...]]:
-    """The solution with surveys that are right, and by how much each knot follows an offset of all of them."""
+) -> tuple[Estimate, Float64, tuple[Float64, ...]]:
+    """The solution with surveys that are right, the same with fixed runs held, and by how much each knot follows an
+    offset of all surveys.
+
+    Fixed runs are estimated like all others as long as observations are judged: what contradicts their poses within
+    the σ of these is not wrong.
+    """
     point, axis, sigma = _surveyed(unknowns)
     left_out = verdict.left_out
     component = {a: name for name, axes in SURVEYED.items() for a in axes}
     names = [component[a] for a in axis.tolist()]
     counts = [n not in applied.refused and (p, n) not in left_out for p, n in zip(point.tolist(), names, strict=True)]
     weight = np.array(counts, np.float64)
+    estimate = alone
+    if weight.any():
+        estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, verdict.survey_factor, alone.rounds)
+    fixed = unknowns.fixed
+    solution = rounds.holding(fixed) if fixed.any() else estimate.solution
     if not weight.any():
-        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
-    estimate = rounds.with_surveys(weight, applied.offset_m[axis] / sigma, verdict.survey_factor, alone.rounds)
+        return estimate, solution, tuple(np.zeros((k.size, len(COMPONENTS), 3)) for k in unknowns.knots)
     moved = [_of_solution(unknowns, rounds.response((axis == a) / sigma)) for a in range(3)]
-    return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+    return estimate, solution, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
 
 
 def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
@@ -343,15 +356,21 @@ def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
 
 
 def _of_knots(
-    unknowns: Unknowns, estimate: Estimate
+    unknowns: Unknowns, estimate: Estimate, solution: Float64
 ) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
-    """Values, covariances, and those with the next knot, of each run."""
-    covariance, with_next = [], []
-    for run, sigma in enumerate(unknowns.sigmas):
-        numbers = unknowns.of_run(run)
-        covariance.append(_blocks(estimate, (numbers, sigma), (numbers, sigma)))
-        with_next.append(_blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:])))
-    return tuple(_of_solution(unknowns, estimate.solution)), tuple(covariance), tuple(with_next)
+    """Values, covariances, and those with the next knot, of each run.
+
+    Where a run is held, the others leave the most likely solution for its sake; their covariance is the mean square
+    error of what is published: that of the most likely solution, and the square of the way from there.
+    """
+    covariance, with_next, values = [], [], _of_solution(unknowns, solution)
+    for run, (sigma, away) in enumerate(zip(unknowns.sigmas, _of_solution(unknowns, estimate.solution), strict=True)):
+        numbers, more = unknowns.of_run(run), values[run] - away
+        own = _blocks(estimate, (numbers, sigma), (numbers, sigma))
+        beside = _blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:]))
+        covariance.append(own + more[:, :, None] * more[:, None, :])
+        with_next.append(beside + more[:-1, :, None] * more[1:, None, :])
+    return tuple(values), tuple(covariance), tuple(with_next)
 
 
 def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
@@ -379,11 +398,11 @@ def _of_observations(
     return residual, weight, redundancy, normalised
 
 
-def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
+def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> MountingErrors:
     prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
     there = numbers >= 0
     error = np.zeros(prior.shape)
-    error[there] = estimate.solution[numbers[there]] * prior[there]
+    error[there] = solution[numbers[there]] * prior[there]
     variance = np.zeros(prior.shape)
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
     # What all heights have in common is not estimated: it is known as well as it was.

@@ -78,6 +78,8 @@ class RunPrior:
     """In the order of `COMPONENTS`; independent of one another."""
     stated: StatedSigma | None = None
     """σ over time, in place of the usual one of the components that it states and that are corrected."""
+    fixed: bool = False
+    """The recorded poses hold, and those of other runs are adjusted to them."""
 
     def __post_init__(self) -> None:
         if self.last_gps_ns < self.first_gps_ns:

@@ -25,6 +25,7 @@ from roadscan.jobs.adjust.control_work import (
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.jobs.adjust.mountings import (
     calibrated_sigma,
     held_values,
@@ -66,12 +67,20 @@ class Work:
     control: tuple[ControlTask, ...]
     points: tuple[ControlPoint, ...]
     """Control points of the survey."""
+    hand: HandWork
+    """Ties by hand."""
+
+    @property
+    def sightings(self) -> tuple[ControlTask, ...]:
+        """Tasks that look at control points, and at the ends of ties by hand."""
+        return (*self.control, *self.hand.tasks)
 
 
 def solution_key(plan: SurveyPlan) -> str:
     """Hash of all that the solution depends on: settings, code, readings, poses, control. No reading is read for it."""
     config = plan.survey.config.adjust
     picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
+    by_hand = [None if f is None or not f.is_file() else file_digest(f) for f in (picked, hand_file(plan.survey))]
     sources = [
         [s.key, *road_key(s), s.trajectory is not None, [f.digest for f in files]]
         for s, files in adjusted_sources(plan)
@@ -86,7 +95,7 @@ def solution_key(plan: SurveyPlan) -> str:
         code_digest(f"{__name__}:adjust_survey"), config.model_dump(mode="json"), runs_of(plan), sources, beside,
         [[name, s.lever_arm_sigma_m, s.boresight_sigma_deg] for name, s in sorted(plan.survey.rig.sensors.items())],
         sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
-        None if picked is None or not picked.is_file() else file_digest(picked), sorted(foreign_runs(plan.store)),
+        by_hand, sorted(foreign_runs(plan.store)),
     )  # fmt: skip
 
 
@@ -124,11 +133,14 @@ def adjust_survey(session: Session) -> None:
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
     ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs, mounted)
     sightings, pictures = load_sightings(session.store, manifest, work.control)
+    ends, _ = load_sightings(session.store, manifest, work.hand.tasks)
+    ties, unmeasured = with_hand_ties(ties, work.hand, ends, mounted, runs)
     evidence = Evidence(runs, priors, ties, tuple(sightings), mounted)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
     ]
+    doubts += [*work.hand.findings, *unmeasured]
     if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
@@ -164,7 +176,8 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan))
     control = control_tasks(plan, sources, tracks, points, priors)
-    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points))
+    hand = hand_work(plan, sources, tracks, priors, len(points))
+    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand)
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
@@ -179,9 +192,9 @@ def _collect(session: Session, work: Work) -> bool:
     """Bring the evidence up to date; True where some of it failed."""
     manifest, bar = session.manifest, session.bar
     manifest.remove(manifest.beside([TIES], {t.unit for t in work.ties}))
-    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in work.control}))
+    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in work.sightings}))
     ties = [t for t in work.ties if not manifest.is_current(TIES, t.unit, t.key)]
-    control = [t for t in work.control if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    control = [t for t in work.sightings if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
     found = [
         (task.unit, reason)
         for task, reason in run_bundles(

@@ -34,6 +34,9 @@ from roadscan.tables.writer import parquet_bytes
 SIGHTINGS: Final = "control_sightings"
 """Table, and product of its files in the manifest."""
 
+HAND: Final = "hand"
+"""Role of an end of a tie by hand."""
+
 _PICKED_COLUMNS: Final = ("run", "name", "easting_m", "northing_m")
 _FIT_RADII: Final = 1.5
 """Readings are kept that far around the search, in radii of the target."""
@@ -60,7 +63,7 @@ class ControlTask:
     @property
     def unit(self) -> str:
         """Its name in the manifest."""
-        return f"point-{self.point.number:06d}"
+        return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}"
 
     @property
     def bytes(self) -> int:
@@ -147,22 +150,38 @@ def control_tasks(
 
     priors : of each run, in the order of the survey file.
     """
+    passes = [passes_of(plan, tracks, point) for point in points]
+    seen = list(zip(points, passes, strict=True))
+    return sighting_tasks(plan, sources, priors, seen, picked_places(plan, points))
+
+
+def _settings(plan: SurveyPlan) -> TargetSettings:
+    """How targets are looked for."""
     config = plan.survey.config.adjust
-    runs = runs_of(plan)
-    settings = TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
-    code, picked = code_digest(f"{__name__}:sight_control"), picked_places(plan, points)
+    return TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
+
+
+def sighting_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    priors: Sequence[RunPrior],
+    seen: Sequence[tuple[ControlPoint, Sequence[tuple[Traverse, ...]]]],
+    picked: Mapping[tuple[str, str], PickedPlace],
+) -> list[ControlTask]:
+    """A task for each point that the traverses of a pass or more came by."""
+    runs, settings = runs_of(plan), _settings(plan)
+    code = code_digest(f"{__name__}:sight_control")
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks: list[ControlTask] = []
-    for point in points:
-        passes = _passes(tracks, point, _radius_m(point, settings), config.places.return_s)
+    for point, passes in seen:
         if not passes:
             continue
         files = tuple(near_files(sources, [t for own in passes for t in own], runs))
         own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
         sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
-        seen = [one.key(road_key(one.source)) for one in files]
+        read = [one.key(road_key(one.source)) for one in files]
         key = key_of(
-            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, seen
+            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read
         )
         tasks.append(ControlTask(plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key))
     return tasks
@@ -178,10 +197,9 @@ def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
     return max(settings.search_radius_m + reach if point.shape is not None else 0.0, settings.height_radius_m)
 
 
-def _passes(
-    tracks: Sequence[Track], point: ControlPoint, radius_m: float, apart_s: float
-) -> list[tuple[Traverse, ...]]:  # fmt: skip
+def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) -> list[tuple[Traverse, ...]]:
     """Traverses by a point, those of one run at one time together."""
+    radius_m, apart_s = _radius_m(point, _settings(plan)), plan.survey.config.adjust.places.return_s
     every = sorted(
         (t for track in tracks for t in passes_by(track, point.easting_m, point.northing_m, radius_m, apart_s)),
         key=lambda t: (t.run, t.first_gps_ns, t.sensor),

@@ -105,6 +105,7 @@ _WORDS: Final = {
     "height_tie": "heights of one pass against another",
     "shift_tie": "shifts of one pass against another",
     "plane_tie": "distances of planes of two passes",
+    "hand_tie": "ties by hand",
     "control_height": "heights measured at control points",
     "control_position": "places measured at control points",
     "control_survey": "the survey of the control points",

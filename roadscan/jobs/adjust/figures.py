@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.control import Sighting, moved_m
+from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
@@ -45,9 +46,12 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float6
 
 
 def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
-    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run."""
+    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run.
+
+    Ties by hand, which are few, are not of them.
+    """
     ties = evidence.ties
-    own = ties.accepted
+    own = ties.accepted & (ties.observations.kind != KINDS.index("hand_tie"))
     observations = ties.observations.chosen(own)
     after = left_after(observations, held, evidence.runs, mounted)
     kinds = np.asarray(ties.columns["kind"])[own]

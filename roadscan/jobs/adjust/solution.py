@@ -35,6 +35,8 @@ from roadscan.jobs.adjust.doubts import (
     time_line,
     wrong_points,
 )
+from roadscan.jobs.adjust.fixed import fixed_findings, fixed_line
+from roadscan.jobs.adjust.hand_ties import wrong_hand_ties
 from roadscan.jobs.adjust.mountings import Mounted, contradicted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
@@ -128,7 +130,8 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
         spans = [span_of(s, files) for s, files in own]
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
-        found.append(RunPrior(run, first, last, _processes(config, stated), stated))
+        held = run in plan.survey.config.adjust.fixed
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated, held))
     return tuple(found)
 
 
@@ -181,6 +184,12 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         return _rigid_solution(plan, evidence, control, entering, found)
     entering_ties = _entering(evidence)
     adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
+    if wrong_ties:
+        found += said
+        evidence = replace(evidence, ties=evidence.ties.without(wrong_ties))
+        entering_ties = _entering(evidence)
+        adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
@@ -189,6 +198,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
+    found += fixed_findings(adjusted.fixed, config.control.false_alarm)
     found += solver_findings(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled)
     reached = {
         int(run) for run in np.unique([*joined.run.ravel(), *control.chosen(entering).run.ravel()]) if run != FIXED
@@ -197,7 +207,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
     lines = [
         solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
-        time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict),
+        fixed_line(adjusted.fixed), time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict),
         power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()),
     ]  # fmt: skip
     return Solution(
@@ -272,6 +282,7 @@ def _not_held(
     """Runs that nothing holds, by ties that count and by points that do."""
     right = {number for (number, _), own in points.items() if own.weight_height != 0.0 or own.weight_horizontal != 0.0}
     held = {int(run) for run, point in zip(control.run.max(axis=1), control.place, strict=True) if int(point) in right}
+    held |= {number for number, prior in enumerate(evidence.priors) if prior.fixed}
     moving = [number for number, prior in enumerate(evidence.priors) if _moves(prior)]
     return not_held(evidence.runs, moving, np.asarray(links, np.int64), held)
 
@@ -282,7 +293,7 @@ def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
 
 
 def _moves(prior: RunPrior) -> bool:
-    return any(process.sigma > 0.0 for process in prior.processes)
+    return not prior.fixed and any(process.sigma > 0.0 for process in prior.processes)
 
 
 def _with_sigma(found: Adjustment, run: int) -> Corrections:

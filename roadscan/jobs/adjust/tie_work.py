@@ -146,6 +146,13 @@ class KnownTies:
         """(n,) ties that passed their tests."""
         return np.asarray(self.columns["accepted"] == 1)
 
+    def without(self, names: Sequence[str]) -> KnownTies:
+        """The same, where ties by hand of some names do not count."""
+        refused = np.isin(self.columns["name"], names)
+        return KnownTies(
+            self.observations, {**self.columns, "accepted": np.where(refused, 0, self.columns["accepted"])}
+        )
+
     @property
     def of_heads(self) -> npt.NDArray[np.bool_]:
         """(n,) ties between heads of one pass: they say nothing of poses, and much of mountings."""

@@ -113,6 +113,21 @@ class ControlUse(ControlRules):
     another CRS or height datum: none of them is used. A single point that does so is not used either."""
 
 
+class HandTies(Strict):
+    """Ties by hand: things that a person found in two passes, as the recorded poses show them."""
+
+    path: Path | None = None
+    """CSV relative to the survey file, a tie a row: first_run, first_easting_m, first_northing_m, second_run,
+    second_easting_m, second_northing_m (map, m). What may be left out: name; kind (`place`, `height` or `both`);
+    first_time, second_time (ISO 8601 with time zone: which time the run came by); sigma_m, sigma_height_m."""
+    kind: Literal["place", "height", "both"] = "both"
+    """What ties without a kind of their own say."""
+    sigma_m: float = Field(default=0.02, gt=0.0, le=10.0)
+    """1 σ of the difference of two places, on each axis, where a tie states none (m)."""
+    sigma_height_m: float = Field(default=0.01, gt=0.0, le=10.0)
+    """1 σ of the difference of two heights, beside that of their measurement, where a tie states none (m)."""
+
+
 class AdjustConfig(Strict):
     """The adjustment of the recorded poses: passes are tied to one another where they overlap, and to ground control.
 
@@ -125,6 +140,10 @@ class AdjustConfig(Strict):
     """`joint`: all runs at once, with ties and control; `each_pass`: each run by itself, to control alone; `vertical`:
     as joint, and heights alone are corrected; `helmert`: the survey as a whole is shifted and turned onto its control
     points with targets, nothing else."""
+    fixed: list[str] = []
+    """Runs that are held fixed, an earlier survey or a reference: their recorded poses hold to the bit, and those of
+    other runs are adjusted to them. How well their poses are known is taken from their σ. Mountings of their sensors
+    are not estimated."""
     priors: PosePriors = PosePriors()
     """Errors of the recorded poses."""
     mountings: MountingPriors = MountingPriors()
@@ -133,6 +152,8 @@ class AdjustConfig(Strict):
     """Where passes are compared."""
     ties: TieSettings = TieSettings()
     """How they are compared."""
+    hand_ties: HandTies = HandTies()
+    """Ties by hand."""
     control: ControlUse = ControlUse()
     """Control points."""
     targets: TargetsConfig = TargetsConfig()
@@ -144,3 +165,12 @@ class AdjustConfig(Strict):
     stay current."""
     moved_arm_m: float = Field(default=5.0, ge=0.0)
     """A turn counts as the movement of a point so far from the vehicle (m)."""
+
+    @model_validator(mode="after")
+    def _holds_runs(self) -> Self:
+        if self.fixed and self.mode == "helmert":
+            raise ValueError(
+                "adjust.fixed holds runs, and mode 'helmert' moves the survey as a whole: state another mode, or no "
+                "fixed run"
+            )
+        return self

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -68,6 +68,15 @@ class PassReadings:
         """From the body's origin to points (k, 3; easting, northing, height) in the body axes of poses (k,): (k, 3)."""
         away = level_from_map(point_m - self.body_m[pose], self.convergence_rad)
         return np.asarray(np.einsum("nji,nj->ni", self.level_from_body[pose], away))
+
+
+def shifted(readings: PassReadings, shift_level_m: Float64) -> PassReadings:
+    """The readings of a traverse and the poses that saw them, shifted (3,; north, east, down) as one."""
+    away = map_from_level(np.asarray(shift_level_m, np.float64)[None], readings.convergence_rad)[0]
+    return replace(
+        readings, easting_m=readings.easting_m + away[0], northing_m=readings.northing_m + away[1],
+        height_m=readings.height_m + away[2], body_m=readings.body_m + away,
+    )  # fmt: skip
 
 
 def level_from_map(vector_m: Float64, convergence_rad: float) -> Float64:

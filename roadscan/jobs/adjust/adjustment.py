@@ -39,7 +39,8 @@ from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES,
 from roadscan.jobs.adjust.publication import digests_of, foreign_runs, publish
 from roadscan.jobs.adjust.seams import shown_seams
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
-from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.jobs.adjust.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.jobs.adjust.ties_again import Again, first_ties, settled
 from roadscan.jobs.adjust.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.engine.fingerprint import key_of
@@ -129,26 +130,42 @@ def adjust_survey(session: Session) -> None:
     runs = runs_of(plan)
     priors = priors_of(plan, sources, runs)
     work = plan_work(plan, sources, priors)
-    failed = _collect(session, work)
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
-    ties = load_ties(session.store, manifest, [t.unit for t in work.ties], runs, mounted)
+    lacking = list[bool]()
+
+    def observe(tasks: Sequence[TieTask]) -> None:
+        lacking.append(_collect_ties(session, tasks))
+
+    def load(tasks: Sequence[TieTask]) -> KnownTies:
+        return load_ties(session.store, manifest, tasks, runs, mounted)
+
+    again = first_ties(plan, sources, work.ties, observe, load)
+    lacking.append(_collect_sightings(session, work))
     sightings, pictures = load_sightings(session.store, manifest, work.control)
     ends, _ = load_sightings(session.store, manifest, work.hand.tasks)
-    ties, unmeasured = with_hand_ties(ties, work.hand, ends, mounted, runs)
-    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted)
+
+    def evidence_of(ties: KnownTies) -> Evidence:
+        with_hand, _ = with_hand_ties(ties, work.hand, ends, mounted, runs)
+        return Evidence(runs, priors, with_hand, tuple(sightings), mounted)
+
+    evidence, unmeasured = evidence_of(again.ties), with_hand_ties(again.ties, work.hand, ends, mounted, runs)[1]
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
     ]
     doubts += [*work.hand.findings, *unmeasured]
-    if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
+    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
         publish_mountings(session.store, None, plan.survey.config.adjust)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
-        _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed)
+        manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+        _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed=any(lacking))
         return
-    solution = solve(plan, evidence)
+    tools = observe, load, lambda ties: solve(plan, evidence_of(ties))
+    again, solution, unsettled = settled(plan, sources, again, tools)
+    evidence = evidence_of(again.ties)
+    manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
     held = publish(session.store, solution.corrections, plan.survey.config.adjust)
     changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
     added = held_values(mounted, changes)
@@ -161,11 +178,11 @@ def adjust_survey(session: Session) -> None:
         "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
-    seams, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
+    seams, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
-    lines = [*_lines(work, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
-    doubts += [*solution.findings, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
-    _keep(session, key, held, (lines, doubts), failed)
+    lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
+    _keep(session, key, held, (lines, doubts), failed=any(lacking))
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
@@ -174,7 +191,7 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
     config = plan.survey.config.adjust
     places = _places(tracks, config.places)
     points = control_points(plan)
-    ties = tie_tasks(plan, sources, places, runs_of(plan))
+    ties = tie_tasks(plan, sources, places, runs_of(plan), config.ties)
     control = control_tasks(plan, sources, tracks, points, priors)
     hand = hand_work(plan, sources, tracks, priors, len(points))
     return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand)
@@ -188,30 +205,32 @@ def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
     return [*dense, *(replace(place, number=len(dense) + place.number) for place in sparse)]
 
 
-def _collect(session: Session, work: Work) -> bool:
-    """Bring the evidence up to date; True where some of it failed."""
-    manifest, bar = session.manifest, session.bar
-    manifest.remove(manifest.beside([TIES], {t.unit for t in work.ties}))
+def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
+    """Bring ties up to date; True where some failed."""
+    manifest = session.manifest
+    due = [t for t in tasks if not manifest.is_current(TIES, t.unit, t.key)]
+    ended = run_bundles(
+        collect_ties, due, lambda t: t.bytes, _BUNDLE_BYTES, manifest, session.compute, session.bar("ties")
+    )
+    failed = [(task.unit, reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
+
+
+def _collect_sightings(session: Session, work: Work) -> bool:
+    """Bring what was seen of control points, and at ends of ties by hand, up to date; True where some failed."""
+    manifest = session.manifest
     manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in work.sightings}))
-    ties = [t for t in work.ties if not manifest.is_current(TIES, t.unit, t.key)]
-    control = [t for t in work.sightings if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
-    found = [
-        (task.unit, reason)
-        for task, reason in run_bundles(
-            collect_ties, ties, lambda t: t.bytes, _BUNDLE_BYTES, manifest, session.compute, bar("ties")
-        )
-    ]
-    found += [
-        (f"{task.unit} ({task.point.name})", reason)
-        for task, reason in run_bundles(
-            sight_control, control, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, bar("control points")
-        )
-    ]
-    session.failed("adjust", found)
-    return bool(found)
+    due = [t for t in work.sightings if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    ended = run_bundles(
+        sight_control, due, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, session.bar("control points")
+    )
+    failed = [(f"{task.unit} ({task.point.name})", reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
 
 
-def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], failed: bool) -> None:
+def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], *, failed: bool) -> None:
     """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
     lines, doubts = said
     detail = {
@@ -260,13 +279,14 @@ def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
 
 
 def _lines(
-    work: Work, evidence: Evidence, solution: Solution, held: Held, tables: dict[str, Rows]
+    work: Work, again: Again, evidence: Evidence, solution: Solution, held: Held, tables: dict[str, Rows]
 ) -> list[str]:  # fmt: skip
     places, counted = sum(len(t.places) for t in work.ties), int((solution.tie_weight > 0).sum())
     lines = [
         f"{places:,} places of overlap with {evidence.ties.observations.size:,} ties, {counted:,} of which count; "
         f"{_seen(work, evidence.sightings)}"
     ]
+    lines += [again.line()] if again.counts else []
     if held:
         moved = {run: largest(own) for run, own in held.items()}
         down = max(float(np.abs(own.north_east_down_m[:, 2]).max()) for own in held.values())

@@ -175,9 +175,8 @@ def hand_work(
         own = [(_point(first + len(seen) + k, tie, end), _passes(plan, tracks, end)) for k, end in enumerate(tie.ends)]
         wrong = [_refused(end, found) for end, (_, found) in zip(tie.ends, own, strict=True) if len(found) != 1]
         if wrong:
-            findings.append(
-                HAND_TIE.finds(subject(tie.name), f"{' and '.join(wrong)}; the tie does not count", left_out=1)
-            )
+            text = f"{' and '.join(wrong)}; the tie does not count"
+            findings.append(HAND_TIE.finds(subject(tie.name), text, left_out=1))
             continue
         ties.append(tie)
         seen += own
@@ -236,7 +235,7 @@ def with_hand_ties(
     columns = _columns(added, names, [seen[t.point.number] for t in work.tasks], work, runs)
     known = {**ties.columns, "name": np.full(ties.observations.size, "", dtype=object)}
     joined = {name: np.concatenate([known[name], own]) for name, own in columns.items()}
-    return KnownTies(Observations.joined([ties.observations, added]), joined), findings
+    return KnownTies(Observations.joined([ties.observations, added]), joined, ties.tried), findings
 
 
 def _is_unseen(one: Sighting, tie: HandTie) -> bool:

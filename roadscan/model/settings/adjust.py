@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.settings.adjustment import ControlRules, SolverSettings
-from roadscan.model.settings.tie_settings import PlaceSettings, TieSettings
+from roadscan.model.settings.tie_settings import AgainSettings, PlaceSettings, TieSettings
 from roadscan.model.strict import Strict
 
 AdjustMode = Literal["joint", "each_pass", "vertical", "helmert"]
@@ -152,6 +152,8 @@ class AdjustConfig(Strict):
     """Where passes are compared."""
     ties: TieSettings = TieSettings()
     """How they are compared."""
+    again: AgainSettings = AgainSettings()
+    """When they are compared again."""
     hand_ties: HandTies = HandTies()
     """Ties by hand."""
     control: ControlUse = ControlUse()

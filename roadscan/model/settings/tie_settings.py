@@ -32,6 +32,32 @@ class PlaceSettings(Strict):
     """Readings of a place are taken for so long at most, where a vehicle stands there (s)."""
 
 
+class AgainSettings(Strict):
+    """When ties are observed again, and how passes that lie far apart are brought together first."""
+
+    share: float = Field(default=0.05, gt=0.0, le=1.0)
+    """A place is observed again where the solution moves its passes against one another by more than this share of the
+    patch's edge: 5 cm of a patch of 1 m. What moved by less was matched where it lies."""
+    rounds: int = Field(default=3, ge=0, le=10)
+    """Times that ties are observed again, at most: one brings passes to centimetres, the next ones to the σ of the
+    ties, and what moves after three does not settle. 0: never."""
+    matched_share: float = Field(default=0.2, ge=0.0, lt=1.0)
+    """Two runs of whose places fewer than this share show a shift, or fewer than half a height, are sought farther
+    apart, with a larger patch."""
+    search_m: float = Field(default=1.0, gt=0.0, le=5.0)
+    """How far apart (m), along, across and in height."""
+    radius_m: float = Field(default=2.0, gt=0.0, le=20.0)
+    """Half the edge of the larger patch (m)."""
+    cell_m: float = Field(default=0.04, gt=0.0, le=1.0)
+    """Edge of its cells (m)."""
+    each_m: float = Field(default=100.0, gt=0.0)
+    """Distance of larger patches along the road (m): errors of poses vary over minutes."""
+    least: int = Field(default=10, ge=3)
+    """Larger patches of two runs, at least, where they have so many places."""
+    alike_m: float = Field(default=0.1, gt=0.0)
+    """Larger patches count that agree with most of the others to this (m)."""
+
+
 class TieSettings(Strict):
     """How two passes are compared at a place, and what a tie has to pass to count."""
 

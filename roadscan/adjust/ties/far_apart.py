@@ -1,0 +1,93 @@
+"""Passes that lie farther apart than ties are sought: which they are, and where larger patches agree that they lie.
+
+A single larger patch may match at a wrong place. What counts is the shift that most patches of two passes agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.ties.tie import HEIGHT, SHIFT
+from roadscan.model.settings.tie_settings import AgainSettings, TieSettings
+
+Bool = npt.NDArray[np.bool_]
+Column = Mapping[str, npt.NDArray[Any]]
+
+_LEAST: int = 3
+"""Patches that have to agree: two agree by chance."""
+_MOST: float = 0.5
+"""Share of the heights of two passes, and of the patches, that is most of them."""
+_SIGMAS: float = 3.0
+
+
+def unmatched(tried: Column, settings: AgainSettings) -> dict[tuple[str, str], list[int]]:
+    """Places of pairs of runs, by name, of which too few show a shift, or a height."""
+    found: dict[tuple[str, str], list[int]] = {}
+    runs = np.stack([tried["first_run"], tried["second_run"]])
+    heads = _of_one_pass(tried)
+    for first, second in sorted({(a, b) for a, b in runs.T[~heads].tolist()}):
+        own = (runs[0] == first) & (runs[1] == second) & ~heads
+        heights = own & (tried["kind"] == HEIGHT)
+        places = np.unique(tried["place"][heights])
+        if not places.size:
+            continue
+        matched = own & (tried["accepted"] == 1)
+        shifts = np.unique(tried["place"][matched & (tried["kind"] == SHIFT)]).size
+        level = np.unique(tried["place"][matched & heights]).size
+        if shifts < settings.matched_share * places.size or level < _MOST * places.size:
+            found[first, second] = places.tolist()
+    return found
+
+
+def _of_one_pass(tried: Column) -> Bool:
+    """Comparisons of heads that passed together."""
+    same = tried["first_run"] == tried["second_run"]
+    apart = np.abs(tried["first_epoch_gps_ns"] - tried["second_epoch_gps_ns"])
+    return np.asarray(same & (apart < 30_000_000_000))
+
+
+def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> Bool:
+    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find."""
+    counts = tried["accepted"] == 1
+    shift = np.zeros(2)
+    kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
+    if kept.any():
+        shift = _solved(tried, np.flatnonzero(kept))
+    heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
+    level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
+    alike = np.zeros(counts.size, np.bool_)
+    alike[heights] = np.abs(tried["value_m"][heights] - level) <= settings.alike_m
+    is_far = np.hypot(*shift) > fine.search_m or (abs(level) > fine.most_apart_m and alike.sum() > _MOST * heights.size)
+    return (kept | alike) if is_far else np.zeros(counts.size, np.bool_)
+
+
+def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
+    """Rows of the places that agree on one shift, none where those are few, or fewer than half of all."""
+    places = tried["place"]
+    numbers, best = np.unique(places[own]), np.zeros(own.size, np.bool_)
+    for number in numbers:
+        rows = np.flatnonzero(own & (places == number))
+        if np.linalg.matrix_rank(_directions(tried, rows), tol=0.5) < 2:
+            continue
+        shift = _solved(tried, rows)
+        away = np.abs(tried["value_m"] - _directions(tried, np.arange(own.size)) @ shift)
+        fits = own & (away <= alike_m + _SIGMAS * np.where(own, tried["sigma_m"], 0.0))
+        if np.unique(places[fits]).size > np.unique(places[best]).size:
+            best = fits
+    count = np.unique(places[best]).size
+    return best if count >= _LEAST and count > _MOST * numbers.size else np.zeros(own.size, np.bool_)
+
+
+def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    return np.stack([tried["direction_north"][rows], tried["direction_east"][rows]], axis=-1)
+
+
+def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Shift (2,) north, east of rows that all say the same."""
+    sigma = tried["sigma_m"][rows]
+    design = _directions(tried, rows) / sigma[:, None]
+    return np.asarray(np.linalg.lstsq(design, tried["value_m"][rows] / sigma, rcond=None)[0])

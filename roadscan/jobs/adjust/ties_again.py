@@ -1,0 +1,220 @@
+"""Ties that are observed again where the solution says that the passes lie, and larger patches before the first one.
+
+Poses of two passes may lie decimetres apart. What is then compared is not one place of the road: shifts are not found,
+and heights are those of neighbouring spots. So the solution of the first ties says where to look again, until no place
+moves by more than a share of its patch. Where too few places match to begin with, larger patches are sought first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.ties.far_apart import agreeing, unmatched
+from roadscan.jobs.adjust.near import Sources
+from roadscan.jobs.adjust.solution import Solution
+from roadscan.jobs.adjust.tie_work import KnownTies, Shift, TieTask, tie_tasks
+from roadscan.jobs.adjust.tracks import runs_of
+from roadscan.jobs.plan.plan import SurveyPlan
+from roadscan.model.counted import counted
+from roadscan.model.gpstime import NS_PER_S
+from roadscan.model.settings.adjust import AdjustConfig
+from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.model.witness import Finding, Witness
+from roadscan.navigation.trajectory import Corrections
+
+Bool = npt.NDArray[np.bool_]
+
+_STILL: Final[Shift] = (0.0, 0.0, 0.0)
+_STEP_M: Final = 0.001
+"""Shifts are rounded to this, so that a solution that changes by less leaves what was observed as it is."""
+
+
+TIES_SETTLED: Final = Witness(
+    "ties_settled",
+    input="ties",
+    fault="Ties that are observed where the solution says move the solution again, and again.",
+    asks="how far the last solution moves each place since it was observed",
+    does="the last solution is published",
+    told=("findings",),
+)
+
+Observe = Callable[[Sequence[TieTask]], None]
+"""Brings the ties of some tasks up to date."""
+Load = Callable[[Sequence[TieTask]], KnownTies]
+"""Ties of tasks that are up to date."""
+Solve = Callable[[KnownTies], Solution]
+
+
+@dataclass(frozen=True)
+class Again:
+    """What is observed, and with which shifts it was observed last."""
+
+    tasks: tuple[TieTask, ...]
+    """Of all rounds, in their order."""
+    ties: KnownTies
+    """Those that count, with larger patches where these are needed."""
+    larger: tuple[TieTask, ...] = ()
+    """Tasks of larger patches."""
+    far: KnownTies | None = None
+    """What these found."""
+    shifts: Mapping[int, tuple[Shift, ...]] = field(default_factory=dict)
+    """Of the traverses of each place that was observed again, by its number."""
+    counts: tuple[int, ...] = ()
+    """Places that were observed again, of each round."""
+
+    @property
+    def every(self) -> tuple[TieTask, ...]:
+        """All tasks."""
+        return (*self.tasks, *self.larger)
+
+    def places(self) -> list[Place]:
+        """Each of them, as it was observed first."""
+        return [place for task in self.tasks if task.round == 0 for place in task.places]
+
+    def line(self) -> str:
+        """Rounds in words; "" where nothing was observed again."""
+        told = f"ties observed again where the solution puts the passes: {', then '.join(map(str, self.counts))} places"
+        return told if self.counts else ""
+
+
+def first_ties(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], observe: Observe, load: Load) -> Again:
+    """Ties where the recorded poses say, and of larger patches where too few of those match."""
+    observe(tasks)
+    ties = load(tasks)
+    larger = _larger_patches(plan, sources, tasks, ties)
+    if not larger:
+        return Again(tuple(tasks), ties)
+    observe(larger)
+    far = load(larger)
+    joined = _with_larger(ties, far, plan.survey.config.adjust)
+    return Again(tuple(tasks), joined, tuple(larger), far)
+
+
+def settled(
+    plan: SurveyPlan, sources: Sources, again: Again, tools: tuple[Observe, Load, Solve]
+) -> tuple[Again, Solution, list[Finding]]:
+    """The solution whose ties lie where it says, and what was observed for it."""
+    config, (observe, load, solve) = plan.survey.config.adjust, tools
+    solution = solve(again.ties)
+    tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
+    while tied and config.again.rounds:
+        more, shifts, largest_m = _places_again(plan, sources, again, solution.corrections)
+        if not more:
+            break
+        if len(again.counts) == config.again.rounds:
+            text = (
+                f"the solution still moves passes against one another by up to {1e3 * largest_m:.0f} mm at "
+                f"{len(shifts)} places after ties were observed again {counted(config.again.rounds, 'time')} "
+                "(adjust.again.rounds)"
+            )
+            findings.append(TIES_SETTLED.finds("adjust", text))
+            break
+        observe(more)
+        tasks = (*again.tasks, *more)
+        ties = load(tasks)
+        joined = ties if again.far is None else _with_larger(ties, again.far, config)
+        counts = (*again.counts, len(shifts))
+        again = replace(again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts)
+        solution = solve(joined)
+    return again, solution, findings
+
+
+def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
+    """Tasks for larger patches of pairs of runs of whose places too few match; their places are numbered on."""
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    known = {place.number: place for task in tasks for place in task.places}
+    first, found = 1 + max(known, default=-1), list[Place]()
+    sought = config.again.rounds and config.mode in ("joint", "vertical")
+    for pair, numbers in unmatched(ties.tried, config.again).items() if sought else ():
+        places = [known[number] for number in numbers if known[number].radius_m == config.places.radius_m]
+        for place in _spread(places, config):
+            own = _of_pair(place, (runs.index(pair[0]), runs.index(pair[1])))
+            if len(own) == 2:
+                reach_m = config.again.radius_m + config.again.search_m
+                wide = tuple(_widened(t, reach_m / (place.radius_m + config.places.margin_m), config) for t in own)
+                found.append(replace(place, number=first + len(found), radius_m=config.again.radius_m, traverses=wide))
+    return tie_tasks(plan, sources, found, runs, _larger(config)) if found else []
+
+
+def _larger(config: AdjustConfig) -> TieSettings:
+    """How larger patches are compared: coarser, farther apart, with σ of centimetres."""
+    own = config.again
+    return config.ties.model_copy(update={
+        "cell_m": own.cell_m, "shift_cell_m": own.cell_m, "search_m": own.search_m, "most_apart_m": own.search_m,
+        "misplaced_m": own.search_m, "most_scatter_m": own.cell_m, "most_shift_sigma_m": own.cell_m,
+        "shift_floor_m": own.cell_m / 4, "sigma_floor_m": own.cell_m / 40,
+    })  # fmt: skip
+
+
+def _spread(places: Sequence[Place], config: AdjustConfig) -> list[Place]:
+    """Some of the places, about evenly along the road."""
+    wanted = max(config.again.least, round(len(places) * 1000.0 / config.places.per_km / config.again.each_m))
+    rows = np.unique(np.linspace(0, len(places) - 1, min(wanted, len(places))).round().astype(np.int64))
+    return [places[k] for k in rows.tolist()]
+
+
+def _of_pair(place: Place, runs: tuple[int, int]) -> list[Traverse]:
+    """A traverse of each of two runs; the first and the last one of a run that comes by again."""
+    first = next((t for t in place.traverses if t.run == runs[0]), None)
+    last = next((t for t in reversed(place.traverses) if t.run == runs[1]), None)
+    return [] if first is None or last is None or first is last else [first, last]
+
+
+def _widened(traverse: Traverse, times: float, config: AdjustConfig) -> Traverse:
+    """The same over so many times its length, and no longer than a place may take."""
+    middle = (traverse.first_gps_ns + traverse.last_gps_ns) // 2
+    half = 0.5 * min(times * (traverse.last_gps_ns - traverse.first_gps_ns), config.places.longest_s * NS_PER_S)
+    return replace(traverse, first_gps_ns=middle - round(half), last_gps_ns=middle + round(half))
+
+
+def _with_larger(ties: KnownTies, larger: KnownTies, config: AdjustConfig) -> KnownTies:
+    """The ties, and of runs of whose places too few match those of larger patches that agree on a larger shift."""
+    tried, kept = larger.tried, np.zeros(larger.observations.size, np.bool_)
+    measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
+    for pair in unmatched(ties.tried, config.again):
+        rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
+        fits = agreeing({name: values[rows] for name, values in tried.items()}, config.again, config.ties)
+        kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
+    return ties.with_more(larger, kept)
+
+
+def _places_again(
+    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+) -> tuple[list[TieTask], dict[int, tuple[Shift, ...]], float]:
+    """Tasks for the places that a solution moves by too much since they were observed, their shifts, and by how much
+    most (m).
+    """
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    chosen, shifts, largest_m = list[Place](), dict[int, tuple[Shift, ...]](), 0.0
+    for place in again.places():
+        own = tuple(_shift(corrections.get(runs[t.run]), t) for t in place.traverses)
+        before = again.shifts.get(place.number, (_STILL,) * len(own))
+        moved = np.array(own)[:, :2] - np.array(before)[:, :2]
+        if len(own) > 1 and _extent(moved) > config.again.share * 2.0 * place.radius_m:
+            largest_m = max(largest_m, _extent(moved))
+            reach_m = float(np.hypot(*np.array(own)[:, :2].T).max())
+            times = 1.0 + reach_m / (place.radius_m + config.places.margin_m)
+            chosen.append(replace(place, traverses=tuple(_widened(t, times, config) for t in place.traverses)))
+            shifts[place.number] = own
+    moves = [shifts[place.number] for place in chosen]
+    number = len(again.counts) + 1
+    return tie_tasks(plan, sources, chosen, runs, config.ties, (number, moves)), shifts, largest_m
+
+
+def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:
+    if corrections is None:
+        return _STILL
+    middle = np.array([(traverse.first_gps_ns + traverse.last_gps_ns) // 2], np.int64)
+    north, east, down = (_STEP_M * np.round(corrections.at(middle)[0][0] / _STEP_M)).tolist()
+    return north, east, down
+
+
+def _extent(moved: npt.NDArray[np.float64]) -> float:
+    """Largest distance between two of some points (n, 2)."""
+    return float(np.hypot(*(moved[:, None] - moved[None]).T).max())

@@ -180,6 +180,27 @@ def sight(
     return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
 
 
+def sight_shifted(
+    point: ControlPoint,
+    heads: Sequence[PassReadings],
+    settings: TargetSettings,
+    sigma_pose_m: float,
+    picked: PickedPlace | None,
+    shift_level_m: Float64,
+) -> Sighting:
+    """The same of a pass whose readings were shifted (3,; north, east, down), told as the recorded poses show it."""
+    east, north, up = map_from_level(shift_level_m[None], heads[0].convergence_rad)[0].tolist()
+    if picked is not None:
+        picked = replace(picked, easting_m=picked.easting_m + east, northing_m=picked.northing_m + north)
+    one = sight(point, heads, settings, sigma_pose_m, picked)
+    if one.is_placed or not np.isfinite(one.slope_east):
+        height = one.height_m - up
+    else:
+        # At the surveyed place: the shift moves it along a road that slopes.
+        height = one.height_m - up + one.slope_east * east + one.slope_north * north
+    return replace(one, easting_m=one.easting_m - east, northing_m=one.northing_m - north, height_m=height)
+
+
 def _with_pose(
     point: ControlPoint,
     heads: Sequence[PassReadings],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Int32 = npt.NDArray[np.int32]
 UInt16 = npt.NDArray[np.uint16]
+
+
+Shift: TypeAlias = tuple[float, float, float]
+"""Of a traverse as a whole: north, east, down (m, local level)."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,8 @@ class PassReadings:
 
 def shifted(readings: PassReadings, shift_level_m: Float64) -> PassReadings:
     """The readings of a traverse and the poses that saw them, shifted (3,; north, east, down) as one."""
+    if not np.any(shift_level_m):
+        return readings
     away = map_from_level(np.asarray(shift_level_m, np.float64)[None], readings.convergence_rad)[0]
     return replace(
         readings, easting_m=readings.easting_m + away[0], northing_m=readings.northing_m + away[1],

@@ -115,6 +115,15 @@ class RunPrior:
         extra = np.sqrt(np.maximum(sigma**2 - usual**2, 0.0))
         return np.concatenate([usual, extra], axis=1) if extra.any() else usual
 
+    def widened(self, more_m: Float64) -> RunPrior:
+        """The same with so much more (3,; north, east, down) 1 σ of the position, at all times."""
+        more = np.concatenate([more_m, np.zeros(3)])
+        n, e, d, r, p, h = (
+            replace(o, sigma=float(np.hypot(o.sigma, m))) for o, m in zip(self.processes, more, strict=True)
+        )
+        stated = self.stated and StatedSigma(self.stated.epochs_gps_ns, np.hypot(self.stated.sigma, more))
+        return replace(self, processes=(n, e, d, r, p, h), stated=stated)
+
     def faster(self, position: float, attitude: float) -> RunPrior:
         """The same with correlation times that are so many times shorter."""
         times = (position,) * 3 + (attitude,) * 3

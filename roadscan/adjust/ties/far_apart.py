@@ -5,23 +5,26 @@ A single larger patch may match at a wrong place. What counts is the shift that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.ties.tie import HEIGHT, SHIFT
 from roadscan.model.settings.tie_settings import AgainSettings, TieSettings
 
 Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
 Column = Mapping[str, npt.NDArray[Any]]
 
-_LEAST: int = 3
+_LEAST: Final = 3
 """Patches that have to agree: two agree by chance."""
-_MOST: float = 0.5
+_MOST: Final = 0.5
 """Share of the heights of two passes, and of the patches, that is most of them."""
-_SIGMAS: float = 3.0
+_SIGMAS: Final = 3.0
 
 
 def unmatched(tried: Column, settings: AgainSettings) -> dict[tuple[str, str], list[int]]:
@@ -50,19 +53,51 @@ def _of_one_pass(tried: Column) -> Bool:
     return np.asarray(same & (apart < 30_000_000_000))
 
 
-def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> Bool:
-    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find."""
+def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> tuple[Bool, Float64]:
+    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find, and
+    that shift (3,): second minus first, north, east, down (m).
+    """
     counts = tried["accepted"] == 1
-    shift = np.zeros(2)
+    shift = np.zeros(3)
     kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
     if kept.any():
-        shift = _solved(tried, np.flatnonzero(kept))
+        shift[:2] = _solved(tried, np.flatnonzero(kept))
     heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
     level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
     alike = np.zeros(counts.size, np.bool_)
     alike[heights] = np.abs(tried["value_m"][heights] - level) <= settings.alike_m
-    is_far = np.hypot(*shift) > fine.search_m or (abs(level) > fine.most_apart_m and alike.sum() > _MOST * heights.size)
-    return (kept | alike) if is_far else np.zeros(counts.size, np.bool_)
+    if alike.sum() > _MOST * heights.size:
+        shift[2] = -level
+    is_far = np.hypot(*shift[:2]) > fine.search_m or abs(shift[2]) > fine.most_apart_m
+    return ((kept | alike), shift) if is_far else (np.zeros(counts.size, np.bool_), np.zeros(3))
+
+
+def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mapping[tuple[str, str], Float64],
+              held: Sequence[str]) -> dict[str, Float64]:  # fmt: skip
+    """How far (3,) runs lie from those that most agree with, by name; all of them where none are most.
+
+    Parameters
+    ----------
+    close : pairs of runs that match where they lie. far : shifts of pairs that do not.
+    held : runs that are right, whatever the others say.
+    """
+    number = {run: k for k, run in enumerate(runs)}
+    pairs = np.array([(number[a], number[b]) for a, b in close], np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(runs), len(runs)))
+    group = connected_components(graph, directed=False)[1]
+    in_far = sorted({run for pair in far for run in pair})
+    sizes = {g: int((group == g).sum()) for g in {int(group[number[run]]) for run in in_far}}
+    right = {int(group[number[run]]) for run in held}
+    if not right & sizes.keys():
+        most = max(sizes.values(), default=0)
+        right = {g for g, size in sizes.items() if size == most}
+        right = right if len(right) == 1 else set()
+    found: dict[str, Float64] = {}
+    for pair, shift in far.items():
+        for run in pair:
+            if int(group[number[run]]) not in right and run not in held:
+                found[run] = np.maximum(found.get(run, np.zeros(3)), np.abs(shift))
+    return found
 
 
 def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
@@ -82,11 +117,11 @@ def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
     return best if count >= _LEAST and count > _MOST * numbers.size else np.zeros(own.size, np.bool_)
 
 
-def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
     return np.stack([tried["direction_north"][rows], tried["direction_east"][rows]], axis=-1)
 
 
-def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
     """Shift (2,) north, east of rows that all say the same."""
     sigma = tried["sigma_m"][rows]
     design = _directions(tried, rows) / sigma[:, None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -71,10 +71,16 @@ class Work:
     hand: HandWork
     """Ties by hand."""
 
-    @property
-    def sightings(self) -> tuple[ControlTask, ...]:
-        """Tasks that look at control points, and at the ends of ties by hand."""
-        return (*self.control, *self.hand.tasks)
+
+class Seen(NamedTuple):
+    """What passes saw."""
+
+    points: list[Sighting]
+    """Control points."""
+    rows: list[dict[str, Any]]
+    """The same as rows of the table."""
+    ends: list[Sighting]
+    """Ends of ties by hand."""
 
 
 def solution_key(plan: SurveyPlan) -> str:
@@ -139,33 +145,40 @@ def adjust_survey(session: Session) -> None:
     def load(tasks: Sequence[TieTask]) -> KnownTies:
         return load_ties(session.store, manifest, tasks, runs, mounted)
 
-    again = first_ties(plan, sources, work.ties, observe, load)
-    lacking.append(_collect_sightings(session, work))
-    sightings, pictures = load_sightings(session.store, manifest, work.control)
-    ends, _ = load_sightings(session.store, manifest, work.hand.tasks)
+    def look(control: Sequence[ControlTask]) -> Seen:
+        lacking.append(_collect_sightings(session, [*control, *work.hand.tasks]))
+        return Seen(
+            *load_sightings(session.store, manifest, control),
+            load_sightings(session.store, manifest, work.hand.tasks)[0],
+        )
 
-    def evidence_of(ties: KnownTies) -> Evidence:
-        with_hand, _ = with_hand_ties(ties, work.hand, ends, mounted, runs)
-        return Evidence(runs, priors, with_hand, tuple(sightings), mounted)
+    def evidence_of(ties: KnownTies, seen: Seen) -> tuple[Evidence, list[Finding]]:
+        joined, unmeasured = with_hand_ties(ties, work.hand, seen.ends, mounted, runs)
+        own = [p.widened(again.misplaced[p.run]) if p.run in again.misplaced else p for p in priors]
+        return Evidence(runs, tuple(own), joined, tuple(seen.points), mounted), unmeasured
 
-    evidence, unmeasured = evidence_of(again.ties), with_hand_ties(again.ties, work.hand, ends, mounted, runs)[1]
+    again = first_ties(plan, sources, work.ties, work.control, (observe, load))
+    seen = look(work.control)
+    sightings = seen.points
+    evidence, unmeasured = evidence_of(again.ties, seen)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
     ]
-    doubts += [*work.hand.findings, *unmeasured]
+    doubts += [*again.findings, *work.hand.findings, *unmeasured]
     if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
         lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
         held: Held = publish(session.store, {}, plan.survey.config.adjust)
         publish_mountings(session.store, None, plan.survey.config.adjust)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
-        manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+        _forget_others(manifest, again, work)
         _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed=any(lacking))
         return
-    tools = observe, load, lambda ties: solve(plan, evidence_of(ties))
+    tools = observe, load, lambda ties, control: solve(plan, evidence_of(ties, look(control))[0])
     again, solution, unsettled = settled(plan, sources, again, tools)
-    evidence = evidence_of(again.ties)
-    manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+    seen = look(again.control)
+    evidence, sightings = evidence_of(again.ties, seen)[0], seen.points
+    _forget_others(manifest, again, work)
     held = publish(session.store, solution.corrections, plan.survey.config.adjust)
     changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
     added = held_values(mounted, changes)
@@ -179,7 +192,7 @@ def adjust_survey(session: Session) -> None:
     }
     keep_tables(session.store, manifest, key, tables)
     seams, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
-    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), pictures)
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
     _keep(session, key, held, (lines, doubts), failed=any(lacking))
@@ -217,17 +230,24 @@ def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
     return bool(failed)
 
 
-def _collect_sightings(session: Session, work: Work) -> bool:
+def _collect_sightings(session: Session, tasks: Sequence[ControlTask]) -> bool:
     """Bring what was seen of control points, and at ends of ties by hand, up to date; True where some failed."""
     manifest = session.manifest
-    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in work.sightings}))
-    due = [t for t in work.sightings if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    due = [t for t in tasks if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    if not due:
+        return False
     ended = run_bundles(
         sight_control, due, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, session.bar("control points")
     )
     failed = [(f"{task.unit} ({task.point.name})", reason) for task, reason in ended]
     session.failed("adjust", failed)
     return bool(failed)
+
+
+def _forget_others(manifest: Manifest, again: Again, work: Work) -> None:
+    """Remove evidence that is no more asked for."""
+    manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in (*again.control, *work.hand.tasks)}))
 
 
 def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], *, failed: bool) -> None:

@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight
+from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight_shifted
+from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.targets.settings import TargetSettings
@@ -59,11 +60,16 @@ class ControlTask:
     """Of each pass what the user picked."""
     files: tuple[NearFile, ...]
     key: str
+    round: int = 0
+    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    shifts_m: tuple[Shift, ...] = ()
+    """Of each pass: how far that solution moves it; none in round 0."""
 
     @property
     def unit(self) -> str:
         """Its name in the manifest."""
-        return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}"
+        again = f"-round-{self.round}" if self.round else ""
+        return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}{again}"
 
     @property
     def bytes(self) -> int:
@@ -167,13 +173,17 @@ def sighting_tasks(
     priors: Sequence[RunPrior],
     seen: Sequence[tuple[ControlPoint, Sequence[tuple[Traverse, ...]]]],
     picked: Mapping[tuple[str, str], PickedPlace],
+    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
 ) -> list[ControlTask]:
-    """A task for each point that the traverses of a pass or more came by."""
-    runs, settings = runs_of(plan), _settings(plan)
+    """A task for each point that the traverses of a pass or more came by.
+
+    again : round, and shifts of each point's passes; none where the recorded poses say where readings lie.
+    """
+    runs, settings, (number, shifts) = runs_of(plan), _settings(plan), again
     code = code_digest(f"{__name__}:sight_control")
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks: list[ControlTask] = []
-    for point, passes in seen:
+    for (point, passes), moved in zip(seen, shifts if number else [()] * len(seen), strict=True):
         if not passes:
             continue
         files = tuple(near_files(sources, [t for own in passes for t in own], runs))
@@ -181,9 +191,14 @@ def sighting_tasks(
         sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
         read = [one.key(road_key(one.source)) for one in files]
         key = key_of(
-            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read
-        )
-        tasks.append(ControlTask(plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key))
+            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read,
+            *([number, moved] if number else []),
+        )  # fmt: skip
+        tasks.append(
+            ControlTask(
+                plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key, number, moved
+            )
+        )  # fmt: skip
     return tasks
 
 
@@ -218,27 +233,30 @@ def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) ->
 def sight_control(task: ControlTask) -> OutputRecord:
     """See what each pass saw of a point and write it (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs)
-    circle = Circle(task.point.easting_m, task.point.northing_m, _radius_m(task.point, task.settings))
     found = []
-    for own, picked, sigma_pose_m in zip(task.passes, task.picked, task.sigma_pose_m, strict=True):
-        heads = [reader.of(traverse, circle) for traverse in own]
+    moved = task.shifts_m or ((0.0, 0.0, 0.0),) * len(task.passes)
+    for own, picked, sigma_pose_m, shift in zip(task.passes, task.picked, task.sigma_pose_m, moved, strict=True):
+        reach_m = _radius_m(task.point, task.settings) + float(np.hypot(*shift[:2]))
+        circle = Circle(task.point.easting_m, task.point.northing_m, reach_m)
+        heads = [shifted(reader.of(traverse, circle), np.array(shift)) for traverse in own]
         # Profiles are dense and returns sparse: where a pass has both, the profiles show the point.
         dense = [h for h in heads if not h.returns and h.pose.size] or heads
-        found.append(sight(task.point, dense, task.settings, sigma_pose_m, picked))
+        found.append(sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift)))
     schema = table_schema(SIGHTINGS)
-    rows = pa.Table.from_pylist([_row(one, task.runs) for one in found], schema=schema.arrow())
+    rows = pa.Table.from_pylist([_row(one, task.runs, task.round) for one in found], schema=schema.arrow())
     content = parquet_bytes(rows, schema)
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(SIGHTINGS, task.unit, task.key, target, len(content), bytes_digest(content))
 
 
-def _row(one: Sighting, runs: Sequence[str]) -> dict[str, Any]:
+def _row(one: Sighting, runs: Sequence[str], number: int) -> dict[str, Any]:
     seen = bool(np.isfinite(one.level_from_body).all())
     turned = [float(a) for a in rph_from_rotation(one.level_from_body)] if seen else [None] * 3
     picture = None if one.find is None else one.find.picture
     values: dict[str, Any] = {
         "point": one.point.number,
+        "round": number,
         "name": one.point.name,
         "run": runs[one.run],
         "sensor": one.sensor,
@@ -271,7 +289,8 @@ def load_sightings(
 ) -> tuple[list[Sighting], list[dict[str, Any]]]:
     """Sightings of some points, in order, and their rows of the table."""
     sightings, rows = [], []
-    for task in tasks:
+    last = {task.point.number: task for task in sorted(tasks, key=lambda task: task.round)}
+    for task in last.values():
         record = manifest.get(SIGHTINGS, task.unit)
         if record is None or not record.path:
             continue

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.adjust.observations import KINDS, Observations, mount_partials
-from roadscan.adjust.patches import shifted
+from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import SAME_PASS
@@ -38,8 +38,6 @@ DIAGONAL: Final = 1.5
 """Readings are kept within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
 """Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
-Shift: TypeAlias = tuple[float, float, float]
-"""North, east, down (m, local level)."""
 _SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
 _TRIED: Final = (
     "place", "kind", "group", "first_run", "second_run", "first_sensor", "second_sensor", "first_epoch_gps_ns",
@@ -123,7 +121,7 @@ def _at_place(reader: NearReader, place: Place, shifts_m: Sequence[Shift], setti
     for traverse, shift in zip(place.traverses, np.array(shifts_m), strict=True):
         reach = DIAGONAL * place.radius_m + float(np.hypot(*shift[:2]))
         own = reader.of(traverse, Circle(place.easting_m, place.northing_m, reach))
-        readings.append(shifted(own, shift) if shift.any() else own)
+        readings.append(shifted(own, shift))
         moved[traverse.run, traverse.sensor] = [*moved.get((traverse.run, traverse.sensor), []), (traverse, shift)]
     found = ties_at(place, readings, settings)
     if not found.observations.size or not np.any(shifts_m):

@@ -14,11 +14,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.patches import Shift
 from roadscan.adjust.places import Place, Traverse
-from roadscan.adjust.ties.far_apart import agreeing, unmatched
+from roadscan.adjust.ties.far_apart import agreeing, misplaced, unmatched
+from roadscan.jobs.adjust.control_work import ControlTask, sighting_tasks
 from roadscan.jobs.adjust.near import Sources
-from roadscan.jobs.adjust.solution import Solution
-from roadscan.jobs.adjust.tie_work import KnownTies, Shift, TieTask, tie_tasks
+from roadscan.jobs.adjust.solution import Solution, priors_of
+from roadscan.jobs.adjust.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.jobs.adjust.tracks import runs_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.model.counted import counted
@@ -29,6 +31,7 @@ from roadscan.model.witness import Finding, Witness
 from roadscan.navigation.trajectory import Corrections
 
 Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)
 _STEP_M: Final = 0.001
@@ -44,11 +47,24 @@ TIES_SETTLED: Final = Witness(
     told=("findings",),
 )
 
+PASSES_APART: Final = Witness(
+    "passes_apart",
+    input="trajectories",
+    fault="The poses of a pass lie decimetres from those of other passes over the same road.",
+    asks="larger patches of the road where too few ties match: the shift that most of them agree on",
+    does="ties are observed again where the solution puts the passes; σ of a run that most others contradict, or of "
+    "both where nothing tells which is wrong, is taken to be as large as the shift",
+    told=("findings",),
+)
+_APART: Final = 4.0
+"""Two passes that are so many σ apart contradict their σ: one of 16,000 does by chance."""
+
 Observe = Callable[[Sequence[TieTask]], None]
 """Brings the ties of some tasks up to date."""
 Load = Callable[[Sequence[TieTask]], KnownTies]
 """Ties of tasks that are up to date."""
-Solve = Callable[[KnownTies], Solution]
+Solve = Callable[[KnownTies, Sequence[ControlTask]], Solution]
+"""The solution of ties and of what passes see of control points, which tasks bring up to date first."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +77,18 @@ class Again:
     """Those that count, with larger patches where these are needed."""
     larger: tuple[TieTask, ...] = ()
     """Tasks of larger patches."""
+    control: tuple[ControlTask, ...] = ()
+    """Tasks that look at control points, of all rounds."""
     far: KnownTies | None = None
     """What these found."""
     shifts: Mapping[int, tuple[Shift, ...]] = field(default_factory=dict)
     """Of the traverses of each place that was observed again, by its number."""
     counts: tuple[int, ...] = ()
     """Places that were observed again, of each round."""
+    misplaced: Mapping[str, Float64] = field(default_factory=dict)
+    """Runs whose σ do not hold that they lie so far (3,; m) from others."""
+    findings: tuple[Finding, ...] = ()
+    """On these."""
 
     @property
     def every(self) -> tuple[TieTask, ...]:
@@ -83,17 +105,27 @@ class Again:
         return told if self.counts else ""
 
 
-def first_ties(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], observe: Observe, load: Load) -> Again:
+def first_ties(
+    plan: SurveyPlan,
+    sources: Sources,
+    tasks: Sequence[TieTask],
+    control: Sequence[ControlTask],
+    tools: tuple[Observe, Load],
+) -> Again:
     """Ties where the recorded poses say, and of larger patches where too few of those match."""
+    observe, load = tools
     observe(tasks)
     ties = load(tasks)
     larger = _larger_patches(plan, sources, tasks, ties)
     if not larger:
-        return Again(tuple(tasks), ties)
+        return Again(tuple(tasks), ties, control=tuple(control))
     observe(larger)
     far = load(larger)
-    joined = _with_larger(ties, far, plan.survey.config.adjust)
-    return Again(tuple(tasks), joined, tuple(larger), far)
+    joined, apart = _with_larger(ties, far, plan.survey.config.adjust)
+    misplaced, findings = _contradicted(plan, sources, ties, apart)
+    return Again(
+        tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=misplaced, findings=tuple(findings)
+    )
 
 
 def settled(
@@ -101,7 +133,7 @@ def settled(
 ) -> tuple[Again, Solution, list[Finding]]:
     """The solution whose ties lie where it says, and what was observed for it."""
     config, (observe, load, solve) = plan.survey.config.adjust, tools
-    solution = solve(again.ties)
+    solution = solve(again.ties, again.control)
     tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
     while tied and config.again.rounds:
         more, shifts, largest_m = _places_again(plan, sources, again, solution.corrections)
@@ -118,10 +150,12 @@ def settled(
         observe(more)
         tasks = (*again.tasks, *more)
         ties = load(tasks)
-        joined = ties if again.far is None else _with_larger(ties, again.far, config)
-        counts = (*again.counts, len(shifts))
-        again = replace(again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts)
-        solution = solve(joined)
+        joined = ties if again.far is None else _with_larger(ties, again.far, config)[0]
+        counts, control = (*again.counts, len(shifts)), _points_again(plan, sources, again, solution.corrections)
+        again = replace(
+            again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts, control=control
+        )
+        solution = solve(joined, control)
     return again, solution, findings
 
 
@@ -173,15 +207,49 @@ def _widened(traverse: Traverse, times: float, config: AdjustConfig) -> Traverse
     return replace(traverse, first_gps_ns=middle - round(half), last_gps_ns=middle + round(half))
 
 
-def _with_larger(ties: KnownTies, larger: KnownTies, config: AdjustConfig) -> KnownTies:
-    """The ties, and of runs of whose places too few match those of larger patches that agree on a larger shift."""
+def _contradicted(
+    plan: SurveyPlan, sources: Sources, ties: KnownTies, apart: Mapping[tuple[str, str], Float64]
+) -> tuple[dict[str, Float64], list[Finding]]:
+    """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
+    runs, config = runs_of(plan), plan.survey.config.adjust
+    every = set(zip(ties.tried["first_run"].tolist(), ties.tried["second_run"].tolist(), strict=True))
+    sigma = {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs)}
+    found = misplaced(runs, every - unmatched(ties.tried, config.again).keys(), apart, config.fixed)
+    wrong, findings = dict[str, Float64](), list[Finding]()
+    for pair, shift in sorted(apart.items()):
+        ratio = np.abs(shift) / np.hypot(*(np.maximum(sigma[run], 1e-6) for run in pair))
+        own = [run for run in pair if run in found]
+        if ratio.max() <= _APART or not own:
+            continue
+        for run in own:
+            wrong[run] = np.where(ratio > _APART, found[run], wrong.get(run, np.zeros(3)))
+        north, east, down = shift
+        says = f"run '{own[0]}' contradicts its σ" if len(own) == 1 else "nothing tells which of them is wrong"
+        text = (
+            f"{pair[1]} lies {north:+.2f} m north, {east:+.2f} m east and {-down:+.2f} m up from {pair[0]} where the road "
+            f"matches ({ratio.max():.0f} σ of their poses): {says}. Ties are observed again where the solution puts the "
+            f"passes, and σ of {' and '.join(own)} is taken to be as large as that"
+        )
+        findings.append(PASSES_APART.finds(" and ".join(f"run '{run}'" for run in own), text))
+    return wrong, findings
+
+
+def _with_larger(
+    ties: KnownTies, larger: KnownTies, config: AdjustConfig
+) -> tuple[KnownTies, dict[tuple[str, str], Float64]]:
+    """The ties, and of runs of whose places too few match those of larger patches that agree on a larger shift, which
+    is told by pair of runs.
+    """
+    apart = dict[tuple[str, str], Float64]()
     tried, kept = larger.tried, np.zeros(larger.observations.size, np.bool_)
     measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
     for pair in unmatched(ties.tried, config.again):
         rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
-        fits = agreeing({name: values[rows] for name, values in tried.items()}, config.again, config.ties)
+        fits, shift = agreeing({name: values[rows] for name, values in tried.items()}, config.again, config.ties)
         kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
-    return ties.with_more(larger, kept)
+        if fits.any():
+            apart[pair] = shift
+    return ties.with_more(larger, kept), apart
 
 
 def _places_again(
@@ -205,6 +273,26 @@ def _places_again(
     moves = [shifts[place.number] for place in chosen]
     number = len(again.counts) + 1
     return tie_tasks(plan, sources, chosen, runs, config.ties, (number, moves)), shifts, largest_m
+
+
+def _points_again(
+    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+) -> tuple[ControlTask, ...]:
+    """Tasks that look at control points, with those of points whose passes a solution moves by too much."""
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    least_m, seen, moves = config.again.share * 2.0 * config.places.radius_m, [], []
+    last = {task.point.number: task for task in again.control}
+    for task in (one for one in again.control if one.round == 0):
+        own = tuple(_shift(corrections.get(runs[one[0].run]), one[0]) for one in task.passes)
+        before = last[task.point.number].shifts_m or (_STILL,) * len(own)
+        if np.hypot(*(np.array(own)[:, :2] - np.array(before)[:, :2]).T).max() > least_m:
+            times = 1.0 + float(np.hypot(*np.array(own)[:, :2].T).max()) / config.targets.search_m
+            seen.append((task.point, [tuple(_widened(t, times, config) for t in one) for one in task.passes]))
+            moves.append(own)
+    priors, number = priors_of(plan, sources, runs), len(again.counts) + 1
+    picked = {(runs[one[0].run], task.point.name): place for task in again.control for one, place in zip(
+        task.passes, task.picked, strict=True) if place is not None}  # fmt: skip
+    return (*again.control, *sighting_tasks(plan, sources, priors, seen, picked, (number, moves)))
 
 
 def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:

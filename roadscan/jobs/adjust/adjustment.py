@@ -24,6 +24,7 @@ from roadscan.jobs.adjust.control_work import (
     sight_control,
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
+from roadscan.jobs.adjust.failed_ties import failed_ties
 from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
 from roadscan.jobs.adjust.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.jobs.adjust.mountings import (
@@ -194,6 +195,8 @@ def adjust_survey(session: Session) -> None:
     seams, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    if plan.survey.config.adjust.mode in ("joint", "vertical"):
+        doubts += failed_ties(evidence.ties, solution.tie_weight)
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
     _keep(session, key, held, (lines, doubts), failed=any(lacking))
 

@@ -215,23 +215,28 @@ def _contradicted(
     every = set(zip(ties.tried["first_run"].tolist(), ties.tried["second_run"].tolist(), strict=True))
     sigma = {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs)}
     found = misplaced(runs, every - unmatched(ties.tried, config.again).keys(), apart, config.fixed)
-    wrong, findings = dict[str, Float64](), list[Finding]()
+    wrong, said = dict[str, Float64](), dict[tuple[str, ...], list[str]]()
     for pair, shift in sorted(apart.items()):
         ratio = np.abs(shift) / np.hypot(*(np.maximum(sigma[run], 1e-6) for run in pair))
-        own = [run for run in pair if run in found]
+        own = tuple(run for run in pair if run in found)
         if ratio.max() <= _APART or not own:
             continue
         for run in own:
             wrong[run] = np.where(ratio > _APART, found[run], wrong.get(run, np.zeros(3)))
-        north, east, down = shift
-        says = f"run '{own[0]}' contradicts its σ" if len(own) == 1 else "nothing tells which of them is wrong"
-        text = (
-            f"{pair[1]} lies {north:+.2f} m north, {east:+.2f} m east and {-down:+.2f} m up from {pair[0]} where the road "
-            f"matches ({ratio.max():.0f} σ of their poses): {says}. Ties are observed again where the solution puts the "
-            f"passes, and σ of {' and '.join(own)} is taken to be as large as that"
+        other, (north, east, down) = (pair[0], shift) if own[-1] == pair[1] else (pair[1], -shift)
+        said.setdefault(own, []).append(
+            f"{north:+.2f} m north, {east:+.2f} m east and {-down:+.2f} m up from {other} ({ratio.max():.0f} σ)"
         )
-        findings.append(PASSES_APART.finds(" and ".join(f"run '{run}'" for run in own), text))
-    return wrong, findings
+    return wrong, [_apart_finding(own, told) for own, told in said.items()]
+
+
+def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
+    doubt = "" if len(runs) == 1 else "; nothing tells which of both is wrong"
+    text = (
+        f"where the road matches, it lies {', '.join(told)}{doubt}. σ of {' and '.join(runs)} is taken to be as large, "
+        "and ties are observed again where the solution puts the passes"
+    )
+    return PASSES_APART.finds(f"run '{runs[-1]}'", text)
 
 
 def _with_larger(

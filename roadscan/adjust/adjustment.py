@@ -12,7 +12,7 @@ share, are unknowns beside the poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -66,6 +66,10 @@ class ControlErrors:
     """(c, 3) surveyed minus what all others say of the point: leave-one-out, coordinate by coordinate."""
     left_out_sigma_m: Float64
     """(c, 3) 1 σ of it, that of the survey included."""
+
+    def chosen(self, which: Bool) -> ControlErrors:
+        """Those of some points (c,)."""
+        return ControlErrors(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 @dataclass(frozen=True)

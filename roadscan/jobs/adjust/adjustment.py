@@ -15,6 +15,7 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.code_reach import code_digest
+from roadscan.jobs.adjust.control_lines import lines_line
 from roadscan.jobs.adjust.control_work import (
     SIGHTINGS,
     ControlTask,
@@ -25,7 +26,16 @@ from roadscan.jobs.adjust.control_work import (
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.jobs.adjust.failed_ties import failed_ties
-from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.figures import (
+    Held,
+    Rows,
+    accuracy_rows,
+    control_rows,
+    distance_rows,
+    of_points,
+    relative_rows,
+    tie_rows,
+)
 from roadscan.jobs.adjust.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.jobs.adjust.mountings import (
     calibrated_sigma,
@@ -72,6 +82,11 @@ class Work:
     hand: HandWork
     """Ties by hand."""
 
+    @property
+    def own_points(self) -> list[ControlPoint]:
+        """Those that do not stand for a surveyed line."""
+        return [point for point in self.points if not point.is_of_line]
+
 
 class Seen(NamedTuple):
     """What passes saw."""
@@ -96,7 +111,7 @@ def solution_key(plan: SurveyPlan) -> str:
     beside = [
         [r.key, [f.digest for f in r.tables.get(table, ())]]
         for r in plan.records
-        for table in ("control_points", "trajectory_accuracy")
+        for table in ("control_points", "control_lines", "trajectory_accuracy")
         if r.tables.get(table)
     ]
     return key_of(
@@ -189,7 +204,7 @@ def adjust_survey(session: Session) -> None:
         "control_residuals": points,
         "relative_accuracy": relative_rows(evidence, work.tracks, held, added),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
-        "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
+        "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, work.tracks),
     }
     keep_tables(session.store, manifest, key, tables)
     seams, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
@@ -267,23 +282,22 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Fi
 
 
 def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
-    if not work.points:
+    if not work.own_points:
         return "no control point"
-    seen = len({one.point.number for one in sightings if one.status != "unseen"})
-    return f"{seen} of {len(work.points)} control points seen"
+    seen = len({one.point.number for one in sightings if one.status != "unseen" and not one.point.is_of_line})
+    return f"{seen} of {len(work.own_points)} control points seen"
 
 
 def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
     """Findings on points that no pass saw, and on targets that are not as they should be."""
     found: list[Finding] = []
-    if work.points and not work.control:
-        text = (
-            f"not one of the {len(work.points)} control points lies where a pass drove: check crs of their [[control]]"
-        )
-        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(work.points)))
+    points = work.own_points
+    if points and not any(not task.point.is_of_line for task in work.control):
+        text = f"not one of the {len(points)} control points lies where a pass drove: check crs of their [[control]]"
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(points)))
     elif beside := _beside(work, sightings):
         text = (
-            f"{len(beside)} of {len(work.points)} control points lie where no pass saw the road: {listed(beside)}; "
+            f"{len(beside)} of {len(points)} control points lie where no pass saw the road: {listed(beside)}; "
             "they are of another stretch, or in another CRS"
         )
         found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(beside)))
@@ -293,7 +307,7 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
     """Points that no pass saw, and how far they lie from where the nearest sensor went."""
     seen = {one.point.number for one in sightings if one.status != "unseen"}
-    unseen = [one for one in work.points if one.number not in seen]
+    unseen = [one for one in work.own_points if one.number not in seen]
     ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
     return [
         f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
@@ -309,7 +323,7 @@ def _lines(
         f"{places:,} places of overlap with {evidence.ties.observations.size:,} ties, {counted:,} of which count; "
         f"{_seen(work, evidence.sightings)}"
     ]
-    lines += [again.line()] if again.counts else []
+    lines += [line for line in (lines_line(evidence.sightings), again.line()) if line]
     if held:
         moved = {run: largest(own) for run, own in held.items()}
         down = max(float(np.abs(own.north_east_down_m[:, 2]).max()) for own in held.values())

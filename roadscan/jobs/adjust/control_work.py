@@ -17,6 +17,7 @@ from roadscan.adjust.process import RunPrior
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 from roadscan.code_reach import code_digest
+from roadscan.jobs.adjust.control_lines import line_points
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.jobs.adjust.tracks import runs_of
 from roadscan.jobs.engine.fingerprint import key_of
@@ -78,14 +79,16 @@ class ControlTask:
 
 
 def control_points(plan: SurveyPlan) -> list[ControlPoint]:
-    """Surveyed points of all control logs, in the order of the survey file and of their names."""
+    """Surveyed points of all control logs, in the order of the survey file and of their names, then those that stand
+    for surveyed lines.
+    """
     config = plan.survey.config.adjust
     found: list[ControlPoint] = []
     for record in plan.records:
         for file in record.tables.get("control_points", ()):
             rows = read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist()
             found += [_point(len(found) + k, row, config) for k, row in enumerate(rows)]
-    return found
+    return found + line_points(plan, len(found))
 
 
 def _point(number: int, row: Mapping[str, Any], config: AdjustConfig) -> ControlPoint:

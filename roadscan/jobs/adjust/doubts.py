@@ -278,7 +278,7 @@ def target_findings(sightings: Sequence[Sighting]) -> list[Finding]:
         ("doubled", "targets are there more than once, and nothing of them is used"),
         ("moved", "targets lie elsewhere than surveyed, and are measured where they lie"),
     ):
-        own = [one for one in sightings if one.status == status]
+        own = [one for one in sightings if one.status == status and not one.point.is_of_line]
         if own:
             told = [f"{one.point.name} in {one.sensor}: {one.why_not}" for one in own]
             unused = len(own) if status == "doubled" else 0

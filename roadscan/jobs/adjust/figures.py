@@ -130,6 +130,11 @@ def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Fl
     return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
 
 
+def of_points(rows: Rows, evidence: Evidence) -> Rows:
+    """Those of `control_residuals` that are of points, and not of surveyed lines."""
+    return [row for row, one in zip(rows, evidence.sightings, strict=True) if not one.point.is_of_line]
+
+
 def _control_row(
     one: Sighting, evidence: Evidence, solution: Solution, held: Held, mounted: Float64
 ) -> dict[str, Any]:  # fmt: skip
@@ -173,7 +178,8 @@ def _control_row(
 def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
     """Of the table `absolute_accuracy`, from rows of `control_residuals`."""
     found: Rows = []
-    checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True) if row["role"] == "check"]
+    checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True)
+              if row["role"] == "check" and not one.point.is_of_line]  # fmt: skip
     for poses, word in (("recorded", "before"), ("adjusted", "after")):
         upright = [
             (-row[f"height_{word}_m"], one.point.sigma_height_m, row["point"])

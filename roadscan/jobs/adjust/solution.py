@@ -20,6 +20,7 @@ from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.jobs.adjust.control_lines import line_findings
 from roadscan.jobs.adjust.doubts import (
     CONTROL,
     CONTROL_DATUM,
@@ -193,7 +194,10 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
-    found += wrong_points(_wrong(evidence.sightings, adjusted, first))
+    wrong = _wrong(evidence.sightings, adjusted, first)
+    of_lines = {one.point.name for one in evidence.sightings if one.point.is_of_line}
+    found += wrong_points([one for one in wrong if one.name not in of_lines])
+    found += line_findings([one for one in wrong if one.name in of_lines], evidence.sightings)
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     joined = evidence.ties.observations.chosen(weight > 0.0)
@@ -212,9 +216,16 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     ]  # fmt: skip
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
-        leave_one_out(adjusted.control) if adjusted.control.place.size else None,
+        _left_out(adjusted.control, first, evidence),
         adjusted.mountings if adjusted.mountings.sensors else None,
     )  # fmt: skip
+
+
+def _left_out(control: ControlErrors, first: int, evidence: Evidence) -> LeaveOneOut | None:
+    """Accuracy at each GCP against all others; a line, which binds across it alone, is none."""
+    lines = {one.point.number for one in evidence.sightings if one.point.is_of_line}
+    own = control.chosen(~np.isin(control.place - first, list(lines)))
+    return leave_one_out(own) if own.place.size else None
 
 
 def _entering(evidence: Evidence) -> Bool:
@@ -383,7 +394,7 @@ def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidF
     """The one rigid movement of the survey onto its targets."""
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
-    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
+    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m) and not one.point.is_of_line]
     sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
     return rigid_fit(seen, sigma, false_alarm)
 

@@ -113,6 +113,17 @@ class ControlUse(ControlRules):
     another CRS or height datum: none of them is used. A single point that does so is not used either."""
 
 
+class LineUse(Strict):
+    """How surveyed lines count: paint and kerbs of a [[control]] of the format `control_lines`."""
+
+    each_m: float = Field(default=10.0, gt=0.0)
+    """Distance of the points along a line that are looked at (m)."""
+    sigma_across_m: float = Field(default=0.02, gt=0.0)
+    """1 σ across the line of lines that state none (m)."""
+    sigma_height_m: float = Field(default=0.02, gt=0.0)
+    """1 σ of the heights of lines that state none (m)."""
+
+
 class HandTies(Strict):
     """Ties by hand: things that a person found in two passes, as the recorded poses show them."""
 
@@ -160,6 +171,8 @@ class AdjustConfig(Strict):
     """Control points."""
     targets: TargetsConfig = TargetsConfig()
     """Painted targets at control points."""
+    lines: LineUse = LineUse()
+    """Surveyed lines."""
     solver: SolverSettings = SolverSettings()
     """How the corrections are computed."""
     moved_m: float = Field(default=0.0001, ge=0.0, le=0.1)

@@ -112,13 +112,13 @@ def _plan(source: LogSource) -> _Plan:
     position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
     layout = text_layout(source.path, options)
     columns = find_columns(
-        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, _units(frame)
+        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, units_of(frame)
     )
     need_role("role" in columns, options.role, source.path)
     return _Plan(layout, columns, frame, options.role or "")
 
 
-def _units(frame: ControlFrame) -> dict[str, float]:
+def units_of(frame: ControlFrame) -> dict[str, float]:
     """Size (rad, m) of the units that the CRS itself fixes, by quantity."""
     if frame.kind == "local":
         return {"easting": 1.0, "northing": 1.0, "height": 1.0}

@@ -87,9 +87,16 @@ def line_findings(wrong: Sequence[WrongPoint], sightings: Sequence[Sighting]) ->
     for bad in wrong:
         by_line[places[bad.name]].append(bad)
     for line, own in sorted(by_line.items()):
+        names = {name for one in own for name in (one.name, *one.alternatives) if places.get(name) == line}
+        away = [(one.horizontal_m, "across") for one in own if np.isfinite(one.horizontal_m)]
+        away += [(abs(one.height_m), "in height") for one in own if np.isfinite(one.height_m)]
+        size, way = max(away)
         worst = max(own, key=lambda one: np.nan_to_num(one.sigmas))
-        text = f"{len(own)} of its {len(points[line])} points are contradicted, {worst.name} most: {worst.told()}"
-        findings.append(CONTROL_LINE.finds(f"line '{line}'", text, left_out=len(own)))
+        text = (
+            f"all other evidence contradicts {len(names)} of its {len(points[line])} points, by up to "
+            f"{1e3 * size:.1f} mm {way} ({worst.sigmas:.1f} σ, where {worst.limit:.1f} σ are the limit): not used"
+        )
+        findings.append(CONTROL_LINE.finds(f"line '{line}'", text, left_out=len(names)))
     for line, names in sorted(points.items()):
         if line not in found and len(names) >= _LEAST:
             text = f"it is found at none of its {len(names)} points that passes saw; it does not count"

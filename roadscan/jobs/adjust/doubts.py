@@ -101,6 +101,8 @@ HELMERT_TURN: Final = Witness(
 
 _UNDERSTATED: Final = 3.0
 """A variance factor from which on a stated σ is told to be too small: 1.7 times."""
+_OPEN_M: Final = 1.0
+"""An offset whose σ is larger is not known: that along surveyed lines, which tell of nothing along them."""
 _WORDS: Final = {
     "height_tie": "heights of one pass against another",
     "shift_tie": "shifts of one pass against another",
@@ -175,7 +177,7 @@ def offset_line(verdict: ControlVerdict) -> str:
         f"{_offset(verdict, name)} ± {1e3 * verdict.offset.sigma_m(name):.1f} mm in {name} (an offset is found four "
         f"times of five from {1e3 * verdict.detectable_m[name]:.0f} mm on)"
         for name in (HEIGHT, PLACE)
-        if np.isfinite(verdict.offset.sigma_m(name))
+        if verdict.offset.sigma_m(name) < _OPEN_M
     ]
     return f"control against the poses as a whole: {', '.join(parts)}" if parts else ""
 

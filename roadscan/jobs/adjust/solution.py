@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
-from roadscan.adjust.control import SeenBy, Sighting, observations_of
+from roadscan.adjust.control import ControlPoint, SeenBy, Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
 from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
@@ -20,6 +20,7 @@ from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.jobs.adjust.control_lines import line_findings
 from roadscan.jobs.adjust.doubts import (
     CONTROL,
@@ -343,10 +344,18 @@ def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> l
         others = tuple(sorted(by_number[int(control.place[k]) - first].name for k in one.alternatives))
         away = control.left_out_m[one.point]
         height = -float(away[2]) if one.component == HEIGHT else float("nan")
-        place = float(np.hypot(*away[:2])) if one.component == PLACE else float("nan")
+        place = _aside_m(point, away) if one.component == PLACE else float("nan")
         sigma = float(control.left_out_sigma_m[one.point, 2])
         found.append(WrongPoint(point.name, height, place, sigma, point.height_m, one.sigmas, one.limit, others))
     return sorted(found, key=lambda one: one.name)
+
+
+def _aside_m(point: ControlPoint, away_m: Float64) -> float:
+    """How far a surveyed place lies from another (3,; north, east, down): across its line where it stands for one."""
+    if isinstance(point.shape, SurveyedLine):
+        sine, cosine = np.sin(point.shape.azimuth_rad), np.cos(point.shape.azimuth_rad)
+        return abs(float(away_m[1] * cosine - away_m[0] * sine))
+    return float(np.hypot(*away_m[:2]))
 
 
 def _rigid_solution(

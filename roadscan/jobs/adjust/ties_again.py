@@ -268,9 +268,11 @@ def _places_again(
     for place in again.places():
         own = tuple(_shift(corrections.get(runs[t.run]), t) for t in place.traverses)
         before = again.shifts.get(place.number, (_STILL,) * len(own))
-        moved = np.array(own)[:, :2] - np.array(before)[:, :2]
-        if len(own) > 1 and _extent(moved) > config.again.share * 2.0 * place.radius_m:
-            largest_m = max(largest_m, _extent(moved))
+        moved = np.array(own) - np.array(before)
+        # What lies beside the patch is not compared with it, and what lies far above it is refused.
+        aside_m, above_m = _extent(moved[:, :2]), float(np.ptp(moved[:, 2]))
+        if aside_m > config.again.share * 2.0 * place.radius_m or above_m > 0.5 * config.ties.most_apart_m:
+            largest_m = max(largest_m, aside_m, above_m)
             reach_m = float(np.hypot(*np.array(own)[:, :2].T).max())
             times = 1.0 + reach_m / (place.radius_m + config.places.margin_m)
             chosen.append(replace(place, traverses=tuple(_widened(t, times, config) for t in place.traverses)))

@@ -140,7 +140,7 @@ def _profile(values: Float64, across_m: Float64, reach_m: float) -> tuple[Float6
     profile[there] = 0.5 * (
         sorted_values[first[there] + (count[there] - 1) // 2] + sorted_values[first[there] + count[there] // 2]
     )
-    return profile, (np.arange(cells) + 0.5) * _CELL_M - reach_m
+    return profile, np.asarray((np.arange(cells) + 0.5) * _CELL_M - reach_m)
 
 
 def _paint(grey: Float64, at_m: Float64) -> tuple[float, float, float] | str:

@@ -25,25 +25,25 @@ _LEAST: Final = 3
 _MOST: Final = 0.5
 """Share of the heights of two passes, and of the patches, that is most of them."""
 _SIGMAS: Final = 3.0
+_ALONG: Final = 0.5
+"""Cosine from which on a direction tells of a shift."""
 
 
-def unmatched(tried: Column, settings: AgainSettings) -> dict[tuple[str, str], list[int]]:
-    """Places of pairs of runs, by name, of which too few show a shift, or a height."""
-    found: dict[tuple[str, str], list[int]] = {}
-    runs = np.stack([tried["first_run"], tried["second_run"]])
-    heads = _of_one_pass(tried)
-    for first, second in sorted({(a, b) for a, b in runs.T[~heads].tolist()}):
-        own = (runs[0] == first) & (runs[1] == second) & ~heads
-        heights = own & (tried["kind"] == HEIGHT)
-        places = np.unique(tried["place"][heights])
-        if not places.size:
-            continue
-        matched = own & (tried["accepted"] == 1)
-        shifts = np.unique(tried["place"][matched & (tried["kind"] == SHIFT)]).size
-        level = np.unique(tried["place"][matched & heights]).size
-        if shifts < settings.matched_share * places.size or level < _MOST * places.size:
-            found[first, second] = places.tolist()
-    return found
+def places_of_pairs(tried: Column) -> dict[tuple[str, str], list[int]]:
+    """Places that two runs share, or two drives of one run, by the names of both."""
+    heights = (tried["kind"] == HEIGHT) & ~_of_one_pass(tried)
+    pairs = sorted(set(zip(tried["first_run"][heights].tolist(), tried["second_run"][heights].tolist(), strict=True)))
+    return {
+        (a, b): np.unique(tried["place"][heights & (tried["first_run"] == a) & (tried["second_run"] == b)]).tolist()
+        for a, b in pairs
+    }
+
+
+def is_matched(tried: Column, pair: tuple[str, str]) -> bool:
+    """Whether the heights of most places that two runs share could be compared."""
+    own = (tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & ~_of_one_pass(tried)
+    heights = tried["accepted"][own & (tried["kind"] == HEIGHT)]
+    return bool(heights.size and (heights == 1).mean() >= _MOST)
 
 
 def _of_one_pass(tried: Column) -> Bool:
@@ -62,6 +62,8 @@ def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> tuple
     kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
     if kept.any():
         shift[:2] = _solved(tried, np.flatnonzero(kept))
+        if not _is_supported(tried, kept, counts & (tried["kind"] == SHIFT), shift[:2]):
+            kept[:], shift[:2] = False, 0.0
     heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
     level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
     alike = np.zeros(counts.size, np.bool_)
@@ -98,6 +100,14 @@ def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mappin
             if int(group[number[run]]) not in right and run not in held:
                 found[run] = np.maximum(found.get(run, np.zeros(3)), np.abs(shift))
     return found
+
+
+def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> bool:
+    """Whether enough places tell of the shift along itself: most of a road tells only how far it lies across."""
+    length = float(np.hypot(*shift))
+    along = np.abs(_directions(tried, np.arange(kept.size)) @ shift) > _ALONG * length
+    support, against = (np.unique(tried["place"][own & along]) for own in (kept, every & ~kept))
+    return support.size >= _LEAST and support.size > np.setdiff1d(against, support).size
 
 
 def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:

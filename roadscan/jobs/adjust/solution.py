@@ -189,7 +189,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
     if wrong_ties:
         found += said
-        evidence = replace(evidence, ties=evidence.ties.without(wrong_ties))
+        evidence = replace(evidence, ties=evidence.ties.refused(np.isin(evidence.ties.columns["name"], wrong_ties)))
         entering_ties = _entering(evidence)
         adjusted, first = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)

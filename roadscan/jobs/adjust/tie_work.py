@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.adjust.observations import KINDS, Observations, mount_partials
-from roadscan.adjust.patches import Shift, shifted
+from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import SAME_PASS
@@ -117,7 +117,7 @@ def collect_ties(task: TieTask) -> OutputRecord:
 
 def _at_place(reader: NearReader, place: Place, shifts_m: Sequence[Shift], settings: TieSettings) -> Ties:
     """Ties of a place whose traverses are shifted, told as the recorded poses place them."""
-    readings, moved = [], {}
+    readings, moved = list[PassReadings](), dict[tuple[int, str], list[tuple[Traverse, npt.NDArray[Any]]]]()
     for traverse, shift in zip(place.traverses, np.array(shifts_m), strict=True):
         reach = DIAGONAL * place.radius_m + float(np.hypot(*shift[:2]))
         own = reader.of(traverse, Circle(place.easting_m, place.northing_m, reach))
@@ -201,11 +201,9 @@ class KnownTies:
         columns = {name: np.concatenate([own, other.columns[name][which]]) for name, own in self.columns.items()}
         return replace(self, observations=observations, columns=columns)
 
-    def without(self, names: Sequence[str]) -> KnownTies:
-        """The same, where ties by hand of some names do not count."""
-        refused = np.isin(self.columns["name"], names)
-        accepted = np.where(refused, 0, self.columns["accepted"])
-        return replace(self, columns={**self.columns, "accepted": accepted})
+    def refused(self, which: npt.NDArray[np.bool_]) -> KnownTies:
+        """The same, where some (n,) do not count."""
+        return replace(self, columns={**self.columns, "accepted": np.where(which, 0, self.columns["accepted"])})
 
     @property
     def of_heads(self) -> npt.NDArray[np.bool_]:

@@ -7,7 +7,7 @@ moves by more than a share of its patch. Where too few places match to begin wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import Shift
 from roadscan.adjust.places import Place, Traverse
-from roadscan.adjust.ties.far_apart import agreeing, misplaced, unmatched
+from roadscan.adjust.ties.far_apart import agreeing, is_matched, misplaced, places_of_pairs
 from roadscan.jobs.adjust.control_work import ControlTask, sighting_tasks
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.solution import Solution, priors_of
@@ -51,7 +51,7 @@ PASSES_APART: Final = Witness(
     "passes_apart",
     input="trajectories",
     fault="The poses of a pass lie decimetres from those of other passes over the same road.",
-    asks="larger patches of the road where too few ties match: the shift that most of them agree on",
+    asks="larger patches of the road, each 100 m: the shift that most of them agree on",
     does="ties are observed again where the solution puts the passes; σ of a run that most others contradict, or of "
     "both where nothing tells which is wrong, is taken to be as large as the shift",
     told=("findings",),
@@ -112,7 +112,7 @@ def first_ties(
     control: Sequence[ControlTask],
     tools: tuple[Observe, Load],
 ) -> Again:
-    """Ties where the recorded poses say, and of larger patches where too few of those match."""
+    """Ties where the recorded poses say, and of larger patches where these agree that passes lie elsewhere."""
     observe, load = tools
     observe(tasks)
     ties = load(tasks)
@@ -121,8 +121,10 @@ def first_ties(
         return Again(tuple(tasks), ties, control=tuple(control))
     observe(larger)
     far = load(larger)
-    joined, apart = _with_larger(ties, far, plan.survey.config.adjust)
+    kept, apart = _agreed(far, plan.survey.config.adjust)
     misplaced, findings = _contradicted(plan, sources, ties, apart)
+    # What was matched where two passes lie apart is not one place of the road.
+    joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
     return Again(
         tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=misplaced, findings=tuple(findings)
     )
@@ -150,7 +152,7 @@ def settled(
         observe(more)
         tasks = (*again.tasks, *more)
         ties = load(tasks)
-        joined = ties if again.far is None else _with_larger(ties, again.far, config)[0]
+        joined = ties if again.far is None else _still_needed(ties, again.far, config)
         counts, control = (*again.counts, len(shifts)), _points_again(plan, sources, again, solution.corrections)
         again = replace(
             again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts, control=control
@@ -160,12 +162,12 @@ def settled(
 
 
 def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
-    """Tasks for larger patches of pairs of runs of whose places too few match; their places are numbered on."""
+    """Tasks for larger patches of all pairs of runs that share places; their places are numbered on."""
     config, runs = plan.survey.config.adjust, runs_of(plan)
     known = {place.number: place for task in tasks for place in task.places}
     first, found = 1 + max(known, default=-1), list[Place]()
     sought = config.again.rounds and config.mode in ("joint", "vertical")
-    for pair, numbers in unmatched(ties.tried, config.again).items() if sought else ():
+    for pair, numbers in places_of_pairs(ties.tried).items() if sought else ():
         places = [known[number] for number in numbers if known[number].radius_m == config.places.radius_m]
         for place in _spread(places, config):
             own = _of_pair(place, (runs.index(pair[0]), runs.index(pair[1])))
@@ -212,9 +214,8 @@ def _contradicted(
 ) -> tuple[dict[str, Float64], list[Finding]]:
     """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
     runs, config = runs_of(plan), plan.survey.config.adjust
-    every = set(zip(ties.tried["first_run"].tolist(), ties.tried["second_run"].tolist(), strict=True))
     sigma = {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs)}
-    found = misplaced(runs, every - unmatched(ties.tried, config.again).keys(), apart, config.fixed)
+    found = misplaced(runs, places_of_pairs(ties.tried).keys() - apart.keys(), apart, config.fixed)
     wrong, said = dict[str, Float64](), dict[tuple[str, ...], list[str]]()
     for pair, shift in sorted(apart.items()):
         ratio = np.abs(shift) / np.hypot(*(np.maximum(sigma[run], 1e-6) for run in pair))
@@ -239,22 +240,31 @@ def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
     return PASSES_APART.finds(f"run '{runs[-1]}'", text)
 
 
-def _with_larger(
-    ties: KnownTies, larger: KnownTies, config: AdjustConfig
-) -> tuple[KnownTies, dict[tuple[str, str], Float64]]:
-    """The ties, and of runs of whose places too few match those of larger patches that agree on a larger shift, which
-    is told by pair of runs.
-    """
-    apart = dict[tuple[str, str], Float64]()
-    tried, kept = larger.tried, np.zeros(larger.observations.size, np.bool_)
+def _still_needed(ties: KnownTies, larger: KnownTies, config: AdjustConfig) -> KnownTies:
+    """The ties, and those of larger patches of pairs of runs that still do not match."""
+    kept, apart = _agreed(larger, config)
+    return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
+
+
+def _agreed(larger: KnownTies, config: AdjustConfig) -> tuple[Bool, dict[tuple[str, str], Float64]]:
+    """Which ties (n,) of larger patches count, and by pair of runs the shift that they agree on."""
+    tried, kept, apart = larger.tried, np.zeros(larger.observations.size, np.bool_), dict[tuple[str, str], Float64]()
     measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
-    for pair in unmatched(ties.tried, config.again):
+    for pair in places_of_pairs(tried):
         rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
         fits, shift = agreeing({name: values[rows] for name, values in tried.items()}, config.again, config.ties)
         kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
         if fits.any():
             apart[pair] = shift
-    return ties.with_more(larger, kept), apart
+    return kept, apart
+
+
+def _of_pairs(ties: KnownTies, pairs: Iterable[tuple[str, str]]) -> Bool:
+    """Ties (n,) of some pairs of runs."""
+    own = np.zeros(ties.observations.size, np.bool_)
+    for first, second in pairs:
+        own |= (ties.columns["first_run"] == first) & (ties.columns["second_run"] == second)
+    return own
 
 
 def _places_again(

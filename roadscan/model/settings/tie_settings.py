@@ -41,15 +41,12 @@ class AgainSettings(Strict):
     rounds: int = Field(default=3, ge=0, le=10)
     """Times that ties are observed again, at most: one brings passes to centimetres, the next ones to the σ of the
     ties, and what moves after three does not settle. 0: never."""
-    matched_share: float = Field(default=0.2, ge=0.0, lt=1.0)
-    """Two runs of whose places fewer than this share show a shift, or fewer than half a height, are sought farther
-    apart, with a larger patch."""
     search_m: float = Field(default=1.0, gt=0.0, le=5.0)
-    """How far apart (m), along, across and in height."""
+    """How far apart (m), along, across and in height, two passes are sought with larger patches."""
     radius_m: float = Field(default=2.0, gt=0.0, le=20.0)
     """Half the edge of the larger patch (m)."""
-    cell_m: float = Field(default=0.04, gt=0.0, le=1.0)
-    """Edge of its cells (m)."""
+    cell_m: float = Field(default=0.02, gt=0.0, le=1.0)
+    """Edge of its cells (m): cracks are to be seen."""
     each_m: float = Field(default=100.0, gt=0.0)
     """Distance of larger patches along the road (m): errors of poses vary over minutes."""
     least: int = Field(default=10, ge=3)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
@@ -38,6 +39,7 @@ from roadscan.jobs.adjust.figures import (
 )
 from roadscan.jobs.adjust.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.jobs.adjust.mountings import (
+    Mounted,
     calibrated_sigma,
     held_values,
     mounted_of,
@@ -65,6 +67,8 @@ from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import file_digest
 
+Float64 = npt.NDArray[np.float64]
+
 _BUNDLE_BYTES: Final = 20_000_000.0
 """Compressed bytes that a task reads, about."""
 _BUNDLE_POINTS: Final = 8
@@ -91,12 +95,11 @@ class Work:
 class Seen(NamedTuple):
     """What passes saw."""
 
-    points: list[Sighting]
-    """Control points."""
+    evidence: Evidence
     rows: list[dict[str, Any]]
-    """The same as rows of the table."""
-    ends: list[Sighting]
-    """Ends of ties by hand."""
+    """Sightings of control points as rows of their table."""
+    unmeasured: list[Finding]
+    """On ties by hand."""
 
 
 def solution_key(plan: SurveyPlan) -> str:
@@ -143,77 +146,97 @@ def withdraw(session: Session) -> None:
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
+class _Collector:
+    """Brings evidence up to date, round by round."""
+
+    def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
+        self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
+        self.runs = runs_of(session.plan)
+        self.work = plan_work(session.plan, sources, priors)
+        self.lacks = False
+        """Whether some of the evidence failed."""
+        self.again = first_ties(session.plan, sources, self.work.ties, self.work.control, (self.observe, self.load))
+
+    def observe(self, tasks: Sequence[TieTask]) -> None:
+        """Bring ties up to date."""
+        self.lacks |= _collect_ties(self.session, tasks)
+
+    def load(self, tasks: Sequence[TieTask]) -> KnownTies:
+        """Ties that are up to date."""
+        return load_ties(self.session.store, self.session.manifest, tasks, self.runs, self.mounted)
+
+    def evidence(self, ties: KnownTies, control: Sequence[ControlTask]) -> Seen:
+        """All that is known, with what passes see of control points and at ends of ties by hand."""
+        store, manifest, hand = self.session.store, self.session.manifest, self.work.hand
+        self.lacks |= _collect_sightings(self.session, [*control, *hand.tasks])
+        points, rows = load_sightings(store, manifest, control)
+        ends, _ = load_sightings(store, manifest, hand.tasks)
+        joined, unmeasured = with_hand_ties(ties, hand, ends, self.mounted, self.runs)
+        wide = self.again.misplaced
+        priors = tuple(p.widened(wide[p.run]) if p.run in wide else p for p in self.priors)
+        return Seen(Evidence(self.runs, priors, joined, tuple(points), self.mounted), rows, unmeasured)
+
+    def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
+        """Corrections of all runs."""
+        return solve(self.session.plan, self.evidence(ties, control).evidence)
+
+
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
-    plan, manifest = session.plan, session.manifest
+    plan, manifest, config = session.plan, session.manifest, session.plan.survey.config.adjust
     key = solution_key(plan)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
-    runs = runs_of(plan)
-    priors = priors_of(plan, sources, runs)
-    work = plan_work(plan, sources, priors)
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
-    lacking = list[bool]()
-
-    def observe(tasks: Sequence[TieTask]) -> None:
-        lacking.append(_collect_ties(session, tasks))
-
-    def load(tasks: Sequence[TieTask]) -> KnownTies:
-        return load_ties(session.store, manifest, tasks, runs, mounted)
-
-    def look(control: Sequence[ControlTask]) -> Seen:
-        lacking.append(_collect_sightings(session, [*control, *work.hand.tasks]))
-        return Seen(
-            *load_sightings(session.store, manifest, control),
-            load_sightings(session.store, manifest, work.hand.tasks)[0],
-        )
-
-    def evidence_of(ties: KnownTies, seen: Seen) -> tuple[Evidence, list[Finding]]:
-        joined, unmeasured = with_hand_ties(ties, work.hand, seen.ends, mounted, runs)
-        own = [p.widened(again.misplaced[p.run]) if p.run in again.misplaced else p for p in priors]
-        return Evidence(runs, tuple(own), joined, tuple(seen.points), mounted), unmeasured
-
-    again = first_ties(plan, sources, work.ties, work.control, (observe, load))
-    seen = look(work.control)
-    sightings = seen.points
-    evidence, unmeasured = evidence_of(again.ties, seen)
+    collector = _Collector(session, sources, priors_of(plan, sources, runs_of(plan)), mounted)
+    work, again = collector.work, collector.again
+    seen = collector.evidence(again.ties, again.control)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
     ]
-    doubts += [*again.findings, *work.hand.findings, *unmeasured]
-    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
-        lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
-        held: Held = publish(session.store, {}, plan.survey.config.adjust)
-        publish_mountings(session.store, None, plan.survey.config.adjust)
+    doubts += [*again.findings, *work.hand.findings, *seen.unmeasured]
+    evidence = seen.evidence
+    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
+        lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, evidence.sightings)}"]
+        held: Held = publish(session.store, {}, config)
+        publish_mountings(session.store, None, config)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
         _forget_others(manifest, again, work)
-        _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed=any(lacking))
+        said = lines, [*doubts, *_of_points(work, evidence.sightings)]
+        _keep(session, key, {}, said, failed=collector.lacks)
         return
-    tools = observe, load, lambda ties, control: solve(plan, evidence_of(ties, look(control))[0])
+    tools = collector.observe, collector.load, collector.solve
     again, solution, unsettled = settled(plan, sources, again, tools)
-    seen = look(again.control)
-    evidence, sightings = evidence_of(again.ties, seen)[0], seen.points
+    seen = collector.evidence(again.ties, again.control)
+    evidence = seen.evidence
     _forget_others(manifest, again, work)
-    held = publish(session.store, solution.corrections, plan.survey.config.adjust)
-    changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
-    added = held_values(mounted, changes)
-    points = control_rows(evidence, solution, held, added)
-    tables = {
-        "tie_residuals": tie_rows(evidence, solution, held, added),
-        "control_residuals": points,
-        "relative_accuracy": relative_rows(evidence, work.tracks, held, added),
-        "absolute_accuracy": accuracy_rows(points, evidence, solution),
-        "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, work.tracks),
-    }
+    held = publish(session.store, solution.corrections, config)
+    changes = publish_mountings(session.store, solution.mountings, config)
+    tables = _tables(evidence, solution, held, held_values(mounted, changes), work.tracks)
     keep_tables(session.store, manifest, key, tables)
     seams, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), seams), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
-    if plan.survey.config.adjust.mode in ("joint", "vertical"):
+    if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)
-    doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
-    _keep(session, key, held, (lines, doubts), failed=any(lacking))
+    doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
+    doubts += _of_points(work, evidence.sightings)
+    _keep(session, key, held, (lines, doubts), failed=collector.lacks)
+
+
+def _tables(
+    evidence: Evidence, solution: Solution, held: Held, added: Float64, tracks: Sequence[Track]
+) -> dict[str, Rows]:
+    """Rows of the tables of the outcome; added : (s, 6) what is added to the mountings."""
+    points = control_rows(evidence, solution, held, added)
+    return {
+        "tie_residuals": tie_rows(evidence, solution, held, added),
+        "control_residuals": points,
+        "relative_accuracy": relative_rows(evidence, tracks, held, added),
+        "absolute_accuracy": accuracy_rows(points, evidence, solution),
+        "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, tracks),
+    }
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:

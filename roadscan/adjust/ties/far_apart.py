@@ -53,9 +53,11 @@ def _of_one_pass(tried: Column) -> Bool:
     return np.asarray(same & (apart < 30_000_000_000))
 
 
-def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> tuple[Bool, Float64]:
+def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float) -> tuple[Bool, Float64]:
     """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find, and
     that shift (3,): second minus first, north, east, down (m).
+
+    most_up_m : passes that lie farther above one another than this contradict the σ of their poses.
     """
     counts = tried["accepted"] == 1
     shift = np.zeros(3)
@@ -70,7 +72,7 @@ def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings) -> tuple
     alike[heights] = np.abs(tried["value_m"][heights] - level) <= settings.alike_m
     if alike.sum() > _MOST * heights.size:
         shift[2] = -level
-    is_far = np.hypot(*shift[:2]) > fine.search_m or abs(shift[2]) > fine.most_apart_m
+    is_far = np.hypot(*shift[:2]) > fine.search_m or abs(shift[2]) > max(most_up_m, settings.alike_m)
     return ((kept | alike), shift) if is_far else (np.zeros(counts.size, np.bool_), np.zeros(3))
 
 

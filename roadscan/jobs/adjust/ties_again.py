@@ -121,7 +121,7 @@ def first_ties(
         return Again(tuple(tasks), ties, control=tuple(control))
     observe(larger)
     far = load(larger)
-    kept, apart = _agreed(far, plan.survey.config.adjust)
+    kept, apart = _agreed(far, plan.survey.config.adjust, _sigmas(plan, sources))
     misplaced, findings = _contradicted(plan, sources, ties, apart)
     # What was matched where two passes lie apart is not one place of the road.
     joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
@@ -152,7 +152,7 @@ def settled(
         observe(more)
         tasks = (*again.tasks, *more)
         ties = load(tasks)
-        joined = ties if again.far is None else _still_needed(ties, again.far, config)
+        joined = ties if again.far is None else _still_needed(plan, sources, ties, again.far)
         counts, control = (*again.counts, len(shifts)), _points_again(plan, sources, again, solution.corrections)
         again = replace(
             again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts, control=control
@@ -214,7 +214,7 @@ def _contradicted(
 ) -> tuple[dict[str, Float64], list[Finding]]:
     """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
     runs, config = runs_of(plan), plan.survey.config.adjust
-    sigma = {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs)}
+    sigma = _sigmas(plan, sources)
     found = misplaced(runs, places_of_pairs(ties.tried).keys() - apart.keys(), apart, config.fixed)
     wrong, said = dict[str, Float64](), dict[tuple[str, ...], list[str]]()
     for pair, shift in sorted(apart.items()):
@@ -223,7 +223,8 @@ def _contradicted(
         if ratio.max() <= _APART or not own:
             continue
         for run in own:
-            wrong[run] = np.where(ratio > _APART, found[run], wrong.get(run, np.zeros(3)))
+            # A position that is off in one component is not to be trusted in the others.
+            wrong[run] = np.full(3, max(float(found[run].max()), *wrong.get(run, np.zeros(3))))
         other, (north, east, down) = (pair[0], shift) if own[-1] == pair[1] else (pair[1], -shift)
         said.setdefault(own, []).append(
             f"{north:+.2f} m north, {east:+.2f} m east and {-down:+.2f} m up from {other} ({ratio.max():.0f} σ)"
@@ -240,19 +241,28 @@ def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
     return PASSES_APART.finds(f"run '{runs[-1]}'", text)
 
 
-def _still_needed(ties: KnownTies, larger: KnownTies, config: AdjustConfig) -> KnownTies:
+def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:
+    """Usual 1 σ (3,) of the recorded positions of each run, north, east, down."""
+    return {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs_of(plan))}
+
+
+def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: KnownTies) -> KnownTies:
     """The ties, and those of larger patches of pairs of runs that still do not match."""
-    kept, apart = _agreed(larger, config)
+    kept, apart = _agreed(larger, plan.survey.config.adjust, _sigmas(plan, sources))
     return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
 
 
-def _agreed(larger: KnownTies, config: AdjustConfig) -> tuple[Bool, dict[tuple[str, str], Float64]]:
+def _agreed(
+    larger: KnownTies, config: AdjustConfig, sigmas: Mapping[str, Float64]
+) -> tuple[Bool, dict[tuple[str, str], Float64]]:
     """Which ties (n,) of larger patches count, and by pair of runs the shift that they agree on."""
     tried, kept, apart = larger.tried, np.zeros(larger.observations.size, np.bool_), dict[tuple[str, str], Float64]()
     measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
     for pair in places_of_pairs(tried):
         rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
-        fits, shift = agreeing({name: values[rows] for name, values in tried.items()}, config.again, config.ties)
+        up_m = _APART * float(np.hypot(*(sigmas[run][2] for run in pair)))
+        own = {name: values[rows] for name, values in tried.items()}
+        fits, shift = agreeing(own, config.again, config.ties, up_m)
         kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
         if fits.any():
             apart[pair] = shift

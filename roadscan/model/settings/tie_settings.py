@@ -49,10 +49,10 @@ class AgainSettings(Strict):
     """Edge of its cells (m): cracks are to be seen."""
     each_m: float = Field(default=100.0, gt=0.0)
     """Distance of larger patches along the road (m): errors of poses vary over minutes."""
-    least: int = Field(default=10, ge=3)
+    least: int = Field(default=20, ge=3)
     """Larger patches of two runs, at least, where they have so many places."""
     alike_m: float = Field(default=0.1, gt=0.0)
-    """Larger patches count that agree with most of the others to this (m)."""
+    """Larger patches count that agree with most of the others to this; passes lie no farther above one another (m)."""
 
 
 class TieSettings(Strict):

@@ -30,7 +30,8 @@ STAGES = ("ingest", "navigate", "footprints", "adjust")
 AZIMUTH = np.radians(128.0)
 """Of the site's road."""
 RADIUS_M = 6_378_000.0
-EVER = [(0, 10**19 // 8)]
+EVER = [(0, 2 * 10**18)]
+"""GPS ns: until 2043."""
 
 
 def findings(store: Store, witness: str) -> list[Finding]:

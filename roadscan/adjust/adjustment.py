@@ -12,7 +12,7 @@ share, are unknowns beside the poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.linalg import block_diag
 from roadscan.adjust.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
+from roadscan.adjust.fixed_runs import FixedRun, fixed_runs
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
 from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
@@ -68,6 +69,10 @@ class ControlErrors:
     """(c, 3) surveyed minus what all others say of the point: leave-one-out, coordinate by coordinate."""
     left_out_sigma_m: Float64
     """(c, 3) 1 σ of it, that of the survey included."""
+
+    def chosen(self, which: Bool) -> ControlErrors:
+        """Those of some points (c,)."""
+        return ControlErrors(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,8 @@ class Adjustment:
     east, down, and for a metre by which points of which heights alone are used lie elsewhere, north, east."""
     run_factors: Float64
     """(runs, 6) by which the stated variances of single runs' poses were multiplied."""
+    fixed: tuple[FixedRun, ...] = ()
+    """What is known of the errors of the runs that are held."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
@@ -237,8 +244,8 @@ def _once(
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
     verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)
     applied = applied_offset(verdict, settings, settings.reject_beyond)
-    estimate, response = _with_control(unknowns, alone, rounds, verdict, applied)
-    values, covariance, with_next = _of_knots(unknowns, estimate)
+    estimate, solution, response = _with_control(unknowns, alone, rounds, verdict, applied)
+    values, covariance, with_next = _of_knots(unknowns, estimate, solution)
     told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
     back = np.empty(order.size, np.int64)
     back[order] = np.arange(order.size)
@@ -249,10 +256,10 @@ def _once(
     return Adjustment(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
-        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate),
+        _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate, solution),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
-        factors_of_runs,
+        factors_of_runs, fixed_runs(unknowns, _of_solution(unknowns, estimate.solution)),
     )  # fmt: skip
 
 
@@ -374,18 +381,27 @@ def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str
 
 def _with_control(
     unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
-) -> tuple[Estimate, tuple[Float64, ...]]:
-    """The solution with surveys that are right, and by how much each knot follows an offset of all of them."""
+) -> tuple[Estimate, Float64, tuple[Float64, ...]]:
+    """The solution with surveys that are right, the same with fixed runs held, and by how much each knot follows an
+    offset of all surveys.
+
+    Fixed runs are estimated like all others as long as observations are judged: what contradicts their poses within
+    the σ of these is not wrong.
+    """
     point, axis, sigma = _surveyed(unknowns)
     weight = _counting(unknowns, verdict, applied.refused)
-    if not weight.any():
-        return alone, tuple(np.zeros((k.size, len(COMPONENTS), 5)) for k in unknowns.knots)
     lean = np.where((axis == _DOWN)[:, None], unknowns.control.lean[point], 0.0)
-    stated = (applied.offset_m[axis] + lean @ verdict.shift.shift_m) / sigma
-    estimate = rounds.with_surveys(weight, stated, verdict.survey_factor, alone.rounds)
+    estimate = alone
+    if weight.any():
+        stated = (applied.offset_m[axis] + lean @ verdict.shift.shift_m) / sigma
+        estimate = rounds.with_surveys(weight, stated, verdict.survey_factor, alone.rounds)
+    fixed = unknowns.fixed
+    solution = rounds.holding(fixed) if fixed.any() else estimate.solution
+    if not weight.any():
+        return estimate, solution, tuple(np.zeros((k.size, len(COMPONENTS), 5)) for k in unknowns.knots)
     moving = [*(axis == a for a in range(3)), *lean.T]
     moved = [_of_solution(unknowns, rounds.response(own / sigma)) for own in moving]
-    return estimate, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+    return estimate, solution, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
 
 
 def _understated_runs(unknowns: Unknowns, rounds: Rounds, verdict: ControlVerdict, estimate: Estimate) -> Float64:
@@ -411,15 +427,21 @@ def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
 
 
 def _of_knots(
-    unknowns: Unknowns, estimate: Estimate
+    unknowns: Unknowns, estimate: Estimate, solution: Float64
 ) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
-    """Values, covariances, and those with the next knot, of each run."""
-    covariance, with_next = [], []
-    for run, sigma in enumerate(unknowns.sigmas):
-        numbers = unknowns.of_run(run)
-        covariance.append(_blocks(estimate, (numbers, sigma), (numbers, sigma)))
-        with_next.append(_blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:])))
-    return tuple(_of_solution(unknowns, estimate.solution)), tuple(covariance), tuple(with_next)
+    """Values, covariances, and those with the next knot, of each run.
+
+    Where a run is held, the others leave the most likely solution for its sake; their covariance is the mean square
+    error of what is published: that of the most likely solution, and the square of the way from there.
+    """
+    covariance, with_next, values = [], [], _of_solution(unknowns, solution)
+    for run, (sigma, away) in enumerate(zip(unknowns.sigmas, _of_solution(unknowns, estimate.solution), strict=True)):
+        numbers, more = unknowns.of_run(run), values[run] - away
+        own = _blocks(estimate, (numbers, sigma), (numbers, sigma))
+        beside = _blocks(estimate, (numbers[:-1], sigma[:-1]), (numbers[1:], sigma[1:]))
+        covariance.append(own + more[:, :, None] * more[:, None, :])
+        with_next.append(beside + more[:-1, :, None] * more[1:, None, :])
+    return tuple(values), tuple(covariance), tuple(with_next)
 
 
 def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
@@ -447,7 +469,7 @@ def _of_observations(
     return residual, weight, redundancy, normalised
 
 
-def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
+def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> MountingErrors:
     prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
     there = numbers >= 0
     i, j = np.broadcast_arrays(numbers.reshape(-1, 1), numbers.reshape(1, -1))
@@ -455,7 +477,7 @@ def _of_mountings(unknowns: Unknowns, estimate: Estimate) -> MountingErrors:
     covariance[both] = estimate.inverse.at(i[both], j[both])
     covariance *= np.outer(prior, prior)
     error = np.zeros(prior.shape)
-    error[there] = estimate.solution[numbers[there]] * prior[there]
+    error[there] = solution[numbers[there]] * prior[there]
     variance = np.zeros(prior.shape)
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
     # What all heights have in common is not estimated: it is known as well as it was.

@@ -14,8 +14,9 @@ from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.targets.find import find_target
 from roadscan.adjust.targets.heights import height_at
+from roadscan.adjust.targets.line import find_line
 from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import Shape
+from roadscan.adjust.targets.shapes import Shape, SurveyedLine
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.mounting_change import MountingChange, Seat
@@ -46,8 +47,13 @@ class ControlPoint:
     height_m: float
     sigma_horizontal_m: float
     sigma_height_m: float
-    shape: Shape | None
+    shape: Shape | SurveyedLine | None
     """None: no target is looked for."""
+
+    @property
+    def is_of_line(self) -> bool:
+        """Whether it stands for a surveyed line: it binds across the line, and in height where that was surveyed."""
+        return isinstance(self.shape, SurveyedLine)
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,14 @@ def sight(
     status: SightStatus = "height"
     why_not, find = "", None
     place, covariance = np.array([nan, nan]), none
+    if isinstance(point.shape, SurveyedLine):
+        seen = find_line(readings, point.easting_m, point.northing_m, point.shape, settings)
+        height = seen.height if np.isfinite(point.height_m) else HeightFind(nan, nan, nan, nan, seen.count, 0.0, "")
+        at = np.array([point.easting_m, point.northing_m]) if seen.status != "found" else seen.place_m
+        found = _with_pose(
+            point, heads, at, height, (seen.status, seen.why_not, seen.place_m, seen.covariance_m2, None)
+        )
+        return replace(found, contrast=seen.contrast)
     if picked is not None:
         status, place = "picked", np.array([picked.easting_m, picked.northing_m])
         covariance = picked.sigma_m**2 * np.eye(2)
@@ -178,6 +192,27 @@ def sight(
         nowhere = float("nan")
         height = replace(height, height_m=nowhere, sigma_m=nowhere, slope_east=nowhere, slope_north=nowhere)
     return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
+
+
+def sight_shifted(
+    point: ControlPoint,
+    heads: Sequence[PassReadings],
+    settings: TargetSettings,
+    sigma_pose_m: float,
+    picked: PickedPlace | None,
+    shift_level_m: Float64,
+) -> Sighting:
+    """The same of a pass whose readings were shifted (3,; north, east, down), told as the recorded poses show it."""
+    east, north, up = map_from_level(shift_level_m[None], heads[0].convergence_rad)[0].tolist()
+    if picked is not None:
+        picked = replace(picked, easting_m=picked.easting_m + east, northing_m=picked.northing_m + north)
+    one = sight(point, heads, settings, sigma_pose_m, picked)
+    if one.is_placed or not np.isfinite(one.slope_east):
+        height = one.height_m - up
+    else:
+        # At the surveyed place: the shift moves it along a road that slopes.
+        height = one.height_m - up + one.slope_east * east + one.slope_north * north
+    return replace(one, easting_m=one.easting_m - east, northing_m=one.northing_m - north, height_m=height)
 
 
 def _with_pose(

@@ -73,12 +73,15 @@ def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:
 
 
 def far_in_height(sightings: Sequence[Sighting], largest_m: float) -> dict[str, float]:
-    """Points, by name, whose height differs from what was measured by more than that: surveyed minus measured (m)."""
+    """Points, by name, whose height differs from what most passes measured by more than that: surveyed minus measured
+    (m).
+    """
     found: dict[str, list[float]] = {}
     for one in sightings:
-        if np.isfinite(one.height_m) and abs(one.point.height_m - one.height_m) > largest_m:
+        if np.isfinite(one.height_m):
             found.setdefault(one.point.name, []).append(one.point.height_m - one.height_m)
-    return {name: float(np.median(values)) for name, values in found.items()}
+    middle = {name: float(np.median(values)) for name, values in found.items()}
+    return {name: away for name, away in middle.items() if abs(away) > largest_m}
 
 
 def swapped(wrong: Sequence[WrongPoint]) -> list[tuple[str, str]]:

@@ -50,6 +50,9 @@ _ALSO: Final = 0.1
 """A component whose factor is below this share of the largest one keeps its stated σ: it follows the other's errors."""
 _SURE: Final = 0.99
 """Share of right solutions whose corrections are no larger."""
+_RIGID: Final = 1e14
+"""Weight, in units of the prior's, of an unknown that is held at 0: what others pull at it moves it by nothing that a
+double would show in a millimetre."""
 _MEDIAN: Final = 0.6745
 """Median of the absolute of a standard normal number."""
 
@@ -162,6 +165,15 @@ class Rounds:
     def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
         """Covariance (m, m) of the unknowns of each group, in their σ, by the last solution."""
         return self._equations.covariances(groups)
+
+    def holding(self, fixed: Bool) -> Float64:
+        """The last solution (u,) where some unknowns (u,) are 0, with the weights that the rounds without it gave."""
+        value = self._value / np.append(self._processes, 1.0)[self._component]
+        own = fixed[self._row] & (self._row == self._column)
+        rows, scaled = self.problem.rows, self._counted() / self._own()
+        self._equations.factor(scaled, np.where(own, _RIGID * value, value))
+        right = rows.transposed_times(scaled * self._observed, self.problem.unknowns.size)
+        return np.where(fixed, 0.0, self._equations.solve(right))
 
     def response(self, shift: Float64) -> Float64:
         """By how much the last solution (u,) moves where surveys state `shift` more of an error, in their σ."""

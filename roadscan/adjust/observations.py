@@ -31,9 +31,12 @@ Int64 = npt.NDArray[np.int64]
 Int32 = npt.NDArray[np.int32]
 UInt8 = npt.NDArray[np.uint8]
 
-KINDS: Final = ("height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie")
+KINDS: Final = (
+    "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",
+)  # fmt: skip
 """Height of one pass against another's; shift of one picture or relief against another's; distance of two planes;
-height, or a component of the place, of a control point; height of one head against that of another of the same pass."""
+height, or a component of the place, of a control point; height of one head against that of another of the same pass;
+what a person found in two passes."""
 
 COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 """The unknowns of a pose, in the order of the partial derivatives."""

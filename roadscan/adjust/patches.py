@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Int32 = npt.NDArray[np.int32]
 UInt16 = npt.NDArray[np.uint16]
+
+
+Shift: TypeAlias = tuple[float, float, float]
+"""Of a traverse as a whole: north, east, down (m, local level)."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,17 @@ class PassReadings:
         """From the body's origin to points (k, 3; easting, northing, height) in the body axes of poses (k,): (k, 3)."""
         away = level_from_map(point_m - self.body_m[pose], self.convergence_rad)
         return np.asarray(np.einsum("nji,nj->ni", self.level_from_body[pose], away))
+
+
+def shifted(readings: PassReadings, shift_level_m: Float64) -> PassReadings:
+    """The readings of a traverse and the poses that saw them, shifted (3,; north, east, down) as one."""
+    if not np.any(shift_level_m):
+        return readings
+    away = map_from_level(np.asarray(shift_level_m, np.float64)[None], readings.convergence_rad)[0]
+    return replace(
+        readings, easting_m=readings.easting_m + away[0], northing_m=readings.northing_m + away[1],
+        height_m=readings.height_m + away[2], body_m=readings.body_m + away,
+    )  # fmt: skip
 
 
 def level_from_map(vector_m: Float64, convergence_rad: float) -> Float64:

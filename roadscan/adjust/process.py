@@ -78,6 +78,8 @@ class RunPrior:
     """In the order of `COMPONENTS`; independent of one another."""
     stated: StatedSigma | None = None
     """σ over time, in place of the usual one of the components that it states and that are corrected."""
+    fixed: bool = False
+    """The recorded poses hold, and those of other runs are adjusted to them."""
 
     def __post_init__(self) -> None:
         if self.last_gps_ns < self.first_gps_ns:
@@ -112,6 +114,15 @@ class RunPrior:
         usual = np.minimum(sigma, _OUTAGE * self.sigmas)
         extra = np.sqrt(np.maximum(sigma**2 - usual**2, 0.0))
         return np.concatenate([usual, extra], axis=1) if extra.any() else usual
+
+    def widened(self, more_m: Float64) -> RunPrior:
+        """The same with so much more (3,; north, east, down) 1 σ of the position, at all times."""
+        more = np.concatenate([more_m, np.zeros(3)])
+        n, e, d, r, p, h = (
+            replace(o, sigma=float(np.hypot(o.sigma, m))) for o, m in zip(self.processes, more, strict=True)
+        )
+        stated = self.stated and StatedSigma(self.stated.epochs_gps_ns, np.hypot(self.stated.sigma, more))
+        return replace(self, processes=(n, e, d, r, p, h), stated=stated)
 
     def faster(self, position: float, attitude: float) -> RunPrior:
         """The same with correlation times that are so many times shorter."""

@@ -117,6 +117,14 @@ class Unknowns:
         sizes = [int((own > 0.0).sum()) for own in self.sigmas]
         return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
+    @cached_property
+    def fixed(self) -> npt.NDArray[np.bool_]:
+        """(u,) unknowns of runs that are held."""
+        found = np.zeros(self.size, np.bool_)
+        for run, prior in enumerate(self.priors):
+            found[self.first[run] : self.first[run + 1]] = prior.fixed
+        return found
+
     @property
     def size(self) -> int:
         """Number of unknowns."""

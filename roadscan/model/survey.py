@@ -441,6 +441,12 @@ class SurveyConfig(Strict):
         for one in self.passes:
             if one.run not in runs:
                 raise ValueError(f"pass {one.id} names the unknown run '{one.run}'{nearest(one.run, runs)}")
+        fixed = self.adjust.fixed if self.adjust.on else []
+        for run in fixed:
+            if run not in runs:
+                raise ValueError(f"adjust.fixed names the unknown run '{run}'{nearest(run, runs)}")
+        if set(fixed) == set(runs):
+            raise ValueError("adjust.fixed names all runs: none is left to adjust; adjust.on = false switches it off")
         return self
 
 

@@ -124,7 +124,10 @@ def test_another_datum_shows_in_the_median_and_one_point_by_itself() -> None:
     assert datum_fault(near, 0.5) == ""
     below = [replace(one, point=replace(POINT, height_m=50.0 - 45.3)) for one in near]
     assert "-45.310 m" in datum_fault(below, 0.5)
-    assert far_in_height([*near, below[0]], 0.5) == {"G7": pytest.approx(-45.3)}
+    others = [replace(one, point=replace(POINT, name="G8")) for one in near]
+    assert far_in_height([*others, below[0]], 0.5) == {"G7": pytest.approx(-45.3)}
+    # One pass of three that lies far above the others does not condemn the point.
+    assert far_in_height([*near[:2], replace(near[2], height_m=near[2].height_m + 45.3)], 0.5) == {}
 
 
 def test_exchanged_heights_are_told_by_what_the_exchange_would_leave() -> None:

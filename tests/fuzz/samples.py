@@ -43,6 +43,7 @@ from tests.fuzz.pose_samples import (
 from tests.sensors import (
     test_argoverse,
     test_carmen,
+    test_control_lines,
     test_control_vector,
     test_encoder_csv,
     test_images,
@@ -418,6 +419,10 @@ def control_degrees() -> Any:
     return test_control_vector.layer().to_crs("EPSG:4326")
 
 
+def surveyed_lines() -> Any:
+    return test_control_lines.layer()
+
+
 def roads() -> Any:
     return test_road_lines.tiger()
 
@@ -547,6 +552,8 @@ def _tables() -> Iterator[Sample]:
     yield Sample("control_csv", "plain", file("a.csv", control_csv), {}, _UTM32, **lines)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)
+    yield Sample("control_lines", "gpkg", vector(surveyed_lines, "a.gpkg"), {}, _UTM32)
+    yield Sample("control_lines", "text", file("a.csv", test_control_lines.TEXT.encode()), {}, _UTM32, text=True)
     lane = {"map": MapFrame(crs="EPSG:26917")}
     yield Sample("road_lines", "geojson", vector(roads_degrees, "a.geojson"), {}, lane, text=True)
     yield Sample("road_lines", "gpkg", vector(roads, "a.gpkg"), {}, lane)

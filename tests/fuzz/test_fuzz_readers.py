@@ -52,7 +52,8 @@ def test_damage_in_one_record_changes_no_other(tmp_path: Path, name: str) -> Non
         assert others_differ(fuzzer, k, data) == "", f"damage {number}, record {k}"
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+# Surveyed lines look like lines of roads: their format is stated.
+@pytest.mark.parametrize("name", [name for name, one in SAMPLES.items() if one.format != "control_lines"])
 def test_sound_files_are_of_one_format(tmp_path: Path, name: str) -> None:
     assert format_of(SAMPLES[name].make(tmp_path)).name == SAMPLES[name].format
 

@@ -104,3 +104,20 @@ def finished(simulated: Simulated) -> Simulated:
     """The same, run once in this process into the store ``store``."""
     simulated.run()
     return simulated
+
+
+@pytest.fixture(scope="session")
+def raw_site(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    """Raw logs of three passes over painted targets, with errors of centimetres in the poses."""
+    from .adjusted_site import site
+
+    return Simulated(simulate(site(), tmp_path_factory.mktemp("adjusted") / "survey").survey_file)
+
+
+@pytest.fixture(scope="session")
+def adjusted(raw_site: Simulated) -> Simulated:
+    """The same, run whole into the store ``store``."""
+    from .adjusted_site import CIRCLES, NO_FILES
+
+    raw_site.run(**CIRCLES, **NO_FILES)
+    return raw_site

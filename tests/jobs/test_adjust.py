@@ -21,79 +21,15 @@ from roadscan.jobs.run import run_stages
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import stage_named
 from roadscan.jobs.status import survey_status
-from roadscan.jobs.tiles.cell_files import read_cells
 from roadscan.jobs.tiles.footprints import load_ranges, stale_footprints
-from roadscan.jobs.tiles.tile_plan import TILE, plan_tiles
+from roadscan.jobs.tiles.tile_plan import plan_tiles
 from roadscan.model.survey import Survey
-from roadscan.simulate import Scene, simulate, truth
 from roadscan.tables.held import held_path, read_held, write_held
 from roadscan.tables.manifest import Manifest
-from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 
+from .adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
 from .conftest import Lines, Simulated, changed
-
-ROLES = ("gcp", "check", "gcp", "check", "gcp", "gcp")
-OFFSETS_M = (3.2, 0.6, 0.6, 3.2, 3.2, 0.6)
-TARGETS = [
-    {"station_m": 3.0 + 4.0 * k, "offset_m": offset, "role": role}
-    for k, (role, offset) in enumerate(zip(ROLES, OFFSETS_M, strict=True))
-]
-CIRCLES = {"adjust__targets": {"shape": "circle", "size_m": 0.30, "centre_m": 0.06, "search_m": 0.3}}
-NO_FILES: dict[str, object] = {"products__make": ["tile_table"]}
-OFF = {"on": False}
-
-
-def site() -> Scene:
-    return Scene.load("reference_site").changed(
-        road={"targets": TARGETS}, length_m=27.0, lidar=OFF, imu=OFF, gnss=OFF, encoder=OFF, camera=OFF,
-        profilers={"spacing_m": 0.02, "readings": 400, "head_imus": None},
-        passes=[{"lane": 2}, {"lane": 2, "offset_m": -0.6}, {"lane": 2, "offset_m": 0.4}],
-        noise={"position_m": 0.02, "attitude_deg": 0.005, "time_constant_s": 60.0, "control_m": 0.001},
-        vehicle={"standstill_s": 0.0}, roadside={"poles": [], "trees": []},
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def raw(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
-    return Simulated(simulate(site(), tmp_path_factory.mktemp("adjusted") / "survey").survey_file)
-
-
-@pytest.fixture(scope="module")
-def adjusted(raw: Simulated) -> Simulated:
-    """Run whole, into the store ``store``."""
-    raw.run(**CIRCLES, **NO_FILES)
-    return raw
-
-
-def adjust(one: Simulated, compute: Any = None, stages: Sequence[str] = ("adjust",), **changes: object) -> Session:
-    survey = changed(Survey.load(one.survey_file), {**CIRCLES, **NO_FILES, **changes})
-    session = Session(survey, one.store(), compute or Inline(), None, Lines())
-    run_stages(session, [stage_named(name) for name in stages])
-    return session
-
-
-def rows(store: Store, statement: str) -> list[dict[str, Any]]:
-    return query(store, statement).to_pylist()
-
-
-def corrections(store: Store) -> bytes:
-    return store.read_bytes(held_path("corrections"))
-
-
-def cell_errors(one: Simulated, store: Store) -> np.ndarray:
-    """Height of each cell with three readings or more minus the true height at its centre."""
-    true, grid = truth.load(one.survey_file.parent), plan_survey(Survey.load(one.survey_file), store).ground.grid
-    found = []
-    for record in Manifest(store).of(TILE).values():
-        if record.path:
-            cells = read_cells(store, record, grid.cells_per_edge)
-            box = grid.bounds(cells.tile)
-            place = (box.easting_min_m + (cells.column + 0.5) * grid.cell_m,
-                     box.northing_min_m + (cells.row + 0.5) * grid.cell_m)  # fmt: skip
-            error = cells.height_robust_m - true.height_m(*place)
-            found.append(error[(cells.count >= 3) & np.isfinite(error)])
-    return np.concatenate(found)
 
 
 def test_surface_and_check_points_come_to_the_truth(adjusted: Simulated) -> None:
@@ -380,8 +316,8 @@ def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Pat
     assert [row["count"] for row in left] == [12 if mode == "each_pass" else 4]
 
 
-def test_a_survey_without_overlap_and_control_is_told_so(raw: Simulated, tmp_path: Path) -> None:
-    copy = raw.copy_to(tmp_path / "survey")
+def test_a_survey_without_overlap_and_control_is_told_so(raw_site: Simulated, tmp_path: Path) -> None:
+    copy = raw_site.copy_to(tmp_path / "survey")
     survey = changed(Survey.load(copy.survey_file), {**CIRCLES, **NO_FILES, "control": []})
     alone = survey.config.model_copy(update={"runs": survey.config.runs[:1], "passes": survey.config.passes[:1]})
     session = Session(Survey(alone, survey.rig, survey.folder), copy.store(), Inline(), None, Lines())

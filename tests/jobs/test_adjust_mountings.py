@@ -12,8 +12,8 @@ from roadscan.simulate import Scene, simulate
 from roadscan.tables.held import held_path, read_held
 from roadscan.tables.manifest import Manifest
 
+from .adjusted_site import cell_errors
 from .conftest import Simulated
-from .test_adjust import cell_errors
 
 pytestmark = pytest.mark.nightly
 

@@ -62,4 +62,23 @@ class Chequered:
         return self.size_m / 2**0.5
 
 
+@dataclass(frozen=True)
+class SurveyedLine:
+    """A point of a surveyed line: what is there binds across the line, and in height."""
+
+    kind: Literal["paint", "kerb"]
+    line: str
+    """Name of the line."""
+    azimuth_rad: float
+    """Of the line, clockwise from grid north."""
+    half_m: float = 0.5
+    """The line is looked at so far ahead and behind (m)."""
+
+    @property
+    def reach_m(self) -> float:
+        """Farthest part from the point (m)."""
+        return self.half_m
+
+
 Shape = Disc | Chequered
+"""A target."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import listed
@@ -15,6 +16,7 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.code_reach import code_digest
+from roadscan.jobs.adjust.control_lines import lines_line
 from roadscan.jobs.adjust.control_work import (
     SIGHTINGS,
     ControlTask,
@@ -24,9 +26,21 @@ from roadscan.jobs.adjust.control_work import (
     sight_control,
 )
 from roadscan.jobs.adjust.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
-from roadscan.jobs.adjust.figures import Held, Rows, accuracy_rows, control_rows, distance_rows, relative_rows, tie_rows
+from roadscan.jobs.adjust.failed_ties import failed_ties
+from roadscan.jobs.adjust.figures import (
+    Held,
+    Rows,
+    accuracy_rows,
+    control_rows,
+    distance_rows,
+    of_points,
+    relative_rows,
+    tie_rows,
+)
+from roadscan.jobs.adjust.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.jobs.adjust.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
 from roadscan.jobs.adjust.mountings import (
+    Mounted,
     calibrated_sigma,
     held_values,
     mounted_of,
@@ -39,7 +53,8 @@ from roadscan.jobs.adjust.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES,
 from roadscan.jobs.adjust.publication import digests_of, foreign_runs, publish
 from roadscan.jobs.adjust.seams import shown_seams
 from roadscan.jobs.adjust.solution import Evidence, Solution, priors_of, solve
-from roadscan.jobs.adjust.tie_work import TIES, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.jobs.adjust.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.jobs.adjust.ties_again import Again, first_ties, settled
 from roadscan.jobs.adjust.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.engine.fingerprint import key_of
@@ -52,6 +67,8 @@ from roadscan.navigation.movement import largest
 from roadscan.products.pictures.adjustment import AdjustmentPicture, Residuals
 from roadscan.tables.manifest import Manifest, OutputRecord
 from roadscan.tables.store import file_digest
+
+Float64 = npt.NDArray[np.float64]
 
 _BUNDLE_BYTES: Final = 20_000_000.0
 """Compressed bytes that a task reads, about."""
@@ -67,12 +84,30 @@ class Work:
     control: tuple[ControlTask, ...]
     points: tuple[ControlPoint, ...]
     """Control points of the survey."""
+    hand: HandWork
+    """Ties by hand."""
+
+    @property
+    def own_points(self) -> list[ControlPoint]:
+        """Those that do not stand for a surveyed line."""
+        return [point for point in self.points if not point.is_of_line]
+
+
+class Seen(NamedTuple):
+    """What passes saw."""
+
+    evidence: Evidence
+    rows: list[dict[str, Any]]
+    """Sightings of control points as rows of their table."""
+    unmeasured: list[Finding]
+    """On ties by hand."""
 
 
 def solution_key(plan: SurveyPlan) -> str:
     """Hash of all that the solution depends on: settings, code, readings, poses, control. No reading is read for it."""
     config = plan.survey.config.adjust
     picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
+    by_hand = [None if f is None or not f.is_file() else file_digest(f) for f in (picked, hand_file(plan.survey))]
     sources = [
         [s.key, *road_key(s), s.trajectory is not None, [f.digest for f in files]]
         for s, files in adjusted_sources(plan)
@@ -80,7 +115,7 @@ def solution_key(plan: SurveyPlan) -> str:
     beside = [
         [r.key, [f.digest for f in r.tables.get(table, ())]]
         for r in plan.records
-        for table in ("control_points", "trajectory_accuracy")
+        for table in ("control_points", "control_lines", "trajectory_accuracy")
         if r.tables.get(table)
     ]
     return key_of(
@@ -90,7 +125,7 @@ def solution_key(plan: SurveyPlan) -> str:
             for name, s in sorted(plan.survey.rig.sensors.items())
         ],
         sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
-        None if picked is None or not picked.is_file() else file_digest(picked), sorted(foreign_runs(plan.store)),
+        by_hand, sorted(foreign_runs(plan.store)),
     )  # fmt: skip
 
 
@@ -115,58 +150,118 @@ def withdraw(session: Session) -> None:
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
+class _Collector:
+    """Brings evidence up to date, round by round."""
+
+    def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
+        self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
+        self.runs = runs_of(session.plan)
+        self.work = plan_work(session.plan, sources, priors)
+        self.lacks = False
+        """Whether some of the evidence failed."""
+        self._seams = {place.number for task in self.work.ties for place in task.places if place.seam}
+        self.of_heads, self._useless = self._heads()
+        """Findings on heads that do not meet as they should."""
+        self.again = first_ties(session.plan, sources, self.work.ties, self.work.control, (self.observe, self.load))
+
+    def observe(self, tasks: Sequence[TieTask]) -> None:
+        """Bring ties up to date."""
+        self.lacks |= _collect_ties(self.session, tasks)
+
+    def load(self, tasks: Sequence[TieTask]) -> KnownTies:
+        """Ties that are up to date."""
+        return self._loaded(tasks).of_seams(self._seams, COMMON_M)
+
+    def _loaded(self, tasks: Sequence[TieTask]) -> KnownTies:
+        return load_ties(self.session.store, self.session.manifest, tasks, self.runs, self.mounted)
+
+    def _heads(self) -> tuple[list[Finding], frozenset[int]]:
+        """Findings on heads of one pass where they meet, and runs whose heads are exchanged.
+
+        A run in which heads meet otherwise than in the others gets mountings of its own.
+        """
+        self.observe(self.work.ties)
+        steps = steps_of(self._loaded(self.work.ties), self.session.plan.survey.config.adjust.ties.return_s)
+        swapped = exchanged(self.session.plan, self.sources, steps)
+        useless = {one.run for one, _ in swapped}
+        odd = odd_steps([one for one in steps if one.run not in useless])
+        if self.mounted.priors and odd:
+            self.mounted = self.mounted.apart((one.run, head) for one, _ in odd for head in one.heads)
+        return head_findings(swapped, odd), frozenset(map(self.runs.index, useless))
+
+    def evidence(self, ties: KnownTies, control: Sequence[ControlTask]) -> Seen:
+        """All that is known, with what passes see of control points and at ends of ties by hand."""
+        store, manifest, hand = self.session.store, self.session.manifest, self.work.hand
+        self.lacks |= _collect_sightings(self.session, [*control, *hand.tasks])
+        points, rows = load_sightings(store, manifest, control)
+        ends, _ = load_sightings(store, manifest, hand.tasks)
+        joined, unmeasured = with_hand_ties(ties, hand, ends, self.mounted, self.runs)
+        wide = self.again.misplaced
+        priors = tuple(p.widened(wide[p.run]) if p.run in wide else p for p in self.priors)
+        evidence = Evidence(self.runs, priors, joined, tuple(points), self.mounted, self._useless)
+        return Seen(evidence, rows, unmeasured)
+
+    def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
+        """Corrections of all runs."""
+        return solve(self.session.plan, self.evidence(ties, control).evidence)
+
+
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
-    plan, manifest = session.plan, session.manifest
+    plan, manifest, config = session.plan, session.manifest, session.plan.survey.config.adjust
     key = solution_key(plan)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
-    runs = runs_of(plan)
-    priors = priors_of(plan, sources, runs)
-    work = plan_work(plan, sources, priors)
-    failed = _collect(session, work)
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
-    units = [t.unit for t in work.ties]
-    ties = load_ties(session.store, manifest, units, runs, mounted)
-    steps = steps_of(ties, plan.survey.config.adjust.ties.return_s)
-    swapped = exchanged(plan, sources, steps)
-    useless = {one.run for one, _ in swapped}
-    odd = odd_steps([one for one in steps if one.run not in useless])
-    if mounted.priors and odd:
-        mounted = mounted.apart((one.run, head) for one, _ in odd for head in one.heads)
-        ties = load_ties(session.store, manifest, units, runs, mounted)
-    ties = ties.of_seams({p.number for t in work.ties for p in t.places if p.seam}, COMMON_M)
-    sightings, pictures = load_sightings(session.store, manifest, work.control)
-    evidence = Evidence(runs, priors, ties, tuple(sightings), mounted, frozenset(map(runs.index, useless)))
+    collector = _Collector(session, sources, priors_of(plan, sources, runs_of(plan)), mounted)
+    work, again = collector.work, collector.again
+    seen = collector.evidence(again.ties, again.control)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
-    ] + head_findings(swapped, odd)
-    if not (ties.accepted.any() or any(one.point.role == "gcp" for one in sightings)):
-        lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, sightings)}"]
-        held: Held = publish(session.store, {}, plan.survey.config.adjust)
-        publish_mountings(session.store, None, plan.survey.config.adjust)
+    ]
+    doubts += [*collector.of_heads, *again.findings, *work.hand.findings, *seen.unmeasured]
+    evidence = seen.evidence
+    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
+        lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, evidence.sightings)}"]
+        held: Held = publish(session.store, {}, config)
+        publish_mountings(session.store, None, config)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
-        _keep(session, key, {}, (lines, [*doubts, *_of_points(work, sightings)]), failed)
+        _forget_others(manifest, again, work)
+        said = lines, [*doubts, *_of_points(work, evidence.sightings)]
+        _keep(session, key, {}, said, failed=collector.lacks)
         return
-    solution = solve(plan, evidence)
-    held = publish(session.store, solution.corrections, plan.survey.config.adjust)
-    changes = publish_mountings(session.store, solution.mountings, plan.survey.config.adjust)
-    added = held_values(mounted, changes)
+    tools = collector.observe, collector.load, collector.solve
+    again, solution, unsettled = settled(plan, sources, again, tools)
+    seen = collector.evidence(again.ties, again.control)
+    evidence = seen.evidence
+    _forget_others(manifest, again, work)
+    held = publish(session.store, solution.corrections, config)
+    changes = publish_mountings(session.store, solution.mountings, config)
+    tables = _tables(evidence, solution, held, held_values(collector.mounted, changes), work.tracks)
+    keep_tables(session.store, manifest, key, tables)
+    shown, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), seen.rows)
+    lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    if config.mode in ("joint", "vertical"):
+        doubts += failed_ties(evidence.ties, solution.tie_weight)
+    doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
+    doubts += _of_points(work, evidence.sightings)
+    _keep(session, key, held, (lines, doubts), failed=collector.lacks)
+
+
+def _tables(
+    evidence: Evidence, solution: Solution, held: Held, added: Float64, tracks: Sequence[Track]
+) -> dict[str, Rows]:
+    """Rows of the tables of the outcome; added : (s, 6) what is added to the mountings."""
     points = control_rows(evidence, solution, held, added)
-    tables = {
+    return {
         "tie_residuals": tie_rows(evidence, solution, held, added),
         "control_residuals": points,
-        "relative_accuracy": relative_rows(evidence, work.tracks, held, added),
+        "relative_accuracy": relative_rows(evidence, tracks, held, added),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
-        "accuracy_by_distance": distance_rows(points, evidence, solution, work.tracks),
+        "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, tracks),
     }
-    keep_tables(session.store, manifest, key, tables)
-    shown, not_drawn = shown_seams(work.ties, evidence, solution, (held, changes), session.compute)
-    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), pictures)
-    lines = [*_lines(work, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
-    doubts += [*solution.findings, *mounting_findings(solution.mountings), *_of_points(work, sightings)]
-    _keep(session, key, held, (lines, doubts), failed)
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
@@ -175,9 +270,10 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
     config = plan.survey.config.adjust
     places = _places(tracks, config.places)
     points = control_points(plan)
-    ties = tie_tasks(plan, sources, places, runs_of(plan))
+    ties = tie_tasks(plan, sources, places, runs_of(plan), config.ties)
     control = control_tasks(plan, sources, tracks, points, priors)
-    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points))
+    hand = hand_work(plan, sources, tracks, priors, len(points))
+    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand)
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
@@ -189,30 +285,39 @@ def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
     return [replace(place, number=number) for number, place in enumerate(found)]
 
 
-def _collect(session: Session, work: Work) -> bool:
-    """Bring the evidence up to date; True where some of it failed."""
-    manifest, bar = session.manifest, session.bar
-    manifest.remove(manifest.beside([TIES], {t.unit for t in work.ties}))
-    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in work.control}))
-    ties = [t for t in work.ties if not manifest.is_current(TIES, t.unit, t.key)]
-    control = [t for t in work.control if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
-    found = [
-        (task.unit, reason)
-        for task, reason in run_bundles(
-            collect_ties, ties, lambda t: t.bytes, _BUNDLE_BYTES, manifest, session.compute, bar("ties")
-        )
-    ]
-    found += [
-        (f"{task.unit} ({task.point.name})", reason)
-        for task, reason in run_bundles(
-            sight_control, control, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, bar("control points")
-        )
-    ]
-    session.failed("adjust", found)
-    return bool(found)
+def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
+    """Bring ties up to date; True where some failed."""
+    manifest = session.manifest
+    due = [t for t in tasks if not manifest.is_current(TIES, t.unit, t.key)]
+    ended = run_bundles(
+        collect_ties, due, lambda t: t.bytes, _BUNDLE_BYTES, manifest, session.compute, session.bar("ties")
+    )
+    failed = [(task.unit, reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
 
 
-def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], failed: bool) -> None:
+def _collect_sightings(session: Session, tasks: Sequence[ControlTask]) -> bool:
+    """Bring what was seen of control points, and at ends of ties by hand, up to date; True where some failed."""
+    manifest = session.manifest
+    due = [t for t in tasks if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    if not due:
+        return False
+    ended = run_bundles(
+        sight_control, due, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, session.bar("control points")
+    )
+    failed = [(f"{task.unit} ({task.point.name})", reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
+
+
+def _forget_others(manifest: Manifest, again: Again, work: Work) -> None:
+    """Remove evidence that is no more asked for."""
+    manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in (*again.control, *work.hand.tasks)}))
+
+
+def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], *, failed: bool) -> None:
     """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
     lines, doubts = said
     detail = {
@@ -226,23 +331,22 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Fi
 
 
 def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
-    if not work.points:
+    if not work.own_points:
         return "no control point"
-    seen = len({one.point.number for one in sightings if one.status != "unseen"})
-    return f"{seen} of {len(work.points)} control points seen"
+    seen = len({one.point.number for one in sightings if one.status != "unseen" and not one.point.is_of_line})
+    return f"{seen} of {len(work.own_points)} control points seen"
 
 
 def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
     """Findings on points that no pass saw, and on targets that are not as they should be."""
     found: list[Finding] = []
-    if work.points and not work.control:
-        text = (
-            f"not one of the {len(work.points)} control points lies where a pass drove: check crs of their [[control]]"
-        )
-        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(work.points)))
+    points = work.own_points
+    if points and not any(not task.point.is_of_line for task in work.control):
+        text = f"not one of the {len(points)} control points lies where a pass drove: check crs of their [[control]]"
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(points)))
     elif beside := _beside(work, sightings):
         text = (
-            f"{len(beside)} of {len(work.points)} control points lie where no pass saw the road: {listed(beside)}; "
+            f"{len(beside)} of {len(points)} control points lie where no pass saw the road: {listed(beside)}; "
             "they are of another stretch, or in another CRS"
         )
         found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(beside)))
@@ -252,7 +356,7 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
     """Points that no pass saw, and how far they lie from where the nearest sensor went."""
     seen = {one.point.number for one in sightings if one.status != "unseen"}
-    unseen = [one for one in work.points if one.number not in seen]
+    unseen = [one for one in work.own_points if one.number not in seen]
     ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
     return [
         f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
@@ -261,13 +365,14 @@ def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
 
 
 def _lines(
-    work: Work, evidence: Evidence, solution: Solution, held: Held, tables: dict[str, Rows]
+    work: Work, again: Again, evidence: Evidence, solution: Solution, held: Held, tables: dict[str, Rows]
 ) -> list[str]:  # fmt: skip
     places, counted = sum(len(t.places) for t in work.ties), int((solution.tie_weight > 0).sum())
     lines = [
         f"{places:,} places of overlap with {evidence.ties.observations.size:,} ties, {counted:,} of which count; "
         f"{_seen(work, evidence.sightings)}"
     ]
+    lines += [line for line in (lines_line(evidence.sightings), again.line()) if line]
     if held:
         moved = {run: largest(own) for run, own in held.items()}
         down = max(float(np.abs(own.north_east_down_m[:, 2]).max()) for own in held.values())

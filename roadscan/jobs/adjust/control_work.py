@@ -10,12 +10,14 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight
+from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight_shifted
+from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 from roadscan.code_reach import code_digest
+from roadscan.jobs.adjust.control_lines import line_points
 from roadscan.jobs.adjust.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.jobs.adjust.tracks import runs_of
 from roadscan.jobs.engine.fingerprint import key_of
@@ -33,6 +35,9 @@ from roadscan.tables.writer import parquet_bytes
 
 SIGHTINGS: Final = "control_sightings"
 """Table, and product of its files in the manifest."""
+
+HAND: Final = "hand"
+"""Role of an end of a tie by hand."""
 
 _PICKED_COLUMNS: Final = ("run", "name", "easting_m", "northing_m")
 _FIT_RADII: Final = 1.5
@@ -56,11 +61,16 @@ class ControlTask:
     """Of each pass what the user picked."""
     files: tuple[NearFile, ...]
     key: str
+    round: int = 0
+    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    shifts_m: tuple[Shift, ...] = ()
+    """Of each pass: how far that solution moves it; none in round 0."""
 
     @property
     def unit(self) -> str:
         """Its name in the manifest."""
-        return f"point-{self.point.number:06d}"
+        again = f"-round-{self.round}" if self.round else ""
+        return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}{again}"
 
     @property
     def bytes(self) -> int:
@@ -69,14 +79,16 @@ class ControlTask:
 
 
 def control_points(plan: SurveyPlan) -> list[ControlPoint]:
-    """Surveyed points of all control logs, in the order of the survey file and of their names."""
+    """Surveyed points of all control logs, in the order of the survey file and of their names, then those that stand
+    for surveyed lines.
+    """
     config = plan.survey.config.adjust
     found: list[ControlPoint] = []
     for record in plan.records:
         for file in record.tables.get("control_points", ()):
             rows = read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist()
             found += [_point(len(found) + k, row, config) for k, row in enumerate(rows)]
-    return found
+    return found + line_points(plan, len(found))
 
 
 def _point(number: int, row: Mapping[str, Any], config: AdjustConfig) -> ControlPoint:
@@ -147,24 +159,49 @@ def control_tasks(
 
     priors : of each run, in the order of the survey file.
     """
+    passes = [passes_of(plan, tracks, point) for point in points]
+    seen = list(zip(points, passes, strict=True))
+    return sighting_tasks(plan, sources, priors, seen, picked_places(plan, points))
+
+
+def _settings(plan: SurveyPlan) -> TargetSettings:
+    """How targets are looked for."""
     config = plan.survey.config.adjust
-    runs = runs_of(plan)
-    settings = TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
-    code, picked = code_digest(f"{__name__}:sight_control"), picked_places(plan, points)
+    return TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
+
+
+def sighting_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    priors: Sequence[RunPrior],
+    seen: Sequence[tuple[ControlPoint, Sequence[tuple[Traverse, ...]]]],
+    picked: Mapping[tuple[str, str], PickedPlace],
+    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+) -> list[ControlTask]:
+    """A task for each point that the traverses of a pass or more came by.
+
+    again : round, and shifts of each point's passes; none where the recorded poses say where readings lie.
+    """
+    runs, settings, (number, shifts) = runs_of(plan), _settings(plan), again
+    code = code_digest(f"{__name__}:sight_control")
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks: list[ControlTask] = []
-    for point in points:
-        passes = _passes(tracks, point, _radius_m(point, settings), config.places.return_s)
+    for (point, passes), moved in zip(seen, shifts if number else [()] * len(seen), strict=True):
         if not passes:
             continue
         files = tuple(near_files(sources, [t for own in passes for t in own], runs))
         own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
         sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
-        seen = [one.key(road_key(one.source)) for one in files]
+        read = [one.key(road_key(one.source)) for one in files]
         key = key_of(
-            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, seen
-        )
-        tasks.append(ControlTask(plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key))
+            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read,
+            *([number, moved] if number else []),
+        )  # fmt: skip
+        tasks.append(
+            ControlTask(
+                plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key, number, moved
+            )
+        )  # fmt: skip
     return tasks
 
 
@@ -178,10 +215,9 @@ def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
     return max(settings.search_radius_m + reach if point.shape is not None else 0.0, settings.height_radius_m)
 
 
-def _passes(
-    tracks: Sequence[Track], point: ControlPoint, radius_m: float, apart_s: float
-) -> list[tuple[Traverse, ...]]:  # fmt: skip
+def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) -> list[tuple[Traverse, ...]]:
     """Traverses by a point, those of one run at one time together."""
+    radius_m, apart_s = _radius_m(point, _settings(plan)), plan.survey.config.adjust.places.return_s
     every = sorted(
         (t for track in tracks for t in passes_by(track, point.easting_m, point.northing_m, radius_m, apart_s)),
         key=lambda t: (t.run, t.first_gps_ns, t.sensor),
@@ -200,27 +236,30 @@ def _passes(
 def sight_control(task: ControlTask) -> OutputRecord:
     """See what each pass saw of a point and write it (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs)
-    circle = Circle(task.point.easting_m, task.point.northing_m, _radius_m(task.point, task.settings))
     found = []
-    for own, picked, sigma_pose_m in zip(task.passes, task.picked, task.sigma_pose_m, strict=True):
-        heads = [reader.of(traverse, circle) for traverse in own]
+    moved = task.shifts_m or ((0.0, 0.0, 0.0),) * len(task.passes)
+    for own, picked, sigma_pose_m, shift in zip(task.passes, task.picked, task.sigma_pose_m, moved, strict=True):
+        reach_m = _radius_m(task.point, task.settings) + float(np.hypot(*shift[:2]))
+        circle = Circle(task.point.easting_m, task.point.northing_m, reach_m)
+        heads = [shifted(reader.of(traverse, circle), np.array(shift)) for traverse in own]
         # Profiles are dense and returns sparse: where a pass has both, the profiles show the point.
         dense = [h for h in heads if not h.returns and h.pose.size] or heads
-        found.append(sight(task.point, dense, task.settings, sigma_pose_m, picked))
+        found.append(sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift)))
     schema = table_schema(SIGHTINGS)
-    rows = pa.Table.from_pylist([_row(one, task.runs) for one in found], schema=schema.arrow())
+    rows = pa.Table.from_pylist([_row(one, task.runs, task.round) for one in found], schema=schema.arrow())
     content = parquet_bytes(rows, schema)
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(SIGHTINGS, task.unit, task.key, target, len(content), bytes_digest(content))
 
 
-def _row(one: Sighting, runs: Sequence[str]) -> dict[str, Any]:
+def _row(one: Sighting, runs: Sequence[str], number: int) -> dict[str, Any]:
     seen = bool(np.isfinite(one.level_from_body).all())
     turned = [float(a) for a in rph_from_rotation(one.level_from_body)] if seen else [None] * 3
     picture = None if one.find is None else one.find.picture
     values: dict[str, Any] = {
         "point": one.point.number,
+        "round": number,
         "name": one.point.name,
         "run": runs[one.run],
         "sensor": one.sensor,
@@ -253,7 +292,8 @@ def load_sightings(
 ) -> tuple[list[Sighting], list[dict[str, Any]]]:
     """Sightings of some points, in order, and their rows of the table."""
     sightings, rows = [], []
-    for task in tasks:
+    last = {task.point.number: task for task in sorted(tasks, key=lambda task: task.round)}
+    for task in last.values():
         record = manifest.get(SIGHTINGS, task.unit)
         if record is None or not record.path:
             continue

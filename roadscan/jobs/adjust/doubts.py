@@ -103,11 +103,14 @@ HELMERT_TURN: Final = Witness(
 
 _UNDERSTATED: Final = 3.0
 """A variance factor from which on a stated σ is told to be too small: 1.7 times."""
+_OPEN_M: Final = 1.0
+"""An offset whose σ is larger is not known: that along surveyed lines, which tell of nothing along them."""
 _WORDS: Final = {
     "height_tie": "heights of one pass against another",
     "shift_tie": "shifts of one pass against another",
     "plane_tie": "distances of planes of two passes",
     "head_tie": "heights of one head against another of the same pass",
+    "hand_tie": "ties by hand",
     "control_height": "heights measured at control points",
     "control_position": "places measured at control points",
     "control_survey": "the survey of the control points",
@@ -213,7 +216,7 @@ def offset_line(verdict: ControlVerdict, applied: AppliedOffset) -> str:
         f"times of five from {1e3 * verdict.detectable_m[name]:.0f} mm on; σ of the tiles is against the control, of "
         f"which the poses confirm the datum to {1e3 * known[name][1]:.0f} mm)"
         for name in (HEIGHT, PLACE)
-        if name in known
+        if name in known and verdict.offset.sigma_m(name) < _OPEN_M
     ]
     return f"control against the poses as a whole: {', '.join(parts)}" if parts else ""
 
@@ -333,7 +336,7 @@ def target_findings(sightings: Sequence[Sighting]) -> list[Finding]:
         ("doubled", "targets are there more than once, and nothing of them is used"),
         ("moved", "targets lie elsewhere than surveyed, and are measured where they lie"),
     ):
-        own = [one for one in sightings if one.status == status]
+        own = [one for one in sightings if one.status == status and not one.point.is_of_line]
         if own:
             told = [f"{one.point.name} in {one.sensor}: {one.why_not}" for one in own]
             unused = len(own) if status == "doubled" else 0

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.control import Sighting, moved_m
 from roadscan.adjust.control_test import HEIGHT
+from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
@@ -46,9 +47,12 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float6
 
 
 def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
-    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run."""
+    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run.
+
+    Ties by hand, which are few, are not of them.
+    """
     ties = evidence.ties
-    own = ties.accepted
+    own = ties.accepted & (ties.observations.kind != KINDS.index("hand_tie"))
     observations = ties.observations.chosen(own)
     after = left_after(observations, held, evidence.runs, mounted)
     kinds = np.asarray(ties.columns["kind"])[own]
@@ -127,6 +131,11 @@ def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Fl
     return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
 
 
+def of_points(rows: Rows, evidence: Evidence) -> Rows:
+    """Those of `control_residuals` that are of points, and not of surveyed lines."""
+    return [row for row, one in zip(rows, evidence.sightings, strict=True) if not one.point.is_of_line]
+
+
 def _control_row(
     one: Sighting, evidence: Evidence, solution: Solution, held: Held, mounted: Float64
 ) -> dict[str, Any]:  # fmt: skip
@@ -170,7 +179,8 @@ def _control_row(
 def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
     """Of the table `absolute_accuracy`, from rows of `control_residuals`."""
     found: Rows = []
-    checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True) if row["role"] == "check"]
+    checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True)
+              if row["role"] == "check" and not one.point.is_of_line]  # fmt: skip
     for poses, word in (("recorded", "before"), ("adjusted", "after")):
         upright = [
             (-row[f"height_{word}_m"], one.point.sigma_height_m, row["point"])

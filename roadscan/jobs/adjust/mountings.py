@@ -109,7 +109,9 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
         return Mounted((), stated, parallel)
     calibrated = calibrated_sigma(plan.store)
     priors = []
-    for sensor in sorted({sensor for _, sensor in stated}):
+    # A run that is held is right as it is, and so are the mountings that place its readings.
+    held = {sensor for run, sensor in stated if run in config.fixed}
+    for sensor in sorted({sensor for _, sensor in stated} - held):
         sigma = _sigma(plan, config, sensor, calibrated.get(sensor))
         if (sigma > 0.0).any():
             priors.append(MountingPrior(sensor, sigma))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
-from roadscan.adjust.control import SeenBy, Sighting, observations_of
+from roadscan.adjust.control import ControlPoint, SeenBy, Sighting, observations_of
 from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
 from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
@@ -20,6 +20,8 @@ from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.targets.shapes import SurveyedLine
+from roadscan.jobs.adjust.control_lines import line_findings
 from roadscan.jobs.adjust.doubts import (
     CONTROL,
     CONTROL_DATUM,
@@ -38,6 +40,8 @@ from roadscan.jobs.adjust.doubts import (
     time_line,
     wrong_points,
 )
+from roadscan.jobs.adjust.fixed import fixed_findings, fixed_line
+from roadscan.jobs.adjust.hand_ties import wrong_hand_ties
 from roadscan.jobs.adjust.mountings import Cause, Mounted, cause_line, causes, contradicted, disproved
 from roadscan.jobs.adjust.near import Sources
 from roadscan.jobs.adjust.tie_work import KnownTies
@@ -136,7 +140,8 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
         spans = [span_of(s, files) for s, files in own]
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
-        found.append(RunPrior(run, first, last, _processes(config, stated), stated))
+        held = run in plan.survey.config.adjust.fixed
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated, held))
     return tuple(found)
 
 
@@ -190,15 +195,25 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         return _rigid_solution(plan, evidence, control, entering, found)
     entering_ties = _entering(evidence)
     adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
+    if wrong_ties:
+        found += said
+        evidence = replace(evidence, ties=evidence.ties.refused(np.isin(evidence.ties.columns["name"], wrong_ties)))
+        entering_ties = _entering(evidence)
+        adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
-    found += wrong_points(_wrong(evidence.sightings, adjusted, first))
+    wrong = _wrong(evidence.sightings, adjusted, first)
+    of_lines = {one.point.name for one in evidence.sightings if one.point.is_of_line}
+    found += wrong_points([one for one in wrong if one.name not in of_lines])
+    found += line_findings([one for one in wrong if one.name in of_lines], evidence.sightings)
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
+    found += fixed_findings(adjusted.fixed, config.control.false_alarm)
     found += solver_findings(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled)
     reached = {
         int(run) for run in np.unique([*joined.run.ravel(), *control.chosen(entering).run.ravel()]) if run != FIXED
@@ -207,15 +222,22 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
     lines = [
         solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
-        time_line(evidence.priors, adjusted.priors), offset_line(adjusted.verdict, adjusted.applied),
+        fixed_line(adjusted.fixed), time_line(evidence.priors, adjusted.priors),
+        offset_line(adjusted.verdict, adjusted.applied),
         power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()), cause_line(named),
     ]  # fmt: skip
     return Solution(
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
-        leave_one_out(adjusted.control) if adjusted.control.place.size else None,
-        datum_figures(adjusted.verdict, adjusted.applied),
+        _left_out(adjusted.control, first, evidence), datum_figures(adjusted.verdict, adjusted.applied),
         adjusted.mountings if adjusted.mountings.sensors else None,
     )  # fmt: skip
+
+
+def _left_out(control: ControlErrors, first: int, evidence: Evidence) -> LeaveOneOut | None:
+    """Accuracy at each GCP against all others; a line, which binds across it alone, is none."""
+    lines = {one.point.number for one in evidence.sightings if one.point.is_of_line}
+    own = control.chosen(~np.isin(control.place - first, list(lines)))
+    return leave_one_out(own) if own.place.size else None
 
 
 def _entering(evidence: Evidence) -> Bool:
@@ -285,6 +307,7 @@ def _not_held(
     """Runs that nothing holds, by ties that count and by points that do."""
     right = {number for (number, _), own in points.items() if own.weight_height != 0.0 or own.weight_horizontal != 0.0}
     held = {int(run) for run, point in zip(control.run.max(axis=1), control.place, strict=True) if int(point) in right}
+    held |= {number for number, prior in enumerate(evidence.priors) if prior.fixed}
     moving = [number for number, prior in enumerate(evidence.priors) if _moves(prior)]
     return not_held(evidence.runs, moving, np.asarray(links, np.int64), held)
 
@@ -295,7 +318,7 @@ def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
 
 
 def _moves(prior: RunPrior) -> bool:
-    return any(process.sigma > 0.0 for process in prior.processes)
+    return not prior.fixed and any(process.sigma > 0.0 for process in prior.processes)
 
 
 def _with_sigma(found: Adjustment, run: int) -> Corrections:
@@ -334,10 +357,18 @@ def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> l
         others = tuple(sorted(by_number[int(control.place[k]) - first].name for k in one.alternatives))
         away = control.left_out_m[one.point]
         height = -float(away[2]) if one.component == HEIGHT else float("nan")
-        place = float(np.hypot(*away[:2])) if one.component == PLACE else float("nan")
+        place = _aside_m(point, away) if one.component == PLACE else float("nan")
         sigma = float(control.left_out_sigma_m[one.point, 2])
         found.append(WrongPoint(point.name, height, place, sigma, point.height_m, one.sigmas, one.limit, others))
     return sorted(found, key=lambda one: one.name)
+
+
+def _aside_m(point: ControlPoint, away_m: Float64) -> float:
+    """How far a surveyed place lies from another (3,; north, east, down): across its line where it stands for one."""
+    if isinstance(point.shape, SurveyedLine):
+        sine, cosine = np.sin(point.shape.azimuth_rad), np.cos(point.shape.azimuth_rad)
+        return abs(float(away_m[1] * cosine - away_m[0] * sine))
+    return float(np.hypot(*away_m[:2]))
 
 
 def _rigid_solution(
@@ -385,7 +416,7 @@ def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidF
     """The one rigid movement of the survey onto its targets."""
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
-    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m)]
+    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m) and not one.point.is_of_line]
     sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
     return rigid_fit(seen, sigma, false_alarm)
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.adjust.observations import KINDS, Observations, mount_partials
-from roadscan.adjust.places import Place
+from roadscan.adjust.patches import PassReadings, Shift, shifted
+from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.code_reach import code_digest
@@ -21,6 +22,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.readings import Ground
+from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.settings.tie_settings import TieSettings
 from roadscan.navigation.mounting_change import Seat
 from roadscan.tables.manifest import Manifest, OutputRecord, read_recorded
@@ -41,6 +43,10 @@ _APART: Final = 0.25
 """Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
 _SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
 _ARMS: Final = ("first_arm_along_m", "second_arm_along_m")
+_TRIED: Final = (
+    "place", "kind", "group", "first_run", "second_run", "first_sensor", "second_sensor", "first_epoch_gps_ns",
+    "second_epoch_gps_ns", "value_m", "sigma_m", "direction_north", "direction_east", "accepted", "why_not",
+)  # fmt: skip
 _TURNS: Final = tuple(
     f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
 )
@@ -57,11 +63,16 @@ class TieTask:
     places: tuple[Place, ...]
     files: tuple[NearFile, ...]
     key: str
+    round: int = 0
+    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    shifts_m: tuple[tuple[Shift, ...], ...] = ()
+    """Of each place and traverse: how far that solution moves it; none in round 0."""
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest: the number of its first place."""
-        return f"places-{self.places[0].number:07d}"
+        """Its name in the manifest: the number of its first place, and the round."""
+        again = f"-round-{self.round}" if self.round else ""
+        return f"places-{self.places[0].number:07d}{again}"
 
     @property
     def bytes(self) -> int:
@@ -69,44 +80,78 @@ class TieTask:
         return sum(one.bytes for one in self.files)
 
 
-def tie_tasks(plan: SurveyPlan, sources: Sources, places: Sequence[Place], runs: tuple[str, ...]) -> list[TieTask]:
-    """Tasks over all places, each with a key of what its ties depend on."""
-    code, settings = code_digest(f"{__name__}:collect_ties"), plan.survey.config.adjust.ties
+def tie_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    places: Sequence[Place],
+    runs: tuple[str, ...],
+    settings: TieSettings,
+    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+) -> list[TieTask]:
+    """Tasks over all places, each with a key of what its ties depend on.
+
+    again : round, and shifts of each place's traverses; none where the recorded poses say where readings lie.
+    """
+    code, (number, shifts) = code_digest(f"{__name__}:collect_ties"), again
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks = []
     for start in range(0, len(places), _PLACES):
-        own = tuple(places[start : start + _PLACES])
+        own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
         files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
         seen = [one.key(road_key(one.source)) for one in files]
-        key = key_of(shaping, [asdict(place) for place in own], seen)
-        tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key))
+        key = key_of(shaping, [asdict(place) for place in own], seen, *([number, moved] if number else []))
+        tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved))
     return tasks
 
 
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write what was found (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
-    found = Ties.joined([ties_of(reader, place, task.settings) for place in task.places])
+    moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
+    found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
     if not found.observations.size:
         return OutputRecord(TIES, task.unit, task.key, "", 0, "")
     schema = table_schema(TIES)
-    content = parquet_bytes(_rows(found, task.runs), schema)
+    content = parquet_bytes(_rows(found, task.runs, task.round), schema)
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(TIES, task.unit, task.key, target, len(content), bytes_digest(content))
 
 
-def ties_of(reader: NearReader, place: Place, settings: TieSettings) -> Ties:
-    """Ties of one place."""
-    circle = Circle(place.easting_m, place.northing_m, DIAGONAL * place.radius_m)
+def ties_of(reader: NearReader, place: Place, settings: TieSettings, shifts_m: Sequence[Shift] | None = None) -> Ties:
+    """Ties of a place, of traverses that may be shifted, told as the recorded poses place them."""
     if place.seam:
         settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
-    return ties_at(place, [reader.of(traverse, circle) for traverse in place.traverses], settings)
+    if shifts_m is None:
+        shifts_m = [(0.0, 0.0, 0.0)] * len(place.traverses)
+    readings, moved = list[PassReadings](), dict[tuple[int, str], list[tuple[Traverse, npt.NDArray[Any]]]]()
+    for traverse, shift in zip(place.traverses, np.array(shifts_m), strict=True):
+        reach = DIAGONAL * place.radius_m + float(np.hypot(*shift[:2]))
+        own = reader.of(traverse, Circle(place.easting_m, place.northing_m, reach))
+        readings.append(shifted(own, shift))
+        moved[traverse.run, traverse.sensor] = [*moved.get((traverse.run, traverse.sensor), []), (traverse, shift)]
+    found = ties_at(place, readings, settings)
+    if not found.observations.size or not np.any(shifts_m):
+        return found
+    ends = [
+        [_shift_at(moved[run, sensor], epoch) for run, sensor, epoch in zip(
+            found.observations.run[:, k].tolist(), found.columns[f"{end}_sensor"].tolist(),
+            found.observations.epoch_gps_ns[:, k].tolist(), strict=True)]
+        for k, end in enumerate(("first", "second"))
+    ]  # fmt: skip
+    away = np.einsum("eni,nei->n", np.array(ends), found.observations.partials[:, :, :3])
+    observed = found.observations.observed_m + away
+    return Ties(replace(found.observations, observed_m=observed), {**found.columns, "value_m": observed})
 
 
-def _rows(found: Ties, runs: Sequence[str]) -> pa.Table:
+def _shift_at(known: Sequence[tuple[Traverse, npt.NDArray[Any]]], epoch_gps_ns: int) -> npt.NDArray[Any]:
+    return next(s for t, s in known if t.first_gps_ns - NS_PER_S <= epoch_gps_ns <= t.last_gps_ns + NS_PER_S)
+
+
+def _rows(found: Ties, runs: Sequence[str], number: int) -> pa.Table:
     """Ties as rows of the table, by place and group; what is not a number is empty."""
     columns: dict[str, npt.NDArray[Any]] = dict(found.columns)
+    columns["round"] = np.full(found.observations.size, number, np.uint8)
     named = np.array([*runs, ""], dtype=object)
     for end in ("first_run", "second_run"):
         columns[end] = named[found.columns[end]]
@@ -150,6 +195,8 @@ class KnownTies:
     observations: Observations
     columns: Mapping[str, npt.NDArray[Any]]
     """(n,) of the table, those that the quality figures need."""
+    tried: Mapping[str, npt.NDArray[Any]]
+    """(m,) the same of all comparisons, those too that measured nothing."""
 
     @property
     def accepted(self) -> npt.NDArray[np.bool_]:
@@ -171,6 +218,18 @@ class KnownTies:
         kind = np.where(upright, np.uint8(KINDS.index("head_tie")), self.observations.kind)
         return replace(self, observations=replace(self.observations, sigma_m=sigma, kind=kind))
 
+    def with_more(self, other: KnownTies, which: npt.NDArray[np.bool_]) -> KnownTies:
+        """These, and some (n,) ties of another collection of tasks."""
+        if not which.any():
+            return self
+        observations = Observations.joined([self.observations, other.observations.chosen(which)])
+        columns = {name: np.concatenate([own, other.columns[name][which]]) for name, own in self.columns.items()}
+        return replace(self, observations=observations, columns=columns)
+
+    def refused(self, which: npt.NDArray[np.bool_]) -> KnownTies:
+        """The same, where some (n,) do not count."""
+        return replace(self, columns={**self.columns, "accepted": np.where(which, 0, self.columns["accepted"])})
+
     @property
     def of_heads(self) -> npt.NDArray[np.bool_]:
         """(n,) ties between heads of one pass: they say nothing of poses, and much of mountings."""
@@ -179,12 +238,20 @@ class KnownTies:
 
 
 def load_ties(
-    store: Store, manifest: Manifest, units: Sequence[str], runs: Sequence[str], mounted: Mounted
+    store: Store, manifest: Manifest, tasks: Sequence[TieTask], runs: Sequence[str], mounted: Mounted
 ) -> KnownTies:
-    """Ties of some tasks, in order; runs are counted as in `runs`, sensors as in `mounted`."""
-    records = [r for unit in units if (r := manifest.get(TIES, unit)) is not None and r.path]
+    """Ties of some tasks, in order, those of the last round of each place; runs are counted as in `runs`, sensors as in
+    `mounted`.
+    """
+    records = [r for task in tasks if (r := manifest.get(TIES, task.unit)) is not None and r.path]
     empty = table_schema(TIES).arrow().empty_table()
     rows = pa.concat_tables([empty, *(store.parse_table(read_recorded(store, r), r.path) for r in records)])
+    last = np.zeros(1 + max((place.number for task in tasks for place in task.places), default=0), np.uint8)
+    for task in tasks:
+        at = [place.number for place in task.places]
+        last[at] = np.maximum(last[at], task.round)
+    rows = rows.filter(pa.array(rows.column("round").to_numpy() == last[rows.column("place").to_numpy()]))
+    tried = {name: rows.column(name).to_numpy() for name in _TRIED}
     rows = rows.filter(pa.compute.is_valid(rows.column("value_m")))
     rows = rows.filter(pa.compute.is_valid(rows.column("sigma_m")))
     column = {name: rows.column(name).to_numpy() for name in rows.column_names}
@@ -207,4 +274,4 @@ def load_ties(
         sensor=np.stack([sensor for sensor, _ in mounts], axis=-1),
         mount_partials=np.stack([by for _, by in mounts], axis=1),
     )  # fmt: skip
-    return KnownTies(observations, column)
+    return KnownTies(observations, column, tried)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadscan.jobs.adjust.adjustment import adjust_survey, is_current, withdraw
+from roadscan.jobs.adjust.hand_ties import read_hand_ties
 from roadscan.jobs.adjust.outcome import FOLDER, TABLES, known_findings, known_lines
 from roadscan.jobs.session import Session
 from roadscan.jobs.stage import Stage, StageState
@@ -39,12 +40,21 @@ class Adjust(Stage):
         session.failed(self.name, found)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Whether the file of picked targets is there."""
+        """Whether the file of picked targets is there, and that of ties by hand is one."""
+        if not survey.config.adjust.on:
+            return []
+        found: list[RoadscanError] = []
         picked = survey.config.adjust.targets.picked
         file = None if picked is None else survey.resolve(picked)
-        if file is None or not survey.config.adjust.on or file.is_file():
-            return []
-        return [ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)]
+        if file is not None and not file.is_file():
+            found.append(
+                ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)
+            )
+        try:
+            read_hand_ties(survey)
+        except ConfigError as error:
+            found.append(error)
+        return found
 
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""

@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from roadscan.model.settings.adjustment import ControlRules, SolverSettings
-from roadscan.model.settings.tie_settings import PlaceSettings, TieSettings
+from roadscan.model.settings.tie_settings import AgainSettings, PlaceSettings, TieSettings
 from roadscan.model.strict import Strict
 
 AdjustMode = Literal["joint", "each_pass", "vertical", "helmert"]
@@ -117,6 +117,32 @@ class ControlUse(ControlRules):
     another CRS or height datum: none of them is used. A single point that does so is not used either."""
 
 
+class LineUse(Strict):
+    """How surveyed lines count: paint and kerbs of a [[control]] of the format `control_lines`."""
+
+    each_m: float = Field(default=10.0, gt=0.0)
+    """Distance of the points along a line that are looked at (m)."""
+    sigma_across_m: float = Field(default=0.02, gt=0.0)
+    """1 σ across the line of lines that state none (m)."""
+    sigma_height_m: float = Field(default=0.02, gt=0.0)
+    """1 σ of the heights of lines that state none (m)."""
+
+
+class HandTies(Strict):
+    """Ties by hand: things that a person found in two passes, as the recorded poses show them."""
+
+    path: Path | None = None
+    """CSV relative to the survey file, a tie a row: first_run, first_easting_m, first_northing_m, second_run,
+    second_easting_m, second_northing_m (map, m). What may be left out: name; kind (`place`, `height` or `both`);
+    first_time, second_time (ISO 8601 with time zone: which time the run came by); sigma_m, sigma_height_m."""
+    kind: Literal["place", "height", "both"] = "both"
+    """What ties without a kind of their own say."""
+    sigma_m: float = Field(default=0.02, gt=0.0, le=10.0)
+    """1 σ of the difference of two places, on each axis, where a tie states none (m)."""
+    sigma_height_m: float = Field(default=0.01, gt=0.0, le=10.0)
+    """1 σ of the difference of two heights, beside that of their measurement, where a tie states none (m)."""
+
+
 class AdjustConfig(Strict):
     """The adjustment of the recorded poses: passes are tied to one another where they overlap, and to ground control.
 
@@ -129,6 +155,10 @@ class AdjustConfig(Strict):
     """`joint`: all runs at once, with ties and control; `each_pass`: each run by itself, to control alone; `vertical`:
     as joint, and heights alone are corrected; `helmert`: the survey as a whole is shifted and turned onto its control
     points with targets, nothing else."""
+    fixed: list[str] = []
+    """Runs that are held fixed, an earlier survey or a reference: their recorded poses hold to the bit, and those of
+    other runs are adjusted to them. How well their poses are known is taken from their σ. Mountings of their sensors
+    are not estimated."""
     priors: PosePriors = PosePriors()
     """Errors of the recorded poses."""
     mountings: MountingPriors = MountingPriors()
@@ -137,10 +167,16 @@ class AdjustConfig(Strict):
     """Where passes are compared."""
     ties: TieSettings = TieSettings()
     """How they are compared."""
+    again: AgainSettings = AgainSettings()
+    """When they are compared again."""
+    hand_ties: HandTies = HandTies()
+    """Ties by hand."""
     control: ControlUse = ControlUse()
     """Control points."""
     targets: TargetsConfig = TargetsConfig()
     """Painted targets at control points."""
+    lines: LineUse = LineUse()
+    """Surveyed lines."""
     solver: SolverSettings = SolverSettings()
     """How the corrections are computed."""
     moved_m: float = Field(default=0.0001, ge=0.0, le=0.1)
@@ -148,3 +184,12 @@ class AdjustConfig(Strict):
     stay current."""
     moved_arm_m: float = Field(default=5.0, ge=0.0)
     """A turn counts as the movement of a point so far from the vehicle (m)."""
+
+    @model_validator(mode="after")
+    def _holds_runs(self) -> Self:
+        if self.fixed and self.mode == "helmert":
+            raise ValueError(
+                "adjust.fixed holds runs, and mode 'helmert' moves the survey as a whole: state another mode, or no "
+                "fixed run"
+            )
+        return self

@@ -36,6 +36,29 @@ class PlaceSettings(Strict):
     """Readings of a place are taken for so long at most, where a vehicle stands there (s)."""
 
 
+class AgainSettings(Strict):
+    """When ties are observed again, and how passes that lie far apart are brought together first."""
+
+    share: float = Field(default=0.05, gt=0.0, le=1.0)
+    """A place is observed again where the solution moves its passes against one another by more than this share of the
+    patch's edge: 5 cm of a patch of 1 m. What moved by less was matched where it lies."""
+    rounds: int = Field(default=3, ge=0, le=10)
+    """Times that ties are observed again, at most: one brings passes to centimetres, the next ones to the σ of the
+    ties, and what moves after three does not settle. 0: never."""
+    search_m: float = Field(default=1.0, gt=0.0, le=5.0)
+    """How far apart (m), along, across and in height, two passes are sought with larger patches."""
+    radius_m: float = Field(default=2.0, gt=0.0, le=20.0)
+    """Half the edge of the larger patch (m)."""
+    cell_m: float = Field(default=0.02, gt=0.0, le=1.0)
+    """Edge of its cells (m): cracks are to be seen."""
+    each_m: float = Field(default=100.0, gt=0.0)
+    """Distance of larger patches along the road (m): errors of poses vary over minutes."""
+    least: int = Field(default=20, ge=3)
+    """Larger patches of two runs, at least, where they have so many places."""
+    alike_m: float = Field(default=0.1, gt=0.0)
+    """Larger patches count that agree with most of the others to this; passes lie no farther above one another (m)."""
+
+
 class TieSettings(Strict):
     """How two passes are compared at a place, and what a tie has to pass to count."""
 

@@ -132,7 +132,7 @@ def _plan(source: LogSource) -> _Plan:
             missing=Missing("options.names", proposed or None, tuple(orders)),
         )
     columns = find_columns(
-        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, _units(frame)
+        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, units_of(frame)
     )
     need_role("role" in columns, options.role, source.path)
     return _Plan(layout, columns, frame, options.role or "")
@@ -164,7 +164,7 @@ def _number(word: str) -> float:
         return math.nan
 
 
-def _units(frame: ControlFrame) -> dict[str, float]:
+def units_of(frame: ControlFrame) -> dict[str, float]:
     """Size (rad, m) of the units that the CRS itself fixes, by quantity."""
     if frame.kind == "local":
         return {"easting": 1.0, "northing": 1.0, "height": 1.0}

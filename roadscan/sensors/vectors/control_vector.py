@@ -131,7 +131,7 @@ def _plan(source: LogSource) -> _Plan:
         info = layer_info(source.path, layer)
     if info["geometry_type"] is None:
         raise FormatError(f"layer '{layer}' has no geometry", expected="points", file=source.path)
-    _check_crs(info["crs"], frame, source.path)
+    check_crs(info["crs"], frame, source.path)
     attributes = tuple(str(field) for field in info["fields"])
     for wanted in (options.name, options.height):
         if wanted is not None and wanted not in attributes:
@@ -151,7 +151,7 @@ def _plan(source: LogSource) -> _Plan:
     )
 
 
-def _check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
+def check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
     """Refuse a layer whose own CRS is another than the stated one."""
     if found is None:
         return

@@ -1,0 +1,140 @@
+"""Passes that lie farther apart than ties are sought: which they are, and where larger patches agree that they lie.
+
+A single larger patch may match at a wrong place. What counts is the shift that most patches of two passes agree on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from roadscan.adjust.ties.tie import HEIGHT, SHIFT
+from roadscan.model.settings.tie_settings import AgainSettings, TieSettings
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+Column = Mapping[str, npt.NDArray[Any]]
+
+_LEAST: Final = 3
+"""Patches that have to agree: two agree by chance."""
+_MOST: Final = 0.5
+"""Share of the heights of two passes, and of the patches, that is most of them."""
+_SIGMAS: Final = 3.0
+_ALONG: Final = 0.5
+"""Cosine from which on a direction tells of a shift."""
+
+
+def places_of_pairs(tried: Column) -> dict[tuple[str, str], list[int]]:
+    """Places that two runs share, or two drives of one run, by the names of both."""
+    heights = (tried["kind"] == HEIGHT) & ~_of_one_pass(tried)
+    pairs = sorted(set(zip(tried["first_run"][heights].tolist(), tried["second_run"][heights].tolist(), strict=True)))
+    return {
+        (a, b): np.unique(tried["place"][heights & (tried["first_run"] == a) & (tried["second_run"] == b)]).tolist()
+        for a, b in pairs
+    }
+
+
+def is_matched(tried: Column, pair: tuple[str, str]) -> bool:
+    """Whether the heights of most places that two runs share could be compared."""
+    own = (tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & ~_of_one_pass(tried)
+    heights = tried["accepted"][own & (tried["kind"] == HEIGHT)]
+    return bool(heights.size and (heights == 1).mean() >= _MOST)
+
+
+def _of_one_pass(tried: Column) -> Bool:
+    """Comparisons of heads that passed together."""
+    same = tried["first_run"] == tried["second_run"]
+    apart = np.abs(tried["first_epoch_gps_ns"] - tried["second_epoch_gps_ns"])
+    return np.asarray(same & (apart < 30_000_000_000))
+
+
+def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float) -> tuple[Bool, Float64]:
+    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find, and
+    that shift (3,): second minus first, north, east, down (m).
+
+    most_up_m : passes that lie farther above one another than this contradict the σ of their poses.
+    """
+    counts = tried["accepted"] == 1
+    shift = np.zeros(3)
+    kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
+    if kept.any():
+        shift[:2] = _solved(tried, np.flatnonzero(kept))
+        if not _is_supported(tried, kept, counts & (tried["kind"] == SHIFT), shift[:2]):
+            kept[:], shift[:2] = False, 0.0
+    heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
+    level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
+    alike = np.zeros(counts.size, np.bool_)
+    alike[heights] = np.abs(tried["value_m"][heights] - level) <= settings.alike_m
+    if alike.sum() > _MOST * heights.size:
+        shift[2] = -level
+    is_far = np.hypot(*shift[:2]) > fine.search_m or abs(shift[2]) > max(most_up_m, settings.alike_m)
+    return ((kept | alike), shift) if is_far else (np.zeros(counts.size, np.bool_), np.zeros(3))
+
+
+def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mapping[tuple[str, str], Float64],
+              held: Sequence[str]) -> dict[str, Float64]:  # fmt: skip
+    """How far (3,) runs lie from those that most agree with, by name; all of them where none are most.
+
+    Parameters
+    ----------
+    close : pairs of runs that match where they lie. far : shifts of pairs that do not.
+    held : runs that are right, whatever the others say.
+    """
+    number = {run: k for k, run in enumerate(runs)}
+    pairs = np.array([(number[a], number[b]) for a, b in close], np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(runs), len(runs)))
+    group = connected_components(graph, directed=False)[1]
+    in_far = sorted({run for pair in far for run in pair})
+    sizes = {g: int((group == g).sum()) for g in {int(group[number[run]]) for run in in_far}}
+    right = {int(group[number[run]]) for run in held}
+    if not right & sizes.keys():
+        most = max(sizes.values(), default=0)
+        right = {g for g, size in sizes.items() if size == most}
+        right = right if len(right) == 1 else set()
+    found: dict[str, Float64] = {}
+    for pair, shift in far.items():
+        for run in pair:
+            if int(group[number[run]]) not in right and run not in held:
+                found[run] = np.maximum(found.get(run, np.zeros(3)), np.abs(shift))
+    return found
+
+
+def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> bool:
+    """Whether enough places tell of the shift along itself: most of a road tells only how far it lies across."""
+    length = float(np.hypot(*shift))
+    along = np.abs(_directions(tried, np.arange(kept.size)) @ shift) > _ALONG * length
+    support, against = (np.unique(tried["place"][own & along]) for own in (kept, every & ~kept))
+    return support.size >= _LEAST and support.size > np.setdiff1d(against, support).size
+
+
+def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
+    """Rows of the places that agree on one shift, none where those are few, or fewer than half of all."""
+    places = tried["place"]
+    numbers, best = np.unique(places[own]), np.zeros(own.size, np.bool_)
+    for number in numbers:
+        rows = np.flatnonzero(own & (places == number))
+        if np.linalg.matrix_rank(_directions(tried, rows), tol=0.5) < 2:
+            continue
+        shift = _solved(tried, rows)
+        away = np.abs(tried["value_m"] - _directions(tried, np.arange(own.size)) @ shift)
+        fits = own & (away <= alike_m + _SIGMAS * np.where(own, tried["sigma_m"], 0.0))
+        if np.unique(places[fits]).size > np.unique(places[best]).size:
+            best = fits
+    count = np.unique(places[best]).size
+    return best if count >= _LEAST and count > _MOST * numbers.size else np.zeros(own.size, np.bool_)
+
+
+def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
+    return np.stack([tried["direction_north"][rows], tried["direction_east"][rows]], axis=-1)
+
+
+def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
+    """Shift (2,) north, east of rows that all say the same."""
+    sigma = tried["sigma_m"][rows]
+    design = _directions(tried, rows) / sigma[:, None]
+    return np.asarray(np.linalg.lstsq(design, tried["value_m"][rows] / sigma, rcond=None)[0])

@@ -1,4 +1,4 @@
-"""Some damaged files of every format in each run of the tests; at night 400, and ``python -m tests.fuzz`` 10,000 a format.
+"""Some damaged files of every format in each run of the tests; each night 400, by ``make fuzz`` 10,000 a format.
 
 What cannot be found out: damage that leaves a value plausible, and damage that makes a part of the log look like
 something the format lets pass (a comment, other traffic in a capture, a return without an echo).

@@ -14,6 +14,14 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 # One thread for linear algebra, as on workers: those of two processes would wait for one another, busily.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Numba words an error for each signature that does not fit, and forgets it: without colours that takes half as long.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+
+# A test's files need not outlive the machine, and a run waits a hundred times for the disk. Tests of a loss of power
+# put a disk of their own in this place.
+os.fsync = lambda _: None
+os.environ.setdefault("OGR_SQLITE_SYNCHRONOUS", "OFF")
+
 # On a build server the same examples each time; at home new ones.
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from roadscan.jobs.tiles.selection import Selection
 from roadscan.model.survey import Survey
 from roadscan.simulate import Scene, simulate
 from roadscan.tables.store import Store
+from tests.pictures import blank, drawn
 
 
 class Lines(Reporter):
@@ -89,6 +91,13 @@ def small_scene(**changes: object) -> Scene:
     return scene.changed(**changes) if changes else scene
 
 
+@pytest.fixture(scope="package", autouse=True)
+def blank_pictures() -> Iterator[None]:
+    """Tests that look at drawings ask for them (:func:`tests.pictures.drawn`)."""
+    with blank():
+        yield
+
+
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     """Two passes of a short road, raw logs only; the poses hold as they were recorded."""
@@ -102,7 +111,8 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
 @pytest.fixture(scope="session")
 def finished(simulated: Simulated) -> Simulated:
     """The same, run once in this process into the store ``store``."""
-    simulated.run()
+    with drawn():
+        simulated.run()
     return simulated
 
 

@@ -24,6 +24,7 @@ from roadscan.model.witness import Finding
 from roadscan.simulate import Scene, simulate
 from roadscan.tables.held import held_path, read_held
 from roadscan.tables.sql import query
+from tests.pictures import drawn
 
 from .conftest import Lines, Simulated, changed
 
@@ -205,7 +206,8 @@ def test_the_order_of_runs_in_the_survey_file_changes_no_bit(three_drives: Simul
         config = changed(Survey.load(copy.survey_file), {"products__make": ["tile_table"]})
         turned = config.config.model_copy(update={"runs": config.config.runs[::step]})
         session = Session(Survey(turned, config.rig, config.folder), copy.store(), Inline(), None, Lines())
-        run_stages(session, [stage_named(stage) for stage in (*STAGES, "tiles")])
+        with drawn():
+            run_stages(session, [stage_named(stage) for stage in (*STAGES, "tiles")])
         folders = ("products/adjustment", "tables/control_residuals", "tables/tie_residuals", "tiles")
         paths = [path for folder in folders for path in copy.store().files(folder)]
         made.append({path: copy.store().read_bytes(path) for path in [*paths, held_path("corrections")]})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,19 @@ from roadscan.simulate import Scene, simulate
 from roadscan.tables.logs import write_log_record
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
+from tests.pictures import drawn
 
 from .conftest import changed
 
 S = 10**9
 HEADS = {"offset_s": -0.7312, "drift_ppm": 23.0}
 WHEEL = {"offset_s": 1.234, "drift_ppm": -8.0}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drawn_pictures() -> Iterator[None]:
+    with drawn():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ from roadscan.model.survey import Survey
 from roadscan.tables.schema import table_schema
 from roadscan.tables.store import Store
 from roadscan.tables.writer import write_parquet
+from tests.pictures import drawn
 
 from .conftest import Simulated, changed, outputs
 
@@ -76,7 +77,8 @@ def write_laz(file: Path) -> None:
 def write_picture(file: Path) -> None:
     figure = Figure(figsize=(10, 10))
     figure.figimage(noise(1000, 1000))
-    figure.savefig(file)
+    with drawn():
+        figure.savefig(file)
 
 
 def write_layer(file: Path) -> None:

@@ -21,6 +21,7 @@ from roadscan.tables.logs import read_log_records
 from roadscan.tables.sql import query
 from roadscan.tables.store import Store
 from tests.navigation.walks import OUTAGES, Walked, walked
+from tests.pictures import drawn
 
 from .test_navigate import navigating_scene
 
@@ -94,7 +95,8 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def alone(driven: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Place:
     """The survey of GNSS, IMU and odometer, run once."""
     place = survey_of(tmp_path_factory.mktemp("run"), *driven)
-    assert place.do("run", "--workers", "0") == 0, place.said
+    with drawn():
+        assert place.do("run", "--workers", "0") == 0, place.said
     return place
 
 
@@ -180,7 +182,8 @@ def test_a_damaged_picture_is_seen_and_drawn_again(alone: Place, damage: Callabl
     assert alone.do("verify") == 1
     assert PICTURE in alone.said and "the next run makes it again" in alone.said
     records = [r.key for r in read_log_records(alone.store)]
-    assert alone.do("run", "--workers", "0") == 0
+    with drawn():
+        assert alone.do("run", "--workers", "0") == 0
     assert f"drawn: {PICTURE}" in alone.said and "computed:" not in alone.said
     assert file.read_bytes() == before
     assert [r.key for r in read_log_records(alone.store)] == records

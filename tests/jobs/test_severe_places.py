@@ -38,7 +38,7 @@ def run(scene: Scene, folder: Path, settings: str) -> Store:
     simulate(scene, folder)
     file = folder / "SURVEY.toml"
     file.write_text(file.read_text() + settings)
-    outcome = CliRunner().invoke(app, ["run", str(file)])
+    outcome = CliRunner().invoke(app, ["run", str(file), "--workers", "0"])
     assert outcome.exit_code == 0, outcome.output
     (folder / "said.txt").write_text(outcome.output)
     return Store(str(folder / "store"), "rough")

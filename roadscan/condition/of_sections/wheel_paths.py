@@ -38,6 +38,9 @@ _MARGIN: Final = 64
 """Places beside a profile whose noise may reach into it."""
 _WANDER_STREAM: Final = 1000
 """First stream of random numbers of the poses' wander; those of noise are below."""
+_HIDDEN_PER_M: Final = 0.5
+"""Heads look at their lines under angles of up to 27 degrees (m/m)."""
+_MOST_HIDDEN_M: Final = 0.15
 _POOR_TIMES: Final = 10.0
 """A stretch whose σ is so many times the median is not measured: lidars reach beyond the profilers at both ends of a
 drive, with σ of millimetres that would count as roughness."""
@@ -147,17 +150,26 @@ def _well_measured(part: Profile, gap_m: float) -> Profile:
 
     A stretch is longer than `gap_m` to both sides of a height, so that a pothole's edge or a crack is none.
     """
-    sigma = part.known_sigma_m
-    if not np.isfinite(sigma).all() or part.distance_m.size < 2:
+    known = np.flatnonzero(np.isfinite(part.sigma_m))
+    if known.size < 2:
         return part
+    sigma = np.interp(part.distance_m, part.distance_m[known], part.sigma_m[known])
     size = 2 * math.ceil(gap_m / float(np.median(np.diff(part.distance_m)))) + 1
     usual = scipy.ndimage.median_filter(sigma, size, mode="nearest")
-    poor = usual > _POOR_TIMES * float(np.median(sigma))
-    return replace(part, height_m=np.where(poor, np.nan, part.height_m))
+    poor = np.pad(usual > _POOR_TIMES * float(np.median(sigma)), size, constant_values=True)
+    poor = scipy.ndimage.binary_closing(poor, np.ones(size, np.bool_))[size:-size]  # what is short between is poor, too
+    return replace(
+        part,
+        height_m=np.where(poor, np.nan, part.height_m),
+        sigma_m=np.where(poor, np.nan, part.sigma_m),
+    )
 
 
 def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[slice, ...]:
     """Where heights differ from the one measured before as at a wall, and on in the same direction.
+
+    A wall may hide the floor at its foot from the sensor, up to half a metre of it a metre of height: heights there are
+    those of the ground beyond, so the wall may stand that much farther out.
 
     measured_m, height_m : (n,) heights with their gaps, and with these bridged; NaN where there is none (m).
     """
@@ -167,7 +179,16 @@ def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[
     steep = np.where(bridged_over & (np.abs(rise) > _WALL_SLOPE * spacing_m), np.sign(rise), 0.0)
     begins = np.flatnonzero((steep != 0.0) & (steep != np.append(0.0, steep[:-1])))
     ends = np.flatnonzero((steep != 0.0) & (steep != np.append(steep[1:], 0.0)))
-    return tuple(slice(int(known[a]), int(known[b + 1]) + 1) for a, b in zip(begins, ends, strict=True))
+    found = []
+    for a, b in zip(known[begins].tolist(), known[ends + 1].tolist(), strict=True):
+        climb = float(measured_m[b] - measured_m[a])
+        hidden = int(min(_HIDDEN_PER_M * abs(climb), _MOST_HIDDEN_M) / spacing_m)
+        first, last = (a, b + hidden) if climb > 0.0 else (a - hidden, b)
+        beyond = measured_m[max(first, 0) : last + 1]
+        clear = first >= 0 and last < measured_m.size and not np.isnan(beyond[: a - first]).any()
+        clear = clear and not np.isnan(measured_m[b : last + 1]).any()
+        found.append(slice(first, last + 1) if clear else slice(a, b + 1))
+    return tuple(found)
 
 
 def greatest_of(rows: Float64) -> Float64:

@@ -35,6 +35,8 @@ _NARROW_CELLS, _WIDE_CELLS = 0.8, 1.6
 """Widths at which a crack shows least of its bottom, and all of it."""
 _SIGMA_NARROW, _SIGMA_WIDE = 0.2, 0.05
 """Standard deviations of depths at these widths, shares of the depth."""
+_SIGMA_READING = 0.1
+"""The same where a cell has one reading; it falls with the root of their number."""
 _SIGMA_M = 0.0005
 """What noise and texture leave of a depth."""
 _ONE_NODE_CELLS = 4.0
@@ -219,7 +221,9 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
         depth_mean_m=depth,
         depth_max_m=max(p.depth_max_m for p in mine),
         seen_share=seen,
-        sigma_depth_mean_m=depth_sigma_m(depth, width / nodes.cell_m, seen),
+        sigma_depth_mean_m=depth_sigma_m(
+            depth, width / nodes.cell_m, seen, beside / measured if beside > 0.0 else math.inf
+        ),
         area_m2=width_sum * (length / measured) if measured > 0 else math.nan,
         covered_m2=float(shapely.convex_hull(line).area),
         junctions=junctions,
@@ -236,17 +240,18 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
     )
 
 
-def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float) -> float:
+def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, readings: float) -> float:
     """Standard deviation (m) of the mean depth of a crack; NaN where its bottom was not seen.
 
     width_cells : its width at half the depth. What is narrow shows its walls more than its bottom.
     seen_share : readings in its middle over those beside it.
+    readings : of a cell beside it; infinite where none are counted.
     """
     if not seen_share >= LEAST_SEEN:
         return math.nan
     narrow = min(max((_WIDE_CELLS - width_cells) / (_WIDE_CELLS - _NARROW_CELLS), 0.0), 1.0)
     share = _SIGMA_WIDE + narrow * (_SIGMA_NARROW - _SIGMA_WIDE)
-    return math.hypot(share * depth_m, _SIGMA_M)
+    return math.hypot(share * depth_m, _SIGMA_READING * depth_m / math.sqrt(readings), _SIGMA_M)
 
 
 def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:

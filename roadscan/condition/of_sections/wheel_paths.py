@@ -146,9 +146,10 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
 
 
 def _well_measured(part: Profile, gap_m: float) -> Profile:
-    """The profile without stretches that are known far worse than most of it, as where one sensor alone reached.
+    """The profile without both ends, where these are known far worse than most of it, as where a lidar alone reached.
 
-    A stretch is longer than `gap_m` to both sides of a height, so that a pothole's edge or a crack is none.
+    What is short between such stretches is left out with them. Within the profile all heights stay: those on the walls
+    of a pothole have a great σ, too.
     """
     known = np.flatnonzero(np.isfinite(part.sigma_m))
     if known.size < 2:
@@ -157,12 +158,13 @@ def _well_measured(part: Profile, gap_m: float) -> Profile:
     size = 2 * math.ceil(gap_m / float(np.median(np.diff(part.distance_m)))) + 1
     usual = scipy.ndimage.median_filter(sigma, size, mode="nearest")
     poor = np.pad(usual > _POOR_TIMES * float(np.median(sigma)), size, constant_values=True)
-    poor = scipy.ndimage.binary_closing(poor, np.ones(size, np.bool_))[size:-size]  # what is short between is poor, too
-    return replace(
-        part,
-        height_m=np.where(poor, np.nan, part.height_m),
-        sigma_m=np.where(poor, np.nan, part.sigma_m),
-    )
+    good = np.flatnonzero(~scipy.ndimage.binary_closing(poor, np.ones(size, np.bool_))[size:-size])
+    if not good.size:
+        return part
+    place = np.arange(part.height_m.size)
+    beyond = (place < good[0]) | (place > good[-1])
+    height, sigma = (np.where(beyond, np.nan, one) for one in (part.height_m, part.sigma_m))
+    return replace(part, height_m=height, sigma_m=sigma)
 
 
 def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[slice, ...]:

@@ -163,10 +163,8 @@ def _joints(
         elif new(fault[0]):
             own.append(_Joint("steps", fault[0], {side: fault}))
     for joint in own:
-        beside = {
-            side: one.fault_at(joint.station_m, _SPACED_M) for side, one in sides.items() if side not in joint.faults
-        }
-        joint.faults.update(_known(beside))
+        missing = {side: one for side, one in sides.items() if side not in joint.faults}
+        joint.faults.update(_known({side: one.fault_at(joint.station_m, _SPACED_M) for side, one in missing.items()}))
     return sorted((joint for joint in found + own if joint.faults), key=lambda joint: joint.station_m)
 
 

@@ -23,8 +23,13 @@ Floats = npt.NDArray[np.float64]
 SEGMENT_MM = 100.0
 """Length of a segment (mm)."""
 HIGHEST_STEP_MM = 20.0
-"""Where the heights on both sides of a spike, or of a step, differ by more, the profile jumps: no texture is so deep
-(mm)."""
+"""Where the heights on both sides of a place differ by more, the profile jumps: no texture is so deep (mm)."""
+_LEVEL_MM = 20.0
+"""Length on each side of a place whose median heights are compared: longer than stones and narrow cracks (mm)."""
+_LEAST_STEP_MM = 1.0
+"""A lower step changes the depth of its segment by less than half of this (mm)."""
+_STEP_SIGMAS = 6.0
+"""A step stands out from what the texture itself makes of these medians by so many of their standard deviations."""
 COARSEST = 1.01
 """Spacing of samples over that of the resampled profile, at the most."""
 
@@ -96,8 +101,8 @@ def texture_segments(
     _check(along_mm, height_mm, chosen)
     place_mm, resampled_mm, read = _resample(along_mm, _bridged(along_mm, height_mm), chosen.resampled_mm)
     spike = _spikes(resampled_mm, chosen)
-    jump = _jumps(resampled_mm, spike)
     resampled_mm = _bridged(place_mm, np.where(spike, np.nan, resampled_mm))
+    jump = _jumps(resampled_mm, chosen)
     smooth_mm = _low_passed(resampled_mm, chosen)
     own, samples = _segment_of(along_mm), _segment_of(place_mm)
     dropout = ~np.isfinite(height_mm)
@@ -181,16 +186,34 @@ def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool
     return spike
 
 
-def _jumps(height_mm: Floats, spike: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Samples between two sound ones whose heights differ too much, and these two.
+def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
+    """Samples at which the profile steps to another level.
 
-    Both samples beside a step are spikes: a line bridges them, which makes the step three times less steep. So the
-    heights on both sides of what was bridged are compared.
+    The medians of the heights on both sides are compared. Their differences scatter by the texture; a step is one that
+    stands out, and lies where the means on both sides differ most.
     """
-    sound = np.flatnonzero(~spike)
-    jump = np.zeros(height_mm.size, np.bool_)
-    for k in np.flatnonzero(np.abs(np.diff(height_mm[sound])) > HIGHEST_STEP_MM).tolist():
-        jump[sound[k] : sound[k + 1] + 1] = True
+    from scipy.ndimage import median_filter, uniform_filter1d
+
+    size, samples = max(round(_LEVEL_MM / settings.resampled_mm), 1), height_mm.size
+    jump = np.zeros(samples, np.bool_)
+    if samples <= 2 * size:
+        return jump
+
+    def rises(smooth_mm: Floats) -> Floats:
+        """From the stretch that ends before a sample to the one that begins with it: sample `size` and those behind."""
+        middle = size // 2
+        behind, before = smooth_mm[size + middle :], smooth_mm[middle:]
+        return behind[: samples - 2 * size + 1] - before[: samples - 2 * size + 1]
+
+    levels = rises(median_filter(height_mm, size, mode="nearest"))
+    levels = np.abs(levels - np.median(levels))  # less the slope of the road
+    limit = max(_LEAST_STEP_MM, _STEP_SIGMAS * 1.4826 * float(np.median(levels)))
+    high = levels > min(limit, HIGHEST_STEP_MM)
+    means = np.abs(rises(uniform_filter1d(height_mm, size, mode="nearest")))
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
+    for a, b in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+        at = size + a + int(np.argmax(means[a:b]))
+        jump[at - 1 : at + 1] = True
     return jump
 
 

@@ -12,10 +12,14 @@ from scipy.spatial import Voronoi
 
 from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.noise import stream
-from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road
+from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road, Slabs
 
 Float64 = npt.NDArray[np.float64]
 
+_FACE_M = 0.001
+"""Width of the face of a slab, seen from above."""
+_RAMP_M = 5.0
+"""Length of the slabs that lead to the first fault and from the last one."""
 RECTANGLE, ELLIPSE, RING, BAND = 0.0, 1.0, 2.0, 3.0
 """Kinds of painted or spilt items."""
 
@@ -35,13 +39,18 @@ class Features:
 def of_road(road: Road, seed: int, first_m: float, last_m: float, length_m: float, *, smooth: bool) -> Features:
     """All features between two stations; none where the surface shall be `smooth`."""
     if smooth:
-        nothing = [np.zeros((0, n)) for n in (7, 2, 8, 2, 8, 2)]
+        nothing = [np.zeros((0, n)) for n in (8, 2, 9, 2, 8, 2)]
         return Features(*nothing)
     again = _shifts(road.repeat_m, length_m)
-    once = _table(_potholes(road) + _cracks(road) + _alligators(road, seed) + _lost_stones(road, seed), 7)
-    defects = np.concatenate([_repeated(once, again, (3,), (5,)), _table(_joints(road, first_m, last_m), 7)])
-    patches = _repeated(_table([_patch(p) for p in road.patches], 8), again, (1,), ())
-    spilt = _repeated(_table(_spilt(road), 8), again, (2,), (6,))
+    slabs = [(one, faults_of(one, seed, number)) for number, one in enumerate(road.slabs)]
+    once = _table(_potholes(road) + _cracks(road) + _alligators(road, seed) + _lost_stones(road, seed), 8)
+    joints = _joints(road, first_m, last_m) + [
+        _gap(one, at, road) for one, (found, _) in slabs for at in found.tolist()
+    ]
+    defects = np.concatenate([_repeated(once, again, 3, 5, 1.0), _table(joints, 8)])
+    patches = _repeated(_table([_patch(p) for p in road.patches], 9), again, 1)
+    patches = np.concatenate([patches, _table([row for _, faults in slabs for row in _slabs(road, *faults)], 9)])
+    spilt = _repeated(_table(_spilt(road), 8), again, 2, 6, BAND)
     items = np.concatenate([spilt, _table(_painted(road), 8)])
     return Features(defects, _defect_reach(defects), patches, _patch_reach(patches), items, _item_reach(items))
 
@@ -85,16 +94,13 @@ def _shifts(repeat_m: float, length_m: float) -> Float64:
     return repeat_m * np.arange(math.ceil(length_m / repeat_m), dtype=np.float64) if repeat_m > 0.0 else np.zeros(1)
 
 
-def _repeated(rows: Float64, shifts_m: Float64, columns: tuple[int, ...], far_ends: tuple[int, ...]) -> Float64:
-    """Rows again at each shift: `columns` hold stations, `far_ends` those of other ends (bands and cracks only)."""
+def _repeated(rows: Float64, shifts_m: Float64, column: int, far_end: int = -1, kind: float = np.nan) -> Float64:
+    """Rows again at each shift: `column` holds their station, `far_end` that of the other end of those of a kind."""
     if not rows.size or shifts_m.size == 1:
         return rows
     again = np.repeat(rows[None], shifts_m.size, axis=0)
-    for column in columns:
-        again[:, :, column] += shifts_m[:, None]
-    has_far_end = (rows[:, 0] == 1.0) if rows.shape[1] == 7 else (rows[:, 0] == BAND)
-    for column in far_ends:
-        again[:, :, column] += np.where(has_far_end, shifts_m[:, None], 0.0)
+    again[:, :, column] += shifts_m[:, None]
+    again[:, :, far_end] += np.where(rows[:, 0] == kind, shifts_m[:, None], 0.0)
     return again.reshape(-1, rows.shape[1])
 
 
@@ -102,12 +108,18 @@ def _repeated(rows: Float64, shifts_m: Float64, columns: tuple[int, ...], far_en
 
 
 def _potholes(road: Road) -> list[list[float]]:
-    return [[0.0, p.depth_m, 1.0 / p.radius_m, p.station_m, p.offset_m, 0.0, 0.0] for p in road.potholes]
+    return [
+        [0.0, p.depth_m, 1.0 / p.radius_m, p.station_m, p.offset_m, 0.0, 0.0, _per_m(p.wall_m)] for p in road.potholes
+    ]
+
+
+def _per_m(wall_m: float) -> float:
+    return 1.0 / wall_m if wall_m > 0.0 else 0.0
 
 
 def _cracks(road: Road) -> list[list[float]]:
     return [
-        [1.0, crack.depth_m, 2.0 / crack.width_m, s0, o0, s1, o1]
+        [1.0, crack.depth_m, 2.0 / crack.width_m, s0, o0, s1, o1, _per_m(crack.wall_m)]
         for crack in road.cracks
         for (s0, o0), (s1, o1) in itertools.pairwise(crack.points_m)
         if (s0, o0) != (s1, o1)
@@ -117,7 +129,7 @@ def _cracks(road: Road) -> list[list[float]]:
 def _joints(road: Road, first_m: float, last_m: float) -> list[list[float]]:
     edge = road.paved_m
     return [
-        [1.0, joints.depth_m, 2.0 / joints.width_m, station, -edge, station, edge]
+        [1.0, joints.depth_m, 2.0 / joints.width_m, station, -edge, station, edge, 0.0]
         for joints in road.joints
         for station in _joint_stations(joints, first_m, last_m)
     ]
@@ -136,7 +148,7 @@ def _alligators(road: Road, seed: int) -> list[list[float]]:
     rows: list[list[float]] = []
     for number, field in enumerate(road.alligators):
         for (s0, o0), (s1, o1) in _cell_borders(field, stream(seed, number, "alligator")):
-            rows.append([1.0, field.crack_depth_m, 2.0 / field.crack_width_m, s0, o0, s1, o1])
+            rows.append([1.0, field.crack_depth_m, 2.0 / field.crack_width_m, s0, o0, s1, o1, 0.0])
     return rows
 
 
@@ -164,7 +176,7 @@ def _lost_stones(road: Road, seed: int) -> list[list[float]]:
         size = rng.uniform(0.7, 1.3, len(middles))
         depth = place.depth_m * rng.uniform(0.7, 1.3, len(middles))
         per_m = 2.0 / (place.stone_m * size)
-        rows += [[0.0, d, r, s, o, 0.0, 0.0] for d, r, (s, o) in zip(depth, per_m, middles.tolist(), strict=True)]
+        rows += [[0.0, d, r, s, o, 0.0, 0.0, 0.0] for d, r, (s, o) in zip(depth, per_m, middles.tolist(), strict=True)]
     return rows
 
 
@@ -183,7 +195,34 @@ def _within(place: Ravelling, rng: np.random.Generator) -> Float64:
 def _patch(p: Patch) -> list[float]:
     circle = p.shape == "circle"
     half_width = (p.length_m if circle else p.width_m) / 2
-    return [float(circle), p.station_m, p.offset_m, p.length_m / 2, half_width, p.height_m, 1.0 / p.edge_m, p.shade]
+    slope, edge = p.rise_m / p.length_m, 1.0 / p.edge_m
+    return [float(circle), p.station_m, p.offset_m, p.length_m / 2, half_width, p.height_m, edge, p.shade, slope]
+
+
+def faults_of(slabs: Slabs, seed: int, number: int) -> tuple[Float64, Float64]:
+    """Stations of the joints (n,), and their faults, positive where the slab behind is lower (n,; m)."""
+    rng = stream(seed, number, "slabs")
+    most = max(int((slabs.end_m - slabs.start_m) / slabs.length_m[0]), 0) + 1
+    stations = slabs.start_m + np.append(0.0, np.cumsum(rng.uniform(*slabs.length_m, most)))
+    faults = rng.uniform(*slabs.fault_m, stations.size) * rng.choice([-1.0, 1.0], stations.size)
+    inside = stations <= slabs.end_m
+    return stations[inside], faults[inside]
+
+
+def _gap(slabs: Slabs, station_m: float, road: Road) -> list[float]:
+    edge = road.paved_m
+    return [1.0, slabs.depth_m, 2.0 / slabs.gap_m, station_m, -edge, station_m, edge, 0.0]
+
+
+def _slabs(road: Road, station_m: Float64, fault_m: Float64) -> list[list[float]]:
+    """Patches over the paved width between the joints; before the first and behind the last a slab ends level."""
+    ends = np.concatenate([station_m[:1] - _RAMP_M, station_m, station_m[-1:] + _RAMP_M])
+    near, far = np.append(0.0, -0.5 * fault_m), np.append(0.5 * fault_m, 0.0)
+    middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
+    return [
+        [0.0, s, 0.0, 0.5 * w, road.paved_m, 0.5 * (a + b), 1.0 / _FACE_M, road.brightness.asphalt, (b - a) / w]
+        for s, w, a, b in zip(middle.tolist(), length.tolist(), near.tolist(), far.tolist(), strict=True)
+    ]
 
 
 def _defect_reach(rows: Float64) -> Float64:

@@ -86,7 +86,11 @@ def _left_profiles(scene: Scene) -> list[np.ndarray]:
     blocks = list(profiler.measure(scene, surface, drive, head, with_hits=True))
     time_s = (np.concatenate([b.epoch_gps_ns for b in blocks]) - drive.start_gps_ns) * 1e-9
     hits = np.concatenate([b.hits for b in blocks])
-    station, offset = surface.station_offset_m(hits[:, :, 0], hits[:, :, 1])
+    lost = np.isnan(hits[:, :, 0])
+    station, offset = surface.station_offset_m(
+        *np.where(lost, surface.origin_enh_m[:2, None, None], hits.T[:2].swapaxes(1, 2))
+    )
+    station, offset = (np.where(lost, np.nan, one) for one in (station, offset))
     rest = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("object_id", "intensity", "ranges"))
     return [np.broadcast_to(time_s[:, None], station.shape), station, offset, *rest]
 
@@ -109,6 +113,35 @@ def test_moving_cars_block_profiler_beams(monkeypatch: pytest.MonkeyPatch):
     # Nor is it there in a pass that it does not drive in.
     empty = _left_profiles(STREET.changed(roadside={"moving_cars": [CAR | {"passes": [2]}]}))
     assert (empty[3] == 0).all()
+
+
+def test_walls_hide_floors_from_a_heads_camera_and_spots_average():
+    """Slots of 6 mm, 20 mm deep: the camera looks along a longitudinal one, and over the edge of a transverse one."""
+    along = {"points_m": [(8.0, -1.0), (12.0, -1.0)], "width_m": 0.006, "depth_m": 0.02, "wall_m": 0.0005}
+    across = along | {"points_m": [(15.0, -2.0), (15.0, 0.0)]}
+    spot = {"spacing_m": 0.001, "readings": 121, "width_m": 0.12, "spot_along_m": 0.001, "spot_across_m": 0.001}
+    heads = {**spot, "camera_deg": 25.0, "left": {"lever_arm_body_m": [-2.35, -1.0, -1.08]}}
+    street = STREET.changed(length_m=20.0, vehicle={"speed_m_per_s": 2.0}, passes=[{"lane": 2, "offset_m": -1.75}])
+    street = street.changed(road={"cracks": [along, across]}, profilers=heads)
+
+    def depth_mm(scene: Scene) -> list[np.ndarray]:
+        _, station, offset, _, _, raw = _left_profiles(scene)
+        usual = np.median(raw)
+        depth = np.where(raw > 0, scene.profilers.range_step_m * 1e3 * (raw - usual), np.nan)
+        in_along = (np.abs(offset + 1.0) < 0.001) & (np.abs(station - 10.0) < 1.5)
+        whole = np.flatnonzero((raw > 0).all(axis=1))  # profiles between which those with lost readings lie
+        at = np.interp(np.arange(len(raw)), whole, station[whole].mean(axis=1))
+        in_across, beside = np.abs(at - 15.0) < 0.002, np.abs(at - 13.5) < 1.0
+        return [depth[in_along], depth[in_across], raw[beside]]
+
+    inside, hidden, ground = depth_mm(street)
+    assert inside.size > 1000 and np.median(inside) == pytest.approx(20.0, abs=0.2)
+    assert np.isnan(hidden).mean() > 0.9 and ground.shape[1] == 121 and (ground > 0).all()
+    _, seen, _ = depth_mm(street.changed(profilers={"camera_deg": 0.0}))
+    assert np.isfinite(seen).all() and np.median(seen) == pytest.approx(20.0, abs=0.2)
+    # A spot of twice the slot's width sees half of it: the mean of floor and ground.
+    wide, _, _ = depth_mm(street.changed(profilers={"spot_along_m": 0.001, "spot_across_m": 0.012}))
+    assert 6.0 < np.median(wide[np.isfinite(wide)]) < 13.0
 
 
 def test_row_groups_and_encoding(tmp_path: Path):

@@ -9,8 +9,9 @@ import pytest
 from scipy.integrate import quad
 
 from roadscan.model.errors import ConfigError
+from roadscan.simulate.features import faults_of
 from roadscan.simulate.scene import Scene, shipped_scenes
-from roadscan.simulate.scene.road import Crack, Element, Marking, Pothole, Rut, Wave
+from roadscan.simulate.scene.road import Crack, Element, Marking, Patch, Pothole, Rut, Slabs, Wave
 from roadscan.simulate.surface import Surface
 
 FLAT = Scene().changed(road={"cross_slope": 0.0, "grade": 0.0, "verge_slope": 0.0})
@@ -54,6 +55,36 @@ def test_rut_pothole_and_crack_have_their_depths():
     for distance, depth in ((0.0025, 0.02 * 0.75**2), (-0.0025, 0.02 * 0.75**2), (0.0051, 0.0)):
         station, offset = np.array([42.0, -1.5]) + distance * across
         assert height_at(surface, station, offset) == pytest.approx(-depth, abs=1e-7)
+
+
+def test_potholes_and_cracks_with_steep_walls():
+    hole = Pothole(station_m=20.0, offset_m=-1.5, radius_m=0.3, depth_m=0.3, wall_m=0.01)
+    slot = Crack(points_m=[(40.0, -2.0), (40.0, 2.0)], width_m=0.006, depth_m=0.02, wall_m=0.001)
+    surface = Surface(FLAT.changed(road={"potholes": [hole], "cracks": [slot]}))
+    np.testing.assert_allclose(height_at(surface, 20.0 + np.array([0.0, 0.289]), -1.5), -0.3, atol=1e-9)
+    np.testing.assert_allclose(height_at(surface, 20.0 + np.array([0.295, 0.301]), -1.5), [-0.15, 0.0], atol=1e-8)
+    np.testing.assert_allclose(height_at(surface, 40.0 + np.array([0.0, 0.0019]), 1.0), -0.02, atol=1e-9)
+    np.testing.assert_allclose(height_at(surface, 40.0 + np.array([0.0025, 0.0031]), 1.0), [-0.01, 0.0], atol=1e-8)
+
+
+def test_slabs_stand_a_fault_apart_and_add_nothing_up():
+    slabs = Slabs(start_m=30.0, end_m=90.0, length_m=(4.0, 6.0), fault_m=(0.002, 0.015))
+    surface = Surface(FLAT.changed(road={"slabs": [slabs]}))
+    stations, faults = faults_of(slabs, FLAT.seed, 0)
+    assert ((np.diff(stations) >= 4.0) & (np.diff(stations) <= 6.0)).all() and stations[-1] > 84.0
+    assert ((np.abs(faults) >= 0.002) & (np.abs(faults) <= 0.015)).all() and len(set(np.sign(faults))) == 2
+    for offset in (-3.4, 0.0, 3.4):
+        approach, departure = (height_at(surface, stations + away, offset) for away in (-0.006, 0.006))
+        np.testing.assert_allclose(approach - departure, faults, atol=4e-5)  # slabs lean by some millimetres a metre
+        np.testing.assert_allclose(approach + departure, 0.0, atol=4e-5)
+    np.testing.assert_allclose(height_at(surface, stations, 1.0), -0.02, atol=1e-9)
+
+
+def test_a_patch_leans():
+    patch = Patch(station_m=40.0, offset_m=0.0, length_m=10.0, width_m=7.0, height_m=0.1, rise_m=0.04, edge_m=0.005)
+    surface = Surface(FLAT.changed(road={"patches": [patch]}))
+    station = np.array([34.9, 35.01, 40.0, 44.99, 45.1])
+    np.testing.assert_allclose(height_at(surface, station, 1.0), [0.0, 0.08004, 0.1, 0.11996, 0.0], atol=1e-9)
 
 
 def test_defects_repeat():

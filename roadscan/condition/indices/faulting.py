@@ -12,11 +12,16 @@ compliance is claimed). Joints are known by
   happens within 0.2 m, and beside which the other wheel path has one of more than half its height within 0.3 m: a joint
   crosses the lane, and unevenness of a metre does not.
 
-A joint that is known by a crack or by the spacing counts in the mean however small its step is.
+A joint that is known by a crack or by the spacing counts in the mean however small its step is. A step of more than
+0.1 m is a kerb that is crossed, or the edge of a hole: it is listed, and is no joint.
+
+σ of a fault holds the noise of the heights, and the unevenness of the road itself over the metre around the joint: how
+far such steps scatter at all places of the section.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, NamedTuple
@@ -27,6 +32,7 @@ import numpy.typing as npt
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.of_sections.wheel_paths import bridged
+from roadscan.condition.quarter_car import SEVERE_M
 from roadscan.kernels.condition.steps import step_heights
 
 Float64 = npt.NDArray[np.float64]
@@ -80,7 +86,9 @@ class Faulting(ConditionIndex):
             reason = f"{100 * share:.0f} % of the wheel paths were measured"
             yield from (Value(name, "section", from_m, to_m, np.nan, np.nan, share, reason) for name in names)
             return
-        remark = _remark(joints)
+        kerbs = [joint for joint in joints if joint.height_mm > _MM * SEVERE_M]
+        joints = [joint for joint in joints if joint.height_mm <= _MM * SEVERE_M]
+        remark = _remark(joints, len(kerbs))
         yield Value("joints", "section", from_m, to_m, float(len(joints)), np.nan, share, remark)
         found = np.array([fault[1:] for joint in joints for fault in joint.faults.values()]).reshape(-1, 2)
         heights, sigma = np.abs(found[:, 0]), found[:, 1]
@@ -101,9 +109,19 @@ class _Joint(NamedTuple):
     faults: dict[str, tuple[float, float, float]]
     """Station (m), fault and its standard deviation (mm) by wheel path."""
 
+    @property
+    def height_mm(self) -> float:
+        """Greatest fault of both wheel paths, without sign."""
+        return max(abs(height) for _, height, _ in self.faults.values())
 
-def _remark(joints: list[_Joint]) -> str:
-    """How the joints are known, and which are missed."""
+
+def _remark(joints: list[_Joint], kerbs: int) -> str:
+    """How the joints are known, which are missed, and how many steps are no joints."""
+    beside = f"steps of more than {_MM * SEVERE_M:g} mm that are no joints: {kerbs}" if kerbs else ""
+    return "; ".join(part for part in (_known_by(joints), beside) if part)
+
+
+def _known_by(joints: list[_Joint]) -> str:
     if not joints:
         return ""
     count = {word: sum(joint.known_by == word for joint in joints) for word in ("cracks", "spacing", "steps")}
@@ -144,6 +162,9 @@ def _joints(
             beside.faults.setdefault(side, fault)
         elif new(fault[0]):
             own.append(_Joint("steps", fault[0], {side: fault}))
+    for joint in own:
+        missing = {side: one for side, one in sides.items() if side not in joint.faults}
+        joint.faults.update(_known({side: one.fault_at(joint.station_m, _SPACED_M) for side, one in missing.items()}))
     return sorted((joint for joint in found + own if joint.faults), key=lambda joint: joint.station_m)
 
 
@@ -183,6 +204,15 @@ def _phase_m(lane: LaneData) -> float | None:
     return float(best + np.median(near[np.abs(near) <= 2.0 * _SPACED_M]))
 
 
+def _unevenness_m(found: Float64) -> float:
+    """Scatter of steps (n, 3) at all places of a section, robust, without the noise of their heights (m)."""
+    height, sigma = found[np.isfinite(found[:, :2]).all(axis=1), :2].T
+    if not height.size:
+        return 0.0
+    scatter = 1.4826 * float(np.median(np.abs(height)))
+    return math.sqrt(max(scatter**2 - float(np.median(sigma)) ** 2, 0.0))
+
+
 @dataclass(frozen=True, eq=False)
 class _Side:
     """What may be steps of a wheel path."""
@@ -193,6 +223,8 @@ class _Side:
     found: Float64
     """(n, 3) height of a step, its standard deviation, and how much of it happens at once (m)."""
     share: float
+    uneven_m: float
+    """Standard deviation of steps as the road's unevenness makes them."""
 
     @classmethod
     def of(cls, profile: Profile, from_m: float, to_m: float, lane: LaneData) -> _Side:
@@ -203,7 +235,7 @@ class _Side:
         if part.height_m.size > 2:
             step_heights(part.distance_m, part.height_m, part.known_sigma_m, (_NEAR_M, _FAR_M), found)
         share = min(1.0, float((~np.isnan(part.height_m[inside])).sum()) / due)
-        return cls(part, inside, found, share)
+        return cls(part, inside, found, share, _unevenness_m(found))
 
     def fault_at(self, station_m: float, reach_m: float) -> tuple[float, float, float] | None:
         """Station (m), fault and standard deviation (mm) at a joint, or at the greatest step within reach of it.
@@ -223,7 +255,8 @@ class _Side:
 
     def _fault(self, k: int) -> tuple[float, float]:
         """Fault of a place and its standard deviation (mm): a rise in the direction of travel is negative."""
-        return -_MM * float(self.found[k, 0]), _MM * float(self.found[k, 1])
+        height, sigma, _ = self.found[k].tolist()
+        return -_MM * height, _MM * math.hypot(sigma, self.uneven_m)
 
     def steps(self, other: _Side) -> Iterator[tuple[float, float, float]]:
         """Station (m), fault and standard deviation (mm) of each step that the other wheel path has as well."""

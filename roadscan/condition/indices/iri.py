@@ -40,6 +40,10 @@ SEVERE_STEP: Final = Witness(
 )
 
 
+_NAMED: Final = 6
+"""Stations of steps that a section names; the others it counts."""
+
+
 class Iri(ConditionIndex):
     """Roughness of sections."""
 
@@ -129,8 +133,9 @@ def _steps(on: Ride, path: WheelPath, noted: str) -> str:
     for word, places, done in (("jump", broken.jump_m, left_out), ("step", broken.severe_m, kept)):
         if word in noted:
             own = places[(places >= path.ends.from_m[0]) & (places <= path.ends.to_m[0])]
-            at = ", ".join(f"{one:.1f}" for one in np.interp(own, way, station)[:3])
-            found.append(f"at station {at} the road steps by {done}")
+            at = list(dict.fromkeys(f"{one:.1f}" for one in np.interp(own, way, station).tolist()))
+            more = f" and {len(at) - _NAMED} more" if len(at) > _NAMED else ""
+            found.append(f"at station {', '.join(at[:_NAMED])}{more} the road steps by {done}")
     return "; ".join(found)
 
 

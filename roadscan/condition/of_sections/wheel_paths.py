@@ -3,17 +3,21 @@
 A height is a mean over a window, which takes short waves, and it holds noise, which adds roughness. The profile gets
 back what the same window takes of it again (van Cittert's iteration, twice), and the power of the noise alone is taken
 from that of an index (:func:`without_noise`).
+
+Where neighbouring heights differ as at a wall, it is not known where between them it stands. In the draws it stands
+anywhere: half a sample to each side of a pothole is some per cent of its share in the roughness.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
+from scipy.special import ndtr
 
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.quarter_car import RULES
@@ -34,6 +38,15 @@ _MARGIN: Final = 64
 """Places beside a profile whose noise may reach into it."""
 _WANDER_STREAM: Final = 1000
 """First stream of random numbers of the poses' wander; those of noise are below."""
+_HIDDEN_PER_M: Final = 0.5
+"""Heads look at their lines under angles of up to 27 degrees (m/m)."""
+_MOST_HIDDEN_M: Final = 0.15
+_POOR_TIMES: Final = 10.0
+"""A stretch whose σ is so many times the median is not measured: lidars reach beyond the profilers at both ends of a
+drive, with σ of millimetres that would count as roughness."""
+_WALL_STREAM: Final = 2000
+_WALL_SLOPE: Final = 0.3
+"""Neighbours that are farther apart in height than this share of the spacing are a wall: no road is so steep."""
 LEAST_M: Final = 20.0
 """Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
 
@@ -43,7 +56,7 @@ class WheelPath:
     """A wheel path along a section and before it."""
 
     profile: Profile
-    """With its short gaps bridged."""
+    """With its short gaps bridged; σ of the heights at walls is not known."""
     ends: Segments
     """The section's ends along the path."""
     inside: npt.NDArray[np.bool_]
@@ -58,11 +71,30 @@ class WheelPath:
     """Variance of the window along the road that a height is a mean over."""
     wander_m2_per_m: float = 0.0
     """Variance a metre by which the heights of the poses wander at random, alike in both wheel paths."""
+    walls: tuple[slice, ...] = ()
+    """From the last height before each wall to the first behind it."""
 
     def with_noise(self, first_stream: int = 0) -> Float64:
         """(1 + 12, n) heights, and the same with noise and wander added; NaN where nothing is known of the noise."""
         height, errors = self.profile.height_m[None], noise(self.profile, self.spacing_m, self.cell_m, first_stream)
-        return np.concatenate([height, height + errors + self.wander()])
+        return np.concatenate([height, height + errors + self.wander() + self.moved_walls(first_stream)])
+
+    def moved_walls(self, first_stream: int = 0) -> Float64:
+        """(12, n) what walls add to the heights (m) where they stand elsewhere between the heights that they part."""
+        added = np.zeros((NOISES, self.profile.height_m.size))
+        if not self.walls:
+            return added
+        share = ndtr(_drawn(_WALL_STREAM + first_stream, _numbers(self.profile, self.spacing_m), 0))
+        for wall in self.walls:
+            height = self.profile.height_m[wall]
+            steps, rise = height.size - 1, height[-1] - height[0]
+            for row, at in zip(added, steps * share[:, wall.start], strict=True):
+                last = min(int(at), steps - 1)  # it stands behind this height, so far in steps
+                beyond = at - last - 0.5
+                moved = np.where(np.arange(height.size) <= last, height[0], height[-1])
+                moved[last + (beyond > 0.0)] -= rise * beyond  # a line between two heights has its wall in the middle
+                row[wall] += moved - height
+        return added
 
     def wander(self) -> Float64:
         """(12, n) random walks of the poses' heights, the same in both wheel paths and in every run."""
@@ -98,13 +130,67 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
     spacing = lane.config.profile_spacing_m
     found = {}
     for side, whole in lane.profiles.items():
-        part = bridged(whole.between(from_m - before, to_m + after), lane.config.largest_gap_m)
+        measured = _well_measured(whole.between(from_m - before, to_m + after), lane.config.largest_gap_m)
+        part = bridged(measured, lane.config.largest_gap_m)
+        walls = walls_of(measured.height_m, part.height_m, spacing)
+        sigma = part.sigma_m.copy()
+        for wall in walls:
+            sigma[wall] = np.nan
+        part = replace(part, sigma_m=sigma)
         inside = (part.station_m >= from_m - 1e-6) & (part.station_m <= to_m + 1e-6)
         share, reason = _judged(part, inside, (from_m, to_m), lane)
         ends = _ends(part, from_m, to_m) if not reason else Segments(np.zeros(0), np.zeros(0))
         found[side] = WheelPath(part, ends, inside, share, reason, spacing, lane.cell_m, lane.window_m2,
-                                lane.wander_m2_per_m)  # fmt: skip
+                                lane.wander_m2_per_m, walls)  # fmt: skip
     return found
+
+
+def _well_measured(part: Profile, gap_m: float) -> Profile:
+    """The profile without both ends, where these are known far worse than most of it, as where a lidar alone reached.
+
+    What is short between such stretches is left out with them. Within the profile all heights stay: those on the walls
+    of a pothole have a great σ, too.
+    """
+    known = np.flatnonzero(np.isfinite(part.sigma_m))
+    if known.size < 2:
+        return part
+    sigma = np.interp(part.distance_m, part.distance_m[known], part.sigma_m[known])
+    size = 2 * math.ceil(gap_m / float(np.median(np.diff(part.distance_m)))) + 1
+    usual = scipy.ndimage.median_filter(sigma, size, mode="nearest")
+    poor = np.pad(usual > _POOR_TIMES * float(np.median(sigma)), size, constant_values=True)
+    good = np.flatnonzero(~scipy.ndimage.binary_closing(poor, np.ones(size, np.bool_))[size:-size])
+    if not good.size:
+        return part
+    place = np.arange(part.height_m.size)
+    beyond = (place < good[0]) | (place > good[-1])
+    height, sigma = (np.where(beyond, np.nan, one) for one in (part.height_m, part.sigma_m))
+    return replace(part, height_m=height, sigma_m=sigma)
+
+
+def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[slice, ...]:
+    """Where heights differ from the one measured before as at a wall, and on in the same direction.
+
+    A wall may hide the floor at its foot from the sensor, up to half a metre of it a metre of height: heights there are
+    those of the ground beyond, so the wall may stand that much farther out.
+
+    measured_m, height_m : (n,) heights with their gaps, and with these bridged; NaN where there is none (m).
+    """
+    known = np.flatnonzero(~np.isnan(measured_m))
+    rise = np.diff(measured_m[known])
+    bridged_over = ~np.isnan(np.append(height_m, np.nan)[known[:-1] + 1])
+    steep = np.where(bridged_over & (np.abs(rise) > _WALL_SLOPE * spacing_m), np.sign(rise), 0.0)
+    begins = np.flatnonzero((steep != 0.0) & (steep != np.append(0.0, steep[:-1])))
+    ends = np.flatnonzero((steep != 0.0) & (steep != np.append(steep[1:], 0.0)))
+    found = []
+    for a, b in zip(known[begins].tolist(), known[ends + 1].tolist(), strict=True):
+        climb = float(measured_m[b] - measured_m[a])
+        hidden = int(min(_HIDDEN_PER_M * abs(climb), _MOST_HIDDEN_M) / spacing_m)
+        first, last = (a, b + hidden) if climb > 0.0 else (a - hidden, b)
+        beyond = measured_m[max(first, 0) : last + 1]
+        clear = first >= 0 and last < measured_m.size and not np.isnan(beyond[: a - first]).any()
+        clear = clear and not np.isnan(measured_m[b : last + 1]).any()
+        found.append(slice(first, last + 1) if clear else slice(a, b + 1))
+    return tuple(found)
 
 
 def greatest_of(rows: Float64) -> Float64:
@@ -175,10 +261,20 @@ def _judged(
         return share, f"cells of {lane.cell_m:g} m are too coarse: {limit:g} m or less are needed"
     if measured < 0.5 * due:
         return share, f"{100 * share:.0f} % of the wheel path were measured"
-    missing = (due - measured) * spacing
+    missing = (due - measured) * spacing - _beyond_ends(part, inside, between_m)
     if missing > lane.config.largest_gap_m + spacing:
         return share, f"gaps wider than {lane.config.largest_gap_m:g} m, {missing:.1f} m in all"
     return share, ""
+
+
+def _beyond_ends(part: Profile, inside: npt.NDArray[np.bool_], between_m: tuple[float, float]) -> float:
+    """Length of a section (m) that lies before the first height of the lane or behind the last one."""
+    known = ~np.isnan(part.height_m)
+    station = part.station_m[known & inside]
+    outside = part.station_m[known & ~inside]
+    before = station.min() - between_m[0] if not (outside < station.min()).any() else 0.0
+    behind = between_m[1] - station.max() if not (outside > station.max()).any() else 0.0
+    return float(before + behind)
 
 
 def _ends(part: Profile, from_m: float, to_m: float) -> Segments:

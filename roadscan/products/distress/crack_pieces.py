@@ -26,7 +26,8 @@ COLUMNS: Final = pa.schema(
     + [
         pa.field(name, pa.float64(), nullable=False)
         for name in (
-            "length_m", "measured_m", "width_sum_m2", "width_max_m", "depth_sum_m2", "depth_max_m", "cell_m",
+            "length_m", "measured_m", "width_sum_m2", "width_max_m", "depth_sum_m2", "depth_max_m", "seen_sum_m",
+            "beside_sum_m", "cell_m",
         )
     ]
 )  # fmt: skip
@@ -87,7 +88,7 @@ class CrackPieces(SurfaceProduct):
         pieces = crack_pieces(window, config)
         rows = [
             (*p.start, *p.end, p.length_m, p.measured_m, p.width_sum_m2, p.width_max_m, p.depth_sum_m2, p.depth_max_m,
-             cell_m)
+             p.seen_sum_m, p.beside_sum_m, cell_m)
             for p in pieces
         ]  # fmt: skip
         table = pa.Table.from_pylist([dict(zip(COLUMNS.names, row, strict=True)) for row in rows], COLUMNS)
@@ -105,7 +106,7 @@ def read_pieces(content: bytes, context: ProductContext) -> tuple[list[CrackPiec
     table, lines = read_geo_table(content, context)
     columns = [table[name].to_pylist() for name in COLUMNS.names]
     pieces = [
-        CrackPiece(shapely.get_coordinates(line), (row[0], row[1]), (row[2], row[3]), *row[4:10])
+        CrackPiece(shapely.get_coordinates(line), (row[0], row[1]), (row[2], row[3]), *row[4:12])
         for line, row in zip(lines, zip(*columns, strict=True), strict=True)
     ]
     return pieces, columns[-1][0] if pieces else 0.0

@@ -21,15 +21,16 @@ _COUNTS: Final = ("junctions", "ends", "polygons")
 _ANGLES: Final = ("azimuth_deg", "lane_angle_deg")
 _LENGTHS: Final = (
     "length_m", "longitudinal_m", "transverse_m", "diagonal_m", "width_mean_m", "width_max_m", "depth_mean_m",
-    "depth_max_m", "area_m2", "covered_m2",
+    "sigma_depth_mean_m", "depth_max_m", "seen_share", "area_m2", "covered_m2",
 )  # fmt: skip
+_MAY_MISS: Final = ("depth_mean_m", "sigma_depth_mean_m", "lane_angle_deg")
 
 COLUMNS: Final = pa.schema(
     [pa.field(name, pa.int32(), nullable=False) for name in ("crack", "network")]
     + [pa.field("type", pa.string(), nullable=False)]
-    + [pa.field(name, pa.float64(), nullable=False) for name in _LENGTHS]
+    + [pa.field(name, pa.float64(), nullable=name in _MAY_MISS) for name in _LENGTHS]
     + [pa.field(name, pa.int32(), nullable=False) for name in _COUNTS]
-    + [pa.field(name, pa.float64(), nullable=name == "lane_angle_deg") for name in _ANGLES]
+    + [pa.field(name, pa.float64(), nullable=name in _MAY_MISS) for name in _ANGLES]
     + [pa.field(name, pa.float64(), nullable=False) for name in ("easting_m", "northing_m")]
     + [pa.field("tiles", pa.string(), nullable=False)]
 )
@@ -91,6 +92,8 @@ def _row(number: int, one: Crack, owner: Sequence[str]) -> dict[str, Any]:
     angle = one.lane_angle_deg
     middle = one.line.centroid
     figures = {name: getattr(one, name) for name in (*_LENGTHS, *_COUNTS, "azimuth_deg")}
+    if np.isnan(one.sigma_depth_mean_m):
+        figures |= {"depth_mean_m": None, "sigma_depth_mean_m": None}
     return {
         **figures,
         "crack": number,

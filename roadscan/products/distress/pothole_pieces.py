@@ -21,7 +21,7 @@ from roadscan.surfaces.tile import SurfaceTile
 COLUMNS: Final = pa.schema(
     [
         pa.field(name, pa.float64(), nullable=False)
-        for name in ("area_m2", "volume_m3", "depth_max_m", "block_depth_max_m", "edge_depth_m")
+        for name in ("area_m2", "volume_m3", "depth_max_m", "block_depth_max_m", "edge_depth_m", "hidden_m2")
     ]
 )
 

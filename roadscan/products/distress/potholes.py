@@ -17,7 +17,8 @@ from roadscan.products.geo_table import check_geo_table, write_geo_table
 from roadscan.surfaces.distress.potholes import Pothole, PotholePiece, join_potholes
 
 _FIGURES: Final = (
-    "area_m2", "rim_area_m2", "sigma_rim_area_m2", "depth_mean_m", "depth_max_m", "volume_m3", "length_m", "breadth_m",
+    "area_m2", "sigma_area_m2", "hidden_m2", "rim_area_m2", "sigma_rim_area_m2", "depth_mean_m", "depth_max_m",
+    "sigma_depth_max_m", "volume_m3", "sigma_volume_m3", "length_m", "breadth_m",
 )  # fmt: skip
 
 COLUMNS: Final = pa.schema(

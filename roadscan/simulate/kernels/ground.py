@@ -29,6 +29,7 @@ from roadscan.simulate.kernels.road import (
     defect_depth,
     edge_distance,
     node_at,
+    patch_height,
     project,
     smooth_step,
     worn_height,
@@ -211,7 +212,7 @@ def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     for i in range(int(road.nodes[k, PATCHES]), int(road.nodes[k, PATCHES_END])):
         inward = edge_distance(patches, i, station, offset)
         if inward > 0.0:
-            height += patches[i, 5] * smooth_step(inward * patches[i, 6])
+            height += patch_height(patches, i, station) * smooth_step(inward * patches[i, 6])
     return height
 
 
@@ -409,9 +410,9 @@ def steepest(road: RoadArrays, k: int, offset: float) -> float:
     slope = 0.0
     for n in range(max(k - 1, 0), min(k + 2, nodes.shape[0] - 1)):
         for i in range(int(nodes[n, DEFECTS]), int(nodes[n, DEFECTS_END])):
-            slope = max(slope, HOLE_SLOPE * defects[i, 1] * defects[i, 2])
+            slope = max(slope, HOLE_SLOPE * defects[i, 1] * max(defects[i, 2], defects[i, 7]))
         for i in range(int(nodes[n, PATCHES]), int(nodes[n, PATCHES_END])):
-            slope = max(slope, HOLE_SLOPE * abs(patches[i, 5]) * patches[i, 6])
+            slope = max(slope, HOLE_SLOPE * (abs(patches[i, 5]) + abs(patches[i, 8]) * patches[i, 3]) * patches[i, 6])
     if abs(abs(offset) - section[PAVED_EDGE]) < STRIDE_M + section[KERB_FACE]:
         slope += 1.5 * kerb_height(road, k, 0.0, offset) / section[KERB_FACE]
     return 0.4 + slope

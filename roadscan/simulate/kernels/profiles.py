@@ -34,6 +34,8 @@ UInt16 = npt.NDArray[np.uint16]
 UInt8 = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 
+WALL_STEP_M = 0.0005
+"""How finely a line of sight out of a defect is walked (m)."""
 WALK_M = 0.5
 """How far above the last guess a beam's walk begins (m)."""
 
@@ -123,6 +125,10 @@ class Head(NamedTuple):
     """(65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind."""
     random_from: np.uint64
     """Where the random numbers of the first reading begin; reading i of profile p has its own."""
+    spot: Float64
+    """(s, 2) places of the parts of a beam's spot, along and across its profile (m); (0, 2): it has no width."""
+    camera: float
+    """Tangent of the angle between the beams and the camera's line of sight, which leans forward; 0: it sees all."""
 
 
 class Measured(NamedTuple):
@@ -164,9 +170,14 @@ def scan_profiles(
                 road_beam(road_planes, p, y, beam)
             found = middle_m + r
             depth = 0.0
+            hidden = False
             if road.nodes[k, DEFECTS] < road.nodes[k, DEFECTS_END]:
                 depth, _ = defect_depth(road, k, u, offset)
-                if depth > 0.0:
+                if head.spot.shape[0]:
+                    below, shown = seen_in_spot(road, planes, p, y, r, head)
+                    found += below
+                    hidden = shown == 0.0
+                elif depth > 0.0:
                     map_beam(map_planes, p, y, beam)
                     turn_to_road(road, beam, r, 0.02, k)
                     further, depth = into_defect(road, beam, 0.0, fall)
@@ -176,7 +187,7 @@ def scan_profiles(
             if road.texture.size:
                 stone = over_texture(road, beam, found - middle_m, road.nodes[k, STATION] + u, offset, r)
                 found -= stone / fall
-            seen = on_surface(road, k, u, offset)
+            seen = on_surface(road, k, u, offset) and not hidden
             value = brightness(road, k, u, offset, depth, stone)
             bits = mixed(random_from + np.uint64(p * y_sensor_m.size + i))
             body = -1
@@ -208,6 +219,52 @@ def scan_profiles(
             seen = seen and 1.0 <= raw <= 65535.0
             ranges[p, i] = int(raw) if seen else 0
             intensity[p, i] = int(min(max(value + 0.5, 0.0), 255.0)) if seen else 0
+
+
+@inlined
+def seen_in_spot(road: RoadArrays, planes: Planes, p: int, y: float, r: float, head: Head) -> tuple[float, float]:
+    """Mean depth that the parts of a beam's spot show, and the share of them that the camera sees.
+
+    A triangulating head tells the middle of what its camera sees of the spot. What walls hide from the camera is lost;
+    where all is, so is the reading. The parts are taken to fall upright: a beam that leans by half a degree meets a
+    floor 100 mm down 1 mm beside. The road is taken as level as far as the camera's line of sight runs below it.
+    """
+    beam = planes.in_road
+    station = beam[p, 0, 0] + y * (beam[p, 0, 1] + y * beam[p, 0, 2]) + r * beam[p, 0, 5]
+    offset = beam[p, 1, 0] + y * (beam[p, 1, 1] + y * beam[p, 1, 2]) + r * beam[p, 1, 5]
+    across = beam[p, 1, 1]  # of the road, for a metre of the profile; negative against the road
+    ahead = 1.0 if across > 0.0 else -1.0
+    total, shown = 0.0, 0.0
+    for s in range(head.spot.shape[0]):
+        at_s, at_o = station + ahead * head.spot[s, 0], offset + across * head.spot[s, 1]
+        depth = depth_at(road, at_s, at_o)
+        if depth > 0.0 and head.camera > 0.0 and is_hidden(road, at_s, at_o, depth, ahead * head.camera):
+            continue
+        total += depth
+        shown += 1.0
+    if shown > 0.0:
+        total /= shown
+    return total, shown / head.spot.shape[0]
+
+
+@inlined
+def depth_at(road: RoadArrays, station: float, offset: float) -> float:
+    """Depth of the deepest defect at a station and offset (m)."""
+    k = node_at(road, station)
+    depth, _ = defect_depth(road, k, station - road.nodes[k, STATION], offset)
+    result: float = depth
+    return result
+
+
+@inlined
+def is_hidden(road: RoadArrays, station: float, offset: float, depth: float, lean: float) -> bool:
+    """Whether a wall stands between a place `depth` deep and a camera whose line of sight leans by `lean` (m/m)."""
+    steps = max(int(abs(lean) * depth / WALL_STEP_M), 8)
+    for i in range(1, steps):
+        up = depth * i / steps
+        if depth_at(road, station + lean * up, offset) < depth - up - WALL_STEP_M:
+            return True
+    return False
 
 
 @inner

@@ -52,11 +52,12 @@ class RoadArrays(NamedTuple):
     """(20 + 6m,) constants, see the names above; then offset, 1 / half width, depth, variation, its wave number
     (rad/m) and phase of each rut."""
     defects: Float64
-    """(m, 7) by node, repeated where one reaches over several. Pothole: 0, depth, 1 / radius, station, offset, 0, 0;
-    piece of a crack: 1, depth, 1 / half width, station and offset of both ends."""
+    """(m, 8) by node, repeated where one reaches over several. Pothole: 0, depth, 1 / radius, station, offset, 0, 0;
+    piece of a crack: 1, depth, 1 / half width, station and offset of both ends; then 1 / width of the walls (0: the
+    rounded form)."""
     patches: Float64
-    """(m, 8) by node. Rectangle (0) or circle (1), station, offset, half length, half width, height, 1 / edge,
-    intensity."""
+    """(m, 9) by node. Rectangle (0) or circle (1), station, offset, half length, half width, height in the middle,
+    1 / edge, intensity, slope along the road."""
     lines: Float64
     """(m, 6) offset, half width, dash and period (0: solid), first and last station of each marking."""
     humps: Float64
@@ -266,6 +267,13 @@ def edge_distance(patches: Float64, i: int, station: float, offset: float) -> fl
 
 
 @inlined
+def patch_height(patches: Float64, i: int, station: float) -> float:
+    """Height of patch `i` above the road around it, within its edge (m)."""
+    height: float = patches[i, 5] + patches[i, 8] * (station - patches[i, 1])
+    return height
+
+
+@inlined
 def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Height without potholes, cracks, joints and texture. Everywhere smooth and defined (m)."""
     nodes = road.nodes
@@ -284,7 +292,7 @@ def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     for i in range(int(nodes[k, PATCHES]), int(nodes[k, PATCHES_END])):
         inward = edge_distance(patches, i, station, offset)
         if inward > 0.0:
-            height += patches[i, 5] * smooth_step(inward * patches[i, 6])
+            height += patch_height(patches, i, station) * smooth_step(inward * patches[i, 6])
     return height
 
 
@@ -308,8 +316,11 @@ def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[flo
             ds -= share * length_s
             do -= share * length_o
         x = (ds * ds + do * do) * sharpness * sharpness
-        finest = min(finest, 1.0 / sharpness)
-        if x < 1.0:
+        per_m = defects[i, 7]
+        finest = min(finest, 1.0 / max(sharpness, per_m))
+        if x < 1.0 and per_m > 0.0:
+            deepest = max(deepest, defects[i, 1] * smooth_step((1.0 - math.sqrt(x)) / sharpness * per_m))
+        elif x < 1.0:
             wall = 1.0 - (x if is_crack else x * x)
             deepest = max(deepest, defects[i, 1] * wall * wall)
     return deepest, finest

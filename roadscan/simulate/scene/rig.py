@@ -85,6 +85,14 @@ class Profilers(Strict):
     """Range that a raw value of 0 would stand for (m)."""
     range_step_m: float = Field(default=0.00005, ge=0.000001, le=0.01)
     """Range of one raw unit (m); rounding errors are half of it."""
+    spot_along_m: float = Field(default=0.0, ge=0.0, le=0.02)
+    """Thickness of the laser's line, along the road (m): a reading in a pothole, crack or joint is the mean of what its
+    spot lights up. 0: as `spot_across_m`, and where both are 0 a beam has no width."""
+    spot_across_m: float = Field(default=0.0, ge=0.0, le=0.02)
+    """Width of the piece of the line that makes a reading (m)."""
+    camera_deg: float = Field(default=0.0, ge=0.0, lt=60.0)
+    """Angle between the beams and the line of sight of the head's camera, which stands ahead of the laser (degrees):
+    what the walls of potholes, cracks and joints hide from it is not seen; it asks for a spot. 0: it sees all."""
     left: Mount = Mount(lever_arm_body_m=(-2.35, -0.98, -1.08), roll_deg=0.4, pitch_deg=-0.3, heading_deg=0.6)
     """Mounting of the left head (axes frd)."""
     right: Mount = Mount(lever_arm_body_m=(-2.28, 0.99, -1.11), roll_deg=-0.35, pitch_deg=0.25, heading_deg=-0.5)
@@ -271,7 +279,9 @@ class Noise(Strict):
     dropout: float = Field(default=0.0, ge=0.0, le=0.5)
     """Share of readings and returns that are lost."""
     impulse: float = Field(default=0.0, ge=0.0, le=0.1)
-    """Share of profiler readings that are wrong: anywhere within 30 mm of the road."""
+    """Share of profiler readings that are wrong …"""
+    impulse_m: float = Field(default=0.03, ge=0.0, le=0.3)
+    """… anywhere within this distance of the road (m)."""
     position_m: float = Field(default=0.0, ge=0.0)
     """Position error of the stated trajectory, a Gauss–Markov process on each of north, east, down (m)."""
     down_m: float | None = Field(default=None, ge=0.0)

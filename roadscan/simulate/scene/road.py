@@ -119,7 +119,7 @@ class Rut(Strict):
 
 
 class Pothole(Strict):
-    """A round hole: depth · (1 − (ρ / radius)⁴)² below the worn surface."""
+    """A round hole: depth · (1 − (ρ / radius)⁴)² below the worn surface, or a level floor between steep walls."""
 
     station_m: float
     """Station of its centre (m)."""
@@ -129,10 +129,18 @@ class Pothole(Strict):
     """Radius of its rim (m)."""
     depth_m: float = Field(gt=0.0, le=0.3)
     """Depth of its centre (m)."""
+    wall_m: float = Field(default=0.0, ge=0.0)
+    """Width of its walls, seen from above (m): its floor is level within them. 0: the rounded form."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.wall_m > self.radius_m:
+            raise ValueError(f"wall_m {self.wall_m:g} is wider than radius_m {self.radius_m:g}")
+        return self
 
 
 class Crack(Strict):
-    """An open crack along a broken line: depth · (1 − (distance / half width)²)² below the worn surface."""
+    """An open crack along a broken line: depth · (1 − (distance / half width)²)² below the worn surface, or a slot."""
 
     points_m: list[tuple[float, float]] = Field(min_length=2)
     """Corners of the line, each a station and an offset (m)."""
@@ -140,6 +148,14 @@ class Crack(Strict):
     """Width at the surface (m)."""
     depth_m: float = Field(default=0.01, gt=0.0, le=0.1)
     """Depth in the middle (m)."""
+    wall_m: float = Field(default=0.0, ge=0.0)
+    """Width of each wall, seen from above (m): a slot, whose floor is level within them. 0: the rounded form."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.wall_m > self.width_m / 2:
+            raise ValueError(f"wall_m {self.wall_m:g} is wider than half of width_m {self.width_m:g}")
+        return self
 
 
 class Alligator(Strict):
@@ -202,6 +218,34 @@ class Joints(Strict):
     """Last station (m)."""
 
 
+class Slabs(Strict):
+    """Concrete slabs over the whole paved width, which stand at different heights: a fault at each joint.
+
+    A slab is tilted: each joint's fault lies half above and half below the worn surface, so that no height adds up.
+    """
+
+    start_m: float
+    """First joint (m)."""
+    end_m: float
+    """No joint lies behind this station (m)."""
+    length_m: tuple[float, float] = (4.0, 6.0)
+    """Shortest and longest slab (m); lengths are even between them. Equal: all of one length."""
+    fault_m: tuple[float, float] = (0.002, 0.015)
+    """Least and greatest fault (m); faults are even between them, of either sign."""
+    gap_m: float = Field(default=0.008, ge=0.001, le=0.1)
+    """Width of a joint (m)."""
+    depth_m: float = Field(default=0.02, gt=0.0, le=0.1)
+    """Depth of a joint (m)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not 1.0 <= self.length_m[0] <= self.length_m[1]:
+            raise ValueError(f"length_m {self.length_m}: give the shortest slab, 1 m or more, and the longest")
+        if not 0.0 <= self.fault_m[0] <= self.fault_m[1] <= 0.1:
+            raise ValueError(f"fault_m {self.fault_m}: give the least fault and the greatest, 0.1 m or less")
+        return self
+
+
 class Hump(Strict):
     """A speed hump or a raised table over the whole width: ramp up, flat top, ramp down."""
 
@@ -217,7 +261,10 @@ class Hump(Strict):
 
 
 class Patch(Strict):
-    """A repaired place or utility cut: a rectangle or circle of other material, sunk or raised."""
+    """A repaired place, utility cut or manhole cover: a rectangle or circle of other material, sunk or raised.
+
+    One over the whole width is a kerb that is crossed, or a step in the texture.
+    """
 
     station_m: float
     """Station of its middle (m)."""
@@ -229,9 +276,11 @@ class Patch(Strict):
     """Extent along the road (m)."""
     width_m: float = Field(default=1.0, gt=0.1)
     """Extent across the road (m)."""
-    height_m: float = Field(default=-0.004, ge=-0.05, le=0.02)
-    """Height of its surface above the road around it (m); negative: sunk."""
-    edge_m: float = Field(default=0.03, ge=0.01, le=0.5)
+    height_m: float = Field(default=-0.004, ge=-0.3, le=0.3)
+    """Height of its surface above the road around it, in its middle (m); negative: sunk."""
+    rise_m: float = Field(default=0.0, ge=-0.3, le=0.3)
+    """By how much its far end stands higher than its near end (m)."""
+    edge_m: float = Field(default=0.03, ge=0.001, le=0.5)
     """Width of the slope along its edge, inside the outline (m); at most half of its shorter extent."""
     shade: Shade = 52.0
     """Intensity."""
@@ -432,6 +481,8 @@ class Road(Strict):
     """Places that have lost stones."""
     joints: list[Joints] = []
     """Transverse joints."""
+    slabs: list[Slabs] = []
+    """Slabs that stand at different heights."""
     patches: list[Patch] = []
     """Patches and utility cuts."""
     repeat_m: float = Field(default=0.0, ge=0.0)

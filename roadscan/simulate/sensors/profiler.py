@@ -51,8 +51,8 @@ BLOCK_PROFILES: Final = 512
 BESIDE_M: Final = 4.0
 """Things farther from the middle of a head's profiles are not met (m)."""
 _OUT_OF_REACH_M: Final = 1e9
-WRONG_WITHIN_M: Final = 0.03
-"""Wrong readings lie this near to the road (m)."""
+_SPOT_PARTS: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
+"""Places of the parts of a beam's spot, as shares of its width."""
 _BENT_M: Final = 1e-7
 """Planes that miss their points in road coordinates by more are followed in the map, which takes longer."""
 _REACH_M: Final = 0.3
@@ -235,9 +235,11 @@ class _Pass:
             range_noise_m=float(noise.profiler_range_m),
             intensity_noise=float(noise.intensity),
             wrong_share=float(noise.impulse),
-            wrong_within_m=WRONG_WITHIN_M,
+            wrong_within_m=float(noise.impulse_m),
             normal=_normal_numbers() if any(errors) else np.zeros(0, np.float32),
             random_from=np.uint64(_random_from(self.scene, self.drive, self.head) + first * y.size),
+            spot=_spot(settings),
+            camera=math.tan(math.radians(settings.camera_deg)),
         )
 
 
@@ -377,6 +379,15 @@ def _hits(drive: Drive, origins: Float64, rotations: Float64, y_sensor_m: Float6
         enh = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(ecef.shape)
     enh[np.isnan(range_m)] = np.nan
     return np.concatenate([enh, range_m[:, :, None]], axis=-1)
+
+
+def _spot(settings: Profilers) -> Float64:
+    """Parts of a beam's spot (25, 2), along and across the profile (m); (0, 2) where it has no width."""
+    if not settings.spot_along_m and not settings.spot_across_m:
+        return np.zeros((0, 2))
+    along = (settings.spot_along_m or settings.spot_across_m) * np.array(_SPOT_PARTS)
+    across = settings.spot_across_m * np.array(_SPOT_PARTS)
+    return np.stack(np.broadcast_arrays(along[:, None], across[None]), axis=-1).reshape(-1, 2)
 
 
 @functools.cache

@@ -74,8 +74,13 @@ class ValleyCells:
         return self.row - south, self.column + east
 
 
-def bottom_depths(window: HeightWindow, cells: ValleyCells, right: Float64, ground_m: Float64) -> Float64:
-    """(n,) depth (m) of the bottom at each cell of a valley; NaN where no lowest reading is known.
+def bottom_depths(
+    window: HeightWindow, cells: ValleyCells, right: Float64, ground_m: Float64
+) -> tuple[Float64, Float64]:
+    """(n,) depth (m) of the bottom at each cell of a valley, NaN where no lowest reading is known; and readings.
+
+    Readings (n, 2) are those of the cell in the middle and of a cell of the flanks: what walls hide from a head's
+    camera is lost.
 
     Parameters
     ----------
@@ -83,11 +88,11 @@ def bottom_depths(window: HeightWindow, cells: ValleyCells, right: Float64, grou
     ground_m : (n,) height of the ground above it; NaN where there is no valley.
     """
     if window.lowest is None:
-        return np.full(cells.row.size, np.nan)
+        return np.full(cells.row.size, np.nan), np.zeros((cells.row.size, 2))
     at = cells.beside(right)
     own = window.lowest.drop_m[at].astype(np.float64)
     floor = ground_m - window.raw_m[at]
-    lower, usual, readings = _flanks(window.lowest, cells)
+    lower, usual, readings, beside = _flanks(window.lowest, cells)
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.where(usual > 0.0, own / usual, np.inf)
     number = np.full(window.raw_m.shape, -1, np.int32)
@@ -100,7 +105,7 @@ def bottom_depths(window: HeightWindow, cells: ValleyCells, right: Float64, grou
     )
     narrow = low - _DROP_SHARE * drop
     on_floor = np.clip((_FLOOR_END - spread) / (_FLOOR_END - _FLOOR_BEGIN), 0.0, 1.0)
-    return np.asarray(narrow + on_floor * (floor - narrow))
+    return np.asarray(narrow + on_floor * (floor - narrow)), np.stack([window.lowest.count[at], beside], axis=-1)
 
 
 def _along(number: npt.NDArray[np.int32], cells: ValleyCells, values: Float64, level: Float64) -> Float64:
@@ -116,8 +121,8 @@ def blended(bottom_m: Float64, depth_m: Float64, width_cells: Float64) -> Float6
     return np.where(np.isnan(bottom_m), depth_m, share * depth_m + (1.0 - share) * bottom_m)
 
 
-def _flanks(lowest: LowestReadings, cells: ValleyCells) -> tuple[Float64, Float64, Float64]:
-    """(n,) drop (m) of the cells in both flanks, lower quartile and median, and how many readings a cell holds.
+def _flanks(lowest: LowestReadings, cells: ValleyCells) -> tuple[Float64, Float64, Float64, Float64]:
+    """(n,) drop (m) of the cells in both flanks, lower quartile and median; readings of those with any, and of all.
 
     NaN where there is none. Wrong readings only add to a drop.
     """
@@ -127,4 +132,4 @@ def _flanks(lowest: LowestReadings, cells: ValleyCells) -> tuple[Float64, Float6
     known = (~np.isnan(drop)).sum(axis=0)
     lower, usual = (np.take_along_axis(drop, (np.maximum(known - 1, 0) // part)[None], 0)[0] for part in (4, 2))
     count = np.stack([lowest.count[at] for at in places]).sum(axis=0)
-    return lower, usual, count / np.maximum(known, 1)
+    return lower, usual, count / np.maximum(known, 1), count / len(places)

@@ -29,6 +29,16 @@ _BESIDE_NET_M = 0.25
 """What hangs on a net and has its middle no farther from the net's hull is its fringe."""
 _LEAST_SHARE = 0.6
 """What has the cross-section of a crack over less of its length, gaps left out, is an edge or a row of pits."""
+LEAST_SEEN: Final = 0.8
+"""Where a crack's middle has a smaller share of the readings than the ground beside it, its bottom was not seen."""
+_NARROW_CELLS, _WIDE_CELLS = 0.8, 1.6
+"""Widths at which a crack shows least of its bottom, and all of it."""
+_SIGMA_NARROW, _SIGMA_WIDE = 0.2, 0.05
+"""Standard deviations of depths at these widths, shares of the depth."""
+_SIGMA_READING = 0.1
+"""The same where a cell has one reading; it falls with the root of their number."""
+_SIGMA_M = 0.0005
+"""What noise and texture leave of a depth."""
 _ONE_NODE_CELLS = 4.0
 """Junctions closer than this are one: thinning makes two of a crossing."""
 
@@ -47,6 +57,10 @@ class Crack:
     width_max_m: float
     depth_mean_m: float
     depth_max_m: float
+    seen_share: float
+    """Readings in its middle over those beside it; 1 where none are counted."""
+    sigma_depth_mean_m: float
+    """NaN where the bottom was not seen."""
     area_m2: float
     """Length times width (m²)."""
     covered_m2: float
@@ -127,13 +141,14 @@ class _Nodes:
     """(n, 2) the same with all junctions apart."""
     degree: Int64
     """Ends that meet at a node, those of pieces within it left out."""
+    cell_m: float
 
     @classmethod
     def of(cls, ends: Int64, length_m: Float64, nodes: int, cell_m: float) -> _Nodes:
         degree = np.bincount(ends.ravel(), minlength=nodes)
         inner = (length_m < _ONE_NODE_CELLS * cell_m) & (degree[ends] >= 3).all(axis=1)
         merged = united(ends[inner], nodes)
-        return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes))
+        return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes), cell_m)
 
     def figures(self, own: Int64) -> tuple[int, int, int]:
         """Junctions and free ends on some pieces, and polygons that they close."""
@@ -190,6 +205,9 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
     mine = [pieces[k] for k in own.tolist()]
     length, measured = sum(p.length_m for p in mine), sum(p.measured_m for p in mine)
     width_sum, depth_sum = sum(p.width_sum_m2 for p in mine), sum(p.depth_sum_m2 for p in mine)
+    width, depth = (total / measured if measured > 0 else math.nan for total in (width_sum, depth_sum))
+    beside = sum(p.beside_sum_m for p in mine)
+    seen = sum(p.seen_sum_m for p in mine) / beside if beside > 0.0 else 1.0
     line = shapely.line_merge(shapely.multilinestrings([shapely.LineString(p.line_m) for p in mine]))
     line = line if line.geom_type == "MultiLineString" else shapely.multilinestrings([line])
     parts = turned.parts_m[own].sum(axis=0)
@@ -198,10 +216,14 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
         network=0,
         kind=kind,
         length_m=length,
-        width_mean_m=width_sum / measured if measured > 0 else math.nan,
+        width_mean_m=width,
         width_max_m=max(p.width_max_m for p in mine),
-        depth_mean_m=depth_sum / measured if measured > 0 else math.nan,
+        depth_mean_m=depth,
         depth_max_m=max(p.depth_max_m for p in mine),
+        seen_share=seen,
+        sigma_depth_mean_m=depth_sigma_m(
+            depth, width / nodes.cell_m, seen, beside / measured if beside > 0.0 else math.inf
+        ),
         area_m2=width_sum * (length / measured) if measured > 0 else math.nan,
         covered_m2=float(shapely.convex_hull(line).area),
         junctions=junctions,
@@ -216,6 +238,20 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
         line=line,
         pieces=own,
     )
+
+
+def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, readings: float) -> float:
+    """Standard deviation (m) of the mean depth of a crack; NaN where its bottom was not seen.
+
+    width_cells : its width at half the depth. What is narrow shows its walls more than its bottom.
+    seen_share : readings in its middle over those beside it.
+    readings : of a cell beside it; infinite where none are counted.
+    """
+    if not seen_share >= LEAST_SEEN:
+        return math.nan
+    narrow = min(max((_WIDE_CELLS - width_cells) / (_WIDE_CELLS - _NARROW_CELLS), 0.0), 1.0)
+    share = _SIGMA_WIDE + narrow * (_SIGMA_NARROW - _SIGMA_WIDE)
+    return math.hypot(share * depth_m, _SIGMA_READING * depth_m / math.sqrt(readings), _SIGMA_M)
 
 
 def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:

@@ -70,6 +70,10 @@ class CrackPiece:
     depth_sum_m2: float
     """Integral of the depth along the piece (m²)."""
     depth_max_m: float
+    seen_sum_m: float = 0.0
+    """Integral along the piece of the readings that the cells in its middle hold (m) …"""
+    beside_sum_m: float = 0.0
+    """… and of those that a cell beside it holds (m)."""
 
     @property
     def middle_m(self) -> Float64:
@@ -87,6 +91,8 @@ class Sections:
     width_m: Float64
     """NaN where it cannot be told."""
     depth_m: Float64
+    seen: Float64
+    """(n, 2) readings of the cell in the crack's middle, and of a cell beside the crack; 0 where none are counted."""
 
 
 def halo_cells(config: CrackDetection, cell_m: float) -> int:
@@ -158,7 +164,7 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
         out[hidden, :4] = lowered[hidden, :4]
     right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)
     width, depth = sharpened(out[:, 1], out[:, 0])
-    bottom = bottom_depths(window, cells, right, np.where(np.isnan(depth), np.nan, out[:, 4]))
+    bottom, seen = bottom_depths(window, cells, right, np.where(np.isnan(depth), np.nan, out[:, 4]))
     depth = blended(bottom, depth, np.where(hidden, 0.0, out[:, 1]))
     columns = found.skeleton.shape[1]
     own = np.searchsorted(row * columns + column, graph.row * columns + graph.column)
@@ -167,7 +173,7 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
     place = np.stack([east, north], axis=-1)[own]
     for _ in range(_SMOOTHINGS):
         place = graph.smoothed(place)
-    return Sections(place, width[own] * window.cell_m, depth[own])
+    return Sections(place, width[own] * window.cell_m, depth[own], seen[own])
 
 
 def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow, config: CrackDetection) -> Float64:
@@ -195,7 +201,10 @@ def _piece(path: Sequence[int], graph: SkeletonGraph, sections: Sections, window
     step = np.hypot(*np.diff(line_m, axis=0).T)
     width, depth = sections.width_m[cells], sections.depth_m[cells]
     known = ~np.isnan(width[:-1] + width[1:])
-    width_step, depth_step = ((0.5 * (a[:-1] + a[1:]) * step)[known] for a in (width, depth))
+    seen, beside = sections.seen[cells].T
+    width_step, depth_step, seen, beside = (
+        (0.5 * (a[:-1] + a[1:]) * step)[known] for a in (width, depth, seen, beside)
+    )
     start, end = (
         (int(graph.row[k]) + window.first_row, int(graph.column[k]) + window.first_column) for k in cells[[0, -1]]
     )
@@ -209,4 +218,6 @@ def _piece(path: Sequence[int], graph: SkeletonGraph, sections: Sections, window
         float(np.nanmax(width, initial=0.0)),
         float(depth_step.sum()),
         float(np.nanmax(depth, initial=0.0)),
+        float(seen.sum()),
+        float(beside.sum()),
     )

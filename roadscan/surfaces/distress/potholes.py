@@ -44,6 +44,19 @@ _ROUNDED = 1.5
 law, by 1.1 to 2 times of it in the simulator's potholes of 30 to 100 mm."""
 
 
+_HIDDEN_PER_M = 0.8
+"""Floor that a wall hides, for a metre of depth: heads look at their lines under angles of 15 to 35 degrees (m/m)."""
+_MOST_HIDDEN_M = 0.15
+_SIGMA_HIDDEN = 0.3
+"""Standard deviation of the area that walls hide, as a share of it."""
+_SIGMA_OUTLINE_M = 0.003
+"""Standard deviation of the place of an outline: half a cell of 5 mm and the spot of a reading."""
+_SIGMA_DEPTH = 0.03
+"""Standard deviation of a greatest depth, as a share of it: the lowest of many cells lies below their floor."""
+_SIGMA_GROUND_M = 0.002
+"""Standard deviation of the ground above a hole: texture and unevenness of what stands around."""
+
+
 @dataclass(frozen=True)
 class PotholePiece:
     """The part of a pothole in a tile, or one that may be none."""
@@ -58,6 +71,8 @@ class PotholePiece:
     """Of a block, that is the mean of its cells, below the lowest that stands around (m)."""
     edge_depth_m: float
     """Depth at which its outline runs (m)."""
+    hidden_m2: float = 0.0
+    """Of its area where no reading is: a wall hides it from the sensor."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +81,17 @@ class Pothole:
 
     area_m2: float
     """Inside the outline, where the hole is `edge_depth_m` or more deep."""
+    sigma_area_m2: float
+    hidden_m2: float
+    """Of that area without a reading, which its walls hide."""
     rim_area_m2: float
     """Inside the rim, estimated."""
     sigma_rim_area_m2: float
     depth_mean_m: float
     depth_max_m: float
+    sigma_depth_max_m: float
     volume_m3: float
+    sigma_volume_m3: float
     length_m: float
     """Longer side of the smallest rectangle around it (m)."""
     breadth_m: float
@@ -83,7 +103,7 @@ class Pothole:
 
 def halo_cells(config: PotholeDetection, cell_m: float) -> int:
     """Smoothed cells that a window needs beyond those of which potholes are wanted."""
-    return 3 * _thin_cells(cell_m)
+    return 3 * _thin_cells(cell_m) + _hidden_cells(cell_m)
 
 
 def around_cells(config: PotholeDetection, cell_m: float) -> int:
@@ -99,13 +119,32 @@ def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[Potho
     margin = halo_cells(config, window.cell_m)
     part = window.part(*((own.start - margin, own.stop + margin) for own in window.inner()))
     cells = _bridged(blocks.below_ground_m(part), _thin_cells(window.cell_m) // 3)
+    hidden = _hidden(cells, config.edge_depth_m, window.cell_m)
     with np.errstate(invalid="ignore"):
         low = (cells >= config.edge_depth_m).astype(np.uint8)
     thin = _thin_cells(window.cell_m)
     low = cv2.morphologyEx(low, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (thin, thin)))
     own = np.zeros(low.shape, np.bool_)
     own[part.inner()] = low[part.inner()] > 0
-    return _pieces(part, own, cells, blocks.of_cells(blocks.depth_m, part), config.edge_depth_m)
+    return _pieces(part, own, cells, hidden, blocks.of_cells(blocks.depth_m, part), config.edge_depth_m)
+
+
+def _hidden(depth_m: Float64, edge_depth_m: float, cell_m: float) -> Bool:
+    """Cells without a reading that the walls of a hole hide, which get its depth.
+
+    A triangulating head sees no floor behind a wall: up to `_HIDDEN_PER_M` metres of it a metre of depth. Ground beside
+    a hole is seen, so what has no reading there and touches the hole is a part of it.
+    """
+    void = np.isnan(depth_m)
+    reach = np.where(depth_m >= edge_depth_m, np.minimum(_HIDDEN_PER_M * depth_m, _MOST_HIDDEN_M), 0.0)
+    floor = np.where(depth_m >= edge_depth_m, depth_m, 0.0)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for _ in range(_hidden_cells(cell_m)):
+        reach = np.where(void, np.maximum(reach, cv2.dilate(reach, cross) - cell_m), reach)
+        floor = np.where(void & (reach > 0.0), np.maximum(floor, cv2.dilate(floor, cross)), floor)
+    hidden = np.asarray(void & (reach > 0.0))
+    depth_m[hidden] = floor[hidden]
+    return hidden
 
 
 def _measured_part(window: HeightWindow, size: int) -> HeightWindow:
@@ -159,8 +198,15 @@ def _pothole(outline: Any, pieces: Sequence[PotholePiece], own: Int64) -> Pothol
     depth = max((p.depth_max_m for p in pieces), default=0.0)
     mean = volume / area if area else 0.0
     rim = rim_area_m2(area, mean, depth, max((p.edge_depth_m for p in pieces), default=0.0))
-    sigma = _ROUNDED * (rim - area)
-    return Pothole(area, rim, sigma, mean, depth, volume, sides[1], sides[0], outline, own)
+    hidden = sum(p.hidden_m2 for p in pieces)
+    sigma_area = math.hypot(_SIGMA_OUTLINE_M * float(outline.length), _SIGMA_HIDDEN * hidden)
+    sigma_rim = math.hypot(_ROUNDED * (rim - area), sigma_area)
+    sigma_depth = math.hypot(_SIGMA_DEPTH * depth, _SIGMA_GROUND_M)
+    sigma_volume = math.hypot(sigma_depth / max(depth, 1e-9) * volume, sigma_area * mean)
+    return Pothole(
+        area, sigma_area, hidden, rim, sigma_rim, mean, depth, sigma_depth, volume, sigma_volume, sides[1], sides[0],
+        outline, own,
+    )  # fmt: skip
 
 
 def rim_area_m2(area_m2: float, depth_mean_m: float, depth_max_m: float, edge_depth_m: float) -> float:
@@ -172,12 +218,16 @@ def rim_area_m2(area_m2: float, depth_mean_m: float, depth_max_m: float, edge_de
     return float(area_m2 * (depth_max_m / below) ** power)
 
 
+def _hidden_cells(cell_m: float) -> int:
+    return math.ceil(_MOST_HIDDEN_M / cell_m)
+
+
 def _thin_cells(cell_m: float) -> int:
     return max(3, math.ceil(_THIN_M / cell_m) | 1)
 
 
 def _pieces(
-    window: HeightWindow, low: Bool, depth_m: Float64, block_depth_m: Float64, edge_depth_m: float
+    window: HeightWindow, low: Bool, depth_m: Float64, hidden: Bool, block_depth_m: Float64, edge_depth_m: float
 ) -> list[PotholePiece]:
     numbers, count = label(low)
     if not count:
@@ -188,12 +238,21 @@ def _pieces(
         outlines[int(number)] = shapely.normalize(shapely.Polygon(rings[0], rings[1:]))
     own = numbers[low]
     area = np.bincount(own, minlength=count + 1) * window.cell_m**2
+    unseen = np.bincount(own, hidden[low], count + 1) * window.cell_m**2
     steps = np.rint(depth_m[low] / HEIGHT_STEP_M)
     volume = np.bincount(own, steps, count + 1) * (HEIGHT_STEP_M * window.cell_m**2)
     deepest, block = np.zeros(count + 1), np.zeros(count + 1)
     np.maximum.at(deepest, own, depth_m[low])
     np.fmax.at(block, own, block_depth_m[low])
     return [
-        PotholePiece(outlines[k], float(area[k]), float(volume[k]), float(deepest[k]), float(block[k]), edge_depth_m)
+        PotholePiece(
+            outlines[k],
+            float(area[k]),
+            float(volume[k]),
+            float(deepest[k]),
+            float(block[k]),
+            edge_depth_m,
+            float(unseen[k]),
+        )
         for k in range(1, count + 1)
     ]

@@ -47,7 +47,7 @@ CONTROL_SIGMA: Final = Witness(
 )
 SIGMA_MAX_M: Final = 1_000.0
 _COARSE_SIGMA_M: Final = 0.5
-"""Points known no better than this hold no drive: hand-held receivers reach it. 0.5 mm and more, given as metres, do."""
+"""Points known no better than this hold no drive, as those of hand-held receivers; 0.5 mm given as metres are such."""
 _FINE_SIGMA_M: Final = 5e-5
 """Precise levelling reaches 0.2 mm over a kilometre; no point of a road is known better than this."""
 NO_TEXT: Final = "\ufffd"

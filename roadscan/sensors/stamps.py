@@ -35,6 +35,14 @@ TIME: Final = Quantity(
 DATES: Final = ("date", "date_utc", "utc_date")
 """Names of a column that holds the date where the column of stamps holds the time of day alone."""
 _TIME_OF_DAY: Final = re.compile(r"T?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?(?:Z|[+-]\d{2}:?\d{2})?")
+_OTHER_TIMES: Final = (
+    (re.compile(r"^\s*\d{1,2}\.\d{1,2}\.\d{4}"), ": day, month and year stand as in German texts"),
+    (re.compile(r"^\s*\d{1,2}/\d{1,2}/\d{4}"), ": whether day or month stands first is not said"),
+    (re.compile(r"[AaPp]\.?[Mm]\.?\s*$"), ": hours of 12 with AM and PM are not read"),
+    (re.compile(r"\d{2}:\d{2}:\d{2}:\d+"), ": the fraction of the second stands behind a colon"),
+)
+"""What is to be said of times that other programs write."""
+_LEAP_SECOND: Final = re.compile(r"23:59:60")
 _UNIT_STAMPS: Final = 50
 """Stamps that a unit is proposed by."""
 _OF_OUR_TIME_S: Final = (4.75e8, 2.524e9)
@@ -172,8 +180,9 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, i
     Raises
     ------
     TimeSystemError
-        if `word` is no calendar time, has a zone and the clock is not UTC, or has no zone and the
-        clock does not say the scale.
+        if `word` has a zone and the clock is not UTC, or has no zone and the clock does not say the scale.
+    FormatError
+        if `word` is no calendar time.
     """
     if zoned or (is_utc and parse_calendar([word], zoned=False) is not None):
         if clock is not None and clock.system is not TimeSystem.UNIX_UTC:
@@ -185,9 +194,11 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, i
             )
         return replace(clock or Clock(TimeSystem.UNIX_UTC), unit="ns")
     if parse_calendar([word], zoned=False) is None:
-        raise TimeSystemError(
-            f"time '{word[:40]}' is neither a number nor ISO 8601 text",
+        why = next((why for pattern, why in _OTHER_TIMES if pattern.search(word)), "")
+        raise FormatError(
+            f"time '{word[:40]}' is neither a number nor ISO 8601 text{why}",
             expected="such as 2026-05-04T09:30:00.125Z",
+            change="export times so, or as seconds",
             file=file,
         )
     if clock is None or clock.system not in CALENDAR_SCALES:
@@ -208,6 +219,8 @@ def calendar_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
         return whole
     singles = [parse_calendar([word], zoned=zoned) for word in words]
     zone = "with" if zoned else "without"
+    leaps = np.array([_LEAP_SECOND.search(word) is not None for word in words])
+    sieve.drop(leaps, "time is a leap second (23:59:60), which counts from 1970 do not have")
     sieve.drop(np.array([one is None for one in singles]), f"time is not ISO 8601 text {zone} a zone, as the first is")
     return np.array([0 if one is None else one[0] for one in singles], dtype=np.int64)
 

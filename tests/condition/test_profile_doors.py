@@ -95,6 +95,19 @@ def test_units_of_text(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> N
     assert "rejected" in told("iri", _with(named, "spoilt\n")).stderr
 
 
+def test_decimal_commas_and_kilometres(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, h = road
+    whole = rs.iri(x, h).iri_m_per_km[0]
+    file = tmp_path / "comma.csv"
+    for separator in (";", "\t", " "):
+        lines = [f"{a / 1e3:.6f}{separator}{1e3 * b:.4f}".replace(".", ",") for a, b in zip(x, h, strict=True)]
+        file.write_text("\n".join([f"station_km{separator}height_mm", *lines]))
+        read = rs.read_profile(file)
+        assert rs.iri(read.x_m, read.height_m).iri_m_per_km[0] == pytest.approx(whole, rel=1e-4)
+    file.write_text("station_m;height_mm\n" + "\n".join(f"1,{k:03d};2,{k:03d}" for k in range(200)))
+    assert "is a decimal mark, or parts thousands" in refused("iri", file)
+
+
 def _with(file: Path, line: str) -> Path:
     file.write_text(file.read_text() + "\n" + line)
     return file

@@ -73,7 +73,7 @@ class SoundHeights(NamedTuple):
         """
         shared = np.concatenate([[0], np.cumsum(np.diff(self.height_m) != 0.0)])
         drawn = self.step_m * np.random.default_rng(1).uniform(-0.5, 0.5, shared.size)
-        return self.height_m + np.stack([drawn, drawn[shared]])
+        return np.asarray(self.height_m + np.stack([drawn, drawn[shared]]), np.float64)
 
     def findings(self, x_m: Floats, whose: str) -> list[Finding]:
         """What was left out; `x_m` (n,) stations (m), `whose` names the profile."""

@@ -88,7 +88,7 @@ def iri(
     columns["ride_number"] = ride_number_of(ride_number_ride(on.x_m, heights), parts).ride_number
     columns["measured_share"] = shares.min(axis=0)
     rounding = np.stack([_rounding(on.x_m, one, parts, own) for one, own in zip(sound, found, strict=True)])
-    coarse = (rounding > NOTABLE * found).any(axis=0)
+    coarse = np.atleast_1d((rounding > NOTABLE * found).any(axis=0))
     columns["accuracy_class"] = np.where(coarse, 3, on.accuracy_class(parts))
     columns["note"] = [
         ", ".join(filter(None, (note, *_left_out(on.x_m, sound, parts, k), "coarse" * bool(coarse[k]))))

@@ -31,9 +31,11 @@ PROFILE_STEPS: Final = Witness(
 )
 
 _LEAST_REPEATED: Final = 10
-"""Samples that repeat a height."""
+"""Samples over which heights are seen to change, at the least."""
 _STEPS_CHANGED: Final = 10.0
-"""Elsewhere, heights change by so many steps over as many samples, in the middle of all places."""
+"""Elsewhere, heights change by so many steps over a third as many samples, in the middle of all places."""
+_TIMES: Final = 3
+"""The top of a wave is flat for some of the samples over which its flanks change so much, not for three times these."""
 _LEAST_OTHERS: Final = 100
 """Samples beside them that tell how heights change; a drawn check profile of straight lines has fewer."""
 _CLOSE_M: Final = 0.1
@@ -97,9 +99,9 @@ def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> Soun
     """Heights of a profile without repeated ones and without spikes.
 
     A height repeats itself where so many samples have it, one after the other, that heights elsewhere change by ten
-    steps over as many. Where most of the others lie on straight lines, as in a drawn check profile, none does. A spike
-    is one sample that rises or falls by more than 15 mm and by ten times the usual scatter, steeper than 0.3, between
-    neighbours that agree; it is sought where samples lie within 0.1 m.
+    steps over a third of them. Where most of the others lie on straight lines, as in a drawn check profile, none does.
+    A spike is one sample that rises or falls by more than 15 mm and by ten times the usual scatter, steeper than 0.3,
+    between neighbours that agree; it is sought where samples lie within 0.1 m.
 
     Parameters
     ----------
@@ -152,7 +154,7 @@ def _repeated(h: Floats, step_m: float) -> Bool:
     first, behind = np.concatenate([[0], changes + 1]), np.concatenate([changes + 1, [h.size]])
     longest = int((behind - first).max(initial=0))
     count = _LEAST_REPEATED
-    while count <= longest:
+    while _TIMES * count <= longest:
         ranges = maximum_filter1d(h, count) - minimum_filter1d(h, count)
         ranges = ranges[ranges > 0.0]
         if ranges.size and np.median(ranges) >= _STEPS_CHANGED * step_m:
@@ -161,7 +163,7 @@ def _repeated(h: Floats, step_m: float) -> Bool:
     else:
         return out
     for begin, end in zip(first.tolist(), behind.tolist(), strict=True):
-        out[begin + 1 : end] = end - begin >= count
+        out[begin + 1 : end] = end - begin >= _TIMES * count
     return out if _is_measured(h[~out], count // 2, step_m) else np.zeros(h.size, np.bool_)
 
 

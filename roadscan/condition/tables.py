@@ -100,8 +100,8 @@ def iri(
         told += [
             PROFILE_STEPS.finds(
                 whose,
-                f"its heights lie on steps of {1e3 * one.step_m:.3g} mm, and rounding alone makes its IRI too high by "
-                f"about {np.nanmax(own):.2f} m/km where it is worst.",
+                f"its heights lie on steps of {1e3 * one.step_m:.3g} mm, and rounding alone makes its IRI too high by some "
+                f"{np.nanmax(own):.2f} m/km where it is worst.",
             )
             for whose, one, own in zip(_whose(labels), sound, rounding, strict=True)
             if (own > NOTABLE * found).any()
@@ -209,7 +209,7 @@ def mpd(
                 PROFILE_STEPS.finds(
                     "",
                     f"its heights lie on steps of {1e3 * sound.step_m:.3g} mm, and rounding alone makes its mean "
-                    f"profile depth too high by about {rounding:.2f} mm from {first:.5g} m to {last:.5g} m.",
+                    f"profile depth too high by some {rounding:.2f} mm from {first:.5g} m to {last:.5g} m.",
                 )
             )
         notes += ["flat"] if depth.mpd_mm < FLATTEST_MM else []

@@ -249,7 +249,7 @@ def test_the_rounding_of_heights_is_told(tmp_path: Path) -> None:
     ((sound,), _) = judged(tmp_path, "iri", x, z)
     ((row,), said) = judged(tmp_path, "iri", x, 5.0 * np.round(z / 5.0))
     assert (row["accuracy_class"], row["note"]) == (3, "start, coarse")
-    (by,) = re.findall(r"too high by about ([\d.]+) m/km", said)
+    (by,) = re.findall(r"too high by some ([\d.]+) m/km", said)
     assert row["iri_m_per_km"] - float(by) == pytest.approx(sound["iri_m_per_km"], rel=0.05)
     assert row["iri_m_per_km"] > 1.2 * sound["iri_m_per_km"]
     assert judged(tmp_path, "iri", x, 0.5 * np.round(z / 0.5))[1] == ""
@@ -278,3 +278,7 @@ def test_sound_profiles_are_not_doubted(recordings: Path) -> None:
     for step_m, scale, rounded_mm in ((0.025, 0.25, 0.1), (0.05, 0.5, 0.1), (0.1, 1.0, 0.5), (0.25, 5.0, 1.0)):
         x, z = measured(7, step_m)
         assert rs.iri(x, 1e-3 * rounded_mm * np.round(scale * z / rounded_mm)).attrs["findings"] == []
+    for seed in (21, 26):
+        x, z = texture(seed)
+        for rounded_mm in (0.01, 0.05):
+            assert rs.mpd(1e-3 * x, 1e-3 * rounded_mm * np.round(0.5 * z / rounded_mm)).attrs["findings"] == []

@@ -100,8 +100,8 @@ def iri(
         told += [
             PROFILE_STEPS.finds(
                 whose,
-                f"its heights lie on steps of {1e3 * one.step_m:.3g} mm, and rounding alone makes its IRI too high by some "
-                f"{np.nanmax(own):.2f} m/km where it is worst.",
+                f"its heights lie on steps of {1e3 * one.step_m:.3g} mm, and rounding alone makes its IRI too high by "
+                f"some {np.nanmax(own):.2f} m/km where it is worst.",
             )
             for whose, one, own in zip(_whose(labels), sound, rounding, strict=True)
             if (own > NOTABLE * found).any()

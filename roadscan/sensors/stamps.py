@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.model.errors import FormatError, Missing, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
+from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
@@ -75,6 +75,8 @@ class StampColumn:
     """Calendar times carry a zone."""
     date: str | None = None
     """Column of the date, where `column` holds the time of day alone."""
+    is_utc: bool = False
+    """Calendar times are UTC: `clock` counts what :meth:`stamps` makes of them, leap seconds included."""
 
     @property
     def kinds(self) -> dict[str, Kind]:
@@ -104,7 +106,10 @@ class StampColumn:
         named_utc = any("utc" in name.lower().split("_") for name in (found.column, date or ""))
         is_utc = zoned or (named_utc and clock is None)
         stated = source.clock if zoned else clock
-        return cls(found.column, kind, calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc), zoned, date)
+        own = calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc)
+        if own.system is TimeSystem.UNIX_UTC:
+            return cls(found.column, kind, replace(own, system=TimeSystem.UNIX_GPS), zoned, date, is_utc=True)
+        return cls(found.column, kind, own, zoned, date)
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> npt.NDArray[np.generic]:
         """Stamps (n,) of a block, float64 or int64, in the unit of `clock`; faulty ones are dropped from `sieve`."""
@@ -113,7 +118,7 @@ class StampColumn:
         words = block.text(self.column)
         if self.date is not None:
             words = [f"{date}T{time}" for date, time in zip(block.text(self.date), words, strict=True)]
-        return calendar_ns(words, sieve, zoned=self.zoned)
+        return (_leaping_ns if self.is_utc else calendar_ns)(words, sieve, zoned=self.zoned)
 
 
 def first_unit(path: Path, layout: TextLayout, found: Found) -> str:
@@ -219,10 +224,18 @@ def calendar_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
         return whole
     singles = [parse_calendar([word], zoned=zoned) for word in words]
     zone = "with" if zoned else "without"
-    leaps = np.array([_LEAP_SECOND.search(word) is not None for word in words])
-    sieve.drop(leaps, "time is a leap second (23:59:60), which counts from 1970 do not have")
     sieve.drop(np.array([one is None for one in singles]), f"time is not ISO 8601 text {zone} a zone, as the first is")
     return np.array([0 if one is None else one[0] for one in singles], dtype=np.int64)
+
+
+def _leaping_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
+    """Nanoseconds (n,) from 1970 on the scale of GPS of UTC times; 23:59:60 is read where UTC had a leap second."""
+    leaps = np.array([_LEAP_SECOND.search(word) is not None for word in words], dtype=np.int64)
+    plain = [word.replace("23:59:60", "23:59:59") for word in words] if leaps.any() else words
+    utc_ns = calendar_ns(plain, sieve, zoned=zoned)
+    before, behind = (leap_seconds_at_unix(utc_ns // NS_PER_S + later) for later in (0, 1))
+    sieve.drop((leaps > 0) & (before == behind), "time is 23:59:60 on a day without a leap second")
+    return np.asarray(utc_ns + (before + leaps) * NS_PER_S, dtype=np.int64)
 
 
 def parse_calendar(words: Sequence[str], *, zoned: bool) -> Int64 | None:

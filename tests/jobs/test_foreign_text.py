@@ -102,6 +102,19 @@ def test_a_calendar_time_without_a_zone_is_asked_for(tmp_path: Path) -> None:
     assert table.epoch_gps_ns.min() == FIRST_GPS_NS - 18_000_000_000  # 18 leap seconds lie between UTC and GPS time
 
 
+def test_a_leap_second_is_read(tmp_path: Path) -> None:
+    """That of the end of 2016 (IERS Bulletin C 52): UTC counts 23:59:60, and GPS − UTC grows from 17 s to 18 s."""
+    seconds = [f"2016-12-31T23:59:{k / 2:04.1f}Z" for k in range(100, 122)]
+    path = tmp_path / "t.csv"
+    path.write_text(poses(lambda k: seconds[k + 2] if k < 20 else "").replace("\n\n", "\n"))
+    (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock=""))
+    assert roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0").exit_code == 0
+    table = rs.open_survey(tmp_path / "SURVEY.toml").table("trajectory")
+    epochs = np.sort(table.epoch_gps_ns.to_numpy())
+    assert np.diff(epochs).tolist() == [500_000_000] * 19
+    assert epochs[-1] == (1_483_228_800 - 315_964_800 + 17) * 10**9 + 500_000_000  # 23:59:60.5, 17 s before the leap
+
+
 POINTS = "name;easting;northing;height\n"
 NAMED: dict[str, tuple[bytes, list[str]]] = {
     "a time of day alone": (
@@ -130,9 +143,9 @@ NAMED: dict[str, tuple[bytes, list[str]]] = {
     ),
     "AM": (poses(lambda k: f"2026-05-04 09:30:{k:02d} AM").encode(), ["hours of 12 with AM and PM"]),
     "a fraction behind a colon": (poses(lambda k: f"09:30:00:{k:03d}").encode(), ["stands behind a colon"]),
-    "a leap second": (
-        poses(lambda k: "2016-12-31T23:59:60Z" if k == 9 else utc(k)).encode(),
-        ["1 × time is a leap second (23:59:60)"],
+    "a leap second that there was not": (
+        poses(lambda k: "2026-05-04T23:59:60Z" if k == 9 else utc(k)).encode(),
+        ["1 × time is 23:59:60 on a day without a leap second"],
     ),
     "two columns of time": (
         CSV.replace("time,", "time,stamp,", 1).replace("Z,", "Z,1,").encode(),

@@ -222,7 +222,7 @@ def test_confirming_and_correcting_an_asset_loses_neither(page: Any, first: str)
     def press(title: str) -> None:
         page.locator(".edit button", has_text=title).click()
         if title == "Correct":
-            page.locator('.edit-form [aria-label="height m"]').fill("4.5")
+            page.locator('.edit-form [aria-label="height"]').fill("4.5")
             page.locator('.edit-form button:has-text("Keep")').click()
 
     press(first)

@@ -442,6 +442,8 @@ def mistakes(_: str) -> str:
     return markdown_table(("mistake", "what roadscan prints", "what to do"), rows)
 
 
+_ACRONYM: Final = re.compile(r"\b(gnss|imu|nmea)\b")
+
 _TOLD: Final = {"error": "an error", "rejects": "rejects", "findings": "a finding"}
 
 
@@ -452,6 +454,7 @@ def witness_list(_: str) -> str:
         by_input.setdefault(one.input, []).append(one)
     parts = []
     for kind, own in sorted(by_input.items()):
+        title = _ACRONYM.sub(lambda found: found[0].upper(), kind)
         rows = [
             f"| `{w.name}` | {w.fault} | {w.asks} | {w.does} | {', '.join(_TOLD[t] for t in w.told)} |" for w in own
         ]
@@ -459,7 +462,7 @@ def witness_list(_: str) -> str:
             "| witness | what can be wrong | what is asked | what the run does | told as |",
             "|---|---|---|---|---|",
         ]
-        parts.append("\n".join([f"## {kind[0].upper()}{kind[1:]}", "", *head, *rows]))
+        parts.append("\n".join([f"## {title[0].upper()}{title[1:]}", "", *head, *rows]))
     return "\n\n".join(parts)
 
 

@@ -204,6 +204,7 @@ def adjust(
         return found
     for _ in range(_SCALED):
         more = _by_group(found.run_factors)
+        more[[prior.fixed for prior in priors]] = 1.0  # what contradicts a run that is held is told, and moves nothing
         if (more == 1.0).all():
             break
         own = [p.wider(f) for p, f in zip(priors, wider * more, strict=True)]

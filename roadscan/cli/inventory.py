@@ -46,7 +46,10 @@ def pull(
     sound: Annotated[bool, typer.Option("--sound", help="Take in sound rows where others are faulty.")] = False,
     confirm: Annotated[
         list[str] | None,
-        typer.Option(help="An asset whose unlikely place is right, as `pull` names it; `all`: each. May be repeated."),
+        typer.Option(
+            help="An asset whose unlikely place or size is right, or a layer whose assets are gone, as `pull` names "
+            "them; `all`: each. May be repeated."
+        ),
     ] = None,
 ) -> None:
     """Take in what people changed in the home."""

@@ -109,9 +109,13 @@ def _numbers(text: str | None) -> list[float] | None:
 
 
 def _show(found: pd.DataFrame, read: ProfileFile, file: Path, as_json: bool) -> None:
+    told_of = found.attrs["findings"]
+    for one in told_of:
+        typer.echo(f"{'left out' if one.left_out else 'doubtful'}: {file}: {one.line}", err=True)
     rows: list[dict[str, Any]] = json.loads(found.to_json(orient="records", double_precision=9))
     if as_json:
-        told = {"file": str(file), "profiles": list(read.names), "rejected_lines": len(read.rejects), "rows": rows}
+        told = {"file": str(file), "profiles": list(read.names), "rejected_lines": len(read.rejects),
+                "findings": [vars(one) for one in told_of], "rows": rows}  # fmt: skip
         typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
         return
     print_table(tuple(found.columns), [tuple(_cell(name, row[name]) for name in found.columns) for row in rows])

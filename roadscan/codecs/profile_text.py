@@ -14,7 +14,12 @@ from roadscan.model.errors import FormatError
 Floats = npt.NDArray[np.float64]
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
-_UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|m|ft|in|mil)$", re.IGNORECASE)
+_UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|km|m|ft|in|mil)$", re.IGNORECASE)
+
+
+_COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
+"""A number whose commas may as well part the thousands."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +41,17 @@ class TextColumns:
 def parse_columns(text: str) -> TextColumns:
     """Columns of the lines of numbers.
 
-    Columns are separated by commas, semicolons, tabs or blanks, whichever the first line of numbers has. A line below
-    it with another number of columns, or one that is no number, is rejected.
+    Columns are separated by commas, semicolons, tabs or blanks, whichever the first line of numbers has; where it is
+    not commas, these may be decimal marks. A line below it with another number of columns, or one that is no number,
+    is rejected.
 
     Raises
     ------
     FormatError
-        where no line holds two numbers, or more lines are damaged than sound.
+        where no line holds two numbers, commas may be decimal marks or part thousands, or more lines are damaged than
+        sound.
     """
-    lines = text.splitlines()
+    lines = _with_points(text.splitlines())
     first = next((k for k, line in enumerate(lines) if _numbers(_cells(line, _separator(line))) is not None), None)
     if first is None:
         raise FormatError("no line with two numbers", expected="a station and a height to a line")
@@ -76,8 +83,31 @@ def parse_columns(text: str) -> TextColumns:
     )
 
 
+def _with_points(lines: list[str]) -> list[str]:
+    """Lines whose decimal commas are points, where commas do not separate columns.
+
+    Raises
+    ------
+    FormatError
+        where each comma may as well part thousands.
+    """
+    told = [cell for line in lines for cell in _cells(line, _separator(line)) if _COMMA_NUMBER.fullmatch(cell)]
+    if not told:
+        return lines
+    if all(_THOUSANDS.fullmatch(cell) for cell in told):
+        raise FormatError(
+            f"the comma of {told[0]} is a decimal mark, or parts thousands",
+            expected="decimal points",
+            change="export the profile with decimal points",
+        )
+    return [line if _separator(line) == "," else line.replace(",", ".") for line in lines]
+
+
 def _separator(line: str) -> str | None:
     """What separates columns in a line: None for blanks."""
+    words = line.split()
+    if len(words) > 1 and all(_COMMA_NUMBER.fullmatch(word) for word in words) and "\t" not in line:
+        return None  # the commas are decimal marks
     return next((mark for mark in ("\t", ";", ",") if mark in line), None)
 
 

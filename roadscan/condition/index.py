@@ -88,14 +88,27 @@ class PerCrossSection:
     value: Float64
     sigma: Float64
     share: Float64
+    noisy: npt.NDArray[np.bool_] | None = None
+    """(n,) which of them have no value for the noise of their heights; None: none."""
 
     def values(self) -> Iterable[Value]:
         """Values of the cross-sections themselves."""
-        for station, value, sigma, share in zip(
-            self.station_m.tolist(), self.value.tolist(), self.sigma.tolist(), self.share.tolist(), strict=True
-        ):
-            reason = "" if math.isfinite(value) else "too little of the cross-section was measured"
+        columns = (self.station_m, self.value, self.sigma, self.share, self._left_out(slice(None)))
+        for station, value, sigma, share, is_noisy in zip(*(column.tolist() for column in columns), strict=True):
+            lacking = "its heights are noise" if is_noisy else "too little of the cross-section was measured"
+            reason = "" if math.isfinite(value) else lacking
             yield Value(self.quantity, "cross_section", station, station, value, sigma, share, reason)
+
+    def remark(self, own: npt.NDArray[np.bool_]) -> str:
+        """What a section of the cross-sections `own` (n,) says of those that are left out."""
+        count = np.count_nonzero(self._left_out(own))
+        return f"{count} cross-sections are left out: their heights are over ten times as noisy as the lane's" * bool(
+            count
+        )
+
+    def _left_out(self, own: npt.NDArray[np.bool_] | slice) -> npt.NDArray[np.bool_]:
+        every = np.zeros(self.value.size, np.bool_) if self.noisy is None else self.noisy
+        return every[own]
 
 
 def by_section(
@@ -116,13 +129,14 @@ def by_section(
         known = ~np.isnan(value)
         due = max(1.0, (to_m - from_m) / (spacing_m or config.cross_section_spacing_m))
         share = min(1.0, float(known.sum()) / due)
+        remark = held.remark(own)
         for name, how in wanted:
             if share < config.least_share or not known.any():
                 reason = f"{100 * share:.0f} % of the cross-sections were measured"
                 yield Value(name, "section", from_m, to_m, np.nan, np.nan, share, reason)
             elif how == "mean":
                 spread = float(np.sqrt(np.mean(sigma[known] ** 2)))
-                yield Value(name, "section", from_m, to_m, float(value[known].mean()), spread, share)
+                yield Value(name, "section", from_m, to_m, float(value[known].mean()), spread, share, remark)
             else:
                 k = int(np.flatnonzero(known)[np.argmax(value[known])])
-                yield Value(name, "section", from_m, to_m, float(value[k]), float(sigma[k]), share)
+                yield Value(name, "section", from_m, to_m, float(value[k]), float(sigma[k]), share, remark)

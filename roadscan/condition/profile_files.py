@@ -16,7 +16,7 @@ from roadscan.model.errors import FormatError, ProfileError, RoadscanError, in_w
 
 Floats = npt.NDArray[np.float64]
 
-UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254, "mil": 2.54e-5}
+UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "in": 0.0254, "mil": 2.54e-5}
 """Units of stations and heights, in metres."""
 _SPELT = {"metre": "m", "meter": "m", "metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm",
           "feet": "ft", "foot": "ft", "inch": "in", "inches": "in", "mils": "mil"}  # fmt: skip

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -211,8 +212,9 @@ def _columns(path: Path, stated: Stated) -> FormatError | None:
         _, names = first_words(path, TextOptions())
         text_layout(path, TextOptions())
     except RoadscanError as error:
+        is_unmarked = any(str(one.proposed).startswith("utf") for one in error.asks_for("options.encoding"))
         is_asked = isinstance(error, FormatError) and error.missing and kind_of(path).words.startswith("text")
-        return _of_text(error, path) if is_asked else None
+        return _of_text(error, path) if is_asked or is_unmarked else None
     if len(names) < 2:
         return None
     tables = [f for f in log_formats().values() if f.column_sets and issubclass(f.options, TextOptions)]
@@ -287,13 +289,30 @@ def _named(path: Path, stated: Stated) -> FormatError | None:
 def _sensible(path: Path, stated: Stated) -> FormatError | None:
     names = list(_sensible_formats(path, stated))
     if not names:
-        return None
+        return _sensible_elsewhere(path, stated)
     return FormatError(
         "the content is of no known raw format, but can be read as " + " or ".join(names),
         change=f'state format = "{names[0]}" for this log, or --format {names[0]} for a look',
         file=path,
         missing=Missing("format", names[0], tuple(names)),
     )
+
+
+def _sensible_elsewhere(path: Path, stated: Stated) -> FormatError | None:
+    """What a reader that makes sense of a file says of the CRS and heights that are stated for it."""
+    if stated.crs is None and stated.height is None:
+        return None
+    for name in _sensible_formats(path, replace(stated, crs=None, height=None)):
+        opened, refusal = try_open(log_formats()[name], path, stated, _TRIALS)
+        if opened is None:
+            said = refusal.removeprefix(f"{path.resolve()}: ")
+            return FormatError(
+                f"the content can be read as {name}, but not in the CRS or with the heights that are stated: {said}",
+                change=f'state format = "{name}" and options.columns for this log',
+                file=path,
+                missing=Missing("format", name),
+            )
+    return None
 
 
 def _sensible_formats(path: Path, stated: Stated) -> Iterator[str]:

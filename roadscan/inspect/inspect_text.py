@@ -14,6 +14,7 @@ from roadscan.inspect.log_figures import ColumnFigures, Extent, Fault, TableFigu
 from roadscan.inspect.provisional import OpenedLog
 from roadscan.model.crs import LOCAL_WORLD, world_title
 from roadscan.model.gpstime import NS_PER_S, WEEK_S, TimeSystem, iso_from_gps_ns
+from roadscan.sensors.columns import UNITS
 
 _LABEL: Final = 9
 _PLAIN_WIDTH: Final = 110
@@ -132,11 +133,20 @@ def _extent(extent: Extent, table: TableFigures, opened: OpenedLog) -> Iterator[
         box = ", ".join(
             f"{axis} {low:,.3f} to {high:,.3f}" for axis, low, high in zip("xyz", extent.low, extent.high, strict=True)
         )
-        is_unknown = opened.needs_key("options.unit") or (opened.needs_key("crs") and extent.frame == LOCAL_WORLD)
+        is_unknown = opened.needs_key("options.unit") or (
+            opened.needs_key("crs") and extent.frame == LOCAL_WORLD and not _names_say_units(opened)
+        )
         unit = "in a unit that is not stated," if is_unknown else "m"
         yield f"{box} {unit} {frame}"
     if table.path_m:
         yield f"a way of {table.path_m:,.3f} m"
+
+
+def _names_say_units(opened: OpenedLog) -> bool:
+    """Whether the names of the columns of places end with units, as easting_m does."""
+    columns = opened.header.attributes.get("columns", {})
+    own = [columns[name] for name in ("easting", "northing", "height") if name in columns]
+    return bool(own) and all(name.rpartition("_")[2].lower() in UNITS["length"] for name in own)
 
 
 def _readings(table: TableFigures) -> Iterator[str]:

@@ -34,7 +34,7 @@ def faults_of(changes: Changes, state: State, unit_m: float = 1.0, confirmed: Co
     ----------
     state : the inventory that the changes are to be taken into.
     unit_m : metres of a unit of its map.
-    confirmed : records whose places a person confirmed; `all` stands for each.
+    confirmed : records, and layers with deletions, that a person confirmed; `all` stands for each.
     """
     found = list(changes.faults)
     drawn = {change.asset_id for change in changes.drawn}

@@ -87,7 +87,7 @@ class Content:
     faults: Sequence[EditFault] = ()
     """What people wrote that no row can hold."""
     confirmed: Collection[str] = ()
-    """Records whose unlikely places a person confirmed in the home."""
+    """Records whose unlikely places or sizes a person confirmed in the home."""
 
 
 class Sheet(NamedTuple):

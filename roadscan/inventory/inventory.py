@@ -162,7 +162,8 @@ class Inventory:
         home : the survey's own where it is left out; a copy of it otherwise.
         who, why : of edits whose home does not tell.
         sound : take in sound rows where others are faulty; else nothing is taken in then.
-        confirm : ids of assets (`fid N` of drawn ones) whose unlikely places are right; `all` stands for each.
+        confirm : ids of assets (`fid N` of drawn ones) whose unlikely places or sizes are right, and names of layers
+            whose deletions are; `all` stands for each.
 
         Raises
         ------
@@ -423,8 +424,14 @@ def _without(changes: Changes, faults: Sequence[EditFault]) -> Changes:
     return Changes(
         [c for c in changes.changed if (asset_schema(c.kind).table, c.record) not in bad],
         [c for c in changes.drawn if (asset_schema(c.kind).table, c.record) not in bad],
-        changes.deleted,
+        [(kind, one) for kind, one in changes.deleted if not _all_deletions_of(kind) & bad],
     )
+
+
+def _all_deletions_of(kind: str) -> set[tuple[str, str]]:
+    """How a fault names what is missing of a layer: by the layer's own name."""
+    table = asset_schema(kind).table
+    return {(table, table)}
 
 
 def _bad(faults: Sequence[EditFault]) -> set[tuple[str, str]]:
@@ -442,9 +449,12 @@ def _as_read(changes: Changes, faults: Sequence[EditFault]) -> Content:
             (table, one) not in bad and (table, f"fid {fid}") not in bad
             for one, fid in zip(ids, own[FID].to_pylist(), strict=True)
         ]
-        refused = pa.array([one for one, is_kept in zip(ids, keep, strict=True) if not is_kept], pa.string())
-        again = before.filter(pc.is_in(before["asset_id"], value_set=refused))
-        rows[kind] = pa.concat_tables([own.filter(pa.array(keep, pa.bool_())), again])
+        again = [one for one, is_kept in zip(ids, keep, strict=True) if not is_kept]
+        if _all_deletions_of(kind) & bad:
+            again += [one for other, one in changes.deleted if other == kind]
+        refused = pa.array(again, pa.string())
+        former = before.filter(pc.is_in(before["asset_id"], value_set=refused))
+        rows[kind] = pa.concat_tables([own.filter(pa.array(keep, pa.bool_())), former])
     return Content(rows)
 
 

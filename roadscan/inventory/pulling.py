@@ -175,7 +175,7 @@ def refuse(faults: Sequence[EditFault], home: str) -> FaultyEditsError:
     what = f"{len(faults)} rows are faulty:" if len(asked) < len(faults) else "is this right?"
     way = ["mend these rows and pull again, or take the others in alone (`--sound`)"]
     if asked:
-        way.append(f"`--confirm '{asked[0]}'` takes in a place that is right as it stands (`--confirm all`: each)")
+        way.append(f"`--confirm '{asked[0]}'` takes in what is right as it stands (`--confirm all`: each)")
     error = FaultyEditsError(f"nothing was taken in: {what} {listed}{more}", change="; ".join(way), file=home)
     error.faults = tuple(faults)
     return error

@@ -1,20 +1,21 @@
-"""Places that people gave and that are asked about before they are in force: far moves, and odd heights."""
+"""What people changed and is asked about before it is in force: far moves, odd heights and sizes, emptied layers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.inventory.comparing import Changes
+from roadscan.inventory.comparing import Change, Changes
 from roadscan.inventory.home import EditFault
 from roadscan.inventory.state import State
 from roadscan.model.witness import Witness
 from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY
+from roadscan.tables.inventory_schema import GEOMETRY, editable_columns
 
 PLACES_OF_EDITS: Final = Witness(
     name="places_of_edits",
@@ -24,6 +25,42 @@ PLACES_OF_EDITS: Final = Witness(
     does="the edit is not taken in until the person confirms it: `pull --confirm ID`, or *It is right* in the page",
     told=("error",),
 )
+DELETED_LAYER: Final = Witness(
+    name="deleted_layer",
+    input="inventory edits",
+    fault="A layer was emptied, or holds what was selected alone: each row that is missing would say that it is gone.",
+    asks="how many of the layer's assets are missing: over half of it and 3, or over a tenth and 20",
+    does="no deletion of the layer is taken in until the person confirms it: `pull --confirm LAYER`",
+    told=("error",),
+)
+SIZES_OF_EDITS: Final = Witness(
+    name="sizes_of_edits",
+    input="inventory edits",
+    fault="A length or height that a person gave is in another unit, or a digit was lost or doubled.",
+    asks="what was found and its σ, the former value, the largest one of the kind, and whether several values of the "
+    "column differ by the factor of one unit",
+    does="the edit is not taken in until the person confirms it: `pull --confirm ID`, or *It is right* in the page",
+    told=("error",),
+)
+_MOST_AND: Final = ((0.5, 3), (0.1, 20))
+"""Shares of a layer, and numbers of assets, from which on deletions are asked about: persons delete one by one."""
+_TIMES: Final = 2.5
+"""Less than the least factor between units of length that are mistaken for one another: 2.54 cm are an inch."""
+_SIZE_M: Final = 0.5
+"""Sizes that differ by less are corrected every day: a kerb, a diameter, the height of a bush."""
+_SIGMAS: Final = 5.0
+_UNIT_FACTORS: Final = {
+    3.28084: "feet",
+    0.3048: "metres out of feet",
+    39.3701: "inches",
+    100.0: "centimetres",
+    1000.0: "millimetres",
+    0.01: "metres out of centimetres",
+    0.001: "metres out of millimetres",
+}
+_SAME_FACTOR: Final = 0.01
+"""Share by which a factor may differ from that of a unit: values have few digits."""
+_SEVERAL: Final = 3
 _MOVED_M: Final = 100.0
 """Farther than any sensor of a survey sees: the evidence of an asset does not lie where it was moved to."""
 _DRAWN_M: Final = 1000.0
@@ -38,7 +75,89 @@ _FACADE_RISE_M: Final = 100.0
 
 
 def questions_of(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Places of changes that are possible and unlikely, against the inventory that they are to be taken into."""
+    """Changes that are possible and unlikely, against the inventory that they are to be taken into."""
+    yield from _emptied(changes, state)
+    yield from _sizes(changes, state)
+    yield from _places(changes, state)
+
+
+def _emptied(changes: Changes, state: State) -> Iterator[EditFault]:
+    """Layers of which all or many rows are missing; their record is the name of the layer."""
+    for kind, count in Counter(kind for kind, one in changes.deleted if _stands(state, one)).items():
+        held = sum(_stands(state, one) for one in changes.before[kind]["asset_id"].to_pylist())
+        if any(count > share * held and count >= least for share, least in _MOST_AND):
+            table = asset_schema(kind).table
+            reason = f"{count} of the {held} assets of the layer are missing, which would say that they are gone"
+            yield EditFault(table, table, reason, is_question=True)
+
+
+def _stands(state: State, asset_id: str) -> bool:
+    row = state.row(asset_id)
+    return row is not None and row["status"] != "rejected"
+
+
+def _sizes(changes: Changes, state: State) -> Iterator[EditFault]:
+    """Lengths and heights that are unlike what was found."""
+    drawn = {change.asset_id for change in changes.drawn}
+    reshaped = drawn | {change.asset_id for change in changes.changed if change.attribute == GEOMETRY}
+    given = [
+        change
+        for change in changes.changed
+        if change.attribute in _lengths(change.kind)
+        and isinstance(change.new, float)
+        and np.isfinite(change.new)
+        and not (change.attribute == "length_m" and change.asset_id in reshaped)
+    ]
+    units = {id(change): _unit_between(change) for change in given}
+    alike = Counter((change.kind, change.attribute, units[id(change)]) for change in given)
+    for change in given:
+        unit = units[id(change)]
+        several = alike[change.kind, change.attribute, unit]
+        reason = _other_size(change, state, is_new=change.asset_id in drawn)
+        if unit and several >= _SEVERAL:
+            reason = f"{change.attribute} is {change.new:g} and was {change.old:g}, as {several} values are: {unit}?"
+        if reason is not None:
+            yield EditFault(asset_schema(change.kind).table, change.record, reason, is_question=True)
+
+
+def _lengths(kind: str) -> Collection[str]:
+    """Columns of a kind that hold a size in metres and that people may change."""
+    own = {column.name for column in asset_schema(kind).own if column.unit == "m" and column.type == "float64"}
+    return own & editable_columns(kind)
+
+
+def _unit_between(change: Change) -> str:
+    """Unit whose factor lies between the former value and the new one; "" for none."""
+    if not change.old or not change.new:
+        return ""
+    ratio = change.new / change.old
+    return next((unit for factor, unit in _UNIT_FACTORS.items() if abs(ratio / factor - 1.0) < _SAME_FACTOR), "")
+
+
+def _other_size(change: Change, state: State, *, is_new: bool) -> str | None:
+    """Why a size is unlike what was found of the asset and what stood there; of a new one, unlike all of its kind."""
+    if is_new:
+        assets = state.assets.get(change.kind)
+        known = [] if assets is None else assets.rows[change.attribute].drop_null().to_pylist()
+        if len(known) < _SEVERAL or change.new <= max(_TIMES * max(known), max(known) + _SIZE_M):
+            return None
+        return f"{change.attribute} is {change.new:g}, and the largest one of its kind is {max(known):g}"
+    row = state.row(change.asset_id, evidence=True) or {}
+    found = row.get(change.attribute)
+    sigma_m = max(row.get("sigma_size_m") or 0.0, row.get("sigma_height_m") or 0.0)
+    stood = [value for value in (found, change.old) if value is not None]
+    if not stood or any(_is_like(change.new, value, sigma_m) for value in stood):
+        return None
+    words = f"{found:.3g} ± {sigma_m:.2g} was found" if found is not None else f"it was {change.old:.3g}"
+    return f"{change.attribute} is {change.new:g}, and {words}"
+
+
+def _is_like(new: float, value: float, sigma_m: float) -> bool:
+    near = abs(new - value) <= max(_SIZE_M, _SIGMAS * sigma_m)
+    return near or value / _TIMES <= new <= value * _TIMES
+
+
+def _places(changes: Changes, state: State) -> Iterator[EditFault]:
     given = [one for one in (*changes.drawn, *changes.changed) if one.attribute == GEOMETRY and one.new is not None]
     if not given:
         return

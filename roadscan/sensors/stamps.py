@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.model.errors import FormatError, Missing, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
+from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
@@ -35,6 +35,14 @@ TIME: Final = Quantity(
 DATES: Final = ("date", "date_utc", "utc_date")
 """Names of a column that holds the date where the column of stamps holds the time of day alone."""
 _TIME_OF_DAY: Final = re.compile(r"T?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?(?:Z|[+-]\d{2}:?\d{2})?")
+_OTHER_TIMES: Final = (
+    (re.compile(r"^\s*\d{1,2}\.\d{1,2}\.\d{4}"), ": day, month and year stand as in German texts"),
+    (re.compile(r"^\s*\d{1,2}/\d{1,2}/\d{4}"), ": whether day or month stands first is not said"),
+    (re.compile(r"[AaPp]\.?[Mm]\.?\s*$"), ": hours of 12 with AM and PM are not read"),
+    (re.compile(r"\d{2}:\d{2}:\d{2}:\d+"), ": the fraction of the second stands behind a colon"),
+)
+"""What is to be said of times that other programs write."""
+_LEAP_SECOND: Final = re.compile(r"23:59:60")
 _UNIT_STAMPS: Final = 50
 """Stamps that a unit is proposed by."""
 _OF_OUR_TIME_S: Final = (4.75e8, 2.524e9)
@@ -67,6 +75,8 @@ class StampColumn:
     """Calendar times carry a zone."""
     date: str | None = None
     """Column of the date, where `column` holds the time of day alone."""
+    is_utc: bool = False
+    """Calendar times are UTC: `clock` counts what :meth:`stamps` makes of them, leap seconds included."""
 
     @property
     def kinds(self) -> dict[str, Kind]:
@@ -96,7 +106,10 @@ class StampColumn:
         named_utc = any("utc" in name.lower().split("_") for name in (found.column, date or ""))
         is_utc = zoned or (named_utc and clock is None)
         stated = source.clock if zoned else clock
-        return cls(found.column, kind, calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc), zoned, date)
+        own = calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc)
+        if own.system is TimeSystem.UNIX_UTC:
+            return cls(found.column, kind, replace(own, system=TimeSystem.UNIX_GPS), zoned, date, is_utc=True)
+        return cls(found.column, kind, own, zoned, date)
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> npt.NDArray[np.generic]:
         """Stamps (n,) of a block, float64 or int64, in the unit of `clock`; faulty ones are dropped from `sieve`."""
@@ -105,7 +118,7 @@ class StampColumn:
         words = block.text(self.column)
         if self.date is not None:
             words = [f"{date}T{time}" for date, time in zip(block.text(self.date), words, strict=True)]
-        return calendar_ns(words, sieve, zoned=self.zoned)
+        return (_leaping_ns if self.is_utc else calendar_ns)(words, sieve, zoned=self.zoned)
 
 
 def first_unit(path: Path, layout: TextLayout, found: Found) -> str:
@@ -172,8 +185,9 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, i
     Raises
     ------
     TimeSystemError
-        if `word` is no calendar time, has a zone and the clock is not UTC, or has no zone and the
-        clock does not say the scale.
+        if `word` has a zone and the clock is not UTC, or has no zone and the clock does not say the scale.
+    FormatError
+        if `word` is no calendar time.
     """
     if zoned or (is_utc and parse_calendar([word], zoned=False) is not None):
         if clock is not None and clock.system is not TimeSystem.UNIX_UTC:
@@ -185,9 +199,11 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, i
             )
         return replace(clock or Clock(TimeSystem.UNIX_UTC), unit="ns")
     if parse_calendar([word], zoned=False) is None:
-        raise TimeSystemError(
-            f"time '{word[:40]}' is neither a number nor ISO 8601 text",
+        why = next((why for pattern, why in _OTHER_TIMES if pattern.search(word)), "")
+        raise FormatError(
+            f"time '{word[:40]}' is neither a number nor ISO 8601 text{why}",
             expected="such as 2026-05-04T09:30:00.125Z",
+            change="export times so, or as seconds",
             file=file,
         )
     if clock is None or clock.system not in CALENDAR_SCALES:
@@ -210,6 +226,16 @@ def calendar_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
     zone = "with" if zoned else "without"
     sieve.drop(np.array([one is None for one in singles]), f"time is not ISO 8601 text {zone} a zone, as the first is")
     return np.array([0 if one is None else one[0] for one in singles], dtype=np.int64)
+
+
+def _leaping_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
+    """Nanoseconds (n,) from 1970 on the scale of GPS of UTC times; 23:59:60 is read where UTC had a leap second."""
+    leaps = np.array([_LEAP_SECOND.search(word) is not None for word in words], dtype=np.int64)
+    plain = [word.replace("23:59:60", "23:59:59") for word in words] if leaps.any() else words
+    utc_ns = calendar_ns(plain, sieve, zoned=zoned)
+    before, behind = (leap_seconds_at_unix(utc_ns // NS_PER_S + later) for later in (0, 1))
+    sieve.drop((leaps > 0) & (before == behind), "time is 23:59:60 on a day without a leap second")
+    return np.asarray(utc_ns + (before + leaps) * NS_PER_S, dtype=np.int64)
 
 
 def parse_calendar(words: Sequence[str], *, zoned: bool) -> Int64 | None:

@@ -52,8 +52,17 @@ _LETTERS: Final = frozenset(b"abcdfghijklmopqrstuvwxyzABCDFGHIJKLMOPQRSTUVWXYZ_"
 """Letters of names that stand in no number (1e5, nan)."""
 _DELIMITERS: Final = (",", ";", "\t", "|")
 _UTF8: Final = "utf-8"
-_UTF16: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
+_MARKED: Final = {
+    codecs.BOM_UTF32_LE: "utf-32-le",  # begins as that of UTF-16 does
+    codecs.BOM_UTF32_BE: "utf-32-be",
+    codecs.BOM_UTF16_LE: "utf-16-le",
+    codecs.BOM_UTF16_BE: "utf-16-be",
+}
 """Encodings by the byte order mark at a text's start."""
+_UNMARKED: Final = {"utf-16-le": (1, 2), "utf-16-be": (0, 2)}
+"""Encodings of which one byte of two is zero in texts of Latin letters: which one it is."""
+_ZEROS: Final = 0.9
+"""Share of these bytes that are zero, and of the others that are not."""
 _DECIMAL_LINES: Final = 200
 """Lines of records whose numbers show the decimal mark."""
 _COMMA_NUMBER: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -73,7 +82,7 @@ DECIMAL_MARK: Final = Witness(
 ENCODING: Final = Witness(
     "text_encoding",
     "any text",
-    "The text is neither UTF-8 nor UTF-16 with its byte order mark.",
+    "The text is neither UTF-8 nor UTF-16 or UTF-32 with its byte order mark.",
     "the bytes of the line of names, and of each line",
     "a log whose names are not UTF-8 is refused until options.encoding states another; other such lines are left out",
     ("error", "rejects"),
@@ -98,8 +107,8 @@ class TextOptions(Strict):
     """Decimal mark of the numbers. Found from the first records where left out; it has to be stated where their commas
     may part thousands as well."""
     encoding: str | None = None
-    """Encoding of the text, such as "cp1252" (Windows, western Europe) or "latin-1". UTF-8, or UTF-16 with its byte
-    order mark, where left out."""
+    """Encoding of the text, such as "cp1252" (Windows, western Europe) or "latin-1". UTF-8, or UTF-16 or UTF-32
+    with its byte order mark, where left out."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +123,7 @@ class TextCoding:
     @classmethod
     def of(cls, head: bytes, encoding: str | None = None) -> TextCoding:
         """Coding of the text that begins with `head`: by its byte order mark, or as stated."""
-        marked = next((name for mark, name in _UTF16.items() if head.startswith(mark)), None)
+        marked = next((name for mark, name in _MARKED.items() if head.startswith(mark)), None)
         found = cls(encoding or marked or _UTF8)
         text = found.decoded(head)
         return replace(found, ends_with_return=b"\r" in text and b"\n" not in text)
@@ -222,7 +231,14 @@ def text_layout(path: Path, options: TextOptions) -> TextLayout:
     names = [name.strip() for name in names]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
-        raise FormatError(f"two columns are called '{twice}'", change="rename one, or state names", file=path)
+        places = [str(k) for k, name in enumerate(names, 1) if name == twice]
+        raise FormatError(
+            f"two columns are called '{twice}': the {places[0]}. and the {places[1]}.",
+            expected="a name of its own for each column",
+            change="rename one, or state options.names",
+            file=path,
+            missing=Missing("options.names", [f"column_{k}" for k in range(1, len(names) + 1)], is_example=True),
+        )
     offset = start.data_offset if options.names is None else start.offset
     layout = TextLayout(tuple(names), start.delimiter, options.comment, offset, coding=start.coding)
     return replace(layout, decimal=options.decimal or _decimal_of(path, layout))
@@ -268,7 +284,7 @@ def _start_of(path: Path, options: TextOptions) -> _Start:
     skip, above = options.skip_lines, ""
     for raw in head[offset:].splitlines(keepends=True) or [b"\x00"]:
         if b"\x00" in raw:
-            raise FormatError("the file holds no text", expected="lines with columns", file=path)
+            raise _no_text(head, path)
         line = raw.strip()
         comment = bool(options.comment) and line.startswith(options.comment.encode())
         if skip <= 0 and line and not comment:
@@ -289,6 +305,21 @@ def _start_of(path: Path, options: TextOptions) -> _Start:
         skip -= 1
         offset += len(raw)
     raise FormatError("the file holds no line of column names", expected="names, then records", file=path)
+
+
+def _no_text(head: bytes, path: Path) -> FormatError:
+    """The error for bytes with zeros among them: they are no text, or one of two bytes a letter."""
+    for encoding, (zero, step) in _UNMARKED.items():
+        own, others = head[zero::step], head[1 - zero :: step]
+        if own and own.count(0) >= _ZEROS * len(own) and others.count(0) <= (1 - _ZEROS) * len(others):
+            return FormatError(
+                f"the text seems to be {encoding.upper()}, and has no byte order mark",
+                expected="UTF-8, or the encoding in options.encoding",
+                change=f'state options.encoding = "{encoding}"',
+                file=path,
+                missing=Missing("options.encoding", encoding),
+            )
+    return FormatError("the file holds no text", expected="lines with columns", file=path)
 
 
 def _coding_of(path: Path, encoding: str | None) -> TextCoding:

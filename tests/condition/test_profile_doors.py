@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,19 @@ def test_units_of_text(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> N
     assert "rejected" in told("iri", _with(named, "spoilt\n")).stderr
 
 
+def test_decimal_commas_and_kilometres(road: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, h = road
+    whole = rs.iri(x, h).iri_m_per_km[0]
+    file = tmp_path / "comma.csv"
+    for separator in (";", "\t", " "):
+        lines = [f"{a / 1e3:.6f}{separator}{1e3 * b:.4f}".replace(".", ",") for a, b in zip(x, h, strict=True)]
+        file.write_text("\n".join([f"station_km{separator}height_mm", *lines]))
+        read = rs.read_profile(file)
+        assert rs.iri(read.x_m, read.height_m).iri_m_per_km[0] == pytest.approx(whole, rel=1e-4)
+    file.write_text("station_m;height_mm\n" + "\n".join(f"1,{k:03d};2,{k:03d}" for k in range(200)))
+    assert "is a decimal mark, or parts thousands" in refused("iri", file)
+
+
 def _with(file: Path, line: str) -> Path:
     file.write_text(file.read_text() + "\n" + line)
     return file
@@ -175,3 +189,96 @@ def test_localised_roughness(road: tuple[np.ndarray, np.ndarray], tmp_path: Path
     rows = json.loads(told("iri", file, "--localised", str(limit), "--json").stdout)["rows"]
     assert len(rows) == len(found) and rows[0]["from_m"] == pytest.approx(found.from_m[0], abs=0.13)
     assert rs.localised_roughness(x, h, 1e3).empty
+
+
+# --- samples that are no road -----------------------------------------------------------------------
+
+
+def measured(seed: int = 3, step_m: float = 0.05, length_m: float = 200.0) -> tuple[np.ndarray, np.ndarray]:
+    """Stations and heights (mm) of a road whose slope is white, but for waves of 100 m and more: an IRI near 2 m/km."""
+    x = np.arange(0.0, length_m, step_m)
+    z = np.cumsum(np.random.default_rng(seed).normal(0.0, 1.6, x.size) * np.sqrt(step_m))
+    half = int(50 / step_m)
+    means = np.convolve(np.pad(z, half, mode="reflect"), np.full(2 * half + 1, 1 / (2 * half + 1)), "valid")
+    return x, z - means
+
+
+def texture(seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Places and heights (mm) of 3 m of texture, a mean profile depth near 1 mm."""
+    x = np.arange(0.0, 3000.0, 0.5)
+    wave = np.exp(-0.5 * (np.arange(-20, 21) / 5) ** 2)
+    return x, 0.6 * np.convolve(
+        np.random.default_rng(seed).normal(size=x.size), wave / np.sqrt((wave**2).sum()), "same"
+    )
+
+
+def judged(folder: Path, command: str, x: np.ndarray, z: np.ndarray, *words: str) -> tuple[list[dict], str]:
+    """Rows of `iri` or `mpd`, and what it says beside them."""
+    names = "station_m,height_mm" if command == "iri" else "place_mm,height_mm"
+    file = folder / "profile.csv"
+    file.write_text("\n".join([names, *(f"{a:.4f},{b:.5f}" for a, b in zip(x, z, strict=True)), ""]))
+    outcome = told(command, file, "--json", *words)
+    assert outcome.exit_code == 0, outcome.output
+    return json.loads(outcome.stdout)["rows"], outcome.stderr
+
+
+@pytest.mark.witness("profile_samples")
+def test_a_stuck_sensor_and_spikes_are_left_out(tmp_path: Path) -> None:
+    x, z = measured()
+    ((sound,), silence) = judged(tmp_path, "iri", x, z)
+    assert silence == "" and sound["note"] == "start"
+    stuck = z.copy()
+    stuck[1000:2000] = stuck[1000]
+    ((row,), said) = judged(tmp_path, "iri", x, stuck)
+    assert "left out" in said and "999 samples from 50.05 m to 99.95 m repeat the height" in said
+    assert (row["note"], row["measured_share"]) == ("start, gap, stuck", pytest.approx(0.75, abs=0.01))
+    parts, _ = judged(tmp_path, "iri", x, stuck, "--segment", "50")
+    whole, _ = judged(tmp_path, "iri", x, z, "--segment", "50")
+    assert parts[1]["iri_m_per_km"] is None and parts[1]["note"] == "gap, stuck"
+    assert parts[3]["iri_m_per_km"] == pytest.approx(whole[3]["iri_m_per_km"], rel=1e-3)
+    spiked = z.copy()
+    spiked[::7] += 40.0
+    ((row,), said) = judged(tmp_path, "iri", x, spiked)
+    assert f"{len(x[::7])} of its samples are spikes" in said and row["note"] == "start, spikes"
+    assert row["iri_m_per_km"] == pytest.approx(sound["iri_m_per_km"], rel=0.01)
+
+
+@pytest.mark.witness("profile_steps")
+def test_the_rounding_of_heights_is_told(tmp_path: Path) -> None:
+    x, z = measured()
+    ((sound,), _) = judged(tmp_path, "iri", x, z)
+    ((row,), said) = judged(tmp_path, "iri", x, 5.0 * np.round(z / 5.0))
+    assert (row["accuracy_class"], row["note"]) == (3, "start, coarse")
+    (by,) = re.findall(r"too high by some ([\d.]+) m/km", said)
+    assert row["iri_m_per_km"] - float(by) == pytest.approx(sound["iri_m_per_km"], rel=0.05)
+    assert row["iri_m_per_km"] > 1.2 * sound["iri_m_per_km"]
+    assert judged(tmp_path, "iri", x, 0.5 * np.round(z / 0.5))[1] == ""
+
+
+@pytest.mark.witness("profile_samples")
+def test_texture_of_a_stuck_laser_and_of_coarse_heights(tmp_path: Path) -> None:
+    x, z = texture()
+    ((sound,), silence) = judged(tmp_path, "mpd", x, z)
+    assert silence == "" and sound["note"] == ""
+    stuck = z.copy()
+    stuck[2000:4000] = stuck[2000]
+    ((row,), said) = judged(tmp_path, "mpd", x, stuck)
+    assert "repeat the height" in said and row["note"] == "dropouts 10, stuck 10" and row["valid_segments"] == 20
+    assert row["mpd_mm"] == pytest.approx(sound["mpd_mm"], rel=0.03)
+    ((row,), said) = judged(tmp_path, "mpd", x, np.round(z))
+    assert row["note"] == "coarse" and "steps of 1 mm" in said
+
+
+def test_sound_profiles_are_not_doubted(recordings: Path) -> None:
+    """A levelled road, a drawn check profile, and roads smooth and rough as recorders round them."""
+    stations, heights = np.loadtxt(recordings / "iri" / "profile_a.txt").T
+    drawn = np.genfromtxt(recordings / "iri" / "worldbank_triangle.csv", delimiter=",", skip_header=1)
+    assert rs.iri(stations, heights, segment_m=100.0).attrs["findings"] == []
+    assert rs.iri(drawn[:, 0], 1e-3 * drawn[:, 1]).attrs["findings"] == []
+    for step_m, scale, rounded_mm in ((0.025, 0.25, 0.1), (0.05, 0.5, 0.1), (0.1, 1.0, 0.5), (0.25, 5.0, 1.0)):
+        x, z = measured(7, step_m)
+        assert rs.iri(x, 1e-3 * rounded_mm * np.round(scale * z / rounded_mm)).attrs["findings"] == []
+    for seed in (21, 26):
+        x, z = texture(seed)
+        for rounded_mm in (0.01, 0.05):
+            assert rs.mpd(1e-3 * x, 1e-3 * rounded_mm * np.round(0.5 * z / rounded_mm)).attrs["findings"] == []

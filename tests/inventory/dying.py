@@ -102,7 +102,7 @@ class Work(NamedTuple):
             inventory.record(self.found)
             return
         if not self.publish or inventory.home.mark() is not None:
-            inventory.pull(who="eva")
+            inventory.pull(who="eva", confirm=("all",))
         if self.publish:
             inventory.publish()
 

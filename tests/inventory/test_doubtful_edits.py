@@ -130,6 +130,56 @@ def test_a_drawn_asset_far_from_all_others_is_asked_about(survey_file: Path) -> 
     assert "assets" in run("pull", survey_file, "--confirm", "all")
 
 
+def emptied(survey_file: Path, keep: int) -> None:
+    """Rows of the layer of poles but the first ones are gone, as in a selection that was exported."""
+    person.replace(home(survey_file), "poles", person.layer(home(survey_file), "poles").iloc[:keep])
+
+
+@pytest.mark.witness("deleted_layer")
+@pytest.mark.parametrize("keep", [0, 1])
+def test_a_layer_that_was_emptied_is_asked_about(survey_file: Path, keep: int) -> None:
+    one = ids(survey_file)[0]
+    person.edit(home(survey_file), "poles", one, condition=3)
+    emptied(survey_file, keep)
+    told = run("pull", survey_file, code=1)
+    assert f"is this right? poles, poles: {6 - keep} of the 6 assets of the layer are missing" in told
+    assert "--confirm 'poles'" in told
+    assert len(roadscan.open_survey(survey_file).inventory.truth.commits) == 1
+    run("pull", survey_file, "--sound", code=1)  # takes in what is left alone
+    assert set(roadscan.open_survey(survey_file).inventory.assets("pole")["status"]) == {"found"}
+    run("pull", survey_file, "--confirm", "poles")
+    states = roadscan.open_survey(survey_file).inventory.assets("pole")["status"]
+    assert list(states).count("rejected") == 6 - keep
+
+
+def test_assets_that_a_person_deletes_one_by_one_are_not_asked_about(survey_file: Path) -> None:
+    for one in ids(survey_file)[:3]:
+        person.delete(home(survey_file), "poles", one)
+    signs = asset_schema("sign").table
+    person.delete(home(survey_file), signs, person.ids(home(survey_file), signs)[0])
+    assert "4 values of 4 assets" in run("pull", survey_file)
+
+
+@pytest.mark.witness("sizes_of_edits")
+def test_a_size_unlike_what_was_found_is_asked_about(survey_file: Path) -> None:
+    one, second, *others = ids(survey_file)
+    person.edit(home(survey_file), "poles", one, asset_height_m=310.0)
+    person.edit(home(survey_file), "poles", second, asset_height_m=6.2)
+    told = run("pull", survey_file, code=1)
+    assert f"poles, {one}: asset_height_m is 310, and 5 ± 0.02 was found" in told and second not in told
+    assert "2 values of 2 assets" in run("pull", survey_file, "--confirm", one)
+    person.edit(home(survey_file), "poles", one, asset_height_m=311.0)  # near what was confirmed
+    assert "1 values of 1 assets" in run("pull", survey_file)
+    for number, other in enumerate(others, 2):
+        person.edit(home(survey_file), "poles", other, asset_height_m=(5.0 + 0.1 * number) * 3.28084)
+    told = run("pull", survey_file, code=1)
+    assert told.count("as 4 values are: feet?") == 4, told
+    assert "asset_height_m is 17.0604 and was 5.2" in told
+    person.draw(home(survey_file), "poles", shapely.Point(EAST + 33.0, NORTH + 4.0, 102.0), asset_height_m=900.0)
+    assert "asset_height_m is 900, and the largest one of its kind is 311" in run("pull", survey_file, code=1)
+    assert "assets" in run("pull", survey_file, "--confirm", "all")
+
+
 def stored(file: Path, layer: str, asset_id: str, column: str, value: object) -> None:
     """Write a value as SQLite takes it, without the checks of OGR; triggers of the spatial index do not concern it."""
     with sqlite3.connect(file) as db:

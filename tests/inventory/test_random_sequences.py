@@ -267,7 +267,7 @@ class Street(RuleBasedStateMachine):
             return
         key = rows[at]["asset_id"], "asset_height_m"
         self.copy.edit("pole", at, asset_height_m=height)
-        edits = self.inventory().pull(home=self.copy, who="max").edits
+        edits = self.inventory().pull(home=self.copy, who="max", confirm=("all",)).edits
         self.tally["copied"] += len(edits)
         row = state_at(self.inventory().truth).row(key[0])
         assert row is not None, key

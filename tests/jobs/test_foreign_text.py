@@ -56,6 +56,7 @@ READ: dict[str, bytes] = {
     "a byte order mark": b"\xef\xbb\xbf" + CSV.encode(),
     "UTF-16 LE": b"\xff\xfe" + CSV.encode("utf-16-le"),
     "UTF-16 BE": b"\xfe\xff" + CSV.encode("utf-16-be"),
+    "UTF-32": CSV.encode("utf-32"),
     "carriage returns": CSV.replace("\n", "\r").encode(),
     "carriage returns and line feeds": CSV.replace("\n", "\r\n").encode(),
     "names behind a #": ("# exported by a program\n# " + CSV).encode(),
@@ -101,6 +102,19 @@ def test_a_calendar_time_without_a_zone_is_asked_for(tmp_path: Path) -> None:
     assert table.epoch_gps_ns.min() == FIRST_GPS_NS - 18_000_000_000  # 18 leap seconds lie between UTC and GPS time
 
 
+def test_a_leap_second_is_read(tmp_path: Path) -> None:
+    """That of the end of 2016 (IERS Bulletin C 52): UTC counts 23:59:60, and GPS − UTC grows from 17 s to 18 s."""
+    seconds = [f"2016-12-31T23:59:{k / 2:04.1f}Z" for k in range(100, 122)]
+    path = tmp_path / "t.csv"
+    path.write_text(poses(lambda k: seconds[k + 2] if k < 20 else "").replace("\n\n", "\n"))
+    (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock=""))
+    assert roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0").exit_code == 0
+    table = rs.open_survey(tmp_path / "SURVEY.toml").table("trajectory")
+    epochs = np.sort(table.epoch_gps_ns.to_numpy())
+    assert np.diff(epochs).tolist() == [500_000_000] * 19
+    assert epochs[-1] == (1_483_228_800 - 315_964_800 + 17) * 10**9 + 500_000_000  # 23:59:60.5, 17 s before the leap
+
+
 POINTS = "name;easting;northing;height\n"
 NAMED: dict[str, tuple[bytes, list[str]]] = {
     "a time of day alone": (
@@ -114,6 +128,24 @@ NAMED: dict[str, tuple[bytes, list[str]]] = {
     "names in CP1252": (
         "Punkt;Höhe_m\na;1,5\n".encode("cp1252"),
         ["byte 0xf6 of the line of column names is not UTF-8", 'options.encoding = "cp1252"'],
+    ),
+    "UTF-16 without its mark": (
+        CSV.encode("utf-16-le"),
+        ["the text seems to be UTF-16-LE, and has no byte order mark", 'options.encoding = "utf-16-le"'],
+    ),
+    "one name twice": (
+        CSV.replace("pitch_deg", "roll_deg").encode(),
+        ["two columns are called 'roll_deg': the 5. and the 6.", "state options.names"],
+    ),
+    "German dates": (
+        poses(lambda k: f"04.05.2026 09:30:{k / 10:04.1f}").encode(),
+        ["'04.05.2026 09:30:00.0' is neither a number nor ISO 8601 text: day, month and year", "2026-05-04T09:30"],
+    ),
+    "AM": (poses(lambda k: f"2026-05-04 09:30:{k:02d} AM").encode(), ["hours of 12 with AM and PM"]),
+    "a fraction behind a colon": (poses(lambda k: f"09:30:00:{k:03d}").encode(), ["stands behind a colon"]),
+    "a leap second that there was not": (
+        poses(lambda k: "2026-05-04T23:59:60Z" if k == 9 else utc(k)).encode(),
+        ["1 × time is 23:59:60 on a day without a leap second"],
     ),
     "two columns of time": (
         CSV.replace("time,", "time,stamp,", 1).replace("Z,", "Z,1,").encode(),
@@ -130,6 +162,18 @@ def test_what_cannot_be_understood_is_named_with_the_way_out(tmp_path: Path, con
     assert [part for part in said if part not in words] == [], words
     assert "but ;" not in words
     assert "such as ;" not in words
+
+
+def test_x_and_y_of_a_stated_crs_are_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("name,x_m,y_m,z_m\n1,5335013.45,691015.11,560.32\n2,5335008.33,691018.43,560.33\n")
+    assert "can be read as control_csv" in words_of(path)
+    words = words_of(path, "--crs", "EPSG:32632", "--height", "ellipsoidal")
+    assert "can be read as control_csv, but not in the CRS" in words and "no column holds the easting" in words
+    path.write_text(
+        "name,easting_m,northing_m,height_m\n1,691015.11,5335013.45,560.32\n2,691018.43,5335008.33,560.33\n"
+    )
+    assert "560.320 to 560.330 m as written" in words_of(path)
 
 
 @pytest.mark.witness("text_encoding")

@@ -470,3 +470,37 @@ def test_a_kind_that_cannot_have_written_the_log(tmp_path: Path, kind: str) -> N
     code, text = run(tmp_path)
     assert code == 2
     assert f"is of kind {kind}, and the log yields scans; expected a sensor of kind lidar or profiler" in text
+
+
+# --- σ of control -----------------------------------------------------------------------------------
+
+CONTROL = '[[control]]\npath = "control.csv"\ncrs = "EPSG:25832"\nheight = "ellipsoidal"\n\n[[runs]]'
+
+
+def with_control(folder: Path, unit: str, *sigmas: str) -> list[str]:
+    """What ingesting a survey says of the σ of its control points."""
+    changed(folder, ("[[runs]]\n", CONTROL + "\n"))
+    lines = [f"P{k},gcp,{500_000 + k},{5_300_000 + k},100,{sigma}" for k, sigma in enumerate(sigmas)]
+    text = "\n".join([f"name,role,easting_m,northing_m,height_m,sigma_height_{unit}", *lines, ""])
+    (folder / "control.csv").write_text(text)
+    assert said(folder, "ingest", "--workers", "0")[0] == 0
+    return [line for line in said(folder, "status")[1].splitlines() if "the σ of the" in line]
+
+
+@pytest.mark.witness("control_sigma")
+@pytest.mark.parametrize(
+    ("unit", "sigmas", "words"),
+    [
+        ("m", ("3", "0.004", "5"), "height of 2 of 3 points (3 m to 5 m) is so large"),
+        ("m", ("0", "0.004", ""), "height of 1 of 3 points is 0: it counts as not stated"),
+        ("mm", ("0.003", "0.004"), "height of 2 of 2 points (3e-06 m to 4e-06 m) is smaller than any survey reaches"),
+    ],
+)
+def test_a_sigma_that_no_survey_has_is_named(tmp_path: Path, unit: str, sigmas: tuple[str, ...], words: str) -> None:
+    (found,) = with_control(tmp_path, unit, *sigmas)
+    assert words in found
+
+
+def test_sigmas_that_surveys_have_are_not_doubted(tmp_path: Path) -> None:
+    """Precise levelling, tachymetry, GNSS in the field."""
+    assert with_control(tmp_path, "mm", "0.2", "3", "25", "150", "") == []

@@ -33,7 +33,7 @@ from roadscan.jobs.inventory import truth_of
 from roadscan.jobs.publish import web_part
 from roadscan.jobs.publish.document import json_bytes
 from roadscan.jobs.publish.edit_door import EditDoor
-from roadscan.jobs.publish.layer import BELOW_TO_ABOVE
+from roadscan.jobs.publish.layer import BELOW_TO_ABOVE, title_of
 from roadscan.jobs.publish.live import LiveSite, open_survey
 from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.jobs.publish.parts import strips, vectors
@@ -800,3 +800,13 @@ def test_a_survey_without_tiles_is_shown_where_its_layers_are(survey_file: Path)
     assert places and entry_of_all["clouds"] is None and entry_of_all["lon_lat"] is not None
     for box in places:
         assert west <= box[0] and south <= box[1] and box[2] <= east and box[3] <= north
+
+
+def test_titles_leave_units_to_the_page() -> None:
+    """The page puts the unit beside each value: "Crown mean mm mm" says it twice."""
+    wanted = {
+        ("crown_mean_mm", "mm"): "crown mean", ("cross_slope_mean_percent", "%"): "cross slope mean",
+        ("mri_m_per_km", "m/km"): "MRI", ("sigma_size_m", "m"): "σ size", ("epoch_gps_ns", "ns"): "epoch",
+        ("ravelling_loss_cm3_per_m2", "cm³/m²"): "ravelling loss", ("joints", "number"): "joints",
+    }  # fmt: skip
+    assert {one: title_of(*one) for one in wanted} == wanted

@@ -112,6 +112,9 @@ def test_passes_that_differ_by_more_than_their_ties_err_are_named() -> None:
     (warning,) = said
     assert isinstance(warning, Paragraph)
     assert "differ by 9.00 mm in the shifts, 4 times their σ of 2.00 mm" in warning.text
+    _, said_of_many = agreement([one | {"sigma_m": 0.0043} for one in rows[:1] * 20])
+    assert isinstance(said_of_many, Paragraph) and not said_of_many.is_warning
+    assert "the shifts differ by 9.00 mm, 2.1 times their σ of 4.30 mm" in said_of_many.text
 
 
 def ruts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

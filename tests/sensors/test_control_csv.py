@@ -142,7 +142,7 @@ def test_damage(tmp_path: Path) -> None:
         3: "the point has no name",
         4: "a point of this name came before",
         5: "role is neither 'gcp' nor 'check'",
-        6: "σ of the height position is outside 0 to 1000 m",
+        6: "σ of the height is outside 0 to 1000 m",
         7: "4 fields, expected 6",
         8: "northing is outside -2.1e+07 to 2.1e+07 m",
     }

@@ -356,7 +356,7 @@ def test_ways_to_state_the_end(tmp_path: Path) -> None:
         ({"end": "modified"}, {"sensor": CAMERA}, TimeSystemError, "time system is not stated"),
         ({"end": "modified"}, STATED, TimeSystemError, "calendar time, the clock says gps"),
         ({"end": "2026-05-04T09:30:00"}, {"sensor": CAMERA}, TimeSystemError, "has no zone"),
-        ({"end": "yesterday"}, {"sensor": CAMERA}, TimeSystemError, "neither a number nor ISO 8601"),
+        ({"end": "yesterday"}, {"sensor": CAMERA}, FormatError, "neither a number nor ISO 8601"),
         ({"end": 1}, STATED | {"clock": UTC}, TimeSystemError, "outside 1980–2080"),
         ({"end": T0, "pattern": "{stamp}"}, STATED, ConfigError, "options.pattern is for a folder"),
         ({"end": T0, "frame_count": 3}, STATED, ConfigError, "frame_count = 3, and the video holds 10"),

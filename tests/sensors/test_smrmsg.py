@@ -187,6 +187,13 @@ def test_sigmas_are_linear_in_time_and_end_with_the_file(tmp_path: Path) -> None
     np.testing.assert_array_equal(bare.positions, log.positions)
 
 
+def test_sigmas_that_are_all_wrong_are_named_as_such(tmp_path: Path) -> None:
+    """Not their times, which fit."""
+    write(tmp_path / "acc.out", [record(1001.0, north=-0.1), record(1002.0, north=-0.3)])
+    with pytest.raises(FormatError, match=r"acc\.out: no record of it is sound: .*sigma_north_m"):
+        sbet_with(sbet(tmp_path / "a.sbet", [1000.0 + 0.25 * i for i in range(13)]), "acc.out")
+
+
 @pytest.mark.parametrize("start", [WEEK_S - 30.0, WEEK_S - 20.0, WEEK_S - 1.0, WEEK_S + 5.0])
 def test_either_file_may_start_in_the_other_week(tmp_path: Path, start: float) -> None:
     """The stated week is the poses' first; the accuracy file may begin before or after the week's end."""

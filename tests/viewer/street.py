@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from roadscan.codecs.copc import CopcWriter
 from roadscan.codecs.mesh import Mesh, write_glb
+from roadscan.jobs.publish.layer import title_of
 from roadscan.jobs.publish.parts import edits
 from roadscan.model.crs import MapFrame
 from roadscan.points.octree import Cube, NodeCutter
@@ -157,7 +158,7 @@ def _layer(name: str, title: str, group: str, kind: str, order: int, label: str 
 
 
 def _column(name: str, unit: str) -> dict[str, Any]:
-    return {"name": name, "title": name.replace("_", " "), "unit": unit, "meaning": HOSTILE}
+    return {"name": name, "title": title_of(name, unit), "unit": unit, "meaning": HOSTILE}
 
 
 def _feature(number: int, geometry: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -136,6 +137,7 @@ def test_degrees_are_a_place_and_the_page_says_what_it_took_them_for(page: Any, 
         for name in ("easting", "northing")
     ]
     assert np.hypot(at[0] - east, at[1] - north) < 0.1
+    page.locator('[data-read="height"]', has_text=re.compile(r"\d")).wait_for()  # that of the surface there
     search(page, "48.1,11.5")
     assert "more than 2 km outside of the survey" in message(page, "Latitude 48.1°")
 
@@ -220,7 +222,7 @@ def test_confirming_and_correcting_an_asset_loses_neither(page: Any, first: str)
     def press(title: str) -> None:
         page.locator(".edit button", has_text=title).click()
         if title == "Correct":
-            page.locator('.edit-form [aria-label="height m"]').fill("4.5")
+            page.locator('.edit-form [aria-label="height"]').fill("4.5")
             page.locator('.edit-form button:has-text("Keep")').click()
 
     press(first)
@@ -230,6 +232,7 @@ def test_confirming_and_correcting_an_asset_loses_neither(page: Any, first: str)
     press("Reject")
     (edit,) = edits_of(page)
     assert edit["attributes"] == {"height_m": 4.5, "status": "rejected"}
+    page.locator("dl.values", has_text=re.compile(r"4\.5.*, edited; it was \d")).wait_for()
 
 
 def test_edits_that_were_not_sent_are_there_again(page: Any) -> None:

@@ -254,7 +254,7 @@ def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
 def test_edits_become_a_document(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#row=asset_poles/1&views=map")
     page.locator(".edit button", has_text="Correct").click()
-    page.locator('.edit-form [aria-label="height m"]').fill("4.5")
+    page.locator('.edit-form [aria-label="height"]').fill("4.5")
     page.locator('.edit-form [aria-label="Comment"]').fill(HOSTILE)
     page.locator('.edit-form button:has-text("Keep")').click()
     with page.expect_download() as download:

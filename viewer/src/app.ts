@@ -1,7 +1,7 @@
 /** The page: puts its parts side by side and passes between them what people point at. */
 
 import { ModelParts } from './parts'
-import type { Desk, ViewName } from './core/desk'
+import type { Desk, Place, ViewName } from './core/desk'
 import { fill, h, icon, iconButton } from './core/dom'
 import * as format from './core/format'
 import { MapView } from './map/map'
@@ -61,6 +61,7 @@ export class App {
         void this.parts.goToStationOf(road ?? '', lane ?? null, station_m ?? 0)
       },
       edit: this.#editing && ((selected) => this.#editing!.controls(selected)),
+      edited: this.#editing && ((selected) => this.#editing!.edited(selected)),
     })
     this.#table = new TablePanel(desk, (feature) => this.#lookAt(feature))
     this.#drawLayers()
@@ -303,13 +304,21 @@ export class App {
     this.#found.hidden = true
     const wanted = parseSearch(text, this.desk.survey.extent_m)
     if (wanted.kind === 'place') {
-      this.desk.place.value = { easting_m: wanted.easting_m, northing_m: wanted.northing_m, height_m: wanted.height_m, from: 'search' }
+      void this.#place({ easting_m: wanted.easting_m, northing_m: wanted.northing_m, height_m: wanted.height_m, from: 'search' })
       this.desk.goTo({ ...wanted, across_m: 20 })
     } else if (wanted.kind === 'tile') this.#goToTile(wanted.tile)
     else if (wanted.kind === 'station' && this.desk.survey.strips) await this.parts.goToStation(wanted.station_m, null)
     else if (wanted.kind === 'degrees') this.#goToDegrees(wanted.latitude_deg, wanted.longitude_deg)
     else if (wanted.kind === 'row' && (await this.#goToRow(wanted.layer, wanted.id))) return
     else if (wanted.kind !== 'station') await this.#find(text.trim())
+  }
+
+  /** Show a place that was looked for; its height, where none was given, is that of the surface there. */
+  async #place(place: Place): Promise<void> {
+    this.desk.place.value = place
+    if (place.height_m !== null) return
+    const height_m = await this.map.heightAt(place.easting_m, place.northing_m)
+    if (this.desk.place.value === place && height_m !== null) this.desk.place.value = { ...place, height_m }
   }
 
   /** Go to latitude and longitude, and say what the numbers were taken for; the other way round where only that lies here. */
@@ -321,7 +330,7 @@ export class App {
     const [lat, lon] = asGiven ? [latitude_deg, longitude_deg] : [longitude_deg, latitude_deg]
     if (!place) return this.desk.complain(`Latitude ${latitude_deg}°, longitude ${longitude_deg}° (WGS 84) is more than 2 km outside of the survey.`)
     const [easting_m, northing_m] = place
-    this.desk.place.value = { easting_m, northing_m, height_m: null, from: 'search', notes: [['Latitude', `${lat}°`], ['Longitude', `${lon}°`]] }
+    void this.#place({ easting_m, northing_m, height_m: null, from: 'search', notes: [['Latitude', `${lat}°`], ['Longitude', `${lon}°`]] })
     this.desk.goTo({ easting_m, northing_m, across_m: 20 })
     this.desk.say(`Taken for latitude ${lat}°, longitude ${lon}° (WGS 84)${asGiven ? '' : ', in this order'}: E ${format.fixed(easting_m, 2)}, N ${format.fixed(northing_m, 2)}.`)
   }

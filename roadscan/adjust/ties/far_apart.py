@@ -25,6 +25,8 @@ _LEAST: Final = 3
 _MOST: Final = 0.5
 """Share of the heights of two passes, and of the patches, that is most of them."""
 _SIGMAS: Final = 3.0
+_ALIKE_M: Final = 0.02
+"""Ties that agree differ by no more, beside their σ (m): poses wander by so much, and chance matches differ by more."""
 _ALONG: Final = 0.5
 """Cosine from which on a direction tells of a shift."""
 
@@ -53,10 +55,16 @@ def _of_one_pass(tried: Column) -> Bool:
     return np.asarray(same & (apart < 30_000_000_000))
 
 
-def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float) -> tuple[Bool, Float64]:
+def agreeing(
+    tried: Column, near: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float
+) -> tuple[Bool, Float64]:
     """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find, and
     that shift (3,): second minus first, north, east, down (m).
 
+    Parameters
+    ----------
+    near : ties of the same runs. Where passes lie apart, these match at odd places; where they agree on another shift,
+        it is the larger patches that are deceived, by marks that repeat.
     most_up_m : passes that lie farther above one another than this contradict the σ of their poses.
     """
     counts = tried["accepted"] == 1
@@ -64,7 +72,9 @@ def agreeing(tried: Column, settings: AgainSettings, fine: TieSettings, most_up_
     kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
     if kept.any():
         shift[:2] = _solved(tried, np.flatnonzero(kept))
-        if not _is_supported(tried, kept, counts & (tried["kind"] == SHIFT), shift[:2]):
+        # Relief that contradicts paint counts as well: one of the two matched at a wrong place.
+        every = (tried["kind"] == SHIFT) & np.isfinite(tried["value_m"])
+        if not _is_supported(tried, kept, every, shift[:2]) or _is_contradicted(near, shift[:2], settings.alike_m):
             kept[:], shift[:2] = False, 0.0
     heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
     level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
@@ -110,6 +120,21 @@ def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> boo
     along = np.abs(_directions(tried, np.arange(kept.size)) @ shift) > _ALONG * length
     support, against = (np.unique(tried["place"][own & along]) for own in (kept, every & ~kept))
     return support.size >= _LEAST and support.size > np.setdiff1d(against, support).size
+
+
+def _is_contradicted(near: Column, shift: Float64, alike_m: float) -> bool:
+    """Whether ties agree on another shift along the same direction."""
+    rows = np.flatnonzero((near["accepted"] == 1) & (near["kind"] == SHIFT))
+    directions = _directions(near, rows)
+    along = directions @ shift / max(float(np.hypot(*shift)), 1e-9)
+    rows, along = rows[np.abs(along) > _ALONG], along[np.abs(along) > _ALONG]
+    if np.unique(near["place"][rows]).size < _LEAST:
+        return False
+    values = near["value_m"][rows] * np.sign(along)
+    level = float(np.median(values))
+    agree = np.abs(values - level) <= _ALIKE_M + _SIGMAS * near["sigma_m"][rows]
+    elsewhere = np.abs(values - np.abs(along) * float(np.hypot(*shift))) > alike_m
+    return bool((agree & elsewhere).sum() > _MOST * rows.size)
 
 
 def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:

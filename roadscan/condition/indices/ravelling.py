@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -24,6 +25,7 @@ import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
+from roadscan.condition.of_sections.whole_sections import noisy
 from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
 from roadscan.condition.on_lane.squares import TextureSquares
 
@@ -62,8 +64,12 @@ def looked_through(lane: LaneData) -> list[RavelledSection]:
 
 
 def _squares(lane: LaneData, from_m: float, to_m: float) -> tuple[TextureSquares, npt.NDArray[np.bool_]]:
-    """Squares of a section, and which of them lie on the road."""
-    squares = lane.texture.between(from_m, to_m)
+    """Squares of a section, and which of them lie on the road; noise is no texture, so that of noisy ones is NaN."""
+    squares, c = lane.texture.between(from_m, to_m), lane.cross_sections
+    wrong_m, near_m = c.station_m[noisy(c)], lane.config.cross_section_spacing_m
+    if wrong_m.size:
+        away = np.abs(squares.station_m[:, None] - wrong_m).min(axis=1)
+        squares = replace(squares, texture_mm=np.where(away[:, None] <= near_m, np.nan, squares.texture_mm))
     inside: npt.NDArray[np.bool_] = np.ones(squares.texture_mm.shape, bool)
     if lane.edges is not None:
         rows = [lane.edges.inside(np.full(squares.offset_m.size, s), squares.offset_m) for s in squares.station_m]

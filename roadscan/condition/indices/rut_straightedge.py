@@ -49,7 +49,7 @@ class RutStraightedge(ConditionIndex):
             straightedge(c.offset_m, whole.height_m, length, found)
             for half, side in enumerate(("left", "right")):
                 depth = PerCrossSection(
-                    _name(side, length), c.station_m, whole.spread(_MM * found[:, half], n), sigma, c.share
+                    _name(side, length), c.station_m, whole.spread(_MM * found[:, half], n), sigma, c.share, whole.noisy
                 )
                 yield from depth.values()
                 yield from by_section(depth, lane, ((_name(side, length, "_mean"), "mean"),))

@@ -61,7 +61,7 @@ class RutWire(ConditionIndex):
         sigma_area = whole.sigma_m * np.sqrt(3.0 * half_m * step + 0.5 * half_m**2)
 
         def held(name: str, values: Float64, sigma: Float64) -> PerCrossSection:
-            return PerCrossSection(name, c.station_m, whole.spread(values, n), sigma, c.share)
+            return PerCrossSection(name, c.station_m, whole.spread(values, n), sigma, c.share, whole.noisy)
 
         for half, side in enumerate(("left", "right")):
             sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(found[:, half, 4]), n)

@@ -3,13 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.condition.lane_data import LaneData
+from roadscan.condition.lane_data import CrossSections, LaneData
 
 Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+_NOISIER: Final = 10.0
+"""Times that of the lane: readings of another kind of sensor. Of one kind, σ varies by two or three."""
+_NOISY_M: Final = 1e-3
+"""Below, noise adds less to a depth than a rut has: the greatest depth under a wire lies some three σ too deep."""
+
+
+def noisy(c: CrossSections) -> Bool:
+    """(n,) True where σ of a cross-section's heights is over ten times that of the lane and over 1 mm.
+
+    So it is where a drive ends, and a lidar alone saw the road from afar: noise makes depths and texture there.
+    """
+    sigma = _sigma_of(c.sigma_m)
+    known = np.isfinite(sigma)
+    usual = float(np.median(sigma[known])) if known.any() else np.inf
+    return np.nan_to_num(sigma) > max(_NOISIER * usual, _NOISY_M)
+
+
+def _sigma_of(sigma_m: Float64) -> Float64:
+    """(n,) medians of rows; NaN where none is known."""
+    rows = (row[~np.isnan(row)] for row in sigma_m)
+    return np.array([np.median(own) if own.size else np.nan for own in rows], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,24 +46,23 @@ class WholeSections:
     """(k, m)"""
     sigma_m: Float64
     """(k,) median standard deviation of a height; NaN where not known."""
+    noisy: Bool
+    """(n,) which of the lane's cross-sections are left out for their noise (:func:`noisy`)."""
 
     @classmethod
     def of(cls, lane: LaneData) -> WholeSections:
-        """Those with at least the share `least_share` measured, both ends included but for a tenth of the width."""
+        """Those that are not noisy, with at least the share `least_share` measured: both ends too, but for a tenth."""
         c = lane.cross_sections
         known = ~np.isnan(c.height_m)
         m = c.offset_m.size
         tenth = max(m // 10, 1)
         ends = known[:, :tenth].any(axis=1) & known[:, -tenth:].any(axis=1)
-        rows = np.flatnonzero((c.share >= lane.config.least_share) & ends)
+        left_out = noisy(c)
+        rows = np.flatnonzero((c.share >= lane.config.least_share) & ends & ~left_out)
         height = np.empty((rows.size, m))
         for k, row in enumerate(rows.tolist()):
             height[k] = np.interp(c.offset_m, c.offset_m[known[row]], c.height_m[row, known[row]])
-        sigma = np.full(rows.size, np.nan)
-        for k, row in enumerate(rows.tolist()):
-            own = c.sigma_m[row][~np.isnan(c.sigma_m[row])]
-            sigma[k] = np.median(own) if own.size else np.nan
-        return cls(rows, height, sigma)
+        return cls(rows, height, _sigma_of(c.sigma_m[rows]), left_out)
 
     def spread(self, values: Float64, count: int) -> Float64:
         """(count,) values of all cross-sections of the lane: NaN where too little was measured."""

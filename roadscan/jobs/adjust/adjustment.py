@@ -61,6 +61,7 @@ from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.plan.road import road_key
 from roadscan.jobs.session import Session
+from roadscan.model.counted import counted as count_of
 from roadscan.model.settings.tie_settings import PlaceSettings
 from roadscan.model.witness import Finding
 from roadscan.navigation.movement import largest
@@ -401,7 +402,7 @@ def _lines(
 def _statement(count: int, nssda_95_m: float) -> str:
     """Accuracy after NSSDA, or that there are too few points for it."""
     if count < NSSDA_CHECK_POINTS:
-        return f"of {count} points (NSSDA takes {NSSDA_CHECK_POINTS} at least)"
+        return f"of {count_of(count, 'point')} (NSSDA takes {NSSDA_CHECK_POINTS} at least)"
     return f"95 % within {nssda_95_m * 1e3:.2f} mm (NSSDA, {count} points)"
 
 

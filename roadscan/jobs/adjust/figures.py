@@ -204,7 +204,7 @@ def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
         found.append(_accuracy("left_out", "height", "adjusted", left.vertical))
     if left is not None and left.horizontal is not None:
         found.append(_accuracy("left_out", "horizontal", "adjusted", left.horizontal))
-    control = {one.point.number for one in evidence.sightings if one.point.role == "gcp"}
+    control = {one.point.number for one in evidence.sightings if one.point.role == "gcp" and not one.point.is_of_line}
     for name, (away, sigma) in solution.datum.items():
         found.append(
             {

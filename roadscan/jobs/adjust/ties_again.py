@@ -121,7 +121,7 @@ def first_ties(
         return Again(tuple(tasks), ties, control=tuple(control))
     observe(larger)
     far = load(larger)
-    kept, apart = _agreed(far, plan.survey.config.adjust, _sigmas(plan, sources))
+    kept, apart = _agreed(far, ties, plan.survey.config.adjust, _sigmas(plan, sources))
     misplaced, findings = _contradicted(plan, sources, ties, apart)
     # What was matched where two passes lie apart is not one place of the road.
     joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
@@ -248,12 +248,12 @@ def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:
 
 def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: KnownTies) -> KnownTies:
     """The ties, and those of larger patches of pairs of runs that still do not match."""
-    kept, apart = _agreed(larger, plan.survey.config.adjust, _sigmas(plan, sources))
+    kept, apart = _agreed(larger, ties, plan.survey.config.adjust, _sigmas(plan, sources))
     return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
 
 
 def _agreed(
-    larger: KnownTies, config: AdjustConfig, sigmas: Mapping[str, Float64]
+    larger: KnownTies, ties: KnownTies, config: AdjustConfig, sigmas: Mapping[str, Float64]
 ) -> tuple[Bool, dict[tuple[str, str], Float64]]:
     """Which ties (n,) of larger patches count, and by pair of runs the shift that they agree on."""
     tried, kept, apart = larger.tried, np.zeros(larger.observations.size, np.bool_), dict[tuple[str, str], Float64]()
@@ -262,7 +262,9 @@ def _agreed(
         rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
         up_m = _APART * float(np.hypot(*(sigmas[run][2] for run in pair)))
         own = {name: values[rows] for name, values in tried.items()}
-        fits, shift = agreeing(own, config.again, config.ties, up_m)
+        of_pair = (ties.tried["first_run"] == pair[0]) & (ties.tried["second_run"] == pair[1])
+        near = {name: values[of_pair] for name, values in ties.tried.items()}
+        fits, shift = agreeing(own, near, config.again, config.ties, up_m)
         kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
         if fits.any():
             apart[pair] = shift

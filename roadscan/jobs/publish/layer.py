@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import functools
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,22 @@ GOOD_TO_POOR: Final = ("#4575b4", "#91bfdb", "#fee090", "#fc8d59", "#d73027")
 """Five steps that all eyes tell apart (ColorBrewer 2, RdYlBu)."""
 
 
+_UNIT_IN_NAME: Final = re.compile(
+    r"_(m_per_km|per_km|kg_m3|cm3_per_m2|m2_per_m|m_m2|gps_ns|mm|cm|m2|m3|cm3|m|px|deg|percent|ns|ms)$"
+)
+"""Units with which names of columns and quantities end."""
+
+
+_ACRONYM: Final = re.compile(r"\b(hri|iri|mpd|mri|psd|rms)\b")
+
+
+def title_of(name: str, unit: str) -> str:
+    """Title of a column or quantity for people: without the unit, which the page puts beside the values."""
+    bare = _UNIT_IN_NAME.sub("", name) if unit and unit not in ("text", "1", "number", "date") else name
+    words = re.sub(r"\bsigma\b", "σ", bare.replace("_", " "))
+    return _ACRONYM.sub(lambda found: found[0].upper(), words)
+
+
 @dataclass(frozen=True)
 class SiteColumn:
     """A column of a layer's rows."""
@@ -50,7 +67,7 @@ class SiteColumn:
 
     def stated(self) -> dict[str, Any]:
         """As the page reads it."""
-        title = self.title or self.name.replace("_", " ")
+        title = self.title or title_of(self.name, self.unit)
         told: dict[str, Any] = {"name": self.name, "title": title, "unit": self.unit, "meaning": self.meaning}
         told |= {"sigma": self.sigma} if self.sigma else {}
         return told if self.edited is None else told | {"edited": {"type": self.edited[0], "values": self.edited[1]}}

@@ -190,7 +190,8 @@ class CarriedAccuracy:
         self._epochs = np.empty(0, dtype=np.int64)
         self._sigmas = np.empty((len(SIGMAS), 0))
         self._gap_ns: float | None = None
-        self._asked = self._answered = 0
+        self._asked = self._answered = self._held = 0
+        self._first_reject = ""
 
     def at(self, epochs: Int64) -> dict[str, Float64]:
         """σ by column name (:data:`CARRIED`), (n,) with NaN beyond the file's span and in its gaps, at epochs (n,)."""
@@ -228,6 +229,13 @@ class CarriedAccuracy:
         while self._next() is not None:
             yield from self.rejects()
         yield from self.rejects()
+        if self._asked and not self._held and self._first_reject:
+            raise FormatError(
+                f"no record of it is sound: {self._first_reject}",
+                expected="σ of positions and angles, none of them negative",
+                change="export the accuracy file anew, or leave out options.accuracy of the SBET log",
+                file=self._path,
+            )
         if self._asked and not self._answered:
             raise FormatError(
                 f"no record lies within the time of the trajectory's {self._asked} poses",
@@ -242,6 +250,7 @@ class CarriedAccuracy:
             block = next(self._blocks, None)
             if isinstance(block, Reject):
                 self._rejects.append(replace(block, file=self._name))
+                self._first_reject = self._first_reject or block.reason
                 continue
             self._ended = block is None
             return block
@@ -255,6 +264,7 @@ class CarriedAccuracy:
         self._forget(first)
 
     def _hold(self, block: AccuracyBlock) -> None:
+        self._held += block.epochs.size
         self._epochs = np.concatenate([self._epochs, block.epochs])
         self._sigmas = np.concatenate([self._sigmas, block.sigmas], axis=1)
         if np.any(np.diff(self._epochs) < 0):

@@ -25,6 +25,7 @@ from roadscan.model.crs import (
     world_from_geodetic,
 )
 from roadscan.model.errors import ConfigError, CrsError, Missing
+from roadscan.model.witness import Finding, Witness
 from roadscan.sensors.base import Item, LogSource, Rows
 from roadscan.sensors.records import Sieve, drop_failing
 from roadscan.sensors.trajectories.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, height_in
@@ -36,7 +37,19 @@ Index = Int64 | slice
 Role = Literal["gcp", "check"]
 CrsKind = Literal["geographic", "projected", "local"]
 
+CONTROL_SIGMA: Final = Witness(
+    name="control_sigma",
+    input="control points",
+    fault="The stated σ of a point is zero, or in another unit than its column: millimetres as metres, or the reverse.",
+    asks="each σ, against what surveyors' instruments reach: 0.05 mm to half a metre",
+    does="a σ of zero counts as not stated; any other is used as stated, and named",
+    told=("findings",),
+)
 SIGMA_MAX_M: Final = 1_000.0
+_COARSE_SIGMA_M: Final = 0.5
+"""Points known no better than this hold no drive, as those of hand-held receivers; 0.5 mm given as metres are such."""
+_FINE_SIGMA_M: Final = 5e-5
+"""Precise levelling reaches 0.2 mm over a kilometre; no point of a road is known better than this."""
 NO_TEXT: Final = "\ufffd"
 """Stands for bytes that could not be decoded."""
 
@@ -160,6 +173,7 @@ class ControlReader:
         self._frame = frame
         self._names: set[str] = set()
         self._placed_any = False
+        self._sigmas: dict[str, list[Float64]] = {"horizontal position": [], "height": []}
 
     def items(self, raw: RawControl) -> Iterator[Item]:
         """Rows of the sound points of a block, then its rejects.
@@ -173,10 +187,10 @@ class ControlReader:
         self._frame.check(raw.coordinates, sieve)
         roles = [role.strip().lower() for role in raw.roles]
         sieve.drop(np.array([role not in ("gcp", "check") for role in roles]), "role is neither 'gcp' nor 'check'")
-        for name, sigma in (("horizontal", raw.sigma_horizontal_m), ("height", raw.sigma_height_m)):
+        for name, sigma in (("horizontal position", raw.sigma_horizontal_m), ("height", raw.sigma_height_m)):
             sieve.drop(
                 ~(np.isnan(sigma) | ((sigma >= 0) & (sigma <= SIGMA_MAX_M))),
-                f"σ of the {name} position is outside 0 to {SIGMA_MAX_M:g} m",
+                f"σ of the {name} is outside 0 to {SIGMA_MAX_M:g} m",
             )
         words = zip(raw.names, raw.codes, strict=True)
         sieve.drop(np.array([NO_TEXT in f"{name}{code}" for name, code in words]), "name or code is not UTF-8 text")
@@ -185,7 +199,31 @@ class ControlReader:
         kept = np.flatnonzero(sieve.good)
         if placed is not None and kept.size:
             yield self._rows(raw, roles, placed, kept)
+            self._sigmas["horizontal position"].append(raw.sigma_horizontal_m[kept])
+            self._sigmas["height"].append(raw.sigma_height_m[kept])
         yield from sieve.rejects(raw.records, raw.offsets)
+
+    def findings(self) -> Iterator[Finding]:
+        """What the σ of all points that were read say, once the file is at its end."""
+        for name, blocks in self._sigmas.items():
+            stated = np.concatenate([np.empty(0), *blocks])
+            for wrong, words in (
+                (stated == 0.0, "is 0: it counts as not stated, and adjust.control.sigma_… takes its place"),
+                (
+                    stated >= _COARSE_SIGMA_M,
+                    "is so large that they hold no drive; it looks like millimetres in a column of metres. "
+                    "It is used as stated",
+                ),
+                (
+                    (stated > 0.0) & (stated < _FINE_SIGMA_M),
+                    "is smaller than any survey reaches; it looks like metres in a column of millimetres. "
+                    "It is used as stated",
+                ),
+            ):
+                if wrong.any():
+                    size = "" if not stated[wrong].any() else f" ({_span(stated[wrong])})"
+                    count = f"{np.count_nonzero(wrong):,} of {stated.size:,} points"
+                    yield CONTROL_SIGMA.finds("", f"the σ of the {name} of {count}{size} {words}.")
 
     def _drop_repeated(self, names: list[str], sieve: Sieve) -> None:
         empty, repeated = np.zeros(len(names), dtype=bool), np.zeros(len(names), dtype=bool)
@@ -228,8 +266,8 @@ class ControlReader:
             "easting_m": pa.array(easting),
             "northing_m": pa.array(northing),
             "height_m": pa.array(height),
-            "sigma_horizontal_m": pa.array(raw.sigma_horizontal_m[kept], from_pandas=True),
-            "sigma_height_m": pa.array(raw.sigma_height_m[kept], from_pandas=True),
+            "sigma_horizontal_m": _stated(raw.sigma_horizontal_m[kept]),
+            "sigma_height_m": _stated(raw.sigma_height_m[kept]),
         }
         first = int(kept[0])
         return Rows(
@@ -238,6 +276,16 @@ class ControlReader:
             first_record=int(raw.records[first]),
             first_offset=int(raw.offsets[first]),
         )
+
+
+def _stated(sigma_m: Float64) -> pa.Array:
+    """The σ of a column (n,), null where none is stated: nothing is known exactly, so 0 states none."""
+    return pa.array(np.where(sigma_m == 0.0, np.nan, sigma_m), from_pandas=True)
+
+
+def _span(sigma_m: Float64) -> str:
+    low, high = float(sigma_m.min()), float(sigma_m.max())
+    return f"{low:g} m" if low == high else f"{low:g} m to {high:g} m"
 
 
 def need_role(column: bool, role: Role | None, file: Path) -> None:

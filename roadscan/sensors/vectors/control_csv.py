@@ -82,6 +82,7 @@ class ControlCsv(LogFormat):
     name = "control_csv"
     title = "Ground control and check points as CSV (name, code, role, position, height, σ)"
     yields = ("control_points",)
+    version = 2
     column_sets: ClassVar[tuple[tuple[Quantity, ...], ...]] = ((NAME, *GEODETIC, HEIGHT), (NAME, *GRID, HEIGHT))
     time = "holds no time"
     options = ControlCsvOptions
@@ -115,6 +116,7 @@ class ControlCsv(LogFormat):
                 yield block
                 continue
             yield from reader.items(_raw(block, plan))
+        yield from reader.findings()
 
 
 def _plan(source: LogSource) -> _Plan:

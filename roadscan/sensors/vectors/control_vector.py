@@ -72,6 +72,7 @@ class ControlVector(LogFormat):
     name = "control_vector"
     title = "Ground control and check points as GeoJSON or GeoPackage points"
     yields = ("control_points",)
+    version = 2
     time = "holds no time"
     options = ControlVectorOptions
 
@@ -102,6 +103,7 @@ class ControlVector(LogFormat):
         for batch in feature_batches(source.path, plan.layer):
             yield from reader.items(_raw(batch, plan, first))
             first += batch.num_rows
+        yield from reader.findings()
         yield from unread_features(source.path, first)
 
 

@@ -55,8 +55,12 @@ export function gpsTime(epoch: unknown): string {
   return `${new Date(milliseconds).toISOString().replace('T', ' ').replace('Z', '')} GPS`
 }
 
-/** A column's title for people: its first letter is large, and the unit that stands beside the value is not repeated. */
-export function titled(title: string, unit: string | null): string {
-  const bare = unit ? title.replace(/ (m per km|kg m3|m m2|gps ns|mm|m2|m3|m|px|deg|percent|ns|ms)$/, '') : title
-  return bare.slice(0, 1).toUpperCase() + bare.slice(1)
+/** A column's title for people: its first letter is large. */
+export function titled(title: string): string {
+  return title.slice(0, 1).toUpperCase() + title.slice(1)
+}
+
+/** The unit that stands beside a column's title or values; empty where they need none, as those of a date and time. */
+export function unitOf({ name, unit }: { name: string; unit: string | null }): string {
+  return unit && !['text', 'number', '1', 'date'].includes(unit) && !/_gps_ns$/.test(name) ? unit : ''
 }

@@ -278,6 +278,15 @@ export class Editing {
     fill(this.#body)
   }
 
+  /** Values that the edit of a row gives, while it waits here. */
+  edited({ layer, feature }: Selected): Record<string, unknown> {
+    const asset_id = String(feature.properties[layer.key ?? ''] ?? feature.id)
+    const edit = this.#edits.find((one) => one.layer === layer.name && one.asset_id === asset_id)
+    if (!edit) return {}
+    const status = STATUS[edit.action]
+    return { ...edit.attributes, ...(status ? { status } : {}) }
+  }
+
   /** An edit that is here no more. */
   #forget(edit: Edit): void {
     const at = this.#edits.indexOf(edit)
@@ -359,6 +368,8 @@ export class Editing {
   #draw(): void {
     if (!this.#edits.length) [this.#base, this.#restored] = [this.rules.commit, '']
     this.#keep()
+    const shown = this.desk.selected.value
+    if (shown) queueMicrotask(() => this.desk.selected.value === shown && (this.desk.selected.value = { ...shown })) // its values
     const { kinds } = this.rules
     const kind = h('select', { 'aria-label': 'Kind of the new asset', onchange: () => (this.#kind = kind.value) }, ...kinds.map((one) => h('option', { value: one.layer, selected: one.layer === this.#kind }, one.title)))
     const author = h('input', { type: 'text', value: this.#author, placeholder: 'Your name', 'aria-label': 'Your name', oninput: () => { this.#author = author.value; this.#keep() } })

@@ -14,6 +14,8 @@ export interface RowActions {
   openRow(layer: string, row: string): void
   openStation(evidence: Evidence): void
   edit: ((selected: Selected) => HTMLElement) | null
+  /** Values that an edit gives which was kept and not sent yet. */
+  edited: ((selected: Selected) => Record<string, unknown>) | null
 }
 
 export class RowPanel {
@@ -97,24 +99,28 @@ export class RowPanel {
     )
   }
 
-  #values({ layer, feature }: Selected): HTMLElement[] {
+  #values(selected: Selected): HTMLElement[] {
+    const { layer, feature } = selected
     const row = feature.properties
+    const edited = this.actions.edited?.(selected) ?? {}
     const sigmas = new Set(layer.columns.map((one) => one.sigma).filter(Boolean))
     return layer.columns
       .filter((column) => !sigmas.has(column.name))
       .map((column) => {
-        const raw = row[column.name]
-        const sigma = column.sigma ? row[column.sigma] : null
-        const unit = column.unit && !['text', 'number', '1', 'date'].includes(column.unit) ? `\u202f${column.unit}` : ''
+        const isEdited = column.name in edited
+        const raw = isEdited ? edited[column.name] : row[column.name]
+        const sigma = column.sigma && !isEdited ? row[column.sigma] : null
+        const unit = format.unitOf(column) && `\u202f${format.unitOf(column)}`
         const text = /_gps_ns$/.test(column.name) ? format.gpsTime(raw) : format.value(raw)
         return h(
           'div',
           { title: column.meaning ?? undefined },
-          h('dt', {}, format.titled(column.title, column.unit)),
+          h('dt', {}, format.titled(column.title)),
           h(
             'dd',
             { class: typeof raw === 'number' ? 'number' : '' },
-            raw === null || raw === undefined || /_gps_ns$/.test(column.name) ? text : text + unit,
+            raw === null || raw === undefined ? text : text + unit,
+            isEdited && h('span', { class: 'sigma' }, `, edited; it was ${format.value(row[column.name])}`),
             typeof sigma === 'number' && h('span', { class: 'sigma', title: '1 σ' }, ` ± ${format.value(sigma)}`),
           ),
         )

@@ -49,7 +49,7 @@ export class TablePanel {
       return h(
         'th',
         { scope: 'col', 'aria-sort': sorted, title: column.meaning ?? undefined },
-        h('button', { type: 'button', onclick: () => this.#sortBy(column.name) }, format.titled(column.title, column.unit), column.unit && !['text', 'number', '1', 'date'].includes(column.unit) ? h('span', { class: 'unit' }, ` ${column.unit}`) : null),
+        h('button', { type: 'button', onclick: () => this.#sortBy(column.name) }, format.titled(column.title), format.unitOf(column) ? h('span', { class: 'unit' }, ` ${format.unitOf(column)}`) : null),
       )
     })
     fill(

@@ -18,6 +18,7 @@ from roadscan.code_reach import code_digest
 from roadscan.condition.index import condition_indices
 from roadscan.jobs.engine.fingerprint import key_of
 from roadscan.jobs.publish.document import Ask, Document, json_bytes
+from roadscan.jobs.publish.layer import title_of
 from roadscan.jobs.publish.material import Material
 from roadscan.jobs.publish.part import SitePart
 from roadscan.tables.manifest import OutputRecord
@@ -209,7 +210,7 @@ def _crossing_url(lane: Lane, place: int) -> str:
 def _quantities() -> dict[str, Any]:
     known = condition_indices().values()
     quantities = [
-        {"name": q.name, "title": q.name.replace("_", " "), "unit": q.unit, "meaning": q.meaning}
+        {"name": q.name, "title": title_of(q.name, q.unit), "unit": q.unit, "meaning": q.meaning}
         for index in known
         for q in index.quantities
     ]

@@ -23,6 +23,9 @@ _TARGET_MM: Final = 25.0
 
 _FEWEST_RMSE: Final = 3
 """With fewer, an RMSE has no σ of its own that is worth stating."""
+_LARGER: Final = 1.5
+"""Ties differ by more than their σ where they do by so many of it; chance alone does not reach it with ten of them."""
+_FEWEST_TIES: Final = 10
 _ODD_SIGMAS: Final = 3.0
 """A residual of more σ than this is named."""
 _NAMES: Final = {"check": "check points", "left_out": "each GCP left out", "datum": "all GCPs against the poses"}
@@ -150,6 +153,11 @@ def agreement(rows: Rows) -> Iterator[Table | Paragraph]:
                 "the poses, the clocks or the mountings err by more.",
                 is_warning=True,
             )
+        elif after > _LARGER * sigma > 0.0 and len(kinds[kind]) >= _FEWEST_TIES:
+            yield Paragraph(
+                f"After the adjustment the {kind}s differ by {_mm(after)} mm, {after / sigma:.1f} times their σ of "
+                f"{_mm(sigma)} mm: this σ is too small, or the poses, the clocks or the mountings err."
+            )
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -179,14 +187,14 @@ def _control(rows: Rows) -> Iterator[Table | Paragraph]:
             ("point", "role", "run", "status", "height before", "height after", "σ", "after / σ", "weight", "remark"),
             [
                 (
-                    r["name"], r["role"], r["run"], r["status"], _mm(r["height_before_m"]), _mm(r["height_after_m"]),
-                    _mm(r["sigma_height_m"]), _ratio(r),
+                    r["name"], r["role"], r["run"], r["status"], _mm(_negative(r["height_before_m"])),
+                    _mm(_negative(r["height_after_m"])), _mm(r["sigma_height_m"]), _ratio(r),
                     "–" if r["weight_height"] is None else f"{r['weight_height']:.2f}", r["why_not"],
                 )
                 for r in rows
             ],
-            "Control and check points: surveyed height minus measured, in mm; σ is that of the point's survey and "
-            "of its measurement by the pass",
+            "Control and check points: height of the surface minus survey, in mm; σ is that of the point's survey and "
+            "of its measurement by the pass (the table has survey minus surface)",
             "control_residuals",
         )  # fmt: skip
         odd = [r for r in rows if abs(_sigmas(r) or 0.0) > _ODD_SIGMAS]
@@ -200,9 +208,13 @@ def _control(rows: Rows) -> Iterator[Table | Paragraph]:
 
 
 def _sigmas(row: dict[str, Any]) -> float | None:
-    """How many of its σ a height is off after the adjustment."""
+    """How many of its σ the surface is too high after the adjustment."""
     after, sigma = row["height_after_m"], row["sigma_height_m"]
-    return None if after is None or not sigma else float(after / sigma)
+    return None if after is None or not sigma else float(-after / sigma)
+
+
+def _negative(value_m: float | None) -> float | None:
+    return None if value_m is None else -value_m
 
 
 def _ratio(row: dict[str, Any]) -> str:

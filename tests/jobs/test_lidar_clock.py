@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.door import open_survey
 from tests.sensors.test_velodyne_clock import NO_PPS, Packets, heard, piece
-from tests.sensors.test_velodyne_pcap import capture
+from tests.sensors.test_velodyne_pcap import capture, data_packet, drive, frame, turning
 
 
 def survey_of(folder: Path, faults: Path, packets: Packets | None = None) -> Path:
@@ -46,3 +46,20 @@ def test_readings_of_a_clock_that_stepped_are_left_out_and_named(tmp_path: Path,
     assert north_m.size
     assert north_m.min() >= 594.0
     assert north_m.max() <= 607.0
+
+
+@pytest.mark.witness("lidar_heads_mixed")
+def test_two_heads_under_one_address_are_refused(tmp_path: Path) -> None:
+    """A second head a quarter of a turn on, its packets half a packet later; the same packets twice are one head."""
+    one = drive(60)
+    at = [(time + 276_000, 1_000_000 + round(k * 553)) for k, (time, _) in enumerate(one)]
+    other = [(t, frame(data_packet(s + 276, turning(9_000 + round(k * 199.2))))) for k, (t, s) in enumerate(at)]
+    capture(tmp_path / "two.pcap", sorted(one + other))
+    capture(tmp_path / "one.pcap", sorted(one + one))
+    said = {
+        name: CliRunner().invoke(app, ["inspect", str(tmp_path / name), "--clock", "utc_hour,date=2026-05-04"])
+        for name in ("one.pcap", "two.pcap")
+    }
+    words = {name: " ".join(done.output.split()) for name, done in said.items()}
+    assert "two heads sent to port 2368 from one address" in words["two.pcap"]
+    assert "two heads" not in words["one.pcap"] and "23,040" in words["one.pcap"]

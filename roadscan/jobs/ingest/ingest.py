@@ -9,6 +9,7 @@ from typing import Final
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
+from roadscan.jobs.ingest.future_times import FutureTimes
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -16,6 +17,7 @@ from roadscan.jobs.ingest.pose_checks import PoseRecords, check_poses
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
+from roadscan.jobs.ingest.stray_points import CloudPoints
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
@@ -146,17 +148,21 @@ def record_of(
 def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     """The rows of a log, finished in a scratch folder, and what its header says."""
     header = task.log.format.header(task.log.source)
-    writer, poses, repeats = LogWriter(folder, header.list_size), PoseRecords(), RepeatedProfiles()
+    writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
     clock = task.log.source.clock
     order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
+    seen = _Seen(header, PoseRecords(), order, FutureTimes.of(task.log.source, header), CloudPoints())
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
-        _take(writer, item, header, poses, order)
+        _take(writer, item, seen)
     writer.findings += [*order.findings(), *([found] if (found := repeats.finding()) else [])]
     writer.finish()
     if writer.rows["trajectory"]:
-        check_poses(writer, str(header.attributes["world_frame"]), poses)
+        check_poses(writer, str(header.attributes["world_frame"]), seen.poses)
+        writer.finish()
+    if writer.rows["cloud"]:
+        seen.cloud.finish(writer, header)
         writer.finish()
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
@@ -264,16 +270,29 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords, order: EpochOrder) -> None:
+@dataclass(frozen=True)
+class _Seen:
+    """What is followed through the rows of a log."""
+
+    header: LogHeader
+    poses: PoseRecords
+    order: EpochOrder
+    future: FutureTimes
+    cloud: CloudPoints
+
+
+def _take(writer: LogWriter, item: Item, seen: _Seen) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    astray = place_faults(item.table, item.batch, header) if item.table in PLACED else []
-    refused = writer.add(item.table, item.batch, [*astray, *order.refused(item)])
-    poses.take(item, [rows for rows, _ in refused])
+    astray = place_faults(item.table, item.batch, seen.header) if item.table in PLACED else []
+    refused = writer.add(item.table, item.batch, [*astray, *seen.future.refused(item), *seen.order.refused(item)])
+    seen.poses.take(item, [rows for rows, _ in refused])
+    if item.table == "cloud":
+        seen.cloud.take(item, [rows for rows, _ in refused])
     for rows, reason in refused:
         for record, offset, count in item.places(rows):
             writer.reject(item.file, record, offset, count, reason)

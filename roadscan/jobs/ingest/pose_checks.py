@@ -102,7 +102,7 @@ def check_poses(writer: LogWriter, world: str, records: PoseRecords) -> None:
     for file, record, offset, epoch in told:
         writer.reject(file, record, offset, 1, found.reasons.get(epoch, NO_FIX))
     if out.size:
-        writer.leave_out(_TABLE, out)
+        writer.leave_out(_TABLE, lambda rows: np.isin(rows.column("epoch_gps_ns").to_numpy(), out))
     writer.findings += found.findings(told)
 
 

@@ -37,8 +37,9 @@ POINTS_TWICE: Final = Witness(
 _CELL_M: Final = np.array([50.0, 50.0, 100.0])
 _FEW: Final = 3
 """Points beside which a cell and its neighbours hold no others are strays; more are something that was seen."""
-_LEAST_POINTS: Final = 1_000
-"""A cloud of fewer points is too small to say what is far from it."""
+_LEAST_IN_CELL: Final = 100
+"""A cloud of which half of the points lie in cells that hold fewer is too thin to say what is far from it: a scanner
+leaves more on a square metre of road, and a survey from the air about as many in a cell."""
 _MOST_STRAYS: Final = 0.01
 """A cloud of which a larger share lies alone is thin, and holds no strays."""
 _BITS: Final = 21
@@ -105,10 +106,12 @@ class CloudPoints:
     def _strays(self) -> Int64:
         """Cells whose points are left out."""
         none = np.zeros(0, dtype=np.int64)
-        if self._points < _LEAST_POINTS or not self._first:
+        if not self._first:
             return none
         keys = np.array(sorted(self._counts), dtype=np.int64)
         counts = np.array([self._counts[key] for key in keys.tolist()])
+        if 2 * counts[counts >= _LEAST_IN_CELL].sum() < self._points:
+            return none
         asked = np.array(sorted(self._first), dtype=np.int64)
         near = np.zeros(asked.size, dtype=np.int64)
         steps = np.arange(-1, 2)

@@ -10,6 +10,7 @@ from typing import Final
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.future_times import FutureTimes
+from roadscan.jobs.ingest.laser_ranges import LaserRanges
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -151,7 +152,8 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
     clock = task.log.source.clock
     order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
-    seen = _Seen(header, PoseRecords(), order, FutureTimes.of(task.log.source, header), CloudPoints())
+    lasers = LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor")
+    seen = _Seen(header, PoseRecords(), order, FutureTimes.of(task.log.source, header), CloudPoints(), lasers)
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
@@ -163,6 +165,9 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
         writer.finish()
     if writer.rows["cloud"]:
         seen.cloud.finish(writer, header)
+        writer.finish()
+    if writer.rows["returns"]:
+        seen.lasers.finish(writer)
         writer.finish()
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
@@ -279,6 +284,7 @@ class _Seen:
     order: EpochOrder
     future: FutureTimes
     cloud: CloudPoints
+    lasers: LaserRanges
 
 
 def _take(writer: LogWriter, item: Item, seen: _Seen) -> None:
@@ -293,6 +299,8 @@ def _take(writer: LogWriter, item: Item, seen: _Seen) -> None:
     seen.poses.take(item, [rows for rows, _ in refused])
     if item.table == "cloud":
         seen.cloud.take(item, [rows for rows, _ in refused])
+    elif item.table == "returns":
+        seen.lasers.take(item.batch)
     for rows, reason in refused:
         for record, offset, count in item.places(rows):
             writer.reject(item.file, record, offset, count, reason)

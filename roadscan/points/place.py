@@ -445,7 +445,7 @@ class CloudFrame:
         units = np.array([own_m, own_m, float(vertical.axis_info[-1].unit_conversion_factor)])
         theirs = np.array([frame.horizontal_unit_m] * 2 + [frame.vertical_unit_m])
         operation = height_operation(self.crs, str(self.vertical), frame)
-        out = np.stack(operation.transform(*(xyz_m / units).T), axis=-1) * theirs
+        out: Float64 = np.stack(operation.transform(*(xyz_m / units).T), axis=-1) * theirs
         if not np.isfinite(out).all():
             raise CrsError(
                 f"the change from {vertical.name} to {frame.vertical_crs} does not cover all points of the cloud",

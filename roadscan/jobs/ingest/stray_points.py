@@ -30,7 +30,7 @@ POINTS_TWICE: Final = Witness(
     input="cloud",
     fault="Points stand twice in a cloud: strips or tiles that overlap were merged.",
     asks="time, place, return number and intensity of each point",
-    does="a point counts once",
+    does="a point counts once, at epochs of which every point stands twice: a coarse scale puts others in one place",
     told=("rejects",),
 )
 
@@ -140,13 +140,20 @@ def _has_ties(epochs_gps_ns: Int64) -> bool:
 
 
 def _again(rows: pa.Table) -> Bool:
-    """Rows (n,) that are those of a row before them."""
+    """Rows (n,) that are those of a row before them, at epochs of which every row stands twice or more.
+
+    Where only some of an epoch's rows are equal, they are points that a coarse scale has put in one place.
+    """
     mixed = np.zeros(rows.num_rows, dtype=np.uint64)
     for name in _SAME:
         column = pc.fill_null(rows.column(name), 0).to_numpy()
         bits = column.view(np.uint64) if column.dtype.itemsize == 8 else column.astype(np.uint64)
         mixed = (mixed ^ bits) * _ODD
         mixed = (mixed ^ (mixed >> np.uint64(29))) * _MIXER
-    again = np.ones(rows.num_rows, dtype=bool)
-    again[np.unique(mixed, return_index=True)[1]] = False
+    _, first, which, counts = np.unique(mixed, return_index=True, return_inverse=True, return_counts=True)
+    epochs = rows.column("epoch_gps_ns").to_numpy()
+    starts = np.flatnonzero(np.diff(epochs, prepend=epochs[0] - 1))
+    lengths = np.diff(starts, append=epochs.size)
+    again = np.repeat(np.minimum.reduceat(counts[which], starts) > 1, lengths)
+    again[first] = False
     return again

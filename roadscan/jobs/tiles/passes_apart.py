@@ -56,7 +56,7 @@ def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]
         count = np.bincount(cell[own], minlength=size)
         total = np.bincount(cell[own], (points.height_quanta[own] - datum).astype(np.float64), minlength=size)
         means[k, count > 0] = total[count > 0] / count[count > 0] * QUANTUM_M
-    words = {p.pass_id: f"run '{p.run}' (pass {p.pass_id})" for p in passes}
+    words = {int(p.pass_id): f"run '{p.run}' (pass {p.pass_id})" for p in passes}
     found: list[list[Any]] = []
     for a, b in zip(*np.triu_indices(ids.size, 1), strict=True):
         off = means[b] - means[a]

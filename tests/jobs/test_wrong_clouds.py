@@ -124,6 +124,8 @@ def test_posix_time_under_the_bit_of_gps_time_is_named(tmp_path: Path) -> None:
     code, _, words = told("run", survey(tmp_path, "c"))
     assert code != 0 and "lies in the future (2068-" in words
     assert "as 'unix_utc' it would be 2026-05-04" in words and 'clock = { system = "unix_utc" }' in words
+    looked = CliRunner().invoke(app, ["inspect", str(tmp_path / "c.las")])
+    assert f"{N:,} × the time lies in the future" in " ".join(looked.output.split())
     points, reasons = ingested(survey(tmp_path, "c", options='clock = { system = "unix_utc" }'))
     assert len(points) == N and not reasons
 

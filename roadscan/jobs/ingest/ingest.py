@@ -9,7 +9,6 @@ from typing import Final
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
-from roadscan.jobs.ingest.future_times import FutureTimes
 from roadscan.jobs.ingest.laser_ranges import LaserRanges
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
@@ -24,6 +23,7 @@ from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
 from roadscan.sensors.base import Item, LogHeader, Reject, Rows
+from roadscan.sensors.future_times import FutureTimes
 from roadscan.tables.logs import (
     DataFile,
     LogRecord,

@@ -147,11 +147,14 @@ def test_returns_of_one_pulse_are_not_one_point(tmp_path: Path) -> None:
     assert len(points) == N and not reasons
 
 
-def test_a_cloud_written_anew_at_another_scale_is_named(tmp_path: Path) -> None:
+def test_a_cloud_written_anew_at_another_scale_counts_once(tmp_path: Path) -> None:
     write(tmp_path / "c.las", road())
     write(tmp_path / "d.las", road(), scale=0.0001)
-    ingested(survey(tmp_path, "c+d"))
-    assert "the middle of those of c.las" in told("status", tmp_path)[2]
+    code, said, words = told("run", survey(tmp_path, "c+d"))
+    assert code == 0, words
+    (finding,) = said["findings"]
+    assert finding["witness"] == "same_content" and finding["subject"] == "d.las" and finding["left_out"] == N
+    assert said["readings"]["kept"] == N
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,8 @@ SAME_CONTENT: Final = Witness(
 
 _READINGS: Final = ("scans", "returns", "cloud", "images")
 """Tables of which no two runs share a log. One trajectory may cover several runs."""
+_FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
+"""What the coordinates of two clouds have to be, for their middles to be compared."""
 _SAME_MIDDLE_M: Final = 0.005
 """Two clouds of as many points of the same times are one where their means differ by less: the coarsest usual scale is
 0.01 m, and two scanners of one vehicle are farther apart."""
@@ -76,8 +78,10 @@ def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord
             )
 
 
-def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
-    """Clouds of other bytes with the same points: written anew at another scale, in another order, or as LAZ."""
+def same_points(records: Sequence[LogRecord]) -> Iterator[tuple[LogRecord, LogRecord]]:
+    """Clouds of other bytes with the same points, the second of each pair the later in the order of paths: a cloud
+    that was written anew at another scale, in another order, or as LAZ.
+    """
     groups: dict[object, list[LogRecord]] = defaultdict(list)
     for record in records:
         files = record.tables.get("cloud", ())
@@ -85,15 +89,24 @@ def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
             groups[sum(file.rows for file in files), tuple(file.group_spans for file in files)].append(record)
     for group in groups.values():
         for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
+            same = all(first.attributes.get(name) == later.attributes.get(name) for name in _FRAME)
             off_m = math.dist(first.attributes["middle_m"], later.attributes["middle_m"])
-            same_crs = first.attributes["crs"] == later.attributes["crs"]
-            if first.content != later.content and same_crs and off_m < _SAME_MIDDLE_M:
-                yield SAME_CONTENT.finds(
-                    later.path,
-                    f"its {later.rows:,} points have the times and the middle of those of {first.path} "
-                    f"({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they are "
-                    "used; list one of the two",
-                )
+            if first.content != later.content and same and off_m < _SAME_MIDDLE_M:
+                yield first, later
+
+
+def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """What is said of such clouds."""
+    for first, later in same_points(records):
+        text = f"its {later.rows:,} points have the times and the middle of those of {first.path}"
+        if first.run == later.run:
+            yield SAME_CONTENT.finds(later.path, f"{text} of the same run {first.run}, and count once", later.rows)
+        else:
+            yield SAME_CONTENT.finds(
+                later.path,
+                f"{text} ({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they "
+                "are used",
+            )
 
 
 def _settings(config: LogConfig) -> dict[str, object]:

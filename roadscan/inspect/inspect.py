@@ -27,6 +27,7 @@ from roadscan.model.errors import RoadscanError
 from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.model.witness import Finding
 from roadscan.sensors.base import Item, LogFormat, Rows, format_named
+from roadscan.sensors.future_times import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
 """Readings after which a quick look stops."""
@@ -215,7 +216,8 @@ def read_figures(
 ) -> tuple[LogReport, str]:
     """Read an opened log and take its figures; the report, and why reading ended early ("" if it did not)."""
     source = opened.source
-    report = LogReport(opened, LogFigures(opened.header, source.map, source.crs))
+    future = FutureTimes.of(source, opened.header)
+    report = LogReport(opened, LogFigures(opened.header, source.map, source.crs, future))
     size = max(_size(opened.format, source.path)[0], 1)
     try:
         for item in opened.format.read(source, opened.header):

@@ -22,6 +22,7 @@ from roadscan.model.gpstime import NS_PER_S
 from roadscan.model.witness import Finding
 from roadscan.navigation.leaps import FASTEST_M_PER_S
 from roadscan.sensors.base import Item, LogHeader, Reject, Rows
+from roadscan.sensors.future_times import FutureTimes
 from roadscan.tables.schema import TableSchema, table_schema
 
 Float64 = npt.NDArray[np.float64]
@@ -351,7 +352,13 @@ class TableFigures:
 class LogFigures:
     """Figures of a whole log: its tables, and the records that were lost."""
 
-    def __init__(self, header: LogHeader, map_frame: MapFrame | None = None, crs: str | None = None) -> None:
+    def __init__(
+        self,
+        header: LogHeader,
+        map_frame: MapFrame | None = None,
+        crs: str | None = None,
+        future: FutureTimes | None = None,
+    ) -> None:
         self.tables: dict[str, TableFigures] = {}
         self.rejects: dict[str, Fault] = {}
         """Lost records by reason."""
@@ -362,6 +369,7 @@ class LogFigures:
         self._header = header
         self._map = map_frame
         self._crs = crs
+        self._future = future
 
     def take(self, item: Item) -> None:
         """Take what a reader yields next."""
@@ -380,7 +388,7 @@ class LogFigures:
         except SchemaError as error:
             self._lose(str(error), item.batch.num_rows, item.first_record, item.first_offset, item.file)
             return
-        faults = schema.faults(batch)
+        faults = [*schema.faults(batch), *(self._future.refused(item) if self._future else [])]
         for rows, reason in faults:
             first = int(rows[0])
             offset = item.first_offset + first * item.record_bytes if item.record_bytes else -1

@@ -39,12 +39,14 @@ from roadscan.model.crs import (
     MapFrame,
     crs_from_text,
     geodetic_from_world,
+    one_vertical_datum,
     world_frame_of,
 )
 from roadscan.model.errors import ConfigError, CrsError, FormatError, RoadscanError, StoreError
 from roadscan.model.gpstime import gps_ns_from_utc
 from roadscan.model.rig import SensorKind
 from roadscan.model.survey import ControlConfig, LogConfig, Survey
+from roadscan.model.witness import Witness
 from roadscan.points.place import CloudFrame
 from roadscan.products.base import ProductContext
 from roadscan.sensors.base import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
@@ -249,7 +251,8 @@ def check_times(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def _cloud_of(survey: Survey, attributes: Mapping[str, Any]) -> CloudFrame:
-    return CloudFrame(attributes["crs"], attributes["height"], survey.geoid(attributes.get("geoid")))
+    geoid, vertical = survey.geoid(attributes.get("geoid")), attributes.get("vertical_crs")
+    return CloudFrame(attributes["crs"], attributes["height"], geoid, vertical)
 
 
 def check_datums(asked: Asked) -> Iterator[RoadscanError]:
@@ -260,13 +263,50 @@ def check_datums(asked: Asked) -> Iterator[RoadscanError]:
             continue
         if isinstance(log.config, LogConfig) and not asked.yields(log.run) & {*_PLACED, "cloud"}:
             continue  # nothing of its run goes to the map
-        if "cloud" in log.yields and _cloud_of(asked.survey, log.header.attributes).is_in(asked.frame):
-            continue
+        if "cloud" in log.yields:
+            cloud = _cloud_of(asked.survey, log.header.attributes)
+            faults = (
+                [] if cloud.is_in(asked.frame) else list(_faults(functools.partial(cloud.check, asked.frame), log.path))
+            )
+            yield from faults
+            if faults or cloud.is_in(asked.frame) or cloud.is_by_proj(asked.frame):
+                continue
         stated = log.header.attributes.get("world_frame") or log.header.attributes.get("crs")
         crs = stated or (log.config.crs if isinstance(log.config, ControlConfig) else None)
         if crs is not None and not (crs == LOCAL_WORLD and asked.frame.is_local):
             world = LOCAL_WORLD if crs == LOCAL_WORLD else world_frame_of(str(crs))
             yield from _faults(lambda frame=asked.frame, world=world: frame.check_world(world), log.path)  # type: ignore[misc]
+
+
+VERTICAL_DATUM: Final = Witness(
+    name="vertical_datum",
+    input="cloud",
+    fault="Heights of a cloud count from another vertical datum than those of the map, or of another cloud.",
+    asks="the vertical CRS that the file names, against map.vertical_crs, or that of the other clouds",
+    does="heights are transformed where PROJ knows the operation within map.max_datum_error_m and has its grid, or by "
+    "the geoids of log and map; otherwise the run ends before it computes",
+    told=("error",),
+)
+
+
+def check_vertical_datums(asked: Asked) -> Iterator[RoadscanError]:
+    """Clouds count their heights from one datum where the map states none."""
+    if asked.frame is None or asked.frame.is_local or asked.frame.vertical_crs is not None:
+        return
+    first: tuple[str, CheckedLog] | None = None
+    for log in asked.logs:
+        vertical = None if log.header is None else log.header.attributes.get("vertical_crs")
+        if vertical is None or log.header is None or log.header.attributes.get("geoid") is not None:
+            continue
+        first = first or (vertical, log)
+        if not one_vertical_datum(vertical, first[0]):
+            yield CrsError(
+                f"its heights are of {crs_from_text(vertical).name} ({vertical}), those of {first[1].config.path} of "
+                f"{crs_from_text(first[0]).name} ({first[0]})",
+                expected="clouds of one vertical datum, or a map that says into which they are brought",
+                change=f'state map.vertical_crs = "{first[0]}"; or name the geoid of each log and map.geoid',
+                file=log.path,
+            )
 
 
 def check_area(asked: Asked) -> Iterator[RoadscanError]:
@@ -418,6 +458,7 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_kinds),
     ("ingest", check_lever_arms),
     ("ingest", check_datums),
+    ("ingest", check_vertical_datums),
     ("ingest", check_area),
     ("ingest", check_scale),
     ("ingest", check_products),

@@ -423,7 +423,7 @@ def geometry_of(source: ReadingSource) -> ScanGeometry | None:
 
 def _cloud_frame(source: ReadingSource) -> CloudFrame:
     attributes = source.attribute
-    return CloudFrame(attributes["crs"], attributes["height"], source.geoid)
+    return CloudFrame(attributes["crs"], attributes["height"], source.geoid, attributes.get("vertical_crs"))
 
 
 def _chunks(one: RawSlice) -> Iterator[list[int]]:

@@ -100,6 +100,22 @@ def heights_of(crs: pyproj.CRS) -> StatedHeights:
     return NO_HEIGHTS
 
 
+def vertical_of(crs: pyproj.CRS) -> str | None:
+    """Authority code of the vertical part of a CRS; None where it has none, or one that PROJ does not know."""
+    if crs.is_bound and crs.source_crs is not None:
+        return vertical_of(crs.source_crs)
+    vertical = next((part for part in crs.sub_crs_list or [crs] if part.is_vertical), None)
+    authority = None if vertical is None else vertical.to_authority(min_confidence=70)
+    return None if authority is None else ":".join(authority)
+
+
+@functools.lru_cache(maxsize=64)
+def one_vertical_datum(one: str, other: str) -> bool:
+    """Whether two vertical CRS count heights from one datum, whatever their units."""
+    first, second = (crs_from_text(text).datum for text in (one, other))
+    return first is not None and second is not None and first.name == second.name
+
+
 @functools.lru_cache(maxsize=64)
 def world_frame_of(crs: str) -> str:
     """World frame (geocentric CRS of the same datum) that positions stated in `crs` live in."""
@@ -312,7 +328,7 @@ class MapFrame:
     height: HeightKind = "ellipsoidal"
     geoid: Geoid | None = None
     vertical_crs: str | None = None
-    """Vertical CRS named in the products' WKT; changes no number."""
+    """Vertical CRS of the map: named in the products' WKT, and that into which clouds of another are brought."""
     max_datum_error_m: float = 0.05
     """A change of datum less accurate than this is refused."""
 
@@ -590,6 +606,32 @@ def best_operation(source: pyproj.CRS, target: pyproj.CRS) -> pyproj.Transformer
         warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: roadscan never does
         group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
     return next((one for one in group.transformers if one.accuracy >= 0), None)
+
+
+@functools.lru_cache(maxsize=64)
+def height_operation(crs: str, vertical: str, frame: MapFrame) -> pyproj.Transformer:
+    """Change of coordinates in a projected CRS (its units) and heights of a vertical one into those of a map.
+
+    Raises
+    ------
+    CrsError
+        where PROJ knows none that is as accurate as the map asks for, or lacks its grid.
+    """
+    source = CompoundCRS(name="cloud", components=[crs_from_text(crs), crs_from_text(vertical)])
+    parts = [crs_from_text(str(frame.crs)), crs_from_text(str(frame.vertical_crs))]
+    best = best_operation(source, CompoundCRS(name="map", components=parts))
+    if best is not None and best.accuracy <= frame.max_datum_error_m:
+        return best
+    raise CrsError(
+        f"the cloud's heights are of {crs_from_text(vertical).name} ({vertical}), the map's of {parts[1].name} "
+        f"({frame.vertical_crs}), and the change is "
+        + ("not known to PROJ with the grids that are here" if best is None else accuracy_words(best)),
+        expected=f"heights of one vertical datum, or a change known within map.max_datum_error_m = "
+        f"{frame.max_datum_error_m:g}",
+        change="name the geoid grids of both: geoid of the log and map.geoid; or put PROJ's grid there; or make "
+        "map.vertical_crs that of the cloud; or, if the file names the wrong datum, state crs of the log and "
+        "options.ignore_file_crs = true",
+    )
 
 
 def accuracy_words(operation: pyproj.Transformer | None) -> str:

@@ -64,7 +64,8 @@ class MapConfig(Strict):
     grids: Path | None = None
     """Folder with geoid grids, relative to the survey file."""
     vertical_crs: str | None = None
-    """Vertical CRS to name in the products' WKT, such as "EPSG:7837"."""
+    """Vertical CRS of the map, such as "EPSG:7837": it stands in the products' WKT, and clouds whose file names one of
+    another datum are brought into it."""
     max_datum_error_m: float = Field(default=0.05, ge=0)
     """Largest accepted error of a change of datum between logs and map (m)."""
 

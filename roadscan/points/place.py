@@ -16,7 +16,15 @@ from roadscan.kernels.georeferencing.flat_profiles import georeference_flat_prof
 from roadscan.kernels.georeferencing.readings import FATES, Georeference, Limits, MirrorProfiles, Points, Returns
 from roadscan.kernels.georeferencing.timed_points import georeference_mirror, georeference_returns
 from roadscan.kernels.options import read_only
-from roadscan.model.crs import Geoid, MapFrame, world_frame_of
+from roadscan.model.crs import (
+    Geoid,
+    MapFrame,
+    crs_from_text,
+    height_operation,
+    one_vertical_datum,
+    vertical_of,
+    world_frame_of,
+)
 from roadscan.model.errors import CrsError
 from roadscan.model.ids import LanePass
 from roadscan.model.rig import Mounting, Mountings
@@ -386,11 +394,20 @@ class CloudFrame:
     height: str
     geoid: Geoid | None = None
     """Grid that orthometric heights count from; None for the map's own, where that has the same kind of heights."""
+    vertical: str | None = None
+    """Vertical CRS that the file names, where PROJ knows it."""
+
+    def check(self, frame: MapFrame) -> None:
+        """Raise :class:`CrsError` where the cloud's heights cannot be brought into those of the map."""
+        if self.crs != "local" and not frame.is_local:
+            self.to_map(np.zeros((0, 3)), frame)
 
     def to_map(self, xyz_m: Float64, frame: MapFrame) -> Float64:
         """Easting, northing, height (n, 3) in the survey's map, metres."""
         if self.is_in(frame):
             return xyz_m
+        if self.is_by_proj(frame):
+            return self._by_proj(xyz_m, frame)
         if self.height == "orthometric" and self.geoid is None:
             raise CrsError(
                 f"the cloud has orthometric heights in {self.crs}, the map {frame.height} heights in {frame.crs}",
@@ -407,8 +424,35 @@ class CloudFrame:
 
     def is_in(self, frame: MapFrame) -> bool:
         """Whether the coordinates are those of the map, heights included."""
-        same_height = self.height == frame.height and not self._other_geoid(frame)
+        same_height = self.height == frame.height and not self._other_geoid(frame) and not self._other_datum(frame)
         return (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height
+
+    def is_by_proj(self, frame: MapFrame) -> bool:
+        """Whether PROJ's operation between two vertical CRS brings the coordinates into the map, and no geoid does."""
+        return self._other_datum(frame) and (self.geoid is None or frame.geoid is None)
+
+    def _other_datum(self, frame: MapFrame) -> bool:
+        """Whether both name a vertical CRS, of two datums."""
+        if self.vertical is None or frame.vertical_crs is None or self.height != frame.height:
+            return False
+        theirs = vertical_of(crs_from_text(frame.vertical_crs))
+        return theirs is not None and not one_vertical_datum(self.vertical, theirs)
+
+    def _by_proj(self, xyz_m: Float64, frame: MapFrame) -> Float64:
+        """Coordinates (n, 3) in the map by the operation that PROJ knows between the two vertical CRS."""
+        vertical = crs_from_text(str(self.vertical))
+        own_m = float(crs_from_text(self.crs).axis_info[0].unit_conversion_factor)
+        units = np.array([own_m, own_m, float(vertical.axis_info[-1].unit_conversion_factor)])
+        theirs = np.array([frame.horizontal_unit_m] * 2 + [frame.vertical_unit_m])
+        operation = height_operation(self.crs, str(self.vertical), frame)
+        out: Float64 = np.stack(operation.transform(*(xyz_m / units).T), axis=-1) * theirs
+        if not np.isfinite(out).all():
+            raise CrsError(
+                f"the change from {vertical.name} to {frame.vertical_crs} does not cover all points of the cloud",
+                expected="grids of the survey's region",
+                change="name the geoid grids of both: geoid of the log and map.geoid",
+            )
+        return out
 
     def _other_geoid(self, frame: MapFrame) -> bool:
         """Whether the heights count from a grid whose content is not that of the map's."""

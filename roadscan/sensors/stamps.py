@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.model.errors import FormatError, Missing, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem, leap_seconds_at_unix
+from roadscan.model.gpstime import NS_PER_S, UNIT_NS, WEEKS_A_ROLLOVER, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.columns import Found, Quantity, need_stamp_unit
@@ -62,6 +62,17 @@ SCALE_OF_TIMES: Final = Witness(
     ("error",),
 )
 
+WEEK_COLUMN: Final = Witness(
+    "week_column",
+    input="any text with seconds of the GPS week",
+    fault="The clock in the survey file states another GPS week than the log.",
+    asks="a column gps_week, gpsweek, week_number or week of the log, in its first row",
+    does="the log is refused; the message names both weeks",
+    told=("error",),
+)
+_WEEKS: Final = ("gps_week", "gpsweek", "gps_week_number", "week_number", "week")
+"""Names of a column that holds the GPS week."""
+
 
 @dataclass(frozen=True)
 class StampColumn:
@@ -97,6 +108,7 @@ class StampColumn:
         if kind != "text":
             clock = source.need_clock("gps", unit=first_unit(file, layout, found))
             need_stamp_unit(found, clock, file)
+            _check_week(clock, layout, file)
             return cls(found.column, kind, clock, zoned=False)
         word = _first_word(file, layout, found.column)
         date = _date_column(word, found.column, layout, file)
@@ -119,6 +131,22 @@ class StampColumn:
         if self.date is not None:
             words = [f"{date}T{time}" for date, time in zip(block.text(self.date), words, strict=True)]
         return (_leaping_ns if self.is_utc else calendar_ns)(words, sieve, zoned=self.zoned)
+
+
+def _check_week(clock: Clock, layout: TextLayout, file: Path) -> None:
+    """Refuse a clock that states another week than the log's own column of weeks, which may count them modulo 1024."""
+    column = next((name for name in layout.names if name.lower() in _WEEKS), None)
+    if clock.system is not TimeSystem.GPS_WEEK or column is None or clock.week == 0:  # inspect assumes week 0
+        return
+    word, stated = _first_word(file, layout, column), clock.first_week()
+    if is_number(word) and (float(word) - stated) % WEEKS_A_ROLLOVER:
+        raise TimeSystemError(
+            f"column '{column}' begins with week {word}, the log's clock says week {stated}",
+            expected="one GPS week",
+            change="correct week or date of the log's clock",
+            file=file,
+            missing=Missing("clock", {"system": "gps_week_seconds", "week": int(float(word))}),
+        )
 
 
 def first_unit(path: Path, layout: TextLayout, found: Found) -> str:

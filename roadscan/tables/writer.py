@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -108,19 +108,35 @@ class LogWriter:
             for path, _, _ in self._bins[key].parts:
                 yield pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
 
-    def leave_out(self, table: str, epochs_gps_ns: npt.NDArray[np.int64]) -> None:
-        """Take the rows of some epochs out of a finished table."""
-        schema = table_schema(table)
+    def leave_out(
+        self,
+        table: str,
+        is_out: Callable[[pa.Table], npt.NDArray[np.bool_]],
+        may_be_out: Callable[[npt.NDArray[np.int64]], bool] = lambda _: True,
+    ) -> int:
+        """Take rows out of a finished table; returns how many.
+
+        Parameters
+        ----------
+        is_out : says of the rows of a file (n,), in order of time, which are taken out.
+        may_be_out : says by the epochs of a file whether it need be looked at.
+        """
+        schema, left_out = table_schema(table), 0
         for key in sorted(key for key in self._bins if key[0] == table):
             parts, self._bins[key].parts = self._bins[key].parts, []
             for path, first, last in parts:
-                rows = pq.read_table(path, partitioning=None)
-                kept = ~np.isin(rows.column("epoch_gps_ns").to_numpy(), epochs_gps_ns)
-                path.unlink()
-                if kept.any():
-                    write_parquet(path, rows.filter(pa.array(kept)), schema)
+                epochs = pq.read_table(path, columns=["epoch_gps_ns"], partitioning=None).column(0).to_numpy()
+                rows = pq.read_table(path, partitioning=None) if may_be_out(epochs) else None
+                out = np.zeros(epochs.size, dtype=bool) if rows is None else is_out(rows)
+                if rows is not None and out.any():
+                    path.unlink()
+                    if not out.all():
+                        write_parquet(path, rows.filter(pa.array(~out)), schema)
+                if not out.all():
                     self._bins[key].parts.append((path, first, last))
-                self.rows[table] -= int((~kept).sum())
+                left_out += int(out.sum())
+        self.rows[table] -= left_out
+        return left_out
 
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
         """Move the finished tables into the store, each at once."""

@@ -176,6 +176,20 @@ def test_x_and_y_of_a_stated_crs_are_asked_for(tmp_path: Path) -> None:
     assert "560.320 to 560.330 m as written" in words_of(path)
 
 
+@pytest.mark.witness("week_column")
+def test_a_week_that_the_log_contradicts_is_refused(tmp_path: Path) -> None:
+    """The log says week 2417, the survey file 2400; receivers that count weeks modulo 1024 say 369."""
+    for week in (2417, 369):
+        (tmp_path / "t.csv").write_text(poses(lambda k, w=week: f"{w},{120_618 + k / 10:.1f}", f"gps_week,{NAMES}"))  # type: ignore[misc]
+        clock = 'clock = {{ system = "gps_week_seconds", week = {} }}'
+        (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock=clock.format(2400)))
+        refused = roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0")
+        said = " ".join(f"{refused.output} {refused.exception}".split())
+        assert f"column 'gps_week' begins with week {week}" in said and "says week 2400" in said
+        (tmp_path / "SURVEY.toml").write_text(SURVEY.format(name="t.csv", clock=clock.format(2417)))
+        assert roadscan("ingest", tmp_path / "SURVEY.toml", "--workers", "0").exit_code == 0
+
+
 @pytest.mark.witness("text_encoding")
 def test_an_umlaut_of_windows_is_read_once_its_encoding_is_stated(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"

@@ -133,7 +133,7 @@ def test_all_columns_of_both_generations(tmp_path: Path, ending: str, version: s
         **fields,
         **colours,
     )
-    log = read("las", path, crs=UTM)
+    log = read("las", path, {"keep_marked": True}, crs=UTM)
     assert log.rejects == []
     assert np.array_equal(log["flags"], k % (64 if new else 32))
     angle = (k * 10 - 15_000) * 0.006 if new else k % 181 - 90

@@ -224,7 +224,7 @@ def adjust_survey(session: Session) -> None:
     doubts += [*collector.of_heads, *again.findings, *work.hand.findings, *seen.unmeasured]
     evidence = seen.evidence
     if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
-        lines = [f"nothing to adjust: no place where passes overlap, {_seen(work, evidence.sightings)}"]
+        lines = [f"nothing to adjust: {_no_ties(work)}, {_seen(work, evidence.sightings)}"]
         held: Held = publish(session.store, {}, config)
         publish_mountings(session.store, None, config)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
@@ -329,6 +329,16 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Fi
     session.manifest.add([OutputRecord(ADJUSTMENT, SOLUTION, own, "", 0, "", json.dumps(detail))])
     for line in lines:
         session.reporter.line(f"adjust: {line}")
+
+
+def _no_ties(work: Work) -> str:
+    """Why no tie counts."""
+    places = sum(len(task.places) for task in work.ties)
+    if not work.tracks:
+        return "no readings with poses (points of a cloud are placed already)"
+    return (
+        f"no tie that counts at {places:,} places of overlap" if places else "no place where passes with poses overlap"
+    )
 
 
 def _seen(work: Work, sightings: Sequence[Sighting]) -> str:

@@ -9,6 +9,7 @@ from typing import Final
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
+from roadscan.jobs.ingest.laser_ranges import LaserRanges
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -16,11 +17,13 @@ from roadscan.jobs.ingest.pose_checks import FIXES, POSES, PoseRecords, check_po
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
+from roadscan.jobs.ingest.stray_points import CloudPoints
 from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
 from roadscan.sensors.base import Item, LogHeader, Reject, Rows
+from roadscan.sensors.future_times import FutureTimes
 from roadscan.tables.logs import (
     DataFile,
     LogRecord,
@@ -146,19 +149,27 @@ def record_of(
 def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     """The rows of a log, finished in a scratch folder, and what its header says."""
     header = task.log.format.header(task.log.source)
-    writer, poses, repeats = LogWriter(folder, header.list_size), PoseRecords(), RepeatedProfiles()
+    writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
     clock = task.log.source.clock
     order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
+    lasers = LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor")
+    seen = _Seen(header, PoseRecords(), order, FutureTimes.of(task.log.source, header), CloudPoints(), lasers)
     for item in _items(task.log, header):
         if isinstance(item, Rows) and item.table == "scans":
             repeats.take(item.batch)
-        _take(writer, item, header, poses, order)
+        _take(writer, item, seen)
     writer.findings += [*order.findings(), *([found] if (found := repeats.finding()) else [])]
     writer.finish()
     for table in (POSES, FIXES):
         if writer.rows[table]:
-            check_poses(writer, table, str(header.attributes["world_frame"]), poses)
+            check_poses(writer, table, str(header.attributes["world_frame"]), seen.poses)
             writer.finish()
+    if writer.rows["cloud"]:
+        seen.cloud.finish(writer, header)
+        writer.finish()
+    if writer.rows["returns"]:
+        seen.lasers.finish(writer)
+        writer.finish()
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header
@@ -265,16 +276,32 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-def _take(writer: LogWriter, item: Item, header: LogHeader, poses: PoseRecords, order: EpochOrder) -> None:
+@dataclass(frozen=True)
+class _Seen:
+    """What is followed through the rows of a log."""
+
+    header: LogHeader
+    poses: PoseRecords
+    order: EpochOrder
+    future: FutureTimes
+    cloud: CloudPoints
+    lasers: LaserRanges
+
+
+def _take(writer: LogWriter, item: Item, seen: _Seen) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    astray = place_faults(item.table, item.batch, header) if item.table in PLACED else []
-    refused = writer.add(item.table, item.batch, [*astray, *order.refused(item)])
-    poses.take(item, [rows for rows, _ in refused])
+    astray = place_faults(item.table, item.batch, seen.header) if item.table in PLACED else []
+    refused = writer.add(item.table, item.batch, [*astray, *seen.future.refused(item), *seen.order.refused(item)])
+    seen.poses.take(item, [rows for rows, _ in refused])
+    if item.table == "cloud":
+        seen.cloud.take(item, [rows for rows, _ in refused])
+    elif item.table == "returns":
+        seen.lasers.take(item.batch)
     for rows, reason in refused:
         for record, offset, count in item.places(rows):
             writer.reject(item.file, record, offset, count, reason)

@@ -22,7 +22,7 @@ from roadscan.sensors.trajectories.poses import GRID_MAX_M
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Raised when other records are left out, so that logs of clouds and GNSS are read again."""
 
 FAR_POINT: Final = Witness(

@@ -135,7 +135,7 @@ def check_poses(writer: LogWriter, table: str, world: str, records: PoseRecords)
     for file, record, offset, epoch in told:
         writer.reject(file, record, offset, 1, found.reasons.get(epoch, NO_FIX))
     if out.size:
-        writer.leave_out(table, out)
+        writer.leave_out(table, lambda rows: np.isin(rows.column("epoch_gps_ns").to_numpy(), out))
     writer.findings += found.findings(told)
 
 

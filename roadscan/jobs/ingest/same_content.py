@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,14 +17,20 @@ SAME_CONTENT: Final = Witness(
     "same_content",
     input="any log",
     fault="The same log is listed under two names: a copy, or one drive listed as two.",
-    asks="the content of the logs of the survey file, byte by byte",
-    does="a copy in the same run and with the same settings counts once; readings that count in two runs or for two "
-    "sensors are used, and named",
+    asks="the content of the logs of the survey file, byte by byte; of clouds also their number of points, their times "
+    "and their middle",
+    does="a copy in the same run and with the same settings counts once; readings that count twice otherwise are used, "
+    "and named",
     told=("findings",),
 )
 
 _READINGS: Final = ("scans", "returns", "cloud", "images")
 """Tables of which no two runs share a log. One trajectory may cover several runs."""
+_FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
+"""What the coordinates of two clouds have to be, for their middles to be compared."""
+_SAME_MIDDLE_M: Final = 0.005
+"""Two clouds of as many points of the same times are one where their means differ by less: the coarsest usual scale is
+0.01 m, and two scanners of one vehicle are farther apart."""
 _COMPARED_BYTES: Final = 1 << 20
 """Bytes of either end that are compared, where sizes are the same."""
 
@@ -31,7 +38,7 @@ _COMPARED_BYTES: Final = 1 << 20
 def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
     """Copies among the survey file's logs, and readings that count twice."""
     listed = {(run.id, str(log.path)): log for run in survey.config.runs for log in run.logs}
-    return [*_copies(survey, listed, records), *_twice(listed, records)]
+    return [*_copies(survey, listed, records), *_twice(listed, records), *_same_points(records)]
 
 
 def _copies(
@@ -68,6 +75,37 @@ def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord
                 later.path,
                 f"its bytes are those of {first.path} ({first.run}/{first.sensor}): its readings count a second time "
                 f"as {later.run}/{later.sensor}; they are used",
+            )
+
+
+def same_points(records: Sequence[LogRecord]) -> Iterator[tuple[LogRecord, LogRecord]]:
+    """Clouds of other bytes with the same points, the second of each pair the later in the order of paths: a cloud
+    that was written anew at another scale, in another order, or as LAZ.
+    """
+    groups: dict[object, list[LogRecord]] = defaultdict(list)
+    for record in records:
+        files = record.tables.get("cloud", ())
+        if files and "middle_m" in record.attributes:
+            groups[sum(file.rows for file in files), tuple(file.group_spans for file in files)].append(record)
+    for group in groups.values():
+        for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
+            same = all(first.attributes.get(name) == later.attributes.get(name) for name in _FRAME)
+            off_m = math.dist(first.attributes["middle_m"], later.attributes["middle_m"])
+            if first.content != later.content and same and off_m < _SAME_MIDDLE_M:
+                yield first, later
+
+
+def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """What is said of such clouds."""
+    for first, later in same_points(records):
+        text = f"its {later.rows:,} points have the times and the middle of those of {first.path}"
+        if first.run == later.run:
+            yield SAME_CONTENT.finds(later.path, f"{text} of the same run {first.run}, and count once", later.rows)
+        else:
+            yield SAME_CONTENT.finds(
+                later.path,
+                f"{text} ({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they "
+                "are used",
             )
 
 

@@ -15,6 +15,7 @@ from roadscan.jobs.engine.fingerprint import grid_key, key_of
 from roadscan.jobs.ingest.ingest import DATA_TABLES
 from roadscan.jobs.ingest.one_stamp import one_stamp_logs
 from roadscan.jobs.ingest.overlap import Fault, NothingPlacedError, apart_logs
+from roadscan.jobs.ingest.same_content import same_points
 from roadscan.jobs.navigate.clocks import load_clocks
 from roadscan.jobs.navigate.navigate import records_with_trajectories
 from roadscan.jobs.plan.centre_line import CentreLines
@@ -129,7 +130,9 @@ def plan_survey(
     clocks = load_clocks(store)
     apart = (*apart_logs(survey, records, clocks, estimated=True), *one_stamp_logs(records))
     corrections = KnownCorrections.load(store)
-    sources = tuple(_sources(survey, store, _without(records, apart), ground, known, corrections))
+    copies = {later.key for first, later in same_points(records) if first.run == later.run}
+    used = [record for record in _without(records, apart) if record.key not in copies]
+    sources = tuple(_sources(survey, store, used, ground, known, corrections))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)
     if not sources:

@@ -11,6 +11,7 @@ from roadscan.jobs.stages.footprints import faults_of_plan
 from roadscan.jobs.surfaces.surface_colours import check_colours
 from roadscan.jobs.tile_work import memory_of, plan_tile_work
 from roadscan.jobs.tiles.footprints import PRODUCT as FOOTPRINTS
+from roadscan.jobs.tiles.passes_apart import apart_findings
 from roadscan.jobs.tiles.tile_fates import fate_words, lost_findings, of_all, told_by_log
 from roadscan.jobs.tiles.tile_files import tile_file_names
 from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TileTask
@@ -87,9 +88,10 @@ class Tiles(Stage):
         return StageState(current, len(stale), empty, next_run=doing)
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Logs of which many readings have no pose."""
-        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *manifest.of(TILE).values()])
-        return lost_findings(logs, records, survey.config.checks.lost_share)
+        """Logs of which many readings have no pose, and passes that lie at different heights."""
+        tiles = list(manifest.of(TILE).values())
+        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
+        return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(tiles)]
 
     def folders(self) -> Sequence[str]:
         """Files a tile, those of surfaces too."""

@@ -13,6 +13,8 @@ import numpy as np
 
 from roadscan.jobs.engine.compute import Compute, reason_of
 from roadscan.jobs.tiles.cell_files import write_cells, write_overviews
+from roadscan.jobs.tiles.passes_apart import FIGURE as PASSES_APART
+from roadscan.jobs.tiles.passes_apart import apart_in_tile
 from roadscan.jobs.tiles.tile_cells import count_tiles
 from roadscan.jobs.tiles.tile_fates import Fates
 from roadscan.jobs.tiles.tile_files import publish_file, write_product
@@ -160,7 +162,7 @@ def summary_of(record: OutputRecord) -> TileSummary | None:
     if not figures.get("points"):
         return None
     figures["passes"] = tuple(figures["passes"])
-    for of_summary in ("fates", "overlapped_cells"):
+    for of_summary in ("fates", "overlapped_cells", PASSES_APART):
         figures.pop(of_summary, None)
     return TileSummary(tile=TileId.parse(record.unit), **figures)
 
@@ -179,7 +181,10 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence,
     records.append(publish_file(task.store, path, target, OVERVIEWS, unit, key))
     path = folder / "cells.parquet"
     write_cells(path, cells, task.cell_table)
-    detail = json.dumps(_figures(cells, evidence))
+    figures = _figures(cells, evidence)
+    if content.points is not None and (apart := apart_in_tile(content.points, task.ground.grid, task.passes)):
+        figures[PASSES_APART] = apart
+    detail = json.dumps(figures)
     records.append(
         publish_file(task.store, path, f"tiles/cells/{unit}.parquet", TILE, unit, key, detail)
     )  # last: a tile is current only with all its files

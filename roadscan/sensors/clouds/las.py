@@ -9,6 +9,9 @@ GPS week. Many programs leave the bit clear and write adjusted time; a bit and s
 refused, and the clock stated in the survey file decides. Stamps outside the run's trajectory (± 1 s) are
 rejected; a log without any inside is refused.
 
+**Marks.** Points that the file marks as withheld ("should not be included in processing", LAS 1.4 R15) or as noise are
+rejected unless `options.keep_marked` says otherwise. Synthetic ones are used, and named.
+
 **Coordinates** are in the file's own CRS (WKT or GeoTIFF keys) or in the one stated; x, y, z become
 metres. A vertical unit that nothing states is taken as the metre only beside horizontal metres.
 """
@@ -29,6 +32,7 @@ import pyarrow as pa
 from roadscan.model.errors import Missing, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.model.strict import Strict
+from roadscan.model.witness import Witness
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.sensors.clouds.las_crs import CloudUnits, LengthUnit
 from roadscan.sensors.clouds.las_file import Cloud, Head
@@ -60,6 +64,23 @@ _FLAG_BITS: Final = (
 )
 _SCAN_ANGLE_DEG: Final = np.float32(0.006)
 
+_WITHHELD: Final = "the file marks the point as withheld"
+_NOISE: Final = "the file classifies the point as noise"
+_NOISE_CLASSES: Final = (7,)
+_NOISE_CLASSES_NEW: Final = (7, 18)
+"""Low noise; and high noise, which point formats 6 to 10 alone define (LAS 1.4 R15, tables 9 and 17)."""
+_FIRST_NEW_FORMAT: Final = 6
+
+MARKED_POINTS: Final = Witness(
+    "marked_points",
+    input="cloud",
+    fault="A point is none of the road: the program that wrote the file took it for noise, withheld it, or made it up.",
+    asks="the file's own withheld and synthetic flags, and its classes 7 and 18",
+    does="withheld points and noise are left out unless options.keep_marked says otherwise; synthetic points are used, "
+    "and named",
+    told=("rejects", "findings"),
+)
+
 _WEEK: Final = Missing("clock", {"system": "gps_week_seconds", "date": dt.date(2026, 5, 4)})
 
 
@@ -70,6 +91,8 @@ class LasOptions(Strict):
     """Unit of z, where neither a vertical CRS nor GeoTIFF keys state it and the CRS is not in metres."""
     ignore_file_crs: bool = False
     """Take the CRS stated in the survey file although the LAS file names another one, known to be wrong."""
+    keep_marked: bool = False
+    """Use points, too, that the file marks as withheld or classifies as noise (7; of point formats 6–10 also 18)."""
 
 
 class Las(LogFormat):
@@ -87,6 +110,7 @@ class Las(LogFormat):
         "date in the clock, and a stated clock decides where bit and stamps disagree"
     )
     options: ClassVar[type[Strict]] = LasOptions
+    version: ClassVar[int] = 2
 
     def sniff(self, path: Path) -> bool:
         """True for a file that begins with LASF."""
@@ -107,6 +131,7 @@ class Las(LogFormat):
             {
                 "crs": units.crs,
                 "height": units.height,
+                "vertical_crs": units.vertical_crs,
                 "geoid": source.geoid.grid if source.geoid and units.height == "orthometric" else None,
                 "horizontal_unit_m": units.horizontal_unit_m,
                 "vertical_unit_m": units.vertical_unit_m,
@@ -120,12 +145,19 @@ class Las(LogFormat):
         with Cloud.open(source.path) as cloud:
             times = _Times.of(source, cloud)
             units = np.array([header.attributes["horizontal_unit_m"]] * 2 + [header.attributes["vertical_unit_m"]])
+            keep_marked = options_of(source, LasOptions).keep_marked
+            synthetic = 0
             for item in cloud.batches():
                 if isinstance(item, Reject):
                     yield item
                 else:
-                    yield from _points(*item, cloud, times, units)
+                    synthetic += int(np.count_nonzero(np.asarray(item[1]["synthetic"])))
+                    yield from _points(*item, cloud, times, units, keep_marked)
             times.finish()
+        if synthetic:
+            yield MARKED_POINTS.finds(
+                "", f"{synthetic:,} of its points are marked synthetic, which no scanner measured; they are used"
+            )
 
 
 def _units(source: LogSource, cloud: Cloud) -> CloudUnits:
@@ -134,11 +166,20 @@ def _units(source: LogSource, cloud: Cloud) -> CloudUnits:
 
 
 def _points(
-    first: int, points: laspy.ScaleAwarePointRecord, cloud: Cloud, times: _Times, units: Float64
+    first: int,
+    points: laspy.ScaleAwarePointRecord,
+    cloud: Cloud,
+    times: _Times,
+    units: Float64,
+    keep_marked: bool,
 ) -> Iterator[Item]:
     count = len(points)
     records = first + np.arange(count)
     sieve = Sieve(count)
+    if not keep_marked:
+        sieve.drop(np.asarray(points["withheld"]) != 0, _WITHHELD)
+        noise = _NOISE_CLASSES_NEW if cloud.head.point_format >= _FIRST_NEW_FORMAT else _NOISE_CLASSES
+        sieve.drop(np.isin(np.asarray(points["classification"]), noise), _NOISE)
     epochs = times.epochs(np.asarray(points["gps_time"]), sieve)
     columns = {"epoch_gps_ns": epochs} | _columns(points, cloud.names, units)
     for axis in "xyz":

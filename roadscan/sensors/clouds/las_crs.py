@@ -11,7 +11,7 @@ import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
 from roadscan.codecs.geo_keys import DIRECTORY, DOUBLES, TEXTS, crs_of_keys, short_keys
-from roadscan.model.crs import NO_HEIGHTS, HeightKind, StatedHeights, crs_from_text, heights_of
+from roadscan.model.crs import NO_HEIGHTS, HeightKind, StatedHeights, crs_from_text, heights_of, vertical_of
 from roadscan.model.errors import ConfigError, CrsError, Missing
 from roadscan.sensors.base import LogSource
 from roadscan.sensors.clouds.las_file import UNREADABLE, Cloud, brief
@@ -51,6 +51,8 @@ class CloudUnits:
     """Length of the unit of x and y (m)."""
     vertical_unit_m: float
     """Length of the unit of z (m)."""
+    vertical_crs: str | None = None
+    """Authority code of the vertical CRS of z, where one is named that PROJ knows."""
 
     @classmethod
     def of(cls, source: LogSource, cloud: Cloud, *, ignore_file: bool, vertical_unit: LengthUnit | None) -> Self:
@@ -80,7 +82,8 @@ class CloudUnits:
             heights.kind, f"their CRS ({heights.name})", "options.ignore_file_crs = true if the file is wrong"
         )
         name = source.crs if source.crs is not None and not crs.is_compound else _name(horizontal)
-        return cls(name, height, unit_m, _vertical_unit_m(source, units, vertical_unit, unit_m))
+        vertical = vertical_of(crs) or (None if written.crs is None else vertical_of(written.crs))
+        return cls(name, height, unit_m, _vertical_unit_m(source, units, vertical_unit, unit_m), vertical)
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,24 @@ TWICE: Final = Witness(
     told=("rejects", "findings"),
 )
 
+TWO_HEADS: Final = Witness(
+    "lidar_heads_mixed",
+    input="lidar",
+    fault="The packets of two heads stand in one capture under one address: an address translation, or a merge of two "
+    "captures.",
+    asks="the azimuth of each packet, against that of the packet before it and the rate at which the head turns",
+    does="the capture is refused where more than a tenth of the packets begin elsewhere than the head can have turned",
+    told=("error",),
+)
+
+_ASTRAY_CENTIDEG: Final = 500
+"""A head does not turn so far (0.01°) besides what its rate says: it holds that to some per cent."""
+_MIXED_SHARE: Final = 0.1
+_MIXED_LEAST: Final = 50
+"""Packets that tell it."""
+_TURNED_PAUSE_US: Final = 5_000
+"""Over a longer pause the rate does not say where the azimuth is."""
+
 
 class VelodyneOptions(Strict):
     """Settings of a Velodyne capture."""
@@ -370,6 +388,11 @@ class _Known:
     products: Counter[int] = field(default_factory=Counter)
     modes: Counter[int] = field(default_factory=Counter)
     parts: Parts = field(default_factory=Parts)
+    turned: int = 0
+    astray: int = 0
+    """Packets whose azimuth was compared with that of the packet before, and those that begin elsewhere."""
+    _before: tuple[int, int, float] | None = None
+    """Stamp (µs), first azimuth (0.01°) and rate (0.01° a µs) of the last packet."""
 
     def take(self, packet: Datagram) -> None:
         """Learn from a data packet that begins well."""
@@ -378,6 +401,21 @@ class _Known:
         self.modes[packet.payload[1204]] += 1
         stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
         self.parts.data(packet.number, stamp_us, packet.capture_ns // 1000)
+        self._turn(packet.payload, stamp_us)
+
+    def _turn(self, payload: bytes, stamp_us: int) -> None:
+        """Compare where a packet begins with where the one before it leads."""
+        azimuth = int.from_bytes(payload[2:4], "little")
+        if self._before is not None:
+            passed_us = stamp_us - self._before[0]
+            if abs(passed_us) <= _TURNED_PAUSE_US:
+                off = azimuth - self._before[1] - self._before[2] * passed_us
+                self.turned += 1
+                self.astray += abs((off + 18_000) % 36_000 - 18_000) > _ASTRAY_CENTIDEG
+        model = next((m for m in MODELS if m.product == payload[1205]), MODELS[0])
+        span_us = float(model.slot_times_ns(payload[1204] == DUAL)[-1, 0]) / 1e3
+        inside = int.from_bytes(payload[100 * (BLOCKS - 1) + 2 : 100 * (BLOCKS - 1) + 4], "little") - azimuth
+        self._before = stamp_us, azimuth, ((inside + 18_000) % 36_000 - 18_000) / span_us
 
     def start(self, sentences: bool) -> Start:
         """Time of the first packet that is on GPS time, and of a sentence that belongs to it."""
@@ -437,6 +475,15 @@ def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None =
             change="list the capture once a sensor, each with its address as options.sender",
             file=path,
             missing=Missing("options.sender", choices=tuple(sorted(known.senders))),
+        )
+    if known.turned >= _MIXED_LEAST and known.astray > _MIXED_SHARE * known.turned:
+        raise FormatError(
+            f"{known.astray:,} of {known.turned:,} packets begin at another azimuth than the packet before them leads "
+            f"to: two heads sent to port {options.port} from one address",
+            expected="one head a log",
+            change="give each head an address or a port of its own, or split the capture by what tells the heads apart "
+            "(their Ethernet addresses), and list each part with its own sensor",
+            file=path,
         )
     return known
 

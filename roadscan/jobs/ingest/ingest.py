@@ -9,6 +9,7 @@ from typing import Final
 
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
+from roadscan.jobs.ingest.motion_checks import motion_findings
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -159,6 +160,8 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
         if writer.rows[table]:
             check_poses(writer, table, str(header.attributes["world_frame"]), poses)
             writer.finish()
+    if writer.rows[POSES]:
+        writer.findings += motion_findings(writer, str(header.attributes["world_frame"]), poses)
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header

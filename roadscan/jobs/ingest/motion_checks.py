@@ -140,7 +140,7 @@ def _speed(motion: PoseMotion) -> Iterator[Finding]:
     elif scale.ratio < _POINTING:
         text = (
             f"the stated velocities point elsewhere than the positions go: along them these go {scale.ratio:.2f} times "
-            f"as far ({scale.way_m:,.0f} m): axes or signs of the velocities are wrong, or positions; all poses are used"
+            f"as far ({scale.way_m:,.0f} m): axes or signs of the velocities are wrong; all poses are used"
         )
     else:
         text = (

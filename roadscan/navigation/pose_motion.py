@@ -36,6 +36,8 @@ _STRAIGHT_RAD: Final = float(np.radians(2.0))
 """A window that turns by less is straight: a point 4 m before the rear axle then moves aside by less than 1.6°."""
 _LEAST_WINDOWS: Final = 8
 """Of fewer windows nothing is said."""
+_LEAST_TOLD: Final = 0.25
+"""Sine of half the angle (29°) between two axes that can be told apart by how they rise."""
 _LEAST_SLOPES: Final = 15
 """Of fewer windows nothing is said of pitch: over 70 m, heights of a drifting fix rise and fall once."""
 _SCATTER: Final = 1.4826
@@ -61,8 +63,8 @@ _ALL_SAME_WAY_M: Final = 50.0
 """A log of one value throughout has to drive so far."""
 _HARD_M_PER_S2: Final = 12.0
 """More than the tyres of a car hold (1.2 g)."""
-_FROZEN_M: Final = 0.05
-"""A leap from the last of frozen poses is longer."""
+_FROZEN_M: Final = 0.5
+"""A leap from the last of frozen poses is longer: coarse positions repeat as well."""
 _EVEN_SHARE: Final = 0.05
 """The way since the first of them is that of the mean speed to this share, beside braking."""
 _LEAST_SCALE: Final = 0.003
@@ -105,6 +107,9 @@ class HeadingOff(NamedTuple):
     """1 σ of one window about it."""
     way_m: float
     """Straight way on which it is compared."""
+    is_mounted: bool | None
+    """True where the axis that points along the way rises with the slope, and so is mounted turned; False where the
+    forward axis does, and the angle alone is wrong; None where neither shows."""
 
 
 class PitchOff(NamedTuple):
@@ -203,27 +208,32 @@ class PoseMotion:
         doubt = _SIGMAS * scatter / np.sqrt(rows.off_rad.size)
         if abs(middle) < _LEAST_OFF_RAD + doubt:
             return None
-        return HeadingOff(middle, scatter, float(rows.way_m.sum()))
+        return HeadingOff(middle, scatter, float(rows.way_m.sum()), self._is_mounted(middle))
 
     def pitch(self) -> PitchOff | None:
         """Pitch that is not the slope; None where it is, and where the log does not say it."""
         rows = self._rows()
         if rows.slope_rad.size < _LEAST_SLOPES:
             return None
-        course, _ = _middle(rows.off_rad)  # of a unit that is mounted turned, the axis that points along the way
-        sine, cosine = np.sin(course), np.cos(course)
-        pitch = -np.arcsin(np.clip(cosine * rows.down_forward - sine * rows.down_right, -1.0, 1.0))
-        roll = np.arcsin(np.clip(cosine * rows.down_right + sine * rows.down_forward, -1.0, 1.0))
-        spread = float(np.std(rows.slope_rad))
-        noise = _SCATTER * float(np.median(np.abs(np.diff(rows.slope_rad)))) / np.sqrt(6.0)
-        if spread < max(_LEAST_SLOPE_RAD, _SLOPE_NOISE_TIMES * noise):
+        if (varies := _varies(rows)) is None:
             return None
-        followed, sigma = _followed(pitch, rows)
-        if followed + _SIGMAS * sigma > _LEAST_FOLLOWED:
+        course, _ = _middle(rows.off_rad)
+        along, beside = (_risen(rows, -turn) for turn in (0.0, course))
+        if any(followed + _SIGMAS * sigma > _LEAST_FOLLOWED for followed, sigma in (along, beside)):
             return None
-        other, other_sigma = _followed(roll, rows)
+        other, other_sigma = _risen(rows, np.pi / 2.0)
         is_roll = abs(other) - _SIGMAS * other_sigma > _LEAST_FOLLOWED
-        return PitchOff(followed, sigma, other if is_roll else 0.0, spread, float(rows.way_m.sum()))
+        return PitchOff(*along, other if is_roll else 0.0, varies, float(rows.way_m.sum()))
+
+    def _is_mounted(self, off_rad: float) -> bool | None:
+        """See :attr:`HeadingOff.is_mounted`."""
+        rows = self._rows()
+        if rows.slope_rad.size < _LEAST_SLOPES or _varies(rows) is None or abs(np.sin(off_rad / 2.0)) < _LEAST_TOLD:
+            return None
+        follows = [
+            one - _SIGMAS * sigma > _LEAST_FOLLOWED for one, sigma in (_risen(rows, 0.0), _risen(rows, -off_rad))
+        ]
+        return None if follows[0] == follows[1] else follows[1]
 
     def same(self) -> list[Same]:
         """Values that do not change while the vehicle drives."""
@@ -235,7 +245,7 @@ class PoseMotion:
                 found.append(Same(name, self._poses, self._way_m, min(self._span), max(self._span), True))
                 continue
             runs, (alike, neighbours) = self._runs[name], self._alike[name]
-            if runs and alike <= _ROUNDED * neighbours:
+            if runs and neighbours >= _LEAST_SAME and alike <= _ROUNDED * neighbours:
                 longest = max(runs, key=lambda run: run[1])
                 poses, way = sum(run[0] for run in runs), sum(run[1] for run in runs)
                 found.append(Same(name, poses, way, longest[2], longest[3], False))
@@ -354,6 +364,19 @@ def _windows(track: PoseTrack, axes: Float64, level_from_body: Float64, way: Flo
     return _Windows(*(each[sound] for each in found))
 
 
+def _varies(rows: _Windows) -> float | None:
+    """1 σ of the slopes; None where they vary too little, or are noise."""
+    spread = float(np.std(rows.slope_rad))
+    noise = _SCATTER * float(np.median(np.abs(np.diff(rows.slope_rad)))) / np.sqrt(6.0)
+    return spread if spread > max(_LEAST_SLOPE_RAD, _SLOPE_NOISE_TIMES * noise) else None
+
+
+def _risen(rows: _Windows, turn_rad: float) -> tuple[float, float]:
+    """How much an axis of the body, turned to the right of the forward one, rises with the slope; and its σ."""
+    down = np.cos(turn_rad) * rows.down_forward + np.sin(turn_rad) * rows.down_right
+    return _followed(-np.arcsin(np.clip(down, -1.0, 1.0)), rows)
+
+
 def _followed(angle: Float64, rows: _Windows) -> tuple[float, float]:
     """Change of an angle by change of slope, and its σ, beside what braking changes."""
     parts = np.column_stack([np.ones(angle.size), rows.slope_rad, rows.acceleration_m_per_s2])
@@ -413,16 +436,17 @@ def _against_left_out(track: PoseTrack, world: str, axes: Float64, links: Float6
     for apart in (2, 4, 8):
         asked = np.arange(apart + apart // 2, size - 2 * apart, apart)
         asked = asked[links[asked] > 0]
-        if asked.size < _LEAST_LEFT_OUT:
-            return None
         placed = _placed(track, world, slice(None, None, apart), apart * step_ns, track.epochs_gps_ns[asked])
-        squares = _squares(placed - track.position_world_m[asked], axes[asked])
-        if squares is None:
-            return None
-        found.append(squares)
-    near, far = np.maximum(found[1] - found[0], 0.0), np.maximum(found[2] - found[1], 0.0)
-    grows = np.clip(np.divide(far, near, out=np.full(2, _ORDERS[1]), where=near > 0), *_ORDERS)
-    return np.asarray(near / (grows - 1.0) / grows)
+        if (squares := _squares(placed - track.position_world_m[asked], axes[asked])) is not None:
+            found.append(squares)
+    if len(found) < 2:
+        return None
+    near = np.maximum(found[1] - found[0], 0.0)
+    grows = found[1] / np.maximum(found[0], _SAME_M**2)  # without noise
+    if len(found) > 2:
+        grows = np.maximum(grows, (found[2] - found[1]) / np.maximum(near, _SAME_M**2))
+    grows = np.clip(grows, *_ORDERS)
+    return np.asarray(np.minimum(near / (grows - 1.0), found[0]) / grows)
 
 
 def _placed(track: PoseTrack, world: str, rows: slice, step_ns: float, epochs: Int64) -> Float64:

@@ -87,14 +87,22 @@ def motion_findings(writer: LogWriter, world: str, records: PoseRecords) -> list
 def _course(motion: PoseMotion) -> Iterator[Finding]:
     """Heading against course, pitch against slope."""
     if (heading := motion.heading()) is not None:
-        off = np.degrees(heading.off_rad)
+        why = "the heading, its north or the axes of the log are wrong, or the unit is mounted turned"
+        if heading.is_mounted is not None:
+            why = "the body's forward axis rises with the road, so that the heading or its north is wrong"
+        if heading.is_mounted:
+            why = (
+                "another axis rises with the road, so that the unit is mounted turned, or the axes of the log are wrong"
+            )
+        mounted = (
+            "" if heading.is_mounted is False else ", which is right where all mountings are stated along its axes"
+        )
         yield POSE_COURSE.finds(
             "",
-            f"the heading is {off:+.1f}° off the course over ground (median of {heading.way_m:,.0f} m of straight "
-            f"driving, scatter {np.degrees(heading.scatter_rad):.1f}°), and a vehicle drives along its body's forward "
-            "axis: the heading, the north that it is counted from or the axes of the log are wrong, or the unit is "
-            "mounted turned, which is right only where the mountings of the rig file are stated along its axes; all "
-            f"poses are used, and a reading 5 m away lies up to {10 * abs(np.sin(heading.off_rad / 2)):.2f} m off",
+            f"the heading is {np.degrees(heading.off_rad):+.1f}° off the course over ground (median of "
+            f"{heading.way_m:,.0f} m of straight driving, scatter {np.degrees(heading.scatter_rad):.1f}°), and a "
+            f"vehicle drives along its body's forward axis: {why}{mounted}; all poses are used, and a reading 5 m away "
+            f"lies up to {10 * abs(np.sin(heading.off_rad / 2)):.2f} m off",
         )
     if (pitch := motion.pitch()) is not None:
         why = "its sign is wrong" if pitch.followed < -0.5 else "one of pitch and height is wrong"

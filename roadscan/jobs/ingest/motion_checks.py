@@ -188,7 +188,7 @@ class _Stated:
         """Look at a block of poses."""
         epochs = rows.column("epoch_gps_ns").to_numpy()
         values = np.stack([rows.column(name).to_numpy(zero_copy_only=False) for name in _SIGMAS], axis=-1)
-        bare = np.isnan(values.astype(np.float64)).any(axis=1)
+        bare: npt.NDArray[np.bool_] = np.asarray(np.isnan(values.astype(np.float64)).any(axis=1))
         self.poses += epochs.size
         self.bare += int(bare.sum())
         self.zero += int((values == 0).all(axis=1).sum())

@@ -110,6 +110,16 @@ class PoseTrack(NamedTuple):
     velocity_world_m_per_s: Float64 | None = None
     """(n, 3) stated velocities, NaN where one is missing; None of a log without any."""
 
+    def of(self, kept: Bool) -> PoseTrack:
+        """The poses of a mask (n,)."""
+        if kept.all():
+            return self
+        return PoseTrack(
+            self.epochs_gps_ns[kept], self.position_world_m[kept], self.quaternion[kept], self.sigma_m[kept],
+            self.sigma_rad[kept], self.is_local,
+            None if self.velocity_world_m_per_s is None else self.velocity_world_m_per_s[kept],
+        )  # fmt: skip
+
 
 class Step(NamedTuple):
     """A link after which poses go on at another level."""

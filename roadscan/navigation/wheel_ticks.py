@@ -111,6 +111,8 @@ class TickVerdict:
     jumps: tuple[ClockJump, ...]
     offset: ClockOffset | None
     """None where the speed does not change enough to know one, and where clocks step."""
+    still_m: float = 0.0
+    """Way of the poses on which the ticks do not count at all; 0 where they do."""
 
     @property
     def is_off(self) -> bool:
@@ -135,6 +137,9 @@ def judge_ticks(wheel: WheelTicks, poses: PoseWay) -> TickVerdict:
         return NOTHING
     distance = way.at(epochs)
     steps_m, steps_ticks = np.diff(distance), np.diff(ticks).astype(np.float64)
+    if not steps_ticks.any():
+        way_m = float(np.sum(steps_m[steps_m > _LEAST_SPEED_M_PER_S * np.diff(epochs) / NS_PER_S]))
+        return TickVerdict((), None, way_m if way_m > _LEAST_WAY_M else 0.0)
     scale = _metres_per_tick(steps_m, steps_ticks)
     if scale is None or distance[-1] - distance[0] < _LEAST_WAY_M:
         return NOTHING

@@ -209,14 +209,14 @@ def test_a_file_of_ties_by_hand_that_is_none_is_refused(
 
 
 @pytest.mark.nightly
-@pytest.mark.witness("passes_apart")
+@pytest.mark.witness("runs_apart")
 def test_a_pass_that_lies_half_a_metre_off_ends_as_one_that_does_not(adjusted: Simulated, tmp_path: Path) -> None:
     """The second of three passes lies 0.5 m aside and 0.5 m up; its log states 0.02 m."""
     copy = adjusted.copy_to(tmp_path / "survey")
     shifted(copy, ["run-2"], (0.4, 0.3, 0.5))
     run = copy.run(**CIRCLES, **NO_FILES)
     store = copy.store()
-    found = findings(store, "passes_apart")
+    found = findings(store, "runs_apart")
     assert [one.subject for one in found] == ["run 'run-2'"]
     assert "from run-1" in found[0].text
     assert "from run-3" in found[0].text

@@ -47,8 +47,8 @@ TIES_SETTLED: Final = Witness(
     told=("findings",),
 )
 
-PASSES_APART: Final = Witness(
-    "passes_apart",
+RUNS_APART: Final = Witness(
+    "runs_apart",
     input="trajectories",
     fault="The poses of a pass lie decimetres from those of other passes over the same road.",
     asks="larger patches of the road, each 100 m: the shift that most of them agree on",
@@ -238,7 +238,7 @@ def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
         f"where the road matches, it lies {', '.join(told)}{doubt}. σ of {' and '.join(runs)} is taken to be as large, "
         "and ties are observed again where the solution puts the passes"
     )
-    return PASSES_APART.finds(f"run '{runs[-1]}'", text)
+    return RUNS_APART.finds(f"run '{runs[-1]}'", text)
 
 
 def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:

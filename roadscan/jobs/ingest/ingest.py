@@ -10,6 +10,7 @@ from typing import Final
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.laser_ranges import LaserRanges
+from roadscan.jobs.ingest.motion_checks import motion_findings
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
@@ -170,6 +171,8 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     if writer.rows["returns"]:
         seen.lasers.finish(writer)
         writer.finish()
+    if writer.rows[POSES]:
+        writer.findings += motion_findings(writer, str(header.attributes["world_frame"]), seen.poses)
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header

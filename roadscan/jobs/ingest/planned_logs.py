@@ -184,9 +184,10 @@ def _checks_of(format_: LogFormat) -> list[list[object]]:
 
 def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
     """What :func:`_checks_of` was in earlier versions, the latest first."""
+    places: list[list[object]] = [["places", 1]] if set(PLACED) & set(format_.yields) else []
     first: list[list[object]] = [["poses", 1]] if POSES in format_.yields else []
-    first += [["places", 1]] if set(PLACED) & set(format_.yields) else []
-    return [first, []]
+    second: list[list[object]] = [["poses", 2]] if {POSES, FIXES} & set(format_.yields) else []
+    return [second + places, first + places, []]
 
 
 def log_source(

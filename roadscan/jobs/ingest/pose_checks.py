@@ -21,6 +21,7 @@ from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
 from roadscan.navigation.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
+from roadscan.navigation.pose_motion import frozen
 from roadscan.sensors.base import Rows
 from roadscan.sensors.motion.gnss import ned_from_ecef
 from roadscan.tables.writer import LogWriter
@@ -29,7 +30,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Raised when other poses are left out, so that logs of trajectories and of GNSS are read again."""
 
 POSE_LEAP: Final = Witness(
@@ -39,6 +40,14 @@ POSE_LEAP: Final = Witness(
     asks="the poses before and after, the stated velocities and σ, and the speed, acceleration and turning of which a "
     "vehicle is able",
     does="a pose that all of them exclude is left out; those about it bridge the gap up to navigation.max_gap_s",
+    told=("rejects", "findings"),
+)
+POSE_FROZEN: Final = Witness(
+    "pose_frozen",
+    input="trajectory",
+    fault="Poses stand still while the vehicle drives: the last one is written again and again.",
+    asks="the poses before and after those that repeat to the bit, and the way that the vehicle drives meanwhile",
+    does="poses that repeat are left out; those about them bridge the gap up to navigation.max_gap_s",
     told=("rejects", "findings"),
 )
 POSE_STEP: Final = Witness(
@@ -80,6 +89,7 @@ _NAMED: Final = 3
 """So many steps are named, the largest."""
 
 _ELSEWHERE: Final = "the position leaps away from the ones before and after it, as no vehicle moves"
+_FROZEN: Final = "position and attitude repeat those of the pose before to the bit, while the vehicle drives on"
 _TURNED: Final = "the attitude leaps away from the poses before and after it, as no vehicle turns"
 
 
@@ -128,8 +138,10 @@ def check_poses(writer: LogWriter, table: str, world: str, records: PoseRecords)
     """
     found = _Found(table)
     no_fix = _without_fix(writer, world) if table == POSES else np.zeros(0, np.int64)
-    for epochs, leaps in _judged(writer, table, _Reading(world, no_fix, records.velocities())):
+    reading = _Reading(world, no_fix, records.velocities())
+    for epochs, leaps, stuck in _judged(writer, table, reading):
         found.add(epochs, leaps)
+        found.reasons |= dict.fromkeys(stuck.tolist(), _FROZEN)
     out = np.union1d(no_fix, np.array(sorted(found.reasons), dtype=np.int64))
     told = list(records.of(out))
     for file, record, offset, epoch in told:
@@ -183,6 +195,13 @@ class _Found:
                 continue
             text += ", and bridged by the others where these are within navigation.max_gap_s"
             found.append(POSE_LEAP.finds("", text, count))
+        if stuck := [(epoch, record) for _, record, _, epoch in told if self.reasons.get(epoch) == _FROZEN]:
+            text = (
+                f"{self._counted(len(stuck), 'repeats', 'repeat')} the one before to the bit in position and attitude, "
+                f"while the vehicle drives on, the first at {iso_from_gps_ns(stuck[0][0])} (record {stuck[0][1]:,}); "
+                "left out, and bridged by the others where these are within navigation.max_gap_s"
+            )
+            found.append(POSE_FROZEN.finds("", text, len(stuck)))
         if no_fix := len(told) - sum(one in self.reasons for *_, one in told):
             first = next(record for _, record, _, epoch in told if epoch not in self.reasons)
             who = self._counted(no_fix, "lies", "lie")
@@ -255,8 +274,8 @@ class _Reading(NamedTuple):
     """Epochs and velocities of the log's rows, of a trajectory that states them."""
 
 
-def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[Int64, Leaps]]:
-    """Epochs and leaps of each file of poses, looked at together with poses of the files before and after it."""
+def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[Int64, Leaps, Int64]]:
+    """What :func:`_judge` says of each file of poses, together with poses of the files before and after it."""
     window: list[pa.Table] = []
     for rows in [*writer.tables(table), None]:
         if len(window) > 0:
@@ -266,19 +285,23 @@ def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[
         window = [*window[-1:], *([] if rows is None else [rows])]
 
 
-def _judge(own: pa.Table, rows: pa.Table, reading: _Reading) -> tuple[Int64, Leaps]:
-    """Leaps of the poses of a table, looked at together with those around it."""
+def _judge(own: pa.Table, rows: pa.Table, reading: _Reading) -> tuple[Int64, Leaps, Int64]:
+    """Epochs and leaps of the poses of a table, and epochs of those that are frozen, with those around it."""
     first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
     track = pose_track(rows, *reading)
+    still = frozen(track) if "qw" in rows.column_names else np.zeros(track.epochs_gps_ns.size, bool)
+    stuck = track.epochs_gps_ns[still]
+    track = track.of(~still)
     found, epochs = find_leaps(track), track.epochs_gps_ns
     inside = (epochs >= first) & (epochs <= last)
     steps, covered = (
         tuple(one for one in each if inside[one.after]) for each in (found.steps, found.covered)
     )  # fmt: skip
     stalls = tuple(one for one in found.stalls if inside[one.after])
-    return epochs, Leaps(
+    leaps = Leaps(
         found.position & inside, found.attitude & inside, found.shift_m, found.turn_rad, steps, covered, stalls
     )
+    return epochs, leaps, stuck[(stuck >= first) & (stuck <= last)]
 
 
 def pose_track(

@@ -92,7 +92,7 @@ def _coarse(table: str, rows: pa.Table, header: LogHeader, source: LogSource) ->
 
 def _coarse_columns(columns: Sequence[_Column], sigma: float) -> Iterator[str]:
     """Words for columns that are coarser than they may be, and than their σ; none where no column jumps on its grid."""
-    found = [(column, *grid_of(column.values)) for column in columns]
+    found = [(column, *_grid_of(column)) for column in columns]
     if not any(jumps and step * column.to_tolerance > max(column.most, sigma) for column, step, jumps in found):
         return
     for column, step, _ in found:
@@ -100,6 +100,15 @@ def _coarse_columns(columns: Sequence[_Column], sigma: float) -> Iterator[str]:
         if reach > max(column.most, sigma):
             metres = f" ({reach:.2g} m)" if column.unit == "°" and column.most == POSITION_M else ""
             yield f"{column.name} is held in steps of {step:.2g} {column.unit}{metres}"
+
+
+def _grid_of(column: _Column) -> tuple[float, bool]:
+    """Grid of a column in its unit; degrees may have been held as radians."""
+    step, jumps = grid_of(column.values)
+    if step == 0.0 and column.unit == "°":
+        step, jumps = grid_of(np.radians(column.values))
+        step = float(np.degrees(step))
+    return step, jumps
 
 
 def _coarse_stamps(rows: pa.Table) -> Iterator[str]:

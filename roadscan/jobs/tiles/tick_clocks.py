@@ -14,6 +14,7 @@ from roadscan.code_reach import code_digest
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.engine.compute import Compute
 from roadscan.jobs.engine.fingerprint import key_of
+from roadscan.jobs.ingest.resolution import COARSE_VALUES
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import ReadingSource, TrajectorySource, load_recorded, read_rows
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
@@ -44,6 +45,15 @@ TICK_CLOCK: Final = Witness(
     told=("findings",),
 )
 
+TICKS_STILL: Final = Witness(
+    "ticks_still",
+    input="profiler",
+    fault="The wheel's ticks stand still while the vehicle drives: the encoder is not connected.",
+    asks="the distance that the poses travel in the same time",
+    does="all readings are used, and the clock of the sensor has no witness in this run: that is named",
+    told=("findings",),
+)
+
 _COLUMNS: Final = ["epoch_gps_ns", "encoder_ticks"]
 _PAD_NS: Final = 25 * NS_PER_S
 """Poses are read so far beyond the readings: a clock may be off by up to 20 s."""
@@ -55,6 +65,8 @@ _SAME_NS: Final = NS_PER_S // 10
 """Steps of two sensors that lie closer are one step of the poses."""
 _SAME_SHARE: Final = 0.2
 """Two sizes that differ by less are the same."""
+_COARSE_M: Final = 1.0
+"""Where positions or stamps of the poses are coarse, smaller steps of their way are those."""
 _NAMED: Final = 3
 """So many steps are named, the largest."""
 
@@ -159,6 +171,7 @@ def _figures(verdicts: Sequence[TickVerdict]) -> dict[str, object]:
     return {
         "jumps": [asdict(jumps[epoch]) for epoch in sorted(jumps)],
         "offset": None if offset is None else [offset.offset_s, offset.sigma_s],
+        "still_m": sum(one.still_m for one in verdicts) if all(one.still_m for one in verdicts) else 0.0,
     }
 
 
@@ -172,17 +185,27 @@ class _Said(NamedTuple):
     jumps: tuple[ClockJump, ...]
     offset: tuple[float, float] | None
     """How far the clock is off, and its σ (s)."""
+    still_m: float
+    """Way on which the ticks stand still; 0 where they count."""
 
 
 def tick_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Finding]:
     """Clocks that ticks and poses contradict, by log; by run where all logs of several sensors say the same."""
     log_of = {file.path: record.path for record in records for files in record.tables.values() for file in files}
+    coarse = {
+        record.run
+        for record in records
+        if record.tables.get("trajectory") and any(one.witness == COARSE_VALUES.name for one in record.findings)
+    }
     runs: dict[str, list[_Said]] = defaultdict(list)
     for _, record in sorted(manifest.of(PRODUCT).items()):
         figures = record.figures()
         if (log := log_of.get(figures["file"])) is not None:
             jumps = tuple(ClockJump(**jump) for jump in figures["jumps"])
-            runs[figures["run"]].append(_Said(log, jumps, figures["offset"] and (*figures["offset"],)))
+            if figures["run"] in coarse:
+                jumps = tuple(jump for jump in jumps if abs(jump.way_m) > _COARSE_M)
+            offset = figures["offset"] and (*figures["offset"],)
+            runs[figures["run"]].append(_Said(log, jumps, offset, figures["still_m"]))
     found: list[Finding] = []
     for run, said in sorted(runs.items()):
         poses = next((r.path for r in records if r.run == run and r.tables.get("trajectory")), f"poses of run '{run}'")
@@ -200,6 +223,12 @@ def _of_run(poses: str, said: Sequence[_Said]) -> list[Finding]:
     if is_shared and offset is not None:
         found.append(TICK_CLOCK.finds(poses, _offset_words(offset, f"of all {len(said)} sensors")))
     for one in said:
+        if one.still_m:
+            text = (
+                f"the wheel's ticks stand still while the poses travel {one.still_m:,.0f} m: the encoder counts "
+                "nothing, and the clock of this sensor has no witness in it; all readings are used"
+            )
+            found.append(TICKS_STILL.finds(one.log, text))
         own = tuple(jump for jump in one.jumps if not _has(shared, jump))
         if own:
             found.append(TICK_CLOCK.finds(one.log, _step_words(own, "of this sensor")))

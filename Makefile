@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check lint types contracts docs docs-check pytest nightly test-library fuzz bench viewer format venv install install-dev constraints clean
+.PHONY: help demo test check lint types contracts house docs docs-check pytest nightly test-library fuzz bench viewer format venv install install-dev constraints clean
 
 help:  ## Show the targets.
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -28,7 +28,7 @@ demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with i
 test: $(VENV)/.installed-dev  ## All that CI runs: check, and the tests.
 	@$(MAKE) --no-print-directory --jobs 2 check pytest
 
-check: lint types contracts docs-check  ## Lint, types, import contracts, documentation.
+check: lint types contracts house docs-check  ## Lint, types, import contracts, documentation.
 
 lint: $(VENV)/.installed-dev  ## Style and formatting.
 	$(BIN)/ruff check .
@@ -40,6 +40,9 @@ types: $(VENV)/.installed-dev  ## Static types.
 
 contracts: $(VENV)/.installed-dev  ## Import contracts: layers, and who may import what.
 	$(BIN)/lint-imports --no-logo
+
+house: $(VENV)/.installed-dev  ## Size and shape of the library, against limits that only fall (tests/house/limits.toml).
+	$(BIN)/python -m tests.house
 
 docs: $(VENV)/.installed-dev  ## Write the generated pages of docs/.
 	$(BIN)/python docs/generate.py

@@ -40,6 +40,7 @@ from roadscan.model.survey import Survey
 from roadscan.sensors.base import LogSource, Reject, format_named, log_formats
 from roadscan.sensors.clouds.opencrg_file import CurvedRegularGrid, write_crg
 from roadscan.sensors.motion.nmea_writer import Fix, sentences
+from roadscan.sensors.motion.ubx import HEADER, SOLUTION
 from roadscan.sensors.scanners.psi_container import PsiContainer, PsiHeader, write_psi
 from roadscan.sensors.scanners.sick_telegrams import encode_scans
 from roadscan.tables.store import Store
@@ -173,8 +174,9 @@ def makers() -> dict[str, Callable[[Path], Log]]:
         "sbet": sbet, "smrmsg": smrmsg, "trajectory_csv": trajectory_csv, "trajectory_table": trajectory_table,
         "returns_table": returns_table, "pose_matrices": pose_matrices,
         "pose_quaternions csv": pose_quaternions, "pose_quaternions parquet": pose_parquet, "pospac": pospac,
-        "rtklib_pos": rtklib_pos, "nmea": nmea, "imu_csv": imu_csv, "encoder_csv": encoder_csv,
-        "control_csv": control_csv, "control_vector": control_vector, "road_lines": road_lines,
+        "rtklib_pos": rtklib_pos, "nmea": nmea, "ubx": ubx, "imu_csv": imu_csv, "encoder_csv": encoder_csv,
+        "control_csv": control_csv, "control_vector": control_vector, "control_lines": control_lines,
+        "road_lines": road_lines,
         "velodyne_pcap": velodyne_pcap, "sick_lms": sick_lms, "carmen": carmen, "kitti": kitti, "argoverse": argoverse,
         "scans": scans, "psi": psi, "psi zip": functools.partial(psi, codec="zip"),
         "las": functools.partial(las, name="a.las"), "las laz": functools.partial(las, name="a.laz"), "e57": e57,
@@ -361,6 +363,25 @@ def nmea(folder: Path) -> Log:
     return Log("nmea", "epochs", path, {}, {"crs": "EPSG:4979"}, n, other, "pynmea2.parse")
 
 
+def ubx(folder: Path) -> Log:
+    n = 100_000
+    frames = np.zeros(n, SOLUTION)
+    content = frames.view(np.uint8).reshape(n, SOLUTION.itemsize)
+    content[:, :6] = np.frombuffer(HEADER, np.uint8)
+    tenths = np.arange(n)
+    frames["year"], frames["month"], frames["day"] = 2026, 5, 4
+    frames["hour"], frames["minute"] = 6 + tenths // 36_000, tenths // 600 % 60
+    frames["second"], frames["nano"] = tenths // 10 % 60, 100_000_000 * (tenths % 10)
+    frames["valid"], frames["fix"], frames["flags"], frames["satellites"] = 3, 3, 1, 12
+    frames["latitude"], frames["longitude"], frames["height_mm"] = 500_000_000 + tenths, 100_000_000 + tenths, 100_000
+    covered = content[:, 2:-2].astype(np.int64)
+    frames["checksum"][:, 0] = covered.sum(axis=1) % 256
+    frames["checksum"][:, 1] = covered @ np.arange(covered.shape[1], 0, -1) % 256
+    path = folder / "a.ubx"
+    path.write_bytes(frames.tobytes())
+    return Log("ubx", "epochs", path, {}, {"crs": "EPSG:4979"}, n)
+
+
 def imu_csv(folder: Path) -> Log:
     t, _, _ = moving(300_000)
     columns = {"time_s": T0 + t} | {f"gyro_{a}_deg_s": np.sin(t + k) for k, a in enumerate("xyz")}
@@ -387,6 +408,18 @@ def control_csv(folder: Path) -> Log:
     path = columns_csv(folder / "a.csv", columns)
     stated = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": MapFrame(crs="EPSG:25832")}
     return Log("control_csv", "", path, {}, stated, other=with_pandas(path), against="pandas.read_csv")
+
+
+def control_lines(folder: Path) -> Log:
+    n = 100_000
+    columns = {
+        "line": np.char.add("L", (np.arange(n) // 100).astype(str)), "kind": np.full(n, "kerb"),
+        "role": np.full(n, "gcp"), "easting": 571_600 + np.arange(n) * 0.1, "northing": 5_539_000 + np.arange(n) * 0.1,
+        "height_m": np.full(n, 300.0),
+    }  # fmt: skip
+    path = columns_csv(folder / "a.csv", columns)
+    stated = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": MapFrame(crs="EPSG:25832")}
+    return Log("control_lines", "", path, {}, stated, other=with_pandas(path), against="pandas.read_csv")
 
 
 def control_vector(folder: Path) -> Log:

@@ -14,10 +14,9 @@ from roadscan.condition.profile_faults import NOTABLE, PROFILE_STEPS, SoundHeigh
 from roadscan.condition.profiles import heights_of, raise_fault, stations_of
 from roadscan.condition.ride import NOTES, Ride, ride
 from roadscan.condition.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.rms_texture import rms_texture_mm
 from roadscan.condition.segments import Segments, segments_of
 from roadscan.condition.stretches import stretches_above
-from roadscan.condition.texture import TextureSettings, texture_segments
+from roadscan.condition.texture import TextureSettings, rms_texture_mm, texture_segments
 from roadscan.model.errors import ProfileError
 from roadscan.model.witness import Finding
 

@@ -8,6 +8,7 @@ for stationary profilers: a Butterworth low-pass of second order, run forwards a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -229,3 +230,14 @@ def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
 def _segment_of(place_mm: Floats) -> npt.NDArray[np.int64]:
     """Number of the segment of each place; one on a border belongs to the segment before it."""
     return np.asarray(np.maximum(np.ceil(np.round(place_mm / SEGMENT_MM, 9)) - 1, 0), np.int64)
+
+
+def segment_rms_mm(height_mm: Floats) -> float:
+    """Root mean square (mm) of the heights (n,) of a segment whose slope was removed."""
+    return float(np.sqrt(np.mean(np.square(height_mm))))
+
+
+def rms_texture_mm(segments: Sequence[TextureSegment]) -> float:
+    """Root of the mean of the squares over all valid segments (mm); NaN where fewer than half are valid."""
+    squares = [segment_rms_mm(one.height_mm) ** 2 for one in segments if not one.note]
+    return float(np.sqrt(np.mean(squares))) if squares and 2 * len(squares) >= len(segments) else np.nan

@@ -10,10 +10,9 @@ import pytest
 from scipy.signal import detrend
 
 from roadscan.condition.mpd import mean_profile_depth, mean_profile_depths, segment_depth_mm
-from roadscan.condition.rms_texture import rms_texture_mm, segment_rms_mm
 from roadscan.condition.segments import segments_of
 from roadscan.condition.tables import mpd
-from roadscan.condition.texture import TextureSettings, texture_segments
+from roadscan.condition.texture import TextureSettings, rms_texture_mm, segment_rms_mm, texture_segments
 from roadscan.model.errors import ProfileError
 
 PLATE_MM, MARGIN_MM = 30.0, 2.0

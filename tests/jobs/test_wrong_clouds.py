@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -217,14 +216,3 @@ def test_heights_of_another_datum_are_refused_or_transformed(tmp_path: Path) -> 
     _, _, heights = change.transform(*road().T)
     assert abs(np.mean(heights - road()[:, 2])) > 0.005  # it changes something
     assert abs(np.mean(np.concatenate([np.asarray(tile.z) for tile in tiles])) - np.mean(heights)) < 1e-3
-
-
-def test_a_file_replaced_with_its_size_and_time_is_read_anew(tmp_path: Path) -> None:
-    write(tmp_path / "c.las", road())
-    before, _ = ingested(survey(tmp_path, "c"))
-    was = (tmp_path / "c.las").stat()
-    write(tmp_path / "c.las", road() + np.array([0.0, 0.0, 1.0]))
-    os.utime(tmp_path / "c.las", ns=(was.st_atime_ns, was.st_mtime_ns))
-    assert (tmp_path / "c.las").stat().st_size == was.st_size
-    after, _ = ingested(tmp_path)
-    assert abs(after[:, 2].mean() - before[:, 2].mean() - 1.0) < 1e-6

@@ -110,12 +110,12 @@ def test_sbet_read_by_hand(survey: SimulatedSurvey):
         heading = np.degrees(rows[1:-1, 9] - wander[1:-1])
         assert np.abs((heading - track + 180.0) % 360.0 - 180.0).max() < 0.35
         # Velocity turned from the wander frame to north and east is along the track too.
-        north = rows[:, 4] * np.cos(wander) + rows[:, 5] * np.sin(wander)
-        east = -rows[:, 4] * np.sin(wander) + rows[:, 5] * np.cos(wander)
+        north = rows[:, 4] * np.cos(wander) - rows[:, 5] * np.sin(wander)
+        east = -rows[:, 4] * np.sin(wander) - rows[:, 5] * np.cos(wander)
         course = np.degrees(np.arctan2(east, north))[1:-1]
         assert np.abs((course - track + 180.0) % 360.0 - 180.0).max() < 0.02
         climbed = np.diff(rows[:, 3])
-        np.testing.assert_allclose(-rows[1:-1, 6], (climbed[1:] + climbed[:-1]) / 0.01, atol=1e-3)
+        np.testing.assert_allclose(rows[1:-1, 6], (climbed[1:] + climbed[:-1]) / 0.01, atol=1e-3)
         turned = np.unwrap(rows[:, 9] - wander)
         np.testing.assert_allclose(rows[1:-1, 16], (turned[2:] - turned[:-2]) / 0.01, atol=2e-3)
 

@@ -24,13 +24,11 @@ _NEAR: Final = 2
 """So many folders above the survey file's a log is still near."""
 
 Known = list[Any]
-"""Size (bytes), time of the last change (ns) and digest of a file; and the time of the last change of its inode (ns),
-which no program can set: a file that was replaced and given the size and time of the old one has another.
-"""
+"""Size (bytes), time of the last change (ns) and digest of a file."""
 
 
 class Sources:
-    """Fingerprints of raw logs; a file of unchanged size and times is not read again, a log moved away is remembered.
+    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered.
 
     Logs are known by their paths from the survey file's folder, where they lie below it or near it: survey, store and
     logs may move together.
@@ -81,10 +79,10 @@ class Sources:
         files = {name: future.result() for name, future in begun.items()}
         self._now[self._name(path)] = {"format": format_.name, "files": files}
         combined = hashlib.blake2b(digest_size=16)
-        for name, (_, _, digest, *_) in files.items():
+        for name, (_, _, digest) in files.items():
             combined.update(f"{name}\0{digest}\n".encode())
-        stamp = _stamp({name: (size, changed_ns) for name, (size, changed_ns, *_) in files.items()})
-        return combined.hexdigest(), sum(size for size, *_ in files.values()), stamp
+        stamp = _stamp({name: (size, changed_ns) for name, (size, changed_ns, _) in files.items()})
+        return combined.hexdigest(), sum(size for size, _, _ in files.values()), stamp
 
     def save(self) -> None:
         """Keep what was learnt; logs that are no longer listed stay known.
@@ -203,13 +201,12 @@ def _name(file: Path, log: Path) -> str:
 def _fingerprint(file: Path, known: Known | None) -> Known:
     try:
         stat = file.stat()
-        now = [stat.st_size, stat.st_mtime_ns]
-        if known is not None and known[:2] == now and known[3:] in ([], [stat.st_ctime_ns]):
-            return [*known[:3], stat.st_ctime_ns]
+        if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+            return known
         old = known is not None and known[0] == stat.st_size and ":" not in known[2]
-        is_same = known is not None and old and digest_holds(file, known[2])  # then the log's key follows from it
-        digest = known[2] if known is not None and is_same else file_digest(file)
-        return [*now, digest, stat.st_ctime_ns]
+        if known is not None and old and digest_holds(file, known[2]):
+            return [stat.st_size, stat.st_mtime_ns, known[2]]  # an older algorithm's: the log's key follows from it
+        return [stat.st_size, stat.st_mtime_ns, file_digest(file)]
     except OSError as error:
         raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error
 

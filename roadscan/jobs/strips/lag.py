@@ -106,7 +106,8 @@ def _summits(likeness: Float64) -> npt.NDArray[np.int64]:
     """Places of the summits that are about as high as the highest."""
     padded = np.pad(np.nan_to_num(likeness, nan=-1.0), 1, constant_values=-1.0)
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
-    return np.flatnonzero(is_top & (padded[1:-1] >= _EQUAL * padded.max()))
+    highest = float(padded.max())
+    return np.flatnonzero(is_top & (padded[1:-1] >= highest - (1.0 - _EQUAL) * abs(highest)))
 
 
 def _summit(likeness: Float64) -> float:

@@ -72,8 +72,11 @@ class Ubx(LogFormat):
         source.need_file()
         placement = _placement(source)
         _clock(source)
+        head = head_of(source.path, _SNIFF_BYTES)
+        if HEADER[:2] not in head:
+            raise FormatError("the beginning holds no UBX message", expected="bytes b5 62", file=source.path)
         attributes = {"world_frame": placement.world, "read": "UBX NAV-PVT"}
-        if _NMEA.search(head_of(source.path, _SNIFF_BYTES)):
+        if _NMEA.search(head):
             attributes["not_read"] = "NMEA sentences between the UBX messages"
         return LogHeader(attributes)
 

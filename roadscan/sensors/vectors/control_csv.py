@@ -82,7 +82,6 @@ class ControlCsv(LogFormat):
     name = "control_csv"
     title = "Ground control and check points as CSV (name, code, role, position, height, σ)"
     yields = ("control_points",)
-    version = 2
     column_sets: ClassVar[tuple[tuple[Quantity, ...], ...]] = ((NAME, *GEODETIC, HEIGHT), (NAME, *GRID, HEIGHT))
     time = "holds no time"
     options = ControlCsvOptions

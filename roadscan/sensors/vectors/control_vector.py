@@ -72,7 +72,6 @@ class ControlVector(LogFormat):
     name = "control_vector"
     title = "Ground control and check points as GeoJSON or GeoPackage points"
     yields = ("control_points",)
-    version = 2
     time = "holds no time"
     options = ControlVectorOptions
 

@@ -82,8 +82,8 @@ def test_the_commands_run_and_print_what_is_shown(tmp_path: Path, monkeypatch: p
     true_sensors = tomllib.loads(Path("made/truth/RIG.toml").read_text())["sensors"]
     for name, sensor in tomllib.loads(Path("RIG.toml").read_text())["sensors"].items():
         assert sensor == {key: true_sensors[name][key] for key in sensor}
-    # The map errs by half of the wrong lever arm first: the adjustment cannot tell which head is wrong. Afterwards it errs
-    # by no more than the trajectory does (σ 1 mm).
+    # The map errs by half of the wrong lever arm first: the adjustment cannot tell which head is wrong. Afterwards it
+    # errs by no more than the trajectory does (σ 1 mm).
     before, after = ([float(v) for v in re.findall(r"(\S+) mm", text)] for text in printed["python truth.py"])
     assert all(9.0 < value < 11.0 for value in before)
     assert max(abs(v) for v in after) < 3.0

@@ -57,8 +57,13 @@ class Watched:
         page.set_default_timeout(WAIT_MS)
         page.on("console", lambda one: self.wrong.append(one.text) if one.type == "error" else None)
         page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        page.on("requestfailed", lambda one: self.wrong.append(f"{one.url}: {one.failure}"))
+        page.on("requestfailed", self._failed)
         page.on("request", lambda one: self.foreign.append(one.url) if not _own(one.url, origin) else None)
+
+    def _failed(self, request: Any) -> None:
+        """Note a request that failed; one that a reload of the page cut off did not."""
+        if request.failure != "net::ERR_ABORTED":
+            self.wrong.append(f"{request.url}: {request.failure}")
 
     def open(self, url: str) -> Any:
         """Open an address and wait until the page is where it says."""

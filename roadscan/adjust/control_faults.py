@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.control import Sighting
+from roadscan.compute.robust import scatter_about
 
 Float64 = npt.NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:
     if away.size == 0 or abs(float(np.median(away))) <= largest_m:
         return ""
     middle = float(np.median(away))
-    spread = 1.4826 * float(np.median(np.abs(away - middle)))
+    spread = scatter_about(away, middle)
     return (
         f"the control points lie {middle:+.3f} m from the road that was measured (median of {away.size} sightings, "
         f"spread {spread:.3f} m): they are in another height datum or CRS than their [[control]] states, or the "

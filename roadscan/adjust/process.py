@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS
+from roadscan.compute.flags import runs_of
 from roadscan.model.errors import ConfigError
 from roadscan.model.gpstime import NS_PER_S
 
@@ -207,8 +208,7 @@ def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
 
 def stretches(there: npt.NDArray[np.bool_]) -> list[slice]:
     """Runs of neighbours that are True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return [slice(first, end) for first, end in runs_of(there).tolist()]
 
 
 def line_variance(

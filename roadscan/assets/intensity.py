@@ -24,6 +24,7 @@ import pyarrow as pa
 
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
+from roadscan.compute.robust import scatter_about
 from roadscan.kernels.assets.beams import log_gains, meet_ground
 from roadscan.kernels.options import read_only
 
@@ -150,7 +151,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         weights = robust * np.minimum(rows.returns, 9) / (1.0 + (rows.unit / (2.0 * _SCATTER * mean)) ** 2)
         solution, covariance = _solved(rows, (columns, values), (np.log(mean) + excess, weights), scale, terms)
         deviation = _without_places(rows, excess, weights)
-        scale = max(1.4826 * float(np.median(np.abs(deviation))), _LEAST_SCATTER)
+        scale = max(scatter_about(deviation, 0.0), _LEAST_SCATTER)
         robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
         if np.abs(solution - before).max() <= _STILL:
             break

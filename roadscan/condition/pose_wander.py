@@ -12,6 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
+
 Float64 = npt.NDArray[np.float64]
 
 _LONGEST_STEP_NS: Final = 11_000_000
@@ -39,5 +41,5 @@ def height_wander(epoch_ns: npt.NDArray[np.int64], place_m: Float64) -> float:
     own = fourth[np.convolve(even, np.ones(4), mode="valid") == 4.0]
     if own.size < 100:
         return 0.0
-    spread = 1.4826 * float(np.median(np.abs(own - np.median(own))))
+    spread = scatter_about(own, float(np.median(own)))
     return spread**2 / (_WALK * seconds * float(np.median(speed[even])))

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.witness import Finding, Witness
 
 Floats = npt.NDArray[np.float64]
@@ -182,7 +183,7 @@ def _alone(x_m: Floats, h: Floats) -> Bool:
     wide = np.maximum(np.diff(x_m)[:-1], np.diff(x_m)[1:])
     wide = np.concatenate([wide[:1], wide, wide[-1:]])
     off = np.abs(h[1:-1] - 0.5 * (h[:-2] + h[2:]))
-    usual = 1.4826 * float(np.median(off))
+    usual = scatter_about(off, 0.0)
     # The first and the last sample have neighbours on one side alone: the two beside them.
     off = np.concatenate([[abs(h[0] - h[1])], off, [abs(h[-1] - h[-2])]])
     apart = np.concatenate([[abs(h[1] - h[2])], np.abs(h[2:] - h[:-2]), [abs(h[-2] - h[-3])]])

@@ -12,6 +12,7 @@ import scipy
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
+from roadscan.compute.ways import way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
 from roadscan.kernels.road.curved_grid import thin_path
 from roadscan.model.settings.condition import ConditionConfig
@@ -104,7 +105,7 @@ def nodes_along(path_m: Float64, smoothing_m: float) -> Float64:
     if len(path_m):
         thin_path(np.ascontiguousarray(path_m), _KNOT_M, kept)
     path = path_m[kept]
-    along = _way(path)
+    along = way_along(path)
     count = int(along[-1] / _KNOT_M) + 1 if len(path) else 0
     if count < 8:
         return np.zeros((0, 2))
@@ -113,14 +114,14 @@ def nodes_along(path_m: Float64, smoothing_m: float) -> Float64:
     window = min(2 * round(smoothing_m / _KNOT_M / 2) + 1, count - 1 + count % 2)
     if window > 3:
         knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
-    way = _way(knots)
+    way = way_along(knots)
     nodes: Float64 = scipy.interpolate.CubicSpline(way, knots)(NODE_M * np.arange(int(way[-1] / NODE_M) + 1))
     return nodes
 
 
 def _line_of(stated: StatedLine) -> RoadLine | None:
     """A layer's line; its corners are rounded within two metres."""
-    length = float(_way(stated.path_m)[-1])
+    length = float(way_along(stated.path_m)[-1])
     nodes = nodes_along(_densified(stated.path_m), 2.0)
     if len(nodes) < 3:
         return None
@@ -131,7 +132,7 @@ def _line_of(stated: StatedLine) -> RoadLine | None:
 
 
 def _densified(path_m: Float64) -> Float64:
-    along = _way(path_m)
+    along = way_along(path_m)
     at = np.union1d(along, np.arange(0.0, along[-1], _KNOT_M))
     return np.column_stack([np.interp(at, along, path_m[:, a]) for a in range(2)])
 
@@ -292,9 +293,3 @@ def _runs(mask: Bool, least: int, bridge: int = 0) -> list[tuple[int, int]]:
     breaks = np.flatnonzero(np.diff(held) > bridge + 1)
     starts, ends = np.append(held[0], held[breaks + 1]), np.append(held[breaks], held[-1]) + 1
     return [(int(a), int(b)) for a, b in zip(starts, ends, strict=True) if b - a >= least]
-
-
-def _way(path: Float64) -> Float64:
-    if not len(path):
-        return np.zeros(1)
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])

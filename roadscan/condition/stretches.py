@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -25,10 +27,8 @@ class Stretch(NamedTuple):
 
 def stretches_above(x_m: Floats, values: Floats, limit: float) -> list[Stretch]:
     """Stretches where values (n,) at stations (n,) are above a limit, in their order; NaN is not above it."""
-    above = np.concatenate([[False], values > limit, [False]])
-    ends = np.flatnonzero(np.diff(above.astype(np.int8))).reshape(-1, 2)
     found = []
-    for first, behind in ends:
+    for first, behind in runs_of(values > limit).tolist():
         peak = first + int(np.argmax(values[first:behind]))
         found.append(Stretch(float(x_m[first]), float(x_m[behind - 1]), float(x_m[peak]), float(values[peak])))
     return found

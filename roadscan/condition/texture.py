@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.flags import runs_of
+from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.condition.profiles import heights_of, stations_of
 from roadscan.model.errors import ProfileError
 from roadscan.model.strict import Strict
@@ -208,11 +210,10 @@ def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_
 
     levels = rises(median_filter(height_mm, size, mode="nearest"))
     levels = np.abs(levels - np.median(levels))  # less the slope of the road
-    limit = max(_LEAST_STEP_MM, _STEP_SIGMAS * 1.4826 * float(np.median(levels)))
+    limit = max(_LEAST_STEP_MM, _STEP_SIGMAS * SIGMA_OF_MAD * float(np.median(levels)))
     high = levels > min(limit, HIGHEST_STEP_MM)
     means = np.abs(rises(uniform_filter1d(height_mm, size, mode="nearest")))
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(np.int8)))
-    for a, b in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+    for a, b in runs_of(high).tolist():
         at = size + a + int(np.argmax(means[a:b]))
         jump[at - 1 : at + 1] = True
     return jump

@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 
+from roadscan.compute.flags import runs_of
+
 Float64 = npt.NDArray[np.float64]
 
 LINE_M: Final = 0.6
@@ -55,18 +57,12 @@ def painted_line(grey: Float64, surface: Float64, away_m: Float64) -> PaintedLin
     greatest = float(bright.max(initial=0.0))
     if greatest < PAINT:
         return None
-    for first, end in _runs(bright >= _ALIKE * greatest):
+    for first, end in runs_of(bright >= _ALIKE * greatest).tolist():
         peak = float(bright[first:end].max())
         low, high = (_crossing(bright, away_m, start, step, 0.5 * peak) for start, step in ((first, -1), (end - 1, 1)))
         if low is not None and high is not None and _NARROWEST_M <= high - low <= _WIDEST_M:
             return PaintedLine(0.5 * (low + high), high - low, peak)
     return None
-
-
-def _runs(held: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and end of each run of true places."""
-    ends = np.flatnonzero(np.diff(held.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    return [(int(first), int(end)) for first, end in ends]
 
 
 def _crossing(bright: Float64, away_m: Float64, start: int, step: int, level: float) -> float | None:

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.jobs.condition.against_truth import compared_values
 from roadscan.jobs.plan.plan import plan_survey
 from roadscan.jobs.session import Session
@@ -68,7 +69,7 @@ class DemoSummary:
         middle = float(np.median(e))
         return {
             "median": middle,
-            "robust_std": float(1.4826 * np.median(np.abs(e - middle))),
+            "robust_std": scatter_about(e, middle),
             "percentile_95": float(np.percentile(np.abs(e), 95)),
         }
 

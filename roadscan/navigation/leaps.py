@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
@@ -644,8 +645,7 @@ def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: 
 def _beside_links(sizes: Float64, out: Bool) -> Float64:
     """The smaller leap (n,) at the two ends of each run of poses that are left out; 0 elsewhere."""
     found = np.zeros(out.size)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
-    for first, end in edges.reshape(-1, 2).tolist():
+    for first, end in runs_of(out).tolist():
         ends = np.array([sizes[k] for k in (first - 1, end - 1) if 0 <= k < sizes.size])
         found[first:end] = ends[ends > 0].min() if (ends > 0).any() else 0.0
     return found

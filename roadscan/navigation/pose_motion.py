@@ -14,6 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
+from roadscan.compute.robust import scatter_about
 from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.frames import rotation_from_quaternion, rph_from_rotation
 from roadscan.model.gpstime import NS_PER_S
@@ -40,8 +42,6 @@ _LEAST_TOLD: Final = 0.25
 """Sine of half the angle (29°) between two axes that can be told apart by how they rise."""
 _LEAST_SLOPES: Final = 15
 """Of fewer windows nothing is said of pitch: over 70 m, heights of a drifting fix rise and fall once."""
-_SCATTER: Final = 1.4826
-"""σ of a normal distribution in median absolute deviations."""
 _SIGMAS: Final = 3.0
 _LEAST_OFF_RAD: Final = float(np.radians(2.0))
 """A unit is mounted along a vehicle to a degree, and a vehicle on a crossfall drifts by half of one."""
@@ -277,7 +277,7 @@ class PoseMotion:
             self._ends[name][:] = [min(self._ends[name][0], own.min()), max(self._ends[name][1], own.max())]
             alike = np.abs(np.diff(own)) < (_SAME_M if name == "height" else _SAME_RAD)
             inside = np.zeros(alike.size, bool)
-            for first, last in _runs_of(alike):
+            for first, last in runs_of(alike).tolist():
                 along = float(way[last] - way[first])
                 if last - first + 1 >= _LEAST_SAME and along > _SAME_WAY_M:
                     inside[first:last] = True
@@ -297,7 +297,7 @@ def frozen(track: PoseTrack) -> Bool:
     epochs, position = track.epochs_gps_ns, track.position_world_m
     out = np.zeros(epochs.size, bool)
     repeats = (np.diff(position, axis=0) == 0).all(axis=1) & (np.diff(track.quaternion, axis=0) == 0).all(axis=1)
-    for first, last in _runs_of(repeats):
+    for first, last in runs_of(repeats).tolist():
         if first < 1 or last + 2 >= epochs.size:
             continue
         after_s, before_s = ((epochs[b] - epochs[a]) / NS_PER_S for a, b in ((last + 1, last + 2), (first - 1, first)))
@@ -324,18 +324,12 @@ def _ways(velocity: Float64, steps: Float64, links: Float64, elapsed_s: Float64)
     return float(along.sum()), float((speed * elapsed_s)[usual].sum()), float(links[usual].sum())
 
 
-def _runs_of(alike: Bool) -> list[tuple[int, int]]:
-    """First and last pose of each run of links that are alike."""
-    edges = np.flatnonzero(np.diff(alike.astype(np.int8), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _middle(angles: Float64) -> tuple[float, float]:
     """Median of angles about a circle, and the scatter about it (1.4826 MAD), rad."""
     centre = float(np.angle(np.mean(np.exp(1j * angles))))
     away = np.angle(np.exp(1j * (angles - centre)))
     middle = float(np.median(away))
-    return float(np.angle(np.exp(1j * (centre + middle)))), _SCATTER * float(np.median(np.abs(away - middle)))
+    return float(np.angle(np.exp(1j * (centre + middle)))), scatter_about(away, middle)
 
 
 def _windows(track: PoseTrack, axes: Float64, level_from_body: Float64, way: Float64) -> _Windows | None:
@@ -367,7 +361,7 @@ def _windows(track: PoseTrack, axes: Float64, level_from_body: Float64, way: Flo
 def _varies(rows: _Windows) -> float | None:
     """1 σ of the slopes; None where they vary too little, or are noise."""
     spread = float(np.std(rows.slope_rad))
-    noise = _SCATTER * float(np.median(np.abs(np.diff(rows.slope_rad)))) / np.sqrt(6.0)
+    noise = scatter_about(np.diff(rows.slope_rad), 0.0) / np.sqrt(6.0)
     return spread if spread > max(_LEAST_SLOPE_RAD, _SLOPE_NOISE_TIMES * noise) else None
 
 

@@ -28,6 +28,7 @@ import scipy
 from scipy.ndimage import binary_closing, median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.settings.smoothing import SplineConfig
@@ -155,7 +156,7 @@ def outages_by_sigma(trajectory: Trajectory, config: SplineConfig) -> list[tuple
     usual = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
     high = sigma > max(config.outage_sigma_factor * usual, config.outage_sigma_m)
     spans = []
-    for a, b in _runs(high):
+    for a, b in runs_of(high):
         # The drift begins where σ begins to grow, before it is far above.
         first = int(a)
         while first > 0 and sigma[first - 1] < sigma[first] and sigma[first - 1] > 1.05 * usual:
@@ -172,7 +173,7 @@ def rugged_spans(trajectory: Trajectory, config: SplineConfig) -> list[tuple[int
     scatter = _moving_median(np.nan_to_num(surprise), width)
     rugged = scatter > max(config.rugged_factor * usual, config.rugged_m)
     spans = []
-    for a, b in _runs(_closed(rugged, width)):
+    for a, b in runs_of(_closed(rugged, width)):
         first, last = max(a - width, 0), min(b + width, surprise.size)
         if _seconds(trajectory, int(first), int(last)) <= config.longest_s:
             spans.append((int(first), int(last)))
@@ -573,9 +574,3 @@ def _moving_median(values: Float64, width: int) -> Float64:
 def _closed(flags: Flags, width: int) -> Flags:
     """Flags with holes of up to `width` filled."""
     return np.asarray(binary_closing(np.pad(flags, width), structure=np.ones(width))[width:-width], dtype=bool)
-
-
-def _runs(flags: Flags) -> Int64:
-    """First and one past the last index (r, 2) of each run of true flags (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return edges.reshape(-1, 2).astype(np.int64)

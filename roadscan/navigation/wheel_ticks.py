@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.leaps import rotation_vectors
 
@@ -250,7 +251,7 @@ def _usual(away: Float64, elapsed_s: Float64) -> tuple[Float64, Float64]:
         near = near[np.isfinite(near)]
         if near.size:
             middle[own] = np.median(near)
-            noise[own] = 1.4826 * np.median(np.abs(near - middle[own.start]))
+            noise[own] = scatter_about(near, middle[own.start])
     return middle, noise
 
 

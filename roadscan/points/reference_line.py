@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from roadscan.compute.ways import way_along
 from roadscan.kernels.road.curved_grid import thin_path
 from roadscan.model.errors import NavigationError
 
@@ -60,7 +61,7 @@ class ReferenceLine:
         kept = np.zeros(len(path_m), dtype=bool)
         thin_path(path_m, KNOT_M, kept)
         path = path_m[kept]
-        along = _way(path)
+        along = way_along(path)
         count = int(along[-1] / KNOT_M) + 1
         if count < LEAST_KNOTS or along[-1] < 2 * step_m:
             raise NavigationError(
@@ -73,7 +74,7 @@ class ReferenceLine:
         window = min(2 * round(smoothing_m / KNOT_M / 2) + 1, count - 1 + count % 2)
         if window > 3:
             knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
-        way = _way(knots)
+        way = way_along(knots)
         stations = step_m * np.arange(int(way[-1] / step_m) + 1)
         steps = np.diff(scipy.interpolate.CubicSpline(way, knots)(stations), axis=0)
         phi = np.arctan2(steps[:, 1], steps[:, 0]).astype(np.float32).astype(np.float64)
@@ -120,8 +121,3 @@ def _left(vectors: Float64) -> Float64:
     turned = np.column_stack([-vectors[:, 1], vectors[:, 0]])
     unit: Float64 = turned / np.hypot(turned[:, 0], turned[:, 1])[:, None]
     return unit
-
-
-def _way(path: Float64) -> Float64:
-    """(k,) distance from the start of a path (k, 2)."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.ways import way_along
 from roadscan.kernels.surface import coarse as kernels
 from roadscan.model.ids import TileId
 from roadscan.model.strict import Strict
@@ -88,7 +89,7 @@ class Stretch:
         path_m : (n, 2) easting and northing of the sensor. Which end of the profiles is the right one is decided once
         for all, by the path as a whole: a vehicle that stands has no direction.
         """
-        along: Float64 = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path_m, axis=0).T))])
+        along: Float64 = way_along(path_m)
         drive = np.gradient(path_m, axis=0) if len(path_m) > 1 else np.zeros_like(path_m)
         road = classes == 0
         count = np.maximum(road.sum(axis=1, keepdims=True), 1)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
+from roadscan.compute.robust import scatter_about
 from roadscan.kernels.adjust import target_shapes as kernels
 from roadscan.kernels.adjust.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 
@@ -49,7 +50,6 @@ _SAME_SIZE: Final = 0.03
 _SIGMA_SAME_SIZE: Final = 0.003
 """1 σ of such a size: 1 %, where ten labels say as much as one, since paint wears off in patches. Without it, a patch
 that is lost at the edge makes the target smaller and moves its centre."""
-_MAD_TO_SIGMA: Final = 1.4826
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def first_levels(cells: Cells, shape: Shape, centre_m: Float64) -> Levels:
 
 def _levels(road: Float64, paint: Float64) -> Levels:
     level = float(np.median(road))
-    noise = _MAD_TO_SIGMA * float(np.median(np.abs(road - level)))
+    noise = scatter_about(road, level)
     return Levels(level, float(np.median(paint)) - level, noise)
 
 

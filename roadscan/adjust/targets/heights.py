@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.compute.robust import SIGMA_OF_MAD
 
 Float64 = npt.NDArray[np.float64]
 
@@ -14,7 +15,6 @@ _LEAST_COUNT = 12
 _CURVED_COUNT = 60
 _CUT = 4.685
 """Of Tukey's biweight: 95 % efficient for normal residuals."""
-_MAD_TO_SIGMA = 1.4826
 _ROUNDS = 30
 _BLOCKS = 6
 """Blocks along an edge: residuals of one block are taken to be of one piece."""
@@ -73,7 +73,7 @@ def _robust_plane(design: Float64, height: Float64) -> tuple[Float64, Float64]:
         weighted = design * weight[:, None]
         plane = np.asarray(np.linalg.lstsq(weighted.T @ design, weighted.T @ height, rcond=None)[0], np.float64)
         left: Float64 = np.abs(height - design @ plane)
-        scale = max(_MAD_TO_SIGMA * float(np.median(left)), _LEAST_SCALE_M)
+        scale = max(SIGMA_OF_MAD * float(np.median(left)), _LEAST_SCALE_M)
         if turn < _ROUNDS // 3:
             weight = 1.0 / np.maximum(left, 0.1 * scale)
         else:

@@ -12,6 +12,7 @@ from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.compute.robust import scatter_about
 from roadscan.edges.painted_line import LINE_M, painted_line, without_lines
 
 Float64 = npt.NDArray[np.float64]
@@ -35,7 +36,6 @@ _STEP_M: Final = 0.04
 """A lower step is no kerb."""
 _BESIDE_M: Final = (0.03, 0.15)
 """Heights so far from the face, on either side, are those of the top and of the foot."""
-_MAD_TO_SIGMA: Final = 1.4826
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _joined(
         height = height_at(readings, float(place[0]), float(place[1]), settings)
     else:
         top = float(np.median(heights))
-        spread = _MAD_TO_SIGMA * float(np.median(np.abs(heights - top)))
+        spread = scatter_about(heights, top)
         height = HeightFind(
             top, float(np.hypot(spread / np.sqrt(count), _SIGMA_PAINT_M)), 0.0, 0.0, count, 1.0, ""
         )  # fmt: skip

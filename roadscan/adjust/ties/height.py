@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
 from roadscan.adjust.ties.tie import COUNTS, FEW_CELLS, HEIGHT, SCATTERED, STEEP, TOO_FAR, TWO_SURFACES, End, Tie
+from roadscan.compute.robust import scatter_about
 from roadscan.model.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-_SIGMA_OF_MAD: Final = 1.4826
 _BLOCKS: Final = 6
 """Blocks along an edge whose means tell how far a mean over the patch can be trusted."""
 _LEAST_BLOCKS: Final = 6
@@ -75,7 +75,7 @@ def _difference(away: Float64, common: Bool, settings: TieSettings) -> _Differen
     """Robust mean of height differences, with a σ from the means of blocks, which know how far cells are correlated."""
     values = away[common]
     middle = float(np.median(values))
-    scatter = _SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))
+    scatter = scatter_about(values, middle)
     limit = settings.outlying * max(scatter, settings.sigma_floor_m)
     used = common & (np.abs(np.where(common, away, np.inf) - middle) <= limit)
     mean = float(away[used].mean())

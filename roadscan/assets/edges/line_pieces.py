@@ -15,6 +15,7 @@ from roadscan.assets.edges.find import Edge
 from roadscan.assets.edges.profiles import Nodes
 from roadscan.assets.edges.raster import HeightRaster
 from roadscan.assets.scene import Box, Scene
+from roadscan.compute.ways import way_along
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -205,7 +206,7 @@ def gathered(owner: Int64, number: int, pass_id: npt.NDArray[np.uint16], epoch_g
 
 def dense(line: Float64, every_m: float) -> tuple[Float64, Float64]:
     """Coordinates x and y (k,) of points at even distances along a line (n, 2), with both ends."""
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    length = way_along(line)
     at = np.linspace(0.0, length[-1], max(int(np.ceil(length[-1] / every_m)), 1) + 1)
     return np.interp(at, length, line[:, 0]), np.interp(at, length, line[:, 1])
 

@@ -12,6 +12,7 @@ import scipy.ndimage
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.edges.paths import Chain
 from roadscan.assets.edges.raster import HeightRaster
+from roadscan.compute.ways import way_along
 from roadscan.kernels.assets import step_profiles as kernel
 
 Float64 = npt.NDArray[np.float64]
@@ -168,7 +169,7 @@ def smooth_line(points: Float64, weight: Float64) -> Float64:
 
 def even_nodes(places: Float64, distance_m: float) -> Float64:
     """Points (k, 2) at even distances along places (n, 2), which are smoothed over 0.6 m first."""
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))
+    length = way_along(places)
     fine = np.arange(0.0, length[-1] + 0.05, 0.1)
     path = np.column_stack([np.interp(fine, length, places[:, i]) for i in range(2)])
     if len(path) >= 3:
@@ -176,7 +177,7 @@ def even_nodes(places: Float64, distance_m: float) -> Float64:
         more = min(len(path) - 1, 12)
         before, behind = 2.0 * path[:1] - path[more:0:-1], 2.0 * path[-1:] - path[-2 : -2 - more : -1]
         path = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, behind]), 3.0, axis=0)[more:-more]
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    length = way_along(path)
     pieces = max(round(length[-1] / distance_m), 1)
     at = np.linspace(0.0, length[-1], pieces + 1)
     return np.column_stack([np.interp(at, length, path[:, i]) for i in range(2)])

@@ -13,6 +13,8 @@ import scipy.spatial
 import shapely
 
 from roadscan.assets.edges.line_pieces import Line
+from roadscan.compute.robust import scatter_about
+from roadscan.compute.ways import way_along
 
 Float64 = npt.NDArray[np.float64]
 
@@ -102,7 +104,7 @@ def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
 def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
     """Greatest slope (m/m, up or down) along the middle of a strip over 2 m, of its heights smoothed over as much."""
     height = strip.column("middle_height_m")
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(strip.line.nodes[:, :2], axis=0).T)))
+    length = way_along(strip.line.nodes)
     good = strip.known & np.isfinite(height)
     if good.sum() < 3 or length[-1] < over_m:
         return None
@@ -122,4 +124,4 @@ def sigma_width_m(strip: Strip) -> float:
     width = strip.column("width_m")[strip.known]
     if width.size < 3:
         return 0.3
-    return math.hypot(0.15, 1.4826 * float(np.median(np.abs(np.diff(width)))) / math.sqrt(2.0))
+    return math.hypot(0.15, scatter_about(np.diff(width), 0.0) / math.sqrt(2.0))

@@ -23,6 +23,7 @@ from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
+from roadscan.compute.ways import way_along
 from roadscan.model.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
@@ -132,7 +133,7 @@ def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tup
     places, levels = [], []
     for nodes in parts:
         x, y = dense(nodes[:, :2], 0.05)
-        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T)))
+        length = way_along(nodes)
         at = np.linspace(0.0, length[-1], len(x))
         step = np.where(np.isfinite(nodes[:, 3]), nodes[:, 3], 0.0)
         places.append(np.column_stack([x, y]))

@@ -18,6 +18,7 @@ from roadscan.assets.edges.line_pieces import dense
 from roadscan.assets.edges.strips import ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
+from roadscan.compute.ways import way_along
 
 Float64 = npt.NDArray[np.float64]
 
@@ -117,7 +118,7 @@ def _even(edge: AssetObject) -> Float64:
     """Points (n, 3) of an edge about each metre."""
     nodes = shapely.get_coordinates(edge.geometry, include_z=True)
     x, y = dense(nodes[:, :2], STATION_M)
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(nodes[:, :2], axis=0).T)))
+    length = way_along(nodes)
     return np.column_stack([x, y, np.interp(np.linspace(0.0, length[-1], len(x)), length, nodes[:, 2])])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.scene import Scene
+from roadscan.compute.ways import way_along
 
 _STEP_M: Final = 1.0
 _OVER_M: Final = 3.0
@@ -23,7 +24,7 @@ class RoadDirection:
         drive = scene.drive_xyh_m
         for number in np.unique(drive[:, 3]) if len(drive) else []:
             xy = drive[drive[:, 3] == number, :2]
-            driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+            driven = way_along(xy)
             moved = np.concatenate([[True], np.diff(driven) > 1e-6])
             if np.count_nonzero(moved) < 2:
                 continue

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 from roadscan.assets.paint.road_direction import RoadDirection
+from roadscan.compute.robust import scatter_about
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -211,7 +212,7 @@ def lies_flat(found: Contrast, component: Component) -> bool:
     design = np.stack([x, y, np.ones(x.size)], axis=1)
     height = found.height_m[near] - np.median(found.height_m[near])
     plane, *_ = np.linalg.lstsq(design, height, rcond=None)
-    scatter = 1.4826 * float(np.median(np.abs(height - design @ plane)))
+    scatter = scatter_about(height, design @ plane)
     return bool(scatter <= _FLAT_M and np.hypot(plane[0], plane[1]) <= _STEEPEST)
 
 

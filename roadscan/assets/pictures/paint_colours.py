@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import ColourReader
+from roadscan.compute.robust import scatter_about
 
 UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
@@ -45,7 +46,7 @@ def paint_colour(own: UInt8, beside: UInt8) -> Mapping[str, Any]:
         return {}
     blue = relative[bright, 2] / relative[bright, :2].mean(axis=1)
     middle = float(np.median(blue))
-    sigma = np.hypot(_SPREAD, 1.4826 * float(np.median(np.abs(blue - middle))) / np.sqrt(len(blue)))
+    sigma = np.hypot(_SPREAD, scatter_about(blue, middle) / np.sqrt(len(blue)))
     yellow = 1.0 / (1.0 + np.exp(2.0 * (middle - _BETWEEN) / sigma))
     name, share = ("yellow", yellow) if yellow > 0.5 else ("white", 1.0 - yellow)
     return {"colour": name, "colour_probability": float(share)}

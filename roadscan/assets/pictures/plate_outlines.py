@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.ways import way_along
+
 Float64 = npt.NDArray[np.float64]
 
 _POINTS: Final = 48
@@ -23,7 +25,7 @@ def plate_outline(shape: str, width_m: float, height_m: float) -> Float64:
     if shape == "round":
         return corners
     closed = np.vstack([corners, corners[:1]])
-    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(closed, axis=0).T)))
+    along = way_along(closed)
     at = np.arange(_POINTS) * along[-1] / _POINTS
     return np.column_stack([np.interp(at, along, closed[:, k]) for k in (0, 1)])
 

@@ -13,6 +13,7 @@ import pyarrow as pa
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.panels import Panel
 from roadscan.assets.upright.pieces import seen_by
+from roadscan.compute.robust import SIGMA_OF_MAD
 
 Float64 = npt.NDArray[np.float64]
 
@@ -67,7 +68,7 @@ class Chain:
         """1 σ (m) of that median, from how the stretches scatter about it."""
         above = self.values[name] - self.values["ground_m"]
         above = above[np.isfinite(above)]
-        return float(1.2533 * 1.4826 * np.median(np.abs(above - np.median(above))) / math.sqrt(above.size))
+        return float(1.2533 * SIGMA_OF_MAD * np.median(np.abs(above - np.median(above))) / math.sqrt(above.size))
 
     @property
     def passing(self) -> float:

@@ -20,6 +20,7 @@ from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.shafts import shafts_of
 from roadscan.assets.upright.slices import usable
+from roadscan.compute.robust import SIGMA_OF_MAD
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -145,7 +146,7 @@ def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
         middle = xyh[kept].mean(axis=0)
         _, _, axes = np.linalg.svd(xyh[kept] - middle, full_matrices=False)
         away = np.abs((xyh - middle) @ axes[2])
-        limit = max(3.0 * 1.4826 * float(np.median(away[kept])), 0.02)
+        limit = max(3.0 * SIGMA_OF_MAD * float(np.median(away[kept])), 0.02)
         kept = away <= limit
         if kept.sum() < 5:
             kept[:] = True

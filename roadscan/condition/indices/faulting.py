@@ -29,6 +29,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.of_sections.wheel_paths import bridged
@@ -209,7 +210,7 @@ def _unevenness_m(found: Float64) -> float:
     height, sigma = found[np.isfinite(found[:, :2]).all(axis=1), :2].T
     if not height.size:
         return 0.0
-    scatter = 1.4826 * float(np.median(np.abs(height)))
+    scatter = scatter_about(height, 0.0)
     return math.sqrt(max(scatter**2 - float(np.median(sigma)) ** 2, 0.0))
 
 

@@ -13,6 +13,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.on_lane.lines import SPACING_M, LaneLines
@@ -75,7 +76,7 @@ def _line(lines: LaneLines, side: str, station: Float64) -> _Side:
         if near.size >= _LEAST_PLACES:
             near = near[np.abs(near - np.median(near)) <= _ALIKE_M]
         if near.size >= _LEAST_PLACES:
-            spread = 1.4826 * float(np.median(np.abs(near - np.median(near))))
+            spread = scatter_about(near, float(np.median(near)))
             place[k] = np.median(near)
             sigma[k] = math.hypot(spread * math.sqrt(math.pi / 2.0 / near.size), _SIGMA_LINE_M)
     return _Side(place, sigma)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import scipy.ndimage
 import shapely
 
+from roadscan.compute.robust import SIGMA_OF_MAD, scatter_about
 from roadscan.condition.on_lane.squares import SQUARE_M, TextureSquares
 
 Float64 = npt.NDArray[np.float64]
@@ -149,7 +150,7 @@ def _by_kind(squares: TextureSquares, inside: Bool) -> tuple[Float64, dict[bool,
 def _level(texture: Float64) -> Level:
     middle = float(np.median(texture))
     below = float(np.median(middle - texture[texture <= middle]))
-    return Level(middle, max(math.log(LEAST_RATIO), _SIGMAS * 1.4826 * below))
+    return Level(middle, max(math.log(LEAST_RATIO), _SIGMAS * SIGMA_OF_MAD * below))
 
 
 def _mixed(texture: Float64, own: Bool, lane: Level) -> bool:
@@ -180,7 +181,7 @@ def _measured(squares: TextureSquares, excess: Float64, own: Bool, sound: Bool) 
     count = int(own.sum())
     border = int((own & ~scipy.ndimage.binary_erosion(own, _CROSS)).sum())
     ratio = math.exp(float(np.median(excess[own])))
-    spread = 1.4826 * float(np.median(np.abs(excess[own] - np.median(excess[own]))))
+    spread = scatter_about(excess[own], float(np.median(excess[own])))
     lost = [float(np.nanmedian(v)) if np.isfinite(v).any() else math.nan
             for v in (squares.loss_mm[own], squares.loss_mm[sound])]  # fmt: skip
     contrast, differs = _contrast(squares.intensity, own, sound)
@@ -208,5 +209,5 @@ def _contrast(intensity: Float64, own: Bool, sound: Bool) -> tuple[float, bool]:
         return math.nan, False
     level = float(np.median(around))
     off = float(np.median(inside)) - level
-    spread = 1.4826 * float(np.median(np.abs(around - level)))
+    spread = scatter_about(around, level)
     return off / level, abs(off) > max(_DIFFERS * spread, 0.01 * level)

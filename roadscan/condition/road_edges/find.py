@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 
+from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, SideRaster
 from roadscan.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
 from roadscan.edges.painted_line import PAINT, without_lines
@@ -187,7 +188,7 @@ def smoothed(away_m: Float64, known: Bool, kind: npt.NDArray[np.int8]) -> tuple[
         middle = scipy.ndimage.median_filter(own, min(_cells(_SMOOTHED_M), _odd(own.size)), mode="nearest")
         smooth = scipy.ndimage.uniform_filter1d(middle, min(_cells(_SMOOTHED_M), _odd(own.size)), mode="nearest")
         width = min(_cells(_SPREAD_M), _odd(own.size))
-        spread = 1.4826 * scipy.ndimage.median_filter(np.abs(own - smooth), width, mode="nearest")
+        spread = SIGMA_OF_MAD * scipy.ndimage.median_filter(np.abs(own - smooth), width, mode="nearest")
         out[first:end], sigma[first:end] = smooth, np.hypot(spread, OFFSET_M / np.sqrt(12.0))
     return out, sigma
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.flags import runs_of
 from roadscan.condition.road_edges.find import INNER_M, KINDS, SideEdge, drops, find_edge, first_m
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, TilePoints, ground_points, side_raster
 from roadscan.condition.road_line import Lane, RoadLine
@@ -165,8 +166,7 @@ def road_surfaces(edges: RoadEdges, line: RoadLine) -> Iterator[RoadSurface]:
     """The road's surface, a polygon for each run of stations with both edges."""
     left, right = edges.sides["left"], edges.sides["right"]
     both = np.isfinite(left.offset_m) & np.isfinite(right.offset_m)
-    ends = np.flatnonzero(np.diff(both.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    for first, end in ends.tolist():
+    for first, end in runs_of(both).tolist():
         run = slice(first, end)
         station = edges.station_m[run]
         if end - first < 2:

@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from roadscan.compute.robust import scatter_about
 from roadscan.condition.roughness_regions.points import RoadPoints
 from roadscan.condition.roughness_regions.surface import fit
 
@@ -48,4 +49,4 @@ def severity(own: RoadPoints, around: RoadPoints) -> Severity:
     readings = float(own.readings.sum())
     mean = float(np.sum(own.readings * above)) / readings
     sigma = float(np.sqrt(np.sum(own.readings * (above - mean) ** 2) / readings))
-    return Severity(contrast, intensity, mean, sigma, 1.4826 * float(np.median(np.abs(rest - np.median(rest)))))
+    return Severity(contrast, intensity, mean, sigma, scatter_about(rest, float(np.median(rest))))

@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
+
 Float64 = npt.NDArray[np.float64]
 
 _ROUNDS: Final = 12
@@ -55,7 +57,7 @@ def fit(x_m: Float64, y_m: Float64, height_m: Float64) -> RoadSurface | None:
             return None
         terms = np.linalg.solve(normal, np.sum(weighed * h[:, None], axis=0))
         residual = h - np.sum(powers * terms, axis=1)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SPREAD_M)
+        spread = max(scatter_about(residual, 0.0), _LEAST_SPREAD_M)
         weight = np.square(np.maximum(1.0 - np.square(residual / (_TUKEY * spread)), 0.0))
     return RoadSurface(middle, scale, terms)
 

@@ -13,6 +13,7 @@ import shapely
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import WrongPoint
 from roadscan.adjust.targets.shapes import SurveyedLine
+from roadscan.compute.ways import way_along
 from roadscan.jobs.plan.plan import SurveyPlan
 from roadscan.jobs.readings import read_groups
 from roadscan.model.settings.adjust import LineUse
@@ -46,7 +47,7 @@ def _of_line(row: Mapping[str, Any], settings: LineUse, first: int) -> Iterator[
     heights = row["height_m"] or [math.nan] * len(row["easting_m"])
     way = shapely.LineString(np.stack([row["easting_m"], row["northing_m"]], axis=-1))
     vertices = np.array(way.coords)
-    station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(vertices, axis=0).T))])
+    station = way_along(vertices)
     count = max(1, round(way.length / settings.each_m))
     across, upright = row["sigma_horizontal_m"], row["sigma_height_m"]
     for k in range(count):

@@ -23,6 +23,7 @@ from roadscan.adjust.quality import (
     relative_accuracy,
     vertical_accuracy,
 )
+from roadscan.compute.ways import way_along
 from roadscan.jobs.adjust.solution import Evidence, Solution
 from roadscan.navigation.mounting_change import MountingChange
 from roadscan.navigation.trajectory import Corrections
@@ -77,8 +78,7 @@ def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mount
 
 def _station_m(track: Track, epochs_gps_ns: Int64) -> Float64:
     """How far (n,) along its way a run was at some epochs."""
-    moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
-    station = np.concatenate([[0.0], np.cumsum(moved)])
+    station = way_along(np.stack([track.easting_m, track.northing_m], axis=-1))
     since = (epochs_gps_ns - track.epoch_gps_ns[0]).astype(np.float64)
     return np.asarray(np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station))
 

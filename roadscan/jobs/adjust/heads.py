@@ -19,6 +19,7 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.swath import WHOLE
 from roadscan.adjust.ties.at_place import Ties
 from roadscan.adjust.ties.tie import HEIGHT
+from roadscan.compute.robust import scatter_about
 from roadscan.jobs.adjust.near import NearReader, Sources, near_files
 from roadscan.jobs.adjust.tie_work import KnownTies, ties_of
 from roadscan.jobs.adjust.tracks import runs_of, tracks_of
@@ -43,7 +44,6 @@ _FALLS: Final = 3.0
 """Exchanged logs make the step of the right ones so many times as large, at least."""
 _TRIED: Final = 12
 """Places, spread over the run, at which that is tried."""
-_SIGMA_OF_MAD: Final = 1.4826
 
 HEADS: Final = Witness(
     "heads_of_a_run",
@@ -91,7 +91,7 @@ class Step:
     def of(cls, run: str, heads: tuple[str, str], values_m: Float64) -> Step:
         """The median of what places say."""
         middle = float(np.median(values_m))
-        scatter = _SIGMA_OF_MAD * float(np.median(np.abs(values_m - middle)))
+        scatter = scatter_about(values_m, middle)
         return cls(run, heads, middle, float(np.hypot(COMMON_M, scatter / np.sqrt(values_m.size))), values_m.size)
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.witness import Finding, Witness
 from roadscan.tables.writer import LogWriter
 
@@ -43,7 +44,6 @@ _NEAREST_M: Final = 1.0
 _EVEN: Final = 0.7
 """Least ratio of the ranges of the two neighbours: beyond, they do not see one surface."""
 _AZIMUTH_RAD: Final = np.radians(2.0)
-_NORMAL: Final = 1.4826
 
 
 @dataclass
@@ -168,7 +168,7 @@ def _sigma_of(off_m: Float64, quarters: npt.NDArray[np.int64], middle_m: float) 
     medians = [
         float(np.median(off_m[quarters == q])) for q in np.unique(quarters) if (quarters == q).sum() >= _LEAST
     ]  # fmt: skip
-    scatter = _NORMAL * float(np.median(np.abs(off_m - middle_m)))
+    scatter = scatter_about(off_m, middle_m)
     if len(medians) < 2 or scatter > _ALIKE * abs(middle_m):
         return None
     if any(abs(one - middle_m) > _ALIKE * abs(middle_m) for one in medians):

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from roadscan.compute.ways import way_along
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
@@ -48,9 +50,8 @@ class Way:
     @classmethod
     def of(cls, body_m: Float64, epochs_gps_ns: Int64) -> Self:
         """The way through places (p, 3) of the body's origin, easting, northing, height, at ascending epochs (p,)."""
-        moved = np.hypot(*np.diff(body_m[:, :2], axis=0).T)
-        station = np.concatenate([[0.0], np.cumsum(moved)])
-        goes_on = np.append(True, moved > 0.0)
+        station = way_along(body_m)
+        goes_on = np.append(True, np.diff(station) > 0.0)
         at = np.arange(0.0, station[-1], _VERTEX_M)
         return cls(*(np.interp(at, station[goes_on], column[goes_on]) for column in (*body_m.T, epochs_gps_ns)))
 

@@ -14,6 +14,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.level import level_poses
 from roadscan.code_reach import code_digest
+from roadscan.compute.robust import scatter_about
+from roadscan.compute.ways import way_along
 from roadscan.jobs.adjust.near import PlacedReadings, placed_readings
 from roadscan.jobs.engine.bundles import run_bundles
 from roadscan.jobs.engine.fingerprint import key_of
@@ -151,7 +153,7 @@ def _way(store: Store, ground: Ground, poses: TrajectorySource, span: tuple[int,
         return None
     poses_at = level_poses(recorded, ground.map, thin)
     body = poses_at.body_m
-    station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(body[:, :2], axis=0).T))])
+    station = way_along(body)
     kept = station <= _LENGTH_M
     return Way.of(body[kept], poses_at.epoch_gps_ns[kept]) if min(station[-1], _LENGTH_M) >= _LEAST_LENGTH_M else None
 
@@ -222,7 +224,7 @@ class Pair:
     away_m: float
     """Median height of the second above the first."""
     spread_m: float
-    """1.4826 times the median deviation from it."""
+    """Robust standard deviation about it."""
     lags: tuple[Lag, ...]
     """How far the second lies ahead along the way, its σ (m), and the likeness, of heights and of intensities."""
 
@@ -299,5 +301,5 @@ def _pair(j: int, k: int, one: Strip, other: Strip) -> Pair | None:
         return None
     middle = float(np.median(away))
     lags = (lag_of(one.height_m, other.height_m), lag_of(one.intensity, other.intensity))
-    spread = 1.4826 * float(np.median(np.abs(away - middle)))
+    spread = scatter_about(away, middle)
     return Pair(j, k, int(away.size), middle, spread, tuple(lag for lag in lags if lag is not None))

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.ids import LanePass
 from roadscan.model.witness import Finding, Witness
 from roadscan.points.cloud import QUANTUM_M, TilePoints
@@ -33,7 +34,6 @@ _LEAST_CELLS: Final = 20
 _LEAST_M: Final = 0.02
 """Two passes of a good mapping system, in one datum, are nearer together."""
 _SCATTERS: Final = 5.0
-_NORMAL: Final = 1.4826
 """σ of a normal distribution over its median absolute deviation."""
 _MOST_TOLD: Final = 8
 
@@ -63,7 +63,7 @@ def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]
         off = off[np.isfinite(off)]
         if off.size >= _LEAST_CELLS:
             middle = float(np.median(off))
-            scatter = _NORMAL * float(np.median(np.abs(off - middle)))
+            scatter = scatter_about(off, middle)
             names = [words.get(int(ids[k]), f"pass {ids[k]}") for k in (a, b)]
             found.append([*names, int(off.size), round(middle, 6), round(scatter, 6)])
     return found

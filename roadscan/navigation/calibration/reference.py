@@ -21,6 +21,7 @@ from pydantic import Field
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.errors import ConfigError
 from roadscan.model.rig import Mounting
 from roadscan.model.strict import Strict
@@ -69,7 +70,6 @@ _BY_NOISE: Final = 5.0
 """Information of less than this many times what the noise of the normals brings is none."""
 _FARTHEST: Final = 5.0
 """An end farther from the start than this many σ of it is another place that looks alike."""
-_MAD_TO_SIGMA: Final = 1.4826
 _NEARLY: Final = 0.05
 _CONVERGED: Final = 0.005
 """A step below this share of the level's uncertainty is the last."""
@@ -428,7 +428,7 @@ class _Search:
 
     def _step(self, met: _Met, surfels: Surfels) -> tuple[Float64, float]:
         """One Gauss–Newton step (6,) with Cauchy weights, and the weighted RMS before it (m)."""
-        scale = max(_MAD_TO_SIGMA * float(np.median(np.abs(met.distance_m))), 1e-4)
+        scale = max(scatter_about(met.distance_m, 0.0), 1e-4)
         weight = 1.0 / (1.0 + (met.distance_m / (_CAUCHY * scale)) ** 2)
         sigma = scale / np.sqrt(weight)
         normal = _insensitive(met.readings, self._pose, surfels.normal[met.patch], surfels.wobble[met.patch], sigma)
@@ -464,7 +464,7 @@ def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, wobble: Floa
 def _range_sigma(met: _Met, other_variance: Float64) -> float:
     """σ along the beam that explains the residuals of readings that meet a surface squarely."""
     square = met.cosine > _SQUARELY if (met.cosine > _SQUARELY).sum() >= _LEAST_USED else met.cosine > 0.0
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(met.distance_m[square])))
+    spread = scatter_about(met.distance_m[square], 0.0)
     rest = spread**2 - float(np.median(other_variance[square]))
     return float(np.sqrt(max(rest, _LEAST_RANGE_SIGMA_M**2)) / np.median(met.cosine[square]))
 

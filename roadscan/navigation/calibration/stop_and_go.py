@@ -26,6 +26,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_matrix, diags
 
+from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.model.crs import LOCAL_WORLD
 from roadscan.model.errors import NavigationError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
@@ -456,7 +457,7 @@ def _spread(residuals: Sequence[Float64], least: float) -> Float64:
     whole = np.concatenate(residuals)
     if not whole.size:
         return np.full(3, least)
-    middle = 1.4826 * np.median(np.abs(whole), axis=0)
+    middle = SIGMA_OF_MAD * np.median(np.abs(whole), axis=0)
     clipped = np.clip(whole, -_HUBER * middle, _HUBER * middle)
     return np.asarray(np.maximum(np.sqrt(np.mean(clipped**2, axis=0)), least))
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.model.clock_evidence import USUAL_DRIFT, Drift
 
 Bool = npt.NDArray[np.bool_]
@@ -61,7 +62,7 @@ def robust_line(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> L
         if x_s.size < _FEW:
             break
         normalised = np.abs(y_s - line.at(x_s)) / sigma_s
-        again = normalised <= _OUTLIER * max(1.0, 1.4826 * float(np.median(normalised[used])))
+        again = normalised <= _OUTLIER * max(1.0, SIGMA_OF_MAD * float(np.median(normalised[used])))
         if np.array_equal(again, used) or np.count_nonzero(again) < _FEW - 1:
             break
         used = again
@@ -85,7 +86,7 @@ def _first_slope(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> 
 def _near(level_s: Float64, sigma_s: Float64) -> Bool:
     """(m,) differences that lie near the median of all."""
     away = np.abs(level_s - np.median(level_s))
-    spread = 1.4826 * float(np.median(away))
+    spread = SIGMA_OF_MAD * float(np.median(away))
     return np.asarray(away <= np.maximum(_OUTLIER * sigma_s, _OUTLIER * spread))
 
 

@@ -32,6 +32,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.errors import NavigationError
 from roadscan.model.frames import rotation_from_quaternion
 from roadscan.model.settings.smoothing import SmootherConfig
@@ -280,7 +281,7 @@ def lasting_sigma(residuals: Float64) -> float:
     """
     worst = 0.0
     for column in residuals.T:
-        scale = 1.4826 * float(np.median(np.abs(column)))
+        scale = scatter_about(column, 0.0)
         values = np.clip(column, -3.0 * scale, 3.0 * scale)
         lags = 2 * max(1, min(_LONGEST_LAG, values.size // 4) // 2)
         covariance = np.array([float((values[k:] * values[: values.size - k]).mean()) for k in range(lags)])

@@ -12,11 +12,11 @@ from typing import Final, NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.errors import ConfigError, NavigationError, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.inertial.motion import GRAVITY_M_PER_S2, STEP_S, Windows, imu_means
 from roadscan.navigation.inertial.readings import ImuReadings, VehicleSensors
-from roadscan.navigation.inertial.records import runs
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -411,7 +411,7 @@ def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
     size = round(_LEAST_S / STEP_S)
     pairs = [
         (_detrended(turned[a:b], size), _detrended(shown[a:b], size))
-        for a, b in runs(w.covered & felt.known)
+        for a, b in runs_of(w.covered & felt.known)
         if b - a >= size
     ]
     if sum(len(gyro) for gyro, _ in pairs) < _TILT_BLOCKS * size:

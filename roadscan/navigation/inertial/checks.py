@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.errors import NavigationError, TimeSystemError
 from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, iso_from_gps_ns
 from roadscan.navigation.inertial.agreement import (
@@ -44,7 +45,6 @@ from roadscan.navigation.inertial.records import (
     imu_in_order,
     listed,
     odometer_in_order,
-    runs,
 )
 
 __all__ = ["Prepared", "Repair", "prepared"]
@@ -176,7 +176,7 @@ def _check_stuck(kept: Kept[ImuReadings], windows: Windows, vehicle: VehicleSens
         for axis in range(3):
             if noise <= 0.0:
                 continue
-            held = runs((np.diff(values[:, axis]) == 0.0) & (driving[1:] == 1.0))
+            held = runs_of((np.diff(values[:, axis]) == 0.0) & (driving[1:] == 1.0))
             seconds = (imu.epochs_gps_ns[held[:, 1]] - imu.epochs_gps_ns[held[:, 0]]) / NS_PER_S
             if seconds.size and seconds.max() > STUCK_S:
                 row = int(held[np.argmax(seconds), 0])
@@ -273,7 +273,7 @@ def _without(readings: Kept[OdometerReadings], windows: Windows, bad: Flags, wha
     keep = np.ones(log.epochs_gps_ns.size, dtype=bool)
     keep[rows] = False
     epochs, speeds, records = [], [], []
-    for a, b in runs(keep):
+    for a, b in runs_of(keep):
         piece = np.arange(a, b)
         seconds, of, at = _speeds(log, piece)
         epochs.append(seconds)
@@ -304,7 +304,7 @@ def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
     """Rows whose epochs lie in runs of bad windows, with half a window and a step around."""
     half = round((windows.window_s / 2 + STEP_S) * NS_PER_S)
     inside = np.zeros(epochs.size, dtype=bool)
-    for a, b in runs(bad):
+    for a, b in runs_of(bad):
         first, last = windows.epochs_gps_ns[a] - half, windows.epochs_gps_ns[b - 1] + half
         inside |= (epochs >= first) & (epochs <= last)
     return np.flatnonzero(inside)
@@ -313,7 +313,7 @@ def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
 def _long(flags: Flags, least_s: float) -> Flags:
     """Runs of flags of at least so long."""
     out = np.zeros_like(flags)
-    for a, b in runs(flags):
+    for a, b in runs_of(flags):
         out[a:b] = (b - a) * STEP_S >= least_s
     return out
 

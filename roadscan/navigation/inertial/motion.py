@@ -15,11 +15,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
+from roadscan.compute.robust import scatter_about
 from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
-from roadscan.navigation.inertial.records import runs
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -80,7 +81,7 @@ class Windows:
     @property
     def stints(self) -> Int64:
         """First and one past the last window (s, 2) of each drive without a stop or a break."""
-        return runs(self.driving)
+        return runs_of(self.driving)
 
 
 def ned_from_world(world: str, position_world_m: Float64) -> Float64:
@@ -207,4 +208,4 @@ def _noise(values: Float64) -> float:
     if len(values) < 3:
         return 0.0
     bends = values[2:] - 2 * values[1:-1] + values[:-2]
-    return float(1.4826 * np.median(np.abs(bends)) / np.sqrt(6.0))
+    return float(scatter_about(bends, 0.0) / np.sqrt(6.0))

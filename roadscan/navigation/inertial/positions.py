@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.model.errors import CrsError, NavigationError
 from roadscan.model.gpstime import NS_PER_S
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import GnssSolutions
-from roadscan.navigation.inertial.records import FASTEST_M_PER_S, FEWEST_SPOILT, Kept, Repair, listed, runs
+from roadscan.navigation.inertial.records import FASTEST_M_PER_S, FEWEST_SPOILT, Kept, Repair, listed
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -116,7 +117,7 @@ def _repeated(gnss: GnssSolutions) -> Flags:
     placed = np.flatnonzero(np.isfinite(gnss.position_world_m[:, 0]))
     epochs, position = gnss.epochs_gps_ns[placed], gnss.position_world_m[placed]
     velocity = gnss.velocity_ned_m_per_s[placed]
-    for a, b in runs((np.diff(position, axis=0) == 0.0).all(axis=1)):
+    for a, b in runs_of((np.diff(position, axis=0) == 0.0).all(axis=1)):
         if b - a < 2:
             continue
         speed = np.linalg.norm(velocity[a : b + 1], axis=1)

@@ -11,6 +11,7 @@ from typing import Final, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.flags import runs_of
 from roadscan.model.errors import NavigationError, TimeSystemError
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
@@ -161,12 +162,6 @@ def odometer_in_order(odometer: OdometerReadings) -> Kept[OdometerReadings]:
     return Kept(OdometerReadings(epochs, distance, values[rows, 1]), rows, repairs + restarted)
 
 
-def runs(flags: Flags) -> Int64:
-    """First and one past the last index (r, 2) of each run of true flags (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return edges.reshape(-1, 2).astype(np.int64)
-
-
 def _each_epoch_once(sensor: str, epochs: Int64, values: Float64) -> tuple[Int64, list[Repair]]:
     """Rows in the order of their epochs, each epoch once, and what had to be done for it."""
     if epochs.size == 0:
@@ -283,7 +278,7 @@ def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Flags, lis
         kind, name = axis // 3, f"{('gyroscope', 'accelerometer')[axis // 3]} {'xyz'[axis % 3]}"
         column = values[:, axis]
         for end in (column.max(), column.min()):
-            held = runs(column == end)
+            held = runs_of(column == end)
             held = held[held[:, 1] - held[:, 0] >= _CLIPPED_SAMPLES]
             if abs(end) < _LEAST_SCALE[kind] or held.size == 0 or _is_constant(column):
                 continue

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.ways import way_along
 from roadscan.kernels.cracks.cross_sections import cross_sections
 from roadscan.kernels.cracks.quantiles_along import HALF_ALONG
 from roadscan.model.settings.distress import CrackDetection
@@ -78,7 +79,7 @@ class CrackPiece:
     @property
     def middle_m(self) -> Float64:
         """(2,) halfway along its line (m): a straight line that was simplified has no vertex there."""
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.line_m, axis=0).T))])
+        along = way_along(self.line_m)
         return np.array([np.interp(0.5 * along[-1], along, axis) for axis in self.line_m.T])
 
 

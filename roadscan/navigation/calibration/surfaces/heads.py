@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.robust import scatter_about
 from roadscan.model.errors import NavigationError
 from roadscan.navigation.calibration.evidence import Seen, Ties, Traverse
 from roadscan.navigation.calibration.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
@@ -136,7 +137,7 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
         return None
     variance = own.variance_m2[a] + other.variance_m2[b]
     away = own.height_m[a] - other.height_m[b]
-    spread = 1.4826 * float(np.median(np.abs(away - np.median(away))))
+    spread = scatter_about(away, float(np.median(away)))
     kept = (variance <= _EVEN * np.median(variance)) & (np.abs(away - np.median(away)) <= _OUTLYING * spread + _FLOOR_M)
     if kept.sum() < _LEAST:
         return None

@@ -1,0 +1,1 @@
+"""What all features compute with, on arrays: robust scatter, runs of flags, ways along places."""

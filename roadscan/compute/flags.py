@@ -1,0 +1,12 @@
+"""Runs of flags."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+
+def runs_of(flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """First and one past the last index (r, 2) of each run of true flags (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return edges.reshape(-1, 2).astype(np.int64)

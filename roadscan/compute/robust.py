@@ -1,0 +1,18 @@
+"""Scatter that single wrong values do not change."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+
+SIGMA_OF_MAD: Final = 1.4826
+"""Standard deviation of a normal distribution in median absolute deviations: 1 / Φ⁻¹(3/4) (Hampel 1974)."""
+
+
+def scatter_about(values: Float64, middle: float | Float64) -> float:
+    """Robust standard deviation of values (n,) about a middle, or about one each (n,): 1.4826 MAD."""
+    return SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))

@@ -14,10 +14,12 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
-from roadscan.sensors.base import Rows
+from roadscan.sensors.base import LogHeader, Rows
 from roadscan.sensors.records import LEAP_NS
+from roadscan.tables.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
@@ -284,7 +286,7 @@ class _Returns:
 
 
 @dataclass
-class EpochOrder:
+class EpochOrder(LogCheck):
     """Follows the epochs of one log, table by table, in the order of its files."""
 
     free: bool
@@ -307,8 +309,11 @@ class EpochOrder:
         series = self._series.setdefault(key, _Series(self.free, rows.table in _EVEN))
         return series.take(column.to_numpy(), batch, rows.first_record)
 
-    def findings(self) -> Iterator[Finding]:
-        """What is doubtful of the log's time, once it is read."""
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Say what is doubtful of the log's time."""
+        writer.findings += self._findings()
+
+    def _findings(self) -> Iterator[Finding]:
         yield from self._returns.findings()
         for (table, file, wheel), series in self._series.items():
             where = "".join([f" of {file}" if file else "", f" of wheel {wheel}" if wheel else ""])

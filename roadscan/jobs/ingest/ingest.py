@@ -10,11 +10,12 @@ from typing import Final
 from roadscan.jobs.engine.compute import Compute, Done, Inline
 from roadscan.jobs.ingest.epoch_order import EpochOrder
 from roadscan.jobs.ingest.laser_ranges import LaserRanges
-from roadscan.jobs.ingest.motion_checks import motion_findings
+from roadscan.jobs.ingest.log_check import LogCheck, Refuses
+from roadscan.jobs.ingest.motion_checks import MotionCheck
 from roadscan.jobs.ingest.overlap import reject_words
 from roadscan.jobs.ingest.place_checks import PLACED, place_faults
 from roadscan.jobs.ingest.planned_logs import Logs, PlannedLog, plan_logs
-from roadscan.jobs.ingest.pose_checks import FIXES, POSES, PoseRecords, check_poses
+from roadscan.jobs.ingest.pose_checks import PoseRecords
 from roadscan.jobs.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.jobs.ingest.resolution import resolution_findings
 from roadscan.jobs.ingest.sources import stamp_of
@@ -23,7 +24,7 @@ from roadscan.model.errors import FormatError, FullDiskError, RoadscanError, Run
 from roadscan.model.gpstime import TimeSystem
 from roadscan.model.survey import Survey
 from roadscan.model.witness import Finding
-from roadscan.sensors.base import Item, LogHeader, Reject, Rows
+from roadscan.sensors.base import Item, LogHeader, LogSource, Reject
 from roadscan.sensors.future_times import FutureTimes
 from roadscan.tables.logs import (
     DataFile,
@@ -150,29 +151,13 @@ def record_of(
 def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     """The rows of a log, finished in a scratch folder, and what its header says."""
     header = task.log.format.header(task.log.source)
-    writer, repeats = LogWriter(folder, header.list_size), RepeatedProfiles()
-    clock = task.log.source.clock
-    order = EpochOrder(free=clock is not None and clock.system is TimeSystem.FREE)
-    lasers = LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor")
-    seen = _Seen(header, PoseRecords(), order, FutureTimes.of(task.log.source, header), CloudPoints(), lasers)
+    writer, checks = LogWriter(folder, header.list_size), _checks(task.log.source, header)
     for item in _items(task.log, header):
-        if isinstance(item, Rows) and item.table == "scans":
-            repeats.take(item.batch)
-        _take(writer, item, seen)
-    writer.findings += [*order.findings(), *([found] if (found := repeats.finding()) else [])]
+        _take(writer, item, checks)
     writer.finish()
-    for table in (POSES, FIXES):
-        if writer.rows[table]:
-            check_poses(writer, table, str(header.attributes["world_frame"]), seen.poses)
-            writer.finish()
-    if writer.rows["cloud"]:
-        seen.cloud.finish(writer, header)
+    for check in checks:
+        check.finish(writer, header)
         writer.finish()
-    if writer.rows["returns"]:
-        seen.lasers.finish(writer)
-        writer.finish()
-    if writer.rows[POSES]:
-        writer.findings += motion_findings(writer, str(header.attributes["world_frame"]), seen.poses)
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header
@@ -279,32 +264,32 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
         raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What is followed through the rows of a log."""
+def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
+    """All that follow the rows of a log, in the order in which they are asked."""
+    free = source.clock is not None and source.clock.system is TimeSystem.FREE
+    poses = PoseRecords()
+    return [
+        Refuses(lambda rows: place_faults(rows.table, rows.batch, header) if rows.table in PLACED else ()),
+        Refuses(FutureTimes.of(source, header).refused),
+        EpochOrder(free=free),
+        RepeatedProfiles(),
+        poses,
+        CloudPoints(),
+        LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor"),
+        MotionCheck(poses),
+    ]
 
-    header: LogHeader
-    poses: PoseRecords
-    order: EpochOrder
-    future: FutureTimes
-    cloud: CloudPoints
-    lasers: LaserRanges
 
-
-def _take(writer: LogWriter, item: Item, seen: _Seen) -> None:
+def _take(writer: LogWriter, item: Item, checks: Sequence[LogCheck]) -> None:
     if isinstance(item, Finding):
         writer.findings.append(item)
         return
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    astray = place_faults(item.table, item.batch, seen.header) if item.table in PLACED else []
-    refused = writer.add(item.table, item.batch, [*astray, *seen.future.refused(item), *seen.order.refused(item)])
-    seen.poses.take(item, [rows for rows, _ in refused])
-    if item.table == "cloud":
-        seen.cloud.take(item, [rows for rows, _ in refused])
-    elif item.table == "returns":
-        seen.lasers.take(item.batch)
+    refused = writer.add(item.table, item.batch, [one for check in checks for one in check.refused(item)])
+    for check in checks:
+        check.take(item, [rows for rows, _ in refused])
     for rows, reason in refused:
         for record, offset, count in item.places(rows):
             writer.reject(item.file, record, offset, count, reason)

@@ -12,7 +12,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.compute.robust import scatter_about
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.model.witness import Finding, Witness
+from roadscan.sensors.base import LogHeader, Rows
 from roadscan.tables.writer import LogWriter
 
 Float64 = npt.NDArray[np.float64]
@@ -47,7 +49,7 @@ _AZIMUTH_RAD: Final = np.radians(2.0)
 
 
 @dataclass
-class LaserRanges:
+class LaserRanges(LogCheck):
     """Compares the ranges of neighbouring lasers, in some chunks of one log."""
 
     in_sensor_frame: bool
@@ -56,8 +58,11 @@ class LaserRanges:
     """By laser and chunk: residuals (m) and quarters (n,), and what 1 m of each neighbour's range adds to them."""
     _beside: dict[int, tuple[int, int]] = field(default_factory=dict)
 
-    def take(self, batch: pa.RecordBatch) -> None:
+    def take(self, rows: Rows, refused: Sequence[npt.NDArray[np.int64]]) -> None:
         """Look at a chunk, or not."""
+        if rows.table != _TABLE:
+            return
+        batch = rows.batch
         self._chunks += 1
         if not self.in_sensor_frame or self._chunks % _EVERY != 1 or self._chunks > _EVERY * _MOST_CHUNKS:
             return
@@ -104,7 +109,7 @@ class LaserRanges:
         pulls = [-float(np.median(w * (should[good] / r[good]) ** 2)) for w, r in zip(share, (one, other), strict=True)]
         self._found.setdefault(lasers[0], []).append((off[good], quarter, *pulls))
 
-    def finish(self, writer: LogWriter) -> None:
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
         """Leave the returns of lasers whose ranges are off out of the finished table."""
         wrong, is_clear = self._wrong()
         is_out = is_clear and len(wrong) <= _MOST_LASERS

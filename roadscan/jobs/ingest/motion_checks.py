@@ -10,11 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.jobs.ingest.pose_checks import POSES, PoseRecords, pose_track
 from roadscan.model.counted import counted
 from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
 from roadscan.navigation.pose_motion import PoseMotion, Same
+from roadscan.sensors.base import LogHeader
 from roadscan.tables.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]
@@ -73,15 +75,24 @@ _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_down_m")
 _NONE: Final = np.zeros(0, np.int64)
 
 
-def motion_findings(writer: LogWriter, world: str, records: PoseRecords) -> list[Finding]:
-    """What the poses of a finished log contradict in themselves."""
-    motion, sigma, velocities = PoseMotion(world), _Stated(), records.velocities()
-    for rows in writer.tables(POSES):
-        for start in range(0, rows.num_rows, _BLOCK):
-            block = rows.slice(start, _BLOCK)
-            motion.take(pose_track(block, world, _NONE, velocities))
-            sigma.take(block)
-    return [*_course(motion), *_constant(motion.same()), *_speed(motion), *_spacing(motion), *sigma.findings()]
+@dataclass(frozen=True)
+class MotionCheck(LogCheck):
+    """Asks whether the poses of a log contradict themselves."""
+
+    records: PoseRecords
+
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Say what they contradict; all poses stay."""
+        world = str(header.attributes.get("world_frame"))
+        motion, sigma = PoseMotion(world), _Stated()
+        for rows in writer.tables(POSES):
+            for start in range(0, rows.num_rows, _BLOCK):
+                block = rows.slice(start, _BLOCK)
+                motion.take(pose_track(block, world, _NONE, self.records.velocities))
+                sigma.take(block)
+        writer.findings += _course(motion)
+        writer.findings += _constant(motion.same())
+        writer.findings += [*_speed(motion), *_spacing(motion), *sigma.findings()]
 
 
 def _course(motion: PoseMotion) -> Iterator[Finding]:
@@ -123,9 +134,8 @@ def _constant(same: Sequence[Same]) -> Iterator[Finding]:
         spans.setdefault((one.first_gps_ns, one.last_gps_ns, one.poses), []).append(one)
     for each in spans.values():
         one = each[0]
-        names = " and ".join(
-            ["the " + ", the ".join(x.value for x in each[:-1])] * (len(each) > 1) + ["the " + each[-1].value]
-        )
+        values = [f"the {x.value}" for x in each]
+        names = " and ".join([", ".join(values[:-1]), values[-1]] if len(values) > 1 else values)
         verb = "is" if len(each) == 1 else "are"
         where = (
             f"in all {one.poses:,} poses"

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.jobs.ingest.place_checks import NO_FIX, without_fix
 from roadscan.model.counted import counted
 from roadscan.model.crs import LOCAL_WORLD
@@ -22,7 +24,7 @@ from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.model.witness import Finding, Witness
 from roadscan.navigation.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
 from roadscan.navigation.pose_motion import frozen
-from roadscan.sensors.base import Rows
+from roadscan.sensors.base import LogHeader, Rows
 from roadscan.sensors.motion.gnss import ned_from_ecef
 from roadscan.tables.writer import LogWriter
 
@@ -94,7 +96,7 @@ _TURNED: Final = "the attitude leaps away from the poses before and after it, as
 
 
 @dataclass
-class PoseRecords:
+class PoseRecords(LogCheck):
     """Which records the poses, or the GNSS positions, of a log come from, and the velocities that it states."""
 
     _parts: list[tuple[str, Int64, Int64, Int64]] = field(default_factory=list)
@@ -113,8 +115,18 @@ class PoseRecords:
         if item.velocity_level_m_per_s is not None:
             self._velocities.append(item.velocity_level_m_per_s[kept])
 
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Leave out the places that no vehicle can have taken."""
+        for table in _NOUN:
+            if writer.rows[table]:
+                check_poses(writer, table, str(header.attributes["world_frame"]), self)
+                writer.finish()
+
+    @cached_property
     def velocities(self) -> tuple[Int64, npt.NDArray[np.float32]] | None:
-        """Epochs, ascending, and velocities (n, 3) north, east, down of a log of which each row states one."""
+        """Epochs, ascending, and velocities (n, 3) north, east, down of a log of which each row states one; once it is
+        read.
+        """
         epochs = np.concatenate([np.zeros(0, np.int64), *(own for _, own, _, _ in self._parts)])
         velocities = np.concatenate([np.zeros((0, 3), np.float32), *self._velocities])
         if not epochs.size or len(velocities) != epochs.size:
@@ -138,7 +150,7 @@ def check_poses(writer: LogWriter, table: str, world: str, records: PoseRecords)
     """
     found = _Found(table)
     no_fix = _without_fix(writer, world) if table == POSES else np.zeros(0, np.int64)
-    reading = _Reading(world, no_fix, records.velocities())
+    reading = _Reading(world, no_fix, records.velocities)
     for epochs, leaps, stuck in _judged(writer, table, reading):
         found.add(epochs, leaps)
         found.reasons |= dict.fromkeys(stuck.tolist(), _FROZEN)

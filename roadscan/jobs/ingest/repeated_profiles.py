@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.model.counted import counted
 from roadscan.model.gpstime import iso_from_gps_ns
-from roadscan.model.witness import Finding, Witness
+from roadscan.model.witness import Witness
+from roadscan.sensors.base import LogHeader, Rows
+from roadscan.tables.writer import LogWriter
 
 REPEATED_PROFILES: Final = Witness(
     "repeated_profiles",
@@ -27,7 +31,7 @@ _SAMPLED: Final = 8
 """Readings of a profile that are compared first: most profiles differ in one of them."""
 
 
-class RepeatedProfiles:
+class RepeatedProfiles(LogCheck):
     """Counts repeated profiles of a log while it streams by, in the order of its file."""
 
     def __init__(self) -> None:
@@ -37,8 +41,11 @@ class RepeatedProfiles:
         self._first_gps_ns = 0
         self._began_gps_ns = 0
 
-    def take(self, batch: pa.RecordBatch) -> None:
+    def take(self, rows: Rows, refused: Sequence[npt.NDArray[np.int64]]) -> None:
         """Take the next rows of the table `scans`."""
+        if rows.table != "scans":
+            return
+        batch = rows.batch
         column = batch.column("range")
         if not batch.num_rows or not pa.types.is_fixed_size_list(column.type):
             return
@@ -51,17 +58,17 @@ class RepeatedProfiles:
             self._count(bool(same[row]), int(epochs[row]))
         self._last = ranges[-1].copy()
 
-    def finding(self) -> Finding | None:
-        """What to say of the log, None where no profile repeats."""
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Say how many profiles repeat."""
         self._count(repeats=False, epoch_gps_ns=0)
         if not self._repeats:
-            return None
-        return REPEATED_PROFILES.finds(
-            "",
+            return
+        text = (
             f"{counted(self._repeats, 'profile')} equal the one before, reading by reading, for the first time at "
             f"{iso_from_gps_ns(self._first_gps_ns)}: the scanner was stuck, or a buffer was sent again; they are used, "
-            "and show the road where it was not measured",
+            "and show the road where it was not measured"
         )
+        writer.findings.append(REPEATED_PROFILES.finds("", text))
 
     def _count(self, repeats: bool, epoch_gps_ns: int) -> None:
         if repeats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -10,6 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.jobs.ingest.log_check import LogCheck
 from roadscan.model.witness import Witness
 from roadscan.sensors.base import LogHeader, Rows
 from roadscan.tables.writer import LogWriter
@@ -55,7 +57,7 @@ _MIXER: Final = np.uint64(0xBF58476D1CE4E5B9)
 
 
 @dataclass
-class CloudPoints:
+class CloudPoints(LogCheck):
     """Follows the points of one log of a cloud."""
 
     _counts: dict[int, int] = field(default_factory=dict)
@@ -65,8 +67,10 @@ class CloudPoints:
     _sum_m: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     _points: int = 0
 
-    def take(self, rows: Rows, refused: list[Int64]) -> None:
+    def take(self, rows: Rows, refused: Sequence[Int64]) -> None:
         """Count the points of a chunk but those `refused` (by index)."""
+        if rows.table != _TABLE:
+            return
         kept = np.ones(rows.batch.num_rows, dtype=bool)
         for bad in refused:
             kept[bad] = False
@@ -91,6 +95,8 @@ class CloudPoints:
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
         """Leave strays and points that stand twice out of the finished table; say where the cloud's middle is."""
+        if not writer.rows[_TABLE]:
+            return
         strays = self._strays()
         if strays.size:
             for key in strays.tolist():

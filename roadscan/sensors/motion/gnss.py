@@ -7,7 +7,7 @@ level, north-east-down; covariances of logs that count up are negated.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.model.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, world_frame_of
-from roadscan.model.errors import ConfigError, CrsError, Missing
+from roadscan.model.errors import ConfigError, CrsError, Missing, TimeSystemError
+from roadscan.model.gpstime import Clock, TimeSystem
 from roadscan.sensors.base import Item, LogSource
 from roadscan.sensors.records import Sieve
 from roadscan.sensors.trajectories.poses import BlockPlacer, Placement, WorldPlacement, block_rows, check_sigmas
@@ -52,6 +53,27 @@ class RawSolutions:
     """(n,) numbers of :data:`QUALITIES`; `NO_POSITION` where the epoch has no position."""
     columns: dict[str, Float64]
     """Further columns of `gnss` by name, (n,) with NaN where missing."""
+
+
+def utc_clock(source: LogSource, says: str) -> Clock:
+    """The clock of a log whose times are UTC by its nature, in ns, as stated or none.
+
+    says : why they are UTC.
+
+    Raises
+    ------
+    TimeSystemError
+        where the survey file states another time system.
+    """
+    stated = source.clock
+    if stated is not None and stated.system is not TimeSystem.UNIX_UTC:
+        raise TimeSystemError(
+            f"{says}, the clock says {stated.system}",
+            expected='clock.system = "unix_utc", or no clock',
+            file=source.path,
+            missing=Missing("clock", {"system": "unix_utc"}),
+        )
+    return replace(stated or Clock(TimeSystem.UNIX_UTC), unit="ns")
 
 
 class GnssReader:

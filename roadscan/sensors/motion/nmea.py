@@ -11,14 +11,14 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import LOCAL_WORLD, Geoid
+from roadscan.model.crs import Geoid
 from roadscan.model.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
+from roadscan.model.gpstime import NS_PER_S, Clock, leap_seconds_at_unix
 from roadscan.model.strict import Strict
 from roadscan.model.witness import Finding, Witness
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.sensors.lidars.pcap import MAGICS, PCAPNG
-from roadscan.sensors.motion.gnss import NO_POSITION, GnssReader, RawSolutions
+from roadscan.sensors.motion.gnss import NO_POSITION, GnssReader, RawSolutions, utc_clock
 from roadscan.sensors.motion.nmea_sentences import (
     DAY_NS,
     KINDS,
@@ -33,7 +33,7 @@ from roadscan.sensors.motion.nmea_sentences import (
 )
 from roadscan.sensors.records import EpochReader, Sieve, drop_failing, few_rejects, options_of
 from roadscan.sensors.text_table import SEARCHED_BYTES, head_of, line_blocks
-from roadscan.sensors.trajectories.poses import GeodeticPlacement
+from roadscan.sensors.trajectories.poses import GeodeticPlacement, check_geographic
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -174,31 +174,17 @@ class _Plan:
 
 def _plan(source: LogSource) -> _Plan:
     options = options_of(source, NmeaOptions)
-    stated = source.clock
-    if stated is not None and stated.system is not TimeSystem.UNIX_UTC:
-        raise TimeSystemError(
-            f"NMEA times are UTC, the clock says {stated.system}",
-            expected='clock.system = "unix_utc", or no clock',
-            file=source.path,
-            missing=Missing("clock", {"system": "unix_utc"}),
-        )
+    clock = utc_clock(source, "NMEA times are UTC")
     if options.altitude == "ellipsoidal" and source.any_height == "orthometric":
         raise ConfigError(
             'options.altitude = "ellipsoidal", and height = "orthometric"',
             expected="one kind of heights",
             file=source.path,
         )
-    if source.need_crs() == LOCAL_WORLD:
-        raise ConfigError(
-            'crs = "local", but the log\'s positions are latitude and longitude',
-            expected='a geographic CRS, such as "EPSG:4979"',
-            file=source.path,
-            missing=Missing("crs", "EPSG:4979"),
-        )
+    check_geographic(source.need_crs(), source.path)
     if source.geoid is not None:
         source.geoid.undulation_m([], [])  # says at once where the grid is missing
     placement = GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
-    clock = replace(stated or Clock(TimeSystem.UNIX_UTC), unit="ns")
     return _Plan(options, clock, placement, _first_day(source))
 
 

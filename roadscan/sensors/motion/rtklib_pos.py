@@ -411,13 +411,6 @@ def _placement(source: LogSource, header: _Header) -> tuple[Placement, Float64 |
 
 def _geodetic_placement(source: LogSource, header: _Header) -> GeodeticPlacement:
     crs = source.need_crs()
-    if crs == LOCAL_WORLD:
-        raise ConfigError(
-            'crs = "local", but the log\'s positions are latitude and longitude',
-            expected='a geographic CRS, such as "EPSG:4979"',
-            file=source.path,
-            missing=Missing("crs", "EPSG:4979"),
-        )
     check_geographic(crs, source.path)
     geodetic = crs_from_text(crs).geodetic_crs
     if header.datum == "Tokyo" and (geodetic is None or "tokyo" not in str(geodetic.datum).lower()):

@@ -12,11 +12,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import LOCAL_WORLD
-from roadscan.model.errors import ConfigError, FormatError, Missing, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.model.errors import FormatError
+from roadscan.model.gpstime import Clock
 from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource
-from roadscan.sensors.motion.gnss import NO_POSITION, QUALITIES, GnssReader, RawSolutions
+from roadscan.sensors.motion.gnss import NO_POSITION, QUALITIES, GnssReader, RawSolutions, utc_clock
 from roadscan.sensors.motion.nmea import Nmea
 from roadscan.sensors.records import EpochReader, Sieve
 from roadscan.sensors.text_table import head_of
@@ -184,24 +183,10 @@ def _columns(frames: npt.NDArray[np.void]) -> dict[str, npt.NDArray[np.float64]]
 
 
 def _clock(source: LogSource) -> Clock:
-    stated = source.clock
-    if stated is not None and stated.system is not TimeSystem.UNIX_UTC:
-        raise TimeSystemError(
-            f"UBX-NAV-PVT states UTC, the clock says {stated.system}",
-            expected='clock.system = "unix_utc", or no clock',
-            file=source.path,
-            missing=Missing("clock", {"system": "unix_utc"}),
-        )
-    return replace(stated or Clock(TimeSystem.UNIX_UTC), unit="ns", date=None)
+    return replace(utc_clock(source, "UBX-NAV-PVT states UTC"), date=None)
 
 
 def _placement(source: LogSource) -> GeodeticPlacement:
-    if source.need_crs() == LOCAL_WORLD:
-        raise ConfigError(
-            'crs = "local", but the log\'s positions are latitude and longitude',
-            expected='a geographic CRS, such as "EPSG:4979"',
-            file=source.path,
-            missing=Missing("crs", "EPSG:4979"),
-        )
+    placement = GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
     source.need_height("ellipsoidal", "the definition of UBX-NAV-PVT")
-    return GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
+    return placement

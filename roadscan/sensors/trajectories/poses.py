@@ -301,6 +301,13 @@ def level_placement(source: LogSource, north: North | None) -> Placement:
 
 def check_geographic(crs: str, file: Path) -> pyproj.CRS:
     """The geographic CRS of positions; an error where it is none, or does not count longitude from Greenwich."""
+    if crs == LOCAL_WORLD:
+        raise ConfigError(
+            'crs = "local", but the log\'s positions are latitude and longitude',
+            expected='a geographic CRS, such as "EPSG:4979"',
+            file=file,
+            missing=Missing("crs", "EPSG:4979"),
+        )
     found = crs_from_text(crs)
     if found.is_compound or not found.is_geographic:
         raise CrsError(

@@ -102,9 +102,8 @@ class PerCrossSection:
     def remark(self, own: npt.NDArray[np.bool_]) -> str:
         """What a section of the cross-sections `own` (n,) says of those that are left out."""
         count = np.count_nonzero(self._left_out(own))
-        return f"{count} cross-sections are left out: their heights are over ten times as noisy as the lane's" * bool(
-            count
-        )
+        words = f"{count} cross-sections are left out: their heights are over ten times as noisy as the lane's"
+        return words if count else ""
 
     def _left_out(self, own: npt.NDArray[np.bool_] | slice) -> npt.NDArray[np.bool_]:
         every = np.zeros(self.value.size, np.bool_) if self.noisy is None else self.noisy

@@ -145,44 +145,41 @@ def _pair(figures: Mapping[str, Any]) -> Pair:
 def _blind(seen: Mapping[tuple[str, str], Sequence[SeenBy]]) -> Iterator[tuple[tuple[str, str], str]]:
     levels = {log: [s.below_m for s in own if s.below_m is not None and s.readings] for log, own in seen.items()}
     for log, own in seen.items():
-        given, placed = sum(s.given for s in own), sum(s.placed for s in own)
-        beside, readings = sum(s.beside for s in own), sum(s.readings for s in own)
-        is_profiler = own[0].is_profiler
-        if given < _LEAST_READINGS or not (is_profiler or max(s.level_share for s in own) > _LEVEL_SHARE):
-            continue  # a lidar may be there to see façades
-        if is_profiler and placed < _LEAST_PLACED * given:
-            yield (
-                log,
-                (
-                    f"{placed:,} of {given:,} readings on stretches of the run have a return in the sensor's range: it "
-                    "looks elsewhere, is covered, or range_min_m and range_max_m are wrong"
-                ),
-            )
-        elif readings < _LEAST_ON_ROAD * beside or (is_profiler and beside < _LEAST_READINGS):
-            above = [-s.below_m for s in own if s.below_m is not None]
-            where = (
-                f"most of them {np.median(above):+.2f} m above the body's origin" if above else "none beside the way"
-            )
-            others = [level for other in levels if other != log for level in levels[other]]
-            road = f"; the other sensors see it {np.median(others):.2f} m below" if others else ""
-            yield (
-                log,
-                (
-                    f"{readings:,} of {placed:,} readings lie where a road can be, {where}{road}: axes, boresight or "
-                    "lever arm of the sensor are stated wrong, or it looks elsewhere"
-                ),
-            )
-        else:
-            others = [level for other in levels if other != log for level in levels[other]]
-            level = float(np.median(levels[log])) if levels[log] else float("nan")
-            if len({o for o in levels if o != log and levels[o]}) > 1 and abs(level - np.median(others)) > _LEVEL_M:
-                yield (
-                    log,
-                    (
-                        f"its readings lie {level:.2f} m below the body's origin, those of the other sensors and runs "
-                        f"{np.median(others):.2f} m: its mounting is stated wrong, or it sees something else than road"
-                    ),
-                )
+        others = [level for other in levels if other != log for level in levels[other]]
+        sees = sum(other != log and bool(levels[other]) for other in levels)
+        if text := _no_road(own, levels[log], others if sees > 1 else [], _road_of(others)):
+            yield log, text
+
+
+def _road_of(levels_m: Sequence[float]) -> str:
+    return f"; the other sensors see it {np.median(levels_m):.2f} m below" if levels_m else ""
+
+
+def _no_road(own: Sequence[SeenBy], levels_m: Sequence[float], others_m: Sequence[float], road: str) -> str:
+    """Why a sensor sees no road, "" where it does; `others_m` : levels of several others, which agree on the road's."""
+    given, placed = sum(s.given for s in own), sum(s.placed for s in own)
+    beside, readings = sum(s.beside for s in own), sum(s.readings for s in own)
+    is_profiler = own[0].is_profiler
+    if given < _LEAST_READINGS or not (is_profiler or max(s.level_share for s in own) > _LEVEL_SHARE):
+        return ""  # a lidar may be there to see façades
+    if is_profiler and placed < _LEAST_PLACED * given:
+        return (
+            f"{placed:,} of {given:,} readings on stretches of the run have a return in the sensor's range: it looks "
+            "elsewhere, is covered, or range_min_m and range_max_m are wrong"
+        )
+    if readings < _LEAST_ON_ROAD * beside or (is_profiler and beside < _LEAST_READINGS):
+        above = [-s.below_m for s in own if s.below_m is not None]
+        where = f"most of them {np.median(above):+.2f} m above the body's origin" if above else "none beside the way"
+        return (
+            f"{readings:,} of {placed:,} readings lie where a road can be, {where}{road}: axes, boresight or lever arm "
+            "of the sensor are stated wrong, or it looks elsewhere"
+        )
+    if levels_m and others_m and abs(np.median(levels_m) - np.median(others_m)) > _LEVEL_M:
+        return (
+            f"its readings lie {np.median(levels_m):.2f} m below the body's origin, those of the other sensors and "
+            f"runs {np.median(others_m):.2f} m: its mounting is stated wrong, or it sees something else than road"
+        )
+    return ""
 
 
 # --- contradictions -------------------------------------------------------------------------------------
@@ -192,13 +189,11 @@ def _astray(seen: Mapping[tuple[str, str], Sequence[SeenBy]]) -> Iterator[tuple[
     for log, own in seen.items():
         astray, lane = sum(s.astray for s in own), sum(s.own_lane for s in own)
         if own[0].is_profiler and lane > _LEAST_READINGS and astray > _ASTRAY * lane:
-            yield (
-                log,
-                (
-                    f"{astray / lane:.1%} of the readings below and close to the vehicle lie more than 0.1 m off the "
-                    "others of their cell: ranges or poses are wrong, or parts of the vehicle are in sight"
-                ),
+            text = (
+                f"{astray / lane:.1%} of the readings below and close to the vehicle lie more than 0.1 m off the "
+                "others of their cell: ranges or poses are wrong, or parts of the vehicle are in sight"
             )
+            yield log, text
 
 
 def _ends(stretch: _Stretch, pair: Pair, *, by_way: bool) -> tuple[End, End]:

@@ -111,7 +111,7 @@ def _summits(likeness: Float64) -> npt.NDArray[np.int64]:
 
 
 def _summit(likeness: Float64) -> float:
-    """Lag (m) of the summit nearest to none of those that are about the highest, between the cells by a parabola."""
+    """The least lag (m) of the summits that are about the highest, between the cells by a parabola."""
     middle = likeness.size // 2
     k = min(_summits(likeness).tolist(), key=lambda step: abs(step - middle))
     if not 0 < k < likeness.size - 1:

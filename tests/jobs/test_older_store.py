@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.jobs.session import Session
 from roadscan.jobs.status import survey_status, verify_store
+from roadscan.sensors.base import log_formats
 from roadscan.tables.sql import query
 
 OLD = Path(__file__).resolve().parents[1] / "stores" / "version-0.1.tar.xz"
@@ -34,12 +35,19 @@ def survey_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "SURVEY.toml"
 
 
-def test_rows_of_archived_logs_stay(survey_file: Path, tmp_path: Path) -> None:
-    """Where the raw logs are gone, poses that were not checked are still the poses of the store."""
+@pytest.mark.parametrize("versions_later", [0, 2])
+def test_rows_of_archived_logs_stay(
+    survey_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, versions_later: int
+) -> None:
+    """Where the raw logs are gone, what an earlier reader and earlier checks left of them stays."""
+    for one in log_formats().values():
+        monkeypatch.setattr(type(one), "version", one.version + versions_later)
     copy = tmp_path / "survey"
     shutil.copytree(survey_file.parent, copy)
     survey_status(Session.open(copy / "SURVEY.toml"))  # learns the bytes of the logs, as any command does
     shutil.rmtree(copy / "raw")
+    if versions_later:
+        (copy / "control.csv").unlink()
     state = survey_status(Session.open(copy / "SURVEY.toml"))
     assert {log["state"] for log in state.logs} == {"ingested"}
 

@@ -166,8 +166,12 @@ def _plan_log(
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     key = key_of(*shaping, *_checks_of(format_))
     if not path.exists() and not has_log(store, key):
-        # It was archived after it was read, before there were these checks: its rows stay.
-        earlier = (key_of(*shaping, *checks) for checks in _earlier_checks(format_))
+        # It was archived after an earlier reader or earlier checks had read it: its rows stay.
+        earlier = (
+            key_of(format_.name, before, *shaping[2:], *checks)
+            for before in range(format_.version, 0, -1)
+            for checks in (_checks_of(format_), *_earlier_checks(format_))
+        )
         key = next((one for one in earlier if has_log(store, one)), key)
     return PlannedLog(run, name, config, format_, source, key, content, size, stamp)
 

@@ -34,7 +34,6 @@ _LEAST_CELLS: Final = 20
 _LEAST_M: Final = 0.02
 """Two passes of a good mapping system, in one datum, are nearer together."""
 _SCATTERS: Final = 5.0
-"""σ of a normal distribution over its median absolute deviation."""
 _MOST_TOLD: Final = 8
 
 
